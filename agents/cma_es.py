@@ -23,11 +23,11 @@ from typing import Any
 import cma
 import numpy as np
 
+from agents.cluster import connected
 from agents.objectives import OBJECTIVES
 from agents.objectives.objective import Objective, Vector, policy_of, to_vector, with_vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Settings
-from bufgym.benchmark.cluster import connected
 from bufgym.ground.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.learned import Weights

@@ -118,7 +118,7 @@ def measure(
         split(evaluation.fixed(AFR, "clairvoyant")),
         {name: split(evaluation.fixed(name)) for name in ranked},
         [split(np.array([row["qoi"] for row in own], np.float64)) for own in rows],
-        {standing.policy: standing.score for standing in result.standings},
+        {standing.policy: standing["score"] for standing in result.standings},
     )
 
 

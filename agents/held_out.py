@@ -14,10 +14,11 @@ from agents.evaluation import play
 from agents.mixed_env import Cell, MixedEnv
 from agents.settings import Settings
 from bufgym import scenario as scenarios
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, percentile_interval, times_drawn
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.score import paired_difference, scores
-from bufgym.benchmark.tasks import bound
+from bufgym.benchmark.score import scores
+from bufgym.benchmark.tasks.queue import best
 from bufgym.oracle.measure import BASELINE, normalised_score, regret
 from bufgym.policies import registry
 from bufgym.scenario import Scenario, Uplink
@@ -51,7 +52,7 @@ class FixedEpisodes:
         self.capacity, self.decide_at = settings.capacity, settings.decide_at
         # With uniform draws for policies that randomise.
         self.episodes = [draw(self.scenario, FIRST_SEED[split] + i) for i in range(count)]
-        self._plans = [bound.best(episode, self.capacity, self.scenario) for episode in self.episodes]
+        self._plans = [best(episode, self.capacity, self.scenario) for episode in self.episodes]
         self._base = math.fsum(result.qoi for result in self.run(BASELINE))
         self._best = math.fsum(plan.qoi for plan in self._plans)
 
@@ -92,21 +93,21 @@ def known_mean(numbers: Sequence[float]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
-def summarise(
-    outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], agent: str, resamples: int = 2000
-) -> list[dict[str, Any]]:
+def summarise(outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], agent: str) -> list[dict[str, Any]]:
     """One entry per policy, best QoI first: its score and regret, means over the episodes, QoI minus the agent's.
 
     ``rows`` belong to the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals, paired as in ``score``:
     policies meet the same episodes, so an episode's own QoI cancels.
     """
-    measured = {cell.policy: cell for cell in scores(rows, resamples=resamples).cells}
-    reference = [result.qoi for result in outcomes[agent]]
+    measured = {cell.policy: cell for cell in scores(rows).cells}
+    reference = np.array([result.qoi for result in outcomes[agent]])
+    weights = times_drawn(len(reference), RESAMPLES, np.random.default_rng(SEED))
     entries = []
     for name, results in outcomes.items():
         score, low, high = measured[name].score
         entry = {"policy": name, "score": score, "score_95": [low, high], "regret": measured[name].regret.value}
         entry |= {field.name: known_mean([getattr(o, field.name) for o in results]) for field in fields(Outcome)}
-        minus, low, high = paired_difference([result.qoi for result in results], reference, resamples=resamples)
+        less = np.array([result.qoi for result in results]) - reference
+        minus, low, high = percentile_interval(weights @ less / len(less))
         entries.append({**entry, "minus_agent": minus, "minus_agent_95": [low, high]})
     return sorted(entries, key=lambda entry: -entry["qoi"])

@@ -215,14 +215,14 @@ def report_suite(
         cells=[dataclasses.asdict(cell) for cell in result.cells],
     )
     # Without a discriminative cell, there are no scores to draw.
-    ranked = {s.policy: s.score for s in result.standings if s.ranked and math.isfinite(s.score.value)}
+    ranked = {s.policy: s["score"] for s in result.standings if s.ranked and math.isfinite(s["score"].value)}
     bars, twins = _drawn(ranked, same(rows))
     rival = "that of AFR or Drop Oldest" if settings.algo == "evolution" else "AFR's"
     # By the last column the agent was chosen.
     curves = [np.array(run.validation)[:, [0, -1]] for run in runs]
     measure = f"regret over {rival}, on validation"
     draw(home / "figure.png", runs, curves, measure, bars, "Test split", notes=twins)
-    return notes, next(s.score for s in result.standings if s.policy == f"agent ({settings.algo})")
+    return notes, next(s["score"] for s in result.standings if s.policy == f"agent ({settings.algo})")
 
 
 def standings(result: Scores) -> str:
@@ -230,10 +230,9 @@ def standings(result: Scores) -> str:
     lines = [["policy", "score [95 %]", "regret [95 %]", "IQM", "P(better than AFR) [95 %]"]]
     for standing in result.standings:
         name = standing.policy if standing.ranked else f"{standing.policy} (not ranked)"
-        iqm = "-" if math.isnan(standing.iqm.value) else f"{standing.iqm.value:.3f}"
-        score, regret = written(standing.score, ".3f"), written(standing.regret, ".2%")
-        lines.append([name, score, regret, iqm, written(standing.improvement, ".2f")])
-    counted = max((standing.cells for standing in result.standings), default=0)
+        iqm = "-" if math.isnan(standing["iqm"].value) else f"{standing['iqm'].value:.3f}"
+        score, regret = written(standing["score"], ".3f"), written(standing["regret"], ".2%")
+        lines.append([name, score, regret, iqm, written(standing["improvement"], ".2f")])
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
-    note = f"{counted} of {total} cells (scenario, L) count; score: 0 is {result.baseline}, 1 the clairvoyant"
+    note = f"{result.counted} of {total} cells (scenario, L) count; score: 0 is {BASELINE}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])

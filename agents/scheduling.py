@@ -10,7 +10,8 @@ from agents.page import command, publish, written
 from agents.runs import MODEL, read_settings
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
-from bufgym.benchmark.summary import Standing, plain
+from bufgym.benchmark.score import Standing
+from bufgym.benchmark.summary import plain
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.errors import BufgymError
 

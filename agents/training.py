@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents import cma_es
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
+from agents.cluster import begun
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluation import EvaluationSet, ValidationSets, Verdict
 from agents.held_out import FixedEpisodes, split_scenario
@@ -32,7 +33,6 @@ from agents.objectives.fleet import FleetObjective, fleet_of
 from agents.objectives.objective import policy_of as slot_policy_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
 from agents.settings import Settings
-from bufgym.benchmark.cluster import begun
 from bufgym.benchmark.rows import Row
 from bufgym.envs.fleet_vec import FleetVecEnv
 from bufgym.ground.errors import BufgymError

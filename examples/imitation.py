@@ -27,9 +27,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-import bufgym  # noqa: F401  (registers the environments)
+import bufgym
 from bufgym import policies, scenario
-from bufgym.benchmark.run import run
 from bufgym.envs import expert
 from bufgym.oracle.measure import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy
@@ -138,7 +137,7 @@ def scores(network: SlotPolicy, settings: Settings) -> dict[str, float]:
     """Score policies on the held-out links, from 0 for Drop Oldest to 1 for the clairvoyant."""
     uplink = scenario.get("lte", traces=TEST, duration_s=settings.test_duration_s)
     players = [as_policy(network, "imitation"), *map(policies.get, RIVALS)]
-    rows = run(players, uplink, [settings.capacity], settings.test_seeds)
+    rows = bufgym.compare(players, uplink, capacity=settings.capacity, seeds=settings.test_seeds).rows
     h = {player.name: sum(row["qoi"] for row in rows if row["policy"] == player.name) for player in players}
     best = sum(row["clairvoyant"] for row in rows if row["policy"] == "drop-oldest")
     return {name: float(normalised_score(total, h["drop-oldest"], best)) for name, total in h.items()}

@@ -30,8 +30,8 @@ from d3rlpy.models.torch.q_functions import DiscreteMeanQFunctionForwarder, Disc
 from gymnasium import spaces
 from torch import Tensor
 
+import bufgym
 from bufgym import policies, scenario
-from bufgym.benchmark.run import run
 from bufgym.envs.expert import dataset
 from bufgym.envs.observation import ObservationForm
 from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
@@ -203,7 +203,8 @@ def main(settings: Settings) -> dict[str, float]:
             began = time.process_time()
             players.append(as_policy(learn(steps, settings), f"{name}-{kind}"))
             print(f"{name} of {len(steps.action):,} {kind} steps: {time.process_time() - began:.0f} CPU seconds")
-    rows = run(players, scenario.get("lte", traces=TEST, duration_s=settings.test_duration_s), [L], settings.test_seeds)
+    held_out = scenario.get("lte", traces=TEST, duration_s=settings.test_duration_s)
+    rows = bufgym.compare(players, held_out, capacity=L, seeds=settings.test_seeds).rows
     h = {player.name: sum(row["qoi"] for row in rows if row["policy"] == player.name) for player in players}
     best = sum(row["clairvoyant"] for row in rows if row["policy"] == "drop-oldest")
     reached = {name: float(normalised_score(total, h["drop-oldest"], best)) for name, total in h.items()}

@@ -9,9 +9,8 @@ import argparse
 import gymnasium as gym
 import numpy as np
 
-import bufgym  # noqa: F401  (registers the environments)
+import bufgym
 from bufgym import scenario
-from bufgym.benchmark import run, table
 from bufgym.traces import Trace
 
 
@@ -38,7 +37,7 @@ def main() -> None:
 
     # Compares policies on others.
     test = scenario.get("lte", traces="own_link:corridor:100-103", duration_s=10.0)
-    print(table.plain(run.run(["afr", "drop-oldest"], test, [8], options.seeds)))
+    print(bufgym.compare(["afr", "drop-oldest"], test, seeds=options.seeds).table())
 
 
 if __name__ == "__main__":

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 import gymnasium as gym
 import numpy as np
 
-import bufgym  # noqa: F401  (registers the environments)
+import bufgym
 from bufgym import scenario
-from bufgym.benchmark import run, table
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.traces import Trace
@@ -52,8 +51,7 @@ def main() -> None:
             print(f"at random: {info['delivered']} of {info['arrived']} delivered, QoI {info['qoi']:.1f}")
             _, info = env.reset()
 
-    rows = run.run(["afr", "drop-oldest"], scenario.get("halls"), [8], options.seeds)
-    print(table.plain(rows))
+    print(bufgym.compare(["afr", "drop-oldest"], "halls", seeds=options.seeds))
 
 
 if __name__ == "__main__":

@@ -8,9 +8,8 @@ import argparse
 
 import gymnasium as gym
 
-import bufgym  # noqa: F401  (registers the environments)
+import bufgym
 from bufgym import scenario
-from bufgym.benchmark import run, table
 from bufgym.model import qoi
 
 
@@ -38,7 +37,7 @@ def main() -> None:
             _, info = env.reset()
 
     test = scenario.get("lte", value="own_value:doorways", duration_s=10.0)
-    print(table.plain(run.run(["min-motion-gap", "afr", "drop-oldest"], test, [8], options.seeds)))
+    print(bufgym.compare(["min-motion-gap", "afr", "drop-oldest"], test, seeds=options.seeds).table())
 
 
 if __name__ == "__main__":

@@ -29,9 +29,8 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
-import bufgym  # noqa: F401  (registers the environments)
+import bufgym
 from bufgym import policies, scenario
-from bufgym.benchmark.run import run
 from bufgym.ground.errors import BufgymError
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
@@ -131,7 +130,7 @@ class Test:
     def __init__(self, settings: Settings) -> None:
         uplink = scenario.get("lte", traces=TEST, duration_s=settings.duration_s)
         fixed = [policies.get(name) for name in ("drop-oldest", "afr")]
-        rows = run(fixed, uplink, [settings.capacity], settings.test_seeds)
+        rows = bufgym.compare(fixed, uplink, capacity=settings.capacity, seeds=settings.test_seeds).rows
         self.h = {p.name: sum(row["qoi"] for row in rows if row["policy"] == p.name) for p in fixed}
         self.best = sum(row["clairvoyant"] for row in rows if row["policy"] == "afr")
         self.episodes = [{"trace": trace, "seed": seed} for trace in TEST for seed in range(settings.test_seeds)]

@@ -16,8 +16,7 @@ from pathlib import Path
 
 from sb3_contrib import MaskablePPO
 
-from bufgym.benchmark import leaderboard, manifest
-from bufgym.benchmark.rows import read_rows
+from bufgym.benchmark import leaderboard
 from bufgym.cli import main as bufgym
 from bufgym.sb3 import SlotPolicy, make_vec_env
 
@@ -47,8 +46,7 @@ def main() -> None:
     chosen = ["--policies", f"{model},afr,drop-oldest", "--format", "csv", "--out", str(rows)]
     if code := bufgym(["bench", "--suite", options.suite, *chosen, *options.bench]):
         raise SystemExit(code)
-    unranked = manifest.read(rows / "manifest.json")["unranked"]
-    board = leaderboard.entries(read_rows(rows / "rows.csv"), options.suite, unranked)
+    board = leaderboard.of_folder(rows)
     # By its file, as the command in the row names it.
     board = [replace(entry, policy=str(model)) if entry.policy == model.stem else entry for entry in board]
     leaderboard.write(board, options.out / "leaderboard.csv")

@@ -14,11 +14,10 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies, scenario
-from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.table import aligned
-from bufgym.benchmark.tasks import bound
+from bufgym import policies, scenario, sim
+from bufgym.oracle import clairvoyant
 from bufgym.oracle.measure import BASELINE, normalised_score
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim.metrics import outcome
 from bufgym.sim.state import NEVER
 
@@ -43,11 +42,10 @@ def main() -> None:
     options = parser.parse_args()
     uplink = scenario.get("lte", duration_s=options.seconds)
     episodes = [draw(part, seed) for _, part in by_trace(uplink) for seed in range(options.seeds)]
-    plans = [bound.best(episode, options.capacity, uplink) for episode in episodes]
-    best = sum(plan.qoi for plan in plans)
+    best = sum(clairvoyant(episode, options.capacity, uplink.value).qoi for episode in episodes)
     h, missed_s = {}, {}
     for name in dict.fromkeys([BASELINE, *options.policies.split(",")]):
-        senders = bound.meet(policies.get(name), episodes, options.capacity, uplink, plans)
+        senders = sim.run(policies.get(name), episodes, options.capacity, uplink.value)
         h[name] = sum(outcome(senders, i).qoi for i in range(len(episodes)))
         logs = [np.asarray(log)[: len(e.arrivals)] for log, e in zip(senders.batch.log, episodes, strict=True)]
         shares = [
@@ -56,10 +54,9 @@ def main() -> None:
         ]
         missed_s[name] = options.seconds * float(np.mean(shares))
     score = {name: float(normalised_score(h[name], h[BASELINE], best)) for name in h}
-    lines = [["policy", "score", "view missed (s)"]]
+    print(f"{'policy':16} score  view missed (s)")
     for name in sorted(h, key=lambda name: -h[name]):
-        lines.append([name, f"{score[name]:.3f}", f"{missed_s[name]:.2f}"])
-    print("\n".join(aligned(lines)))
+        print(f"{name:16} {score[name]:5.3f}  {missed_s[name]:15.2f}")
     print(f"means over {len(episodes)} episodes of {options.seconds:g} s, L = {options.capacity}")
     between = sorted(score, key=lambda name: score[name])
     about_s = np.interp(options.score, [score[name] for name in between], [missed_s[name] for name in between])

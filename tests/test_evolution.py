@@ -12,7 +12,7 @@ import pytest
 from safetensors.numpy import load_file
 from train_cases import columns, in_a_folder_of_its_own  # noqa: F401
 
-from agents import training
+from agents import cluster, training
 from agents.cma_es import Evolution
 from agents.mixed_env import Cell, cells
 from agents.objectives import queue
@@ -20,7 +20,6 @@ from agents.objectives.objective import to_vector, with_vector
 from agents.runs import MODEL, prepare
 from agents.settings import LINK, MOTION, SEES, Settings
 from bufgym import policies
-from bufgym.benchmark import cluster
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import exponential
 from bufgym.oracle import integer, law
@@ -130,14 +129,6 @@ def test_a_suite_is_measured_by_the_better_of_afr_and_drop_oldest() -> None:
     assert suite.decisions_of() == suite.decisions == 2 * 42
 
 
-def test_interruptions_side_by_side_are_what_each_is_alone() -> None:
-    given = cells("interruption-v1", "train", (1, 4, 9))[:6]
-    together = queue.ExactRegrets(given)
-    for name in ("min-gap", "afr", "min-gap"):
-        alone = [EveryLength(cell.scenario, [cell.capacity]).regrets(policies.get(name))[0] for cell in given]
-        assert together.regrets(policies.get(name)).tolist() == alone
-
-
 def test_a_part_is_measured_by_what_the_rivals_reach_on_all_parts() -> None:
     """Two parts with one cell each, of the same L and V: each part's regret over the mean of both rivals'."""
     cell = cells("sustained-v1", "train", (10,))[1]
@@ -223,20 +214,3 @@ def test_a_missing_library_is_one_clear_error(backend: str, monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, LIBRARY[backend], None)
     with pytest.raises(BufgymError, match=f"{LIBRARY[backend]} is missing: "), cluster.begun(backend, None):
         pass
-
-
-def test_resuming_may_change_the_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The settings of a run leave out where it was computed, as the result is the same."""
-    local = Settings(name="run", **{**FEW, "seeds": 1})  # type: ignore[arg-type]
-    prepare(local)
-    dask = Settings(name="run", backend="dask", address="tcp://host:1", resume=True, **FEW)  # type: ignore[arg-type]
-    folder = prepare(dask)
-    assert dask.command == Settings(**FEW).command  # type: ignore[arg-type]
-
-    def refuse(backend: str, address: str | None) -> None:
-        raise BufgymError(f"{backend} at {address}")
-
-    monkeypatch.setattr(cluster, "_client", refuse)
-    monkeypatch.setattr(training, "ValidationSets", lambda *args, **options: None)
-    with pytest.raises(BufgymError, match="dask at tcp://host:1"):
-        training.train_all(dask, folder)

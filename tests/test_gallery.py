@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 from browser_cases import embedded, opened
 
-from bufgym.benchmark import picture
 from bufgym.envs.render.scene import DELIVERED, DROPPED, QUEUED, SENDING
 from bufgym.scenario import Interruption
 from bufgym.scenario.numbered import draw
-from website import films
+from website import films, picture
 
 REPO = Path(__file__).resolve().parent.parent
 FILMS = REPO / "docs" / "gallery"

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bufgym import policies
-from bufgym.benchmark import picture
-from bufgym.benchmark.picture import fading, play
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderEnv
 from bufgym.envs.expert import Player
@@ -25,7 +23,8 @@ from bufgym.envs.render.image import COLOURS, canvas_of, pixels
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Episode, Interruption, Scenario, get, suites
 from bufgym.scenario.numbered import numbered
-from website import interactive
+from website import interactive, picture
+from website.picture import fading, play
 
 Frames = Iterator[NDArray[np.uint8]]
 

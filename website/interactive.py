@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from bufgym import policies, sim
-from bufgym.benchmark.picture import fading, play
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, get
 from bufgym.sim import metrics
+from website.picture import fading, play
 
 POLICIES = ("drop-oldest", "afr", "min-gap", "learned-motion")
 CAPACITIES = (4, 8, 16)

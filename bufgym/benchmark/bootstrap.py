@@ -14,19 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.episodes import Numbers
-from bufgym.ground.errors import BufgymError
+
+RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0
+"""Resamples, confidence of the intervals and seed of the draws."""
 
 
 class Interval(NamedTuple):
     """A statistic and its bootstrap interval. All are NaN if it is undefined; the bounds are if no interval is
     known."""
 
-    value: float
-    """Statistic of the sample."""
-    low: float
-    """Lower bound of the interval."""
-    high: float
-    """Upper bound of the interval."""
+    value: float  # statistic of the sample
+    low: float  # lower bound of the interval
+    high: float  # upper bound of the interval
 
 
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
@@ -53,7 +52,7 @@ def times_drawn(n: int, resamples: int, rng: np.random.Generator) -> Numbers:
     return np.vstack([np.ones((1, n)), drawn])
 
 
-def percentile_interval(numbers: Numbers, confidence: float) -> Interval:
+def percentile_interval(numbers: Numbers, confidence: float = CONFIDENCE) -> Interval:
     """Compute the interval of [1 + resamples] numbers; resamples with an undefined statistic, NaN, are left out."""
     drawn = numbers[1:][~np.isnan(numbers[1:])]
     if np.isnan(numbers[0]) or not len(drawn):
@@ -66,11 +65,3 @@ def ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers
     """Divide ``above`` by ``below`` where ``defined``; NaN elsewhere."""
     quotient: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
     return quotient
-
-
-def check_resampling(resamples: int, confidence: float) -> None:
-    """Raise an error for numbers that cannot make an interval."""
-    if resamples < 1:
-        raise BufgymError(f"resamples = {resamples}: must be >= 1")
-    if not 0 < confidence < 1:
-        raise BufgymError(f"confidence = {confidence}: must be above 0 and below 1")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import policies, scenario
-from bufgym.benchmark import report, sources, table
+from bufgym.benchmark import report, sources, summary, table, tasks
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
@@ -47,13 +47,15 @@ class Comparison:
     """Policies side by side on the same episodes. It prints as its table, in a notebook too."""
 
     rows: list[Row]
-    """One row for each policy, capacity and episode."""
+    """One row for each policy, capacity and episode; with several topics or robots, one for each of these."""
     about: str
     """The scenario or suite."""
     plain: str
     """The table as aligned text."""
     markdown: str
     """The table as Markdown."""
+    html: str
+    """The table as HTML."""
 
     def table(self, form: str = "plain") -> str:
         """Means by policy: ``"plain"`` text or ``"markdown"``."""
@@ -62,12 +64,13 @@ class Comparison:
         return self.plain if form == "plain" else self.markdown
 
     def to_pandas(self) -> Any:
-        """``rows`` as a pandas DataFrame."""
+        """``rows`` as a pandas DataFrame; ``scenario`` is the name, or ``about`` where it has none."""
         try:
             import pandas  # type: ignore[import-untyped,unused-ignore]
         except ImportError:
             raise BufgymError("to_pandas needs pandas: pip install pandas") from None
-        return pandas.DataFrame(self.rows)
+        about = self.about.partition("\n")[0]
+        return pandas.DataFrame([{**row, "scenario": row["scenario"] or about} for row in self.rows])
 
     def plot(self, axes: Any = None) -> Any:
         """Draw each policy's regret as a bar, a colour for each L; Matplotlib's axes. QoI where no regret is known."""
@@ -100,7 +103,7 @@ class Comparison:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(str(self))}</pre>"
+        return f"<p>{html.escape(self.about)}</p>\n{self.html}"
 
 
 def compare(
@@ -121,7 +124,7 @@ def compare(
         capacity: L, messages, or several; by default 8, or the suite's.
         seeds: so many episodes on each trace, or these; by default 10, or the suite's.
         progress: show a bar on stderr, where that is a terminal.
-        about: a line that stands above the table; by default what ``on`` is.
+        about: lines that stand above the table and explain it; by default what ``on`` is.
         settings: of a queue, ``max_bytes`` and ``decide_at``; the others are parameters of a scenario that is named.
 
     Raises:
@@ -140,13 +143,21 @@ def compare(
         raise BufgymError(f"{on!r}: no scenario and no suite; {hint}")
     queue = {name: settings.pop(name) for name in ("max_bytes", "decide_at") if name in settings}
     stream = scenario.get(on, **settings) if isinstance(on, str) else on
+    label = on if isinstance(on, str) else ""
     seeds, capacities = 10 if seeds is None else seeds, capacities or [8]
-    rows = run(chosen, stream, capacities, seeds, progress=progress, **queue)
-    floor: list[Row] = []  # of the scores
-    if all(policy.name != BASELINE for policy in chosen):
-        floor = run([BASELINE], stream, capacities, seeds, bound=False, **queue)
-    text, page = table.plain(rows, floor), table.markdown(rows, floor)
-    return Comparison(rows, about or (on if isinstance(on, str) else repr(stream)), text, page)
+    task = tasks.of(stream)
+    alone = all(policy.name != task.baseline for policy in chosen)
+    if task.kind != "queue":
+        chosen = [*chosen, make_policy(task.baseline)] if alone else chosen
+        rows = run(chosen, stream, capacities, seeds, label=label, progress=progress)
+        shown = summary.table_of(task.summary(rows, table.unranked(rows)))
+    else:
+        rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
+        floor = run([BASELINE], stream, capacities, seeds, label=label, bound=False, **queue) if alone else []
+        shown = table.of(rows, floor)
+        if not about and "score" in shown.head:
+            shown = shown._replace(notes=[table.SCORE, *shown.notes])
+    return Comparison(rows, about or label or repr(stream), shown.plain(), shown.markdown(), shown.html())
 
 
 def _on_suite(chosen: Sequence[Policy], name: str, capacities: Sequence[int], seeds: Any, progress: bool) -> Comparison:
@@ -159,4 +170,4 @@ def _on_suite(chosen: Sequence[Policy], name: str, capacities: Sequence[int], se
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, form="csv", progress=progress)
-        return Comparison(rows, f"suite {name}", report.plain(out), report.markdown(out))
+        return Comparison(rows, f"suite {name}", report.plain(out), report.markdown(out), report.html(out))

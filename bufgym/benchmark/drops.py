@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.table import aligned
-from bufgym.benchmark.tasks.bound import meet
+from bufgym.benchmark.table import Table
+from bufgym.benchmark.tasks.queue import meet
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.policies import Policy
@@ -68,36 +69,26 @@ def drops(
                     dropped_us = np.asarray(senders.batch.log[0])["dropped_us"][: len(arrivals)]
                     for k in np.flatnonzero(dropped_us != NEVER).tolist():
                         arrival = arrivals[k]
-                        yield Drop(
-                            policy.name,
-                            capacity,
-                            trace,
-                            seed,
-                            k,
-                            int(arrival["arrival_us"]) / 1e6,
-                            workload.topic_of(k),
-                            int(arrival["size_bytes"]),
-                            float(arrival["x"]),
-                            int(dropped_us[k]) / 1e6,
-                        )
+                        message = k, int(arrival["arrival_us"]) / 1e6, workload.topic_of(k), int(arrival["size_bytes"])
+                        moved, dropped_s = float(arrival["x"]), int(dropped_us[k]) / 1e6
+                        yield Drop(policy.name, capacity, trace, seed, *message, moved, dropped_s)
 
 
 def write_drops(drops: Iterable[Drop], path: Path | None) -> Counter[tuple[str, int, str]]:
     """Write drops as CSV, or nowhere if ``path`` is None; count them by policy, capacity and topic."""
     counts: Counter[tuple[str, int, str]] = Counter()
-
-    def counted() -> Iterator[Drop]:
+    with contextlib.ExitStack() as stack:
+        writer: Any = None
+        if path is not None:
+            temporary = stack.enter_context(replaced(path))
+            writer = csv.writer(
+                stack.enter_context(temporary.open("w", encoding="utf-8", newline="")), lineterminator="\n"
+            )
+            writer.writerow(Drop._fields)
         for drop in drops:
             counts[drop.policy, drop.capacity, drop.topic] += 1
-            yield drop
-
-    if path is None:
-        deque(counted(), maxlen=0)
-        return counts
-    with replaced(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(Drop._fields)
-        writer.writerows(counted())
+            if writer is not None:
+                writer.writerow(drop)
     return counts
 
 
@@ -105,9 +96,9 @@ def by_topic(counts: Counter[tuple[str, int, str]], scenario: Uplink, policies: 
     """Tabulate the share of each topic's messages that each policy dropped, over ``runs`` episodes per capacity."""
     assert scenario.workload is not None
     summary = sorted(scenario.workload.summary(), key=lambda line: (-line.messages, line.topic))[:_SHOWN_TOPICS]
-    lines = [["dropped of", "L", *(line.topic for line in summary)]]
+    lines = []
     for capacity in sorted({capacity for _, capacity, _ in counts}):
         for policy in policies:
             shares = [counts[policy, capacity, line.topic] / (runs * line.messages) for line in summary]
             lines.append([policy, str(capacity), *(f"{share:.1%}" for share in shares)])
-    return "\n".join(aligned(lines))
+    return Table(["dropped of", "L", *(line.topic for line in summary)], [("", lines)]).plain()

@@ -24,23 +24,16 @@ Run = tuple[int | None, Episode]
 
 
 @dataclass(frozen=True)
-class Table:
+class Arrays:
     """Rows as arrays in sorted order."""
 
-    cells: list[Cell]
-    """Every (scenario, capacity)."""
-    episodes: dict[str, list[Episode]]
-    """Episodes of each scenario."""
-    training_seeds: dict[str, list[int | None]]
-    """Training seeds of each policy; [None] for an untrained one."""
-    qoi: dict[tuple[str, Cell], Numbers]
-    """H[training seeds, episodes] by policy and cell."""
-    best: dict[Cell, Numbers]
-    """Clairvoyant H[episodes]; NaN where unknown."""
-    exact: dict[Cell, bool]
-    """Whether every clairvoyant H of the cell is certified."""
-    unbounded: set[str]
-    """Policies that the clairvoyant's H does not bound; their rows have no regret."""
+    cells: list[Cell]  # every (scenario, capacity)
+    episodes: dict[str, list[Episode]]  # episodes of each scenario
+    training_seeds: dict[str, list[int | None]]  # training seeds of each policy; [None] for an untrained one
+    qoi: dict[tuple[str, Cell], Numbers]  # H[training seeds, episodes] by policy and cell
+    best: dict[Cell, Numbers]  # clairvoyant H[episodes]; NaN where unknown
+    exact: dict[Cell, bool]  # whether every clairvoyant H of the cell is certified
+    unbounded: set[str]  # policies that the clairvoyant's H does not bound; their rows have no regret
 
 
 def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]]:
@@ -61,7 +54,7 @@ def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Ru
     return groups
 
 
-def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Table:
+def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Arrays:
     """Make arrays of the rows, checked as ``score.scores`` says."""
     groups = _by_run(rows)
     cells = sorted({cell for _, cell in groups})
@@ -83,7 +76,7 @@ def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Table:
             if run not in runs:
                 raise BufgymError(f"{_place(policy, cell, run)}: no row; every policy must meet the same episodes")
     unbounded = {row["policy"] for row in rows if row.get("clairvoyant") is not None and row.get("regret", 0.0) is None}
-    table = Table(cells, episodes, training_seeds, {}, {}, {}, unbounded)
+    table = Arrays(cells, episodes, training_seeds, {}, {}, {}, unbounded)
     for cell in cells:
         truth = {episode: groups[baseline, cell][training_seeds[baseline][0], episode] for episode in episodes[cell[0]]}
         best = {episode: _clairvoyant(row) for episode, row in truth.items()}

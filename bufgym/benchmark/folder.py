@@ -1,17 +1,35 @@
-"""Reader of a folder of ``bufgym bench --suite``: manifest, rows and the timeline of one episode, all checked."""
+"""The folder of ``bufgym bench --suite``: manifest, rows and the timeline of one episode, all checked when read.
+
+``manifest.json`` records the settings, so that runs do not mix their rows.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bufgym.benchmark import manifest
 from bufgym.benchmark.checked_json import check, read_object
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.files import replaced
+
+FORMAT = 2
+"""Version of the folder's layout, raised when manifest, rows or timeline change their meaning."""
+
+_MANIFEST = {
+    **dict.fromkeys(("task", "suite", "split", "about", "episodes", "bufgym", "command"), str),
+    **dict.fromkeys(("unranked", "scenarios", "changes"), dict),
+}
+
+_SAME = [
+    *("format", "bufgym", "suite", "split", "policies", "policy_file", "sources"),
+    *("capacities", "seeds", "changes", "scenarios"),
+]
+"""Entries that must be equal in two runs that share a folder."""
 
 _ROWS = ("rows.parquet", "rows.csv")
 _TIMELINE = {"scenario": str, "capacity": int, "arrival_s": list, "x": list, "rate": dict, "policies": dict}
@@ -19,19 +37,14 @@ _LANE = {"qoi": (int, float), "received": list, "dropped": list}
 
 
 @dataclass(frozen=True)
-class Run:
+class SuiteRun:
     """One finished run of a suite."""
 
     folder: Path
-    """Folder of the run."""
-    manifest: Mapping[str, Any]
-    """Settings of the run."""
+    manifest: Mapping[str, Any]  # its settings
     rows: list[Row]
-    """All rows."""
-    rows_file: Path
-    """File of the rows, for error messages."""
-    timeline: Mapping[str, Any] | None
-    """One episode, message by message; None if none was written."""
+    rows_file: Path  # for error messages
+    timeline: Mapping[str, Any] | None  # one episode, message by message; None if none was written
 
     @property
     def task(self) -> Task:
@@ -49,18 +62,18 @@ class Run:
         return (listed.index(scenario) if scenario in listed else len(listed), scenario)
 
 
-def read(folder: Path) -> Run:
+def read(folder: Path) -> SuiteRun:
     """Read the run in ``folder``; an error names the file and the broken rule."""
     if not folder.is_dir():
         raise BufgymError(f"{folder}: must be a folder that `bufgym bench --suite` wrote")
-    entries = manifest.read(folder / "manifest.json")
+    entries = read_manifest(folder / "manifest.json")
     timeline = folder / "timeline.json"
     if (folder / "parts").is_dir() and not any((folder / name).exists() for name in _ROWS):
         raise BufgymError(
             f"{folder}: this run is not finished; the command that began it resumes it: {entries['command']}"
         )
     rows, rows_file = _rows(folder, TASKS[entries["task"]])
-    return Run(folder, entries, rows, rows_file, _timeline(timeline) if timeline.exists() else None)
+    return SuiteRun(folder, entries, rows, rows_file, _timeline(timeline) if timeline.exists() else None)
 
 
 def _rows(folder: Path, task: Task) -> tuple[list[Row], Path]:
@@ -107,3 +120,54 @@ def _timeline(path: Path) -> Mapping[str, Any]:
 
 def _are_numbers(entries: Any) -> bool:
     return isinstance(entries, list) and all(isinstance(number, int | float) for number in entries)
+
+
+# --- the manifest ----------------------------------------------------------------------------------------------------
+
+
+def claim(out: Path, manifest: dict[str, Any]) -> None:
+    """Write the manifest into the folder; raise an error if another run's rows are in it."""
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "manifest.json"
+    if not file.exists():
+        if (out / "parts").exists() or any(out.glob("rows.*")):
+            raise BufgymError(f"{out}: holds rows without a manifest.json; choose another --out")
+        write_json(file, manifest)
+        return
+    held = read_manifest(file)
+    for key in _SAME:
+        if held.get(key) != manifest[key]:
+            raise BufgymError(
+                f"{file}: {key} is {_short(held.get(key))}, but this run has {_short(manifest[key])};"
+                " choose another --out (finished rows are never mixed)"
+            )
+
+
+def read_manifest(path: Path) -> Mapping[str, Any]:
+    """Read a manifest of this version; an error names the file and the broken rule."""
+    if not path.exists():
+        raise BufgymError(f"{path.parent}: no {path.name}; it must be a folder that `bufgym bench --suite` wrote")
+    manifest = read_object(path)
+    if manifest.get("format") != FORMAT:
+        rule = f"must be {FORMAT}; another version of bufgym wrote this folder"
+        raise BufgymError(where(path, None, manifest.get("format"), rule, field="format"))
+    check(path, "", manifest, _MANIFEST)
+    if manifest["task"] not in TASKS:
+        raise BufgymError(where(path, None, manifest["task"], f"must be one of {', '.join(TASKS)}", field="task"))
+    for label, scenario in manifest["scenarios"].items():
+        check(path, f"scenarios.{label}", scenario, {})
+        if not isinstance(scenario.get("outage_s", 0.0), int | float):
+            rule = "must be a number of seconds"
+            raise BufgymError(where(path, None, scenario["outage_s"], rule, field=f"scenarios.{label}.outage_s"))
+    return manifest
+
+
+def write_json(file: Path, content: dict[str, Any]) -> None:
+    """Write the file, whole or not at all."""
+    with replaced(file) as temporary:
+        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def _short(entry: object) -> str:
+    text = json.dumps(entry)
+    return text if len(text) <= 80 else f"{text[:77]}..."

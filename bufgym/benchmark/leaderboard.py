@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 import tempfile
@@ -12,17 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import __version__
-from bufgym.benchmark import manifest, table
+from bufgym.benchmark import folder
 from bufgym.benchmark.bootstrap import Interval
-from bufgym.benchmark.rows import Row
+from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
 from bufgym.benchmark.summary import shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.benchmark.table import Table
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8, replaced
 from bufgym.scenario import suites
 
-COLUMNS = ("suite", "policy", "rank", "cells", "quantity", "value", "low", "high", "bufgym", "command")
+COLUMNS: Layout = {
+    **{"suite": str, "policy": str, "rank": int, "cells": int, "quantity": str},
+    **{"value": float, "low": float, "high": float, "bufgym": str, "command": str},
+}
 """Columns of the file, which has one line for each quantity of an entry."""
 
 MAX_BYTES = 16 * 2**20
@@ -36,17 +39,11 @@ class Entry:
     """One policy on one suite."""
 
     suite: str
-    """Its name."""
-    policy: str
-    """Policy as ``bufgym bench --policies`` takes it."""
-    rank: int
-    """1 for the best; 0 for a policy that is not ranked."""
-    cells: int
-    """Number of cells that the values are over; for one queue only discriminative cells count."""
-    values: Mapping[str, Interval]
-    """The quantities that the suite's task lists, by key."""
-    bufgym: str
-    """Version of bufgym that made it."""
+    policy: str  # as ``bufgym bench --policies`` takes it
+    rank: int  # 1 for the best; 0 for a policy that is not ranked
+    cells: int  # number of cells that the values are over; for one queue only discriminative cells count
+    values: Mapping[str, Interval]  # the quantities that the suite's task lists, by key
+    bufgym: str  # version that made it
 
     @property
     def name(self) -> str:
@@ -87,8 +84,14 @@ def make(path: Path, names: Sequence[str], specs: Mapping[str, Sequence[str]], *
 def _run(suite: str, specs: Sequence[str], data: str | None = None, jobs: int | None = None) -> list[Entry]:
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
-        rows = run_sweep(Sweep(suite, tuple(specs), data=data), out, jobs=jobs)
-        return entries(rows, suite, manifest.read(out / "manifest.json")["unranked"])
+        run_sweep(Sweep(suite, tuple(specs), data=data), out, jobs=jobs)
+        return of_folder(out)
+
+
+def of_folder(out: Path) -> list[Entry]:
+    """Make one entry for each policy of a run of ``bufgym bench --suite --out``, best first."""
+    run = folder.read(out)
+    return entries(run.rows, run.manifest["suite"], run.manifest["unranked"])
 
 
 def validate(entry: Entry, **options: Any) -> Entry:
@@ -127,46 +130,36 @@ def write(board: Sequence[Entry], path: Path) -> None:
     """Write a CSV file, and beside it the same as Markdown."""
     if path.suffix != ".csv":
         raise BufgymError(f"{path}: a leaderboard is written to a .csv file")
-    with replaced(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for entry in board:
-            for key, interval in entry.values.items():
-                place = entry.suite, entry.policy, entry.rank, entry.cells
-                writer.writerow([*place, key, *interval, entry.bufgym, entry.command])
+    lines = []
+    for entry in board:
+        for key, interval in entry.values.items():
+            cells = entry.suite, entry.policy, entry.rank, entry.cells, key, *interval, entry.bufgym, entry.command
+            lines.append(dict(zip(COLUMNS, cells, strict=True)))
+    write_rows(lines, path, COLUMNS)
     with replaced(path.with_suffix(".md")) as temporary:
         temporary.write_text(markdown(board), encoding="utf-8")
 
 
 def read(path: Path) -> dict[str, Entry]:
     """Read the entries by name; an error names the file, the line and the unreadable value."""
-    kinds = {**dict.fromkeys(COLUMNS, str), "rank": int, "cells": int, "value": float, "low": float, "high": float}
+    text = read_utf8(path, MAX_BYTES)
+    if text.partition("\n")[0].rstrip("\r") != ",".join(COLUMNS):
+        raise BufgymError(where(path, 1, None, f"must have the columns {', '.join(COLUMNS)}"))
     board: dict[str, Entry] = {}
-    reader = csv.DictReader(io.StringIO(read_utf8(path, MAX_BYTES), newline=""), strict=True)
-    try:
-        if reader.fieldnames != list(COLUMNS):
-            raise BufgymError(where(path, 1, None, f"must have the columns {', '.join(COLUMNS)}"))
-        for line in reader:
-            if None in line or None in line.values():
-                raise BufgymError(where(path, reader.line_num, None, f"must have {len(COLUMNS)} cells"))
-            row: dict[str, Any] = {}
-            for name, kind in kinds.items():
-                try:
-                    row[name] = kind(line[name])
-                except ValueError:
-                    rule = "must be a number"
-                    raise BufgymError(where(path, reader.line_num, line[name], rule, field=name)) from None
-            if row["suite"] not in suites.SUITES:
-                raise BufgymError(where(path, reader.line_num, row["suite"], "must be a suite", field="suite"))
-            if row["quantity"] not in task_of(row["suite"]).listed:
-                rule = f"must be one of {', '.join(task_of(row['suite']).listed)}"
-                raise BufgymError(where(path, reader.line_num, row["quantity"], rule, field="quantity"))
-            entry = Entry(row["suite"], row["policy"], row["rank"], row["cells"], {}, row["bufgym"])
-            values = board.get(entry.name, entry).values
-            interval = Interval(row["value"], row["low"], row["high"])
-            board[entry.name] = replace(entry, values={**values, row["quantity"]: interval})
-    except csv.Error as error:
-        raise BufgymError(where(path, reader.line_num, None, f"must be CSV: {error}")) from None
+    for number, row in parsed(path, io.StringIO(text, newline=""), COLUMNS):
+        if None in row.values():
+            raise BufgymError(where(path, number, None, "must have no empty cell"))
+        listed = task_of(row["suite"]).listed if row["suite"] in suites.SUITES else ()
+        for field, known, rule in (
+            ("suite", row["suite"] in suites.SUITES, "a suite"),
+            ("quantity", row["quantity"] in listed, f"one of {', '.join(listed)}"),
+        ):
+            if not known:
+                raise BufgymError(where(path, number, row[field], f"must be {rule}", field=field))
+        entry = Entry(row["suite"], row["policy"], row["rank"], row["cells"], {}, row["bufgym"])
+        values = board.get(entry.name, entry).values
+        interval = Interval(row["value"], row["low"], row["high"])
+        board[entry.name] = replace(entry, values={**values, row["quantity"]: interval})
     return board
 
 
@@ -198,5 +191,5 @@ def markdown(board: Sequence[Entry]) -> str:
         about = suites.get(suite).about
         out += ["", f"## {suite}", "", f"{about[0].upper()}{about[1:]}.", ""]
         out += [*(f"- {quantity.title}: {quantity.about}." for quantity in quantities), ""]
-        out += table.markdown_table(head, lines, left=2)
+        out.append(Table(head, [("", lines)], left=2).markdown())
     return "\n".join(out) + "\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -77,17 +77,22 @@ def read_rows(path: str | os.PathLike[str], layout: Layout = RUNS) -> list[Row]:
     if source.suffix == ".parquet":
         return _read_parquet(source)
     with open(source, encoding="utf-8", newline="") as file:
-        # Extra cells of a line have the name None, and missing cells the value None.
-        reader = csv.DictReader(file, strict=True)
-        try:
-            lines = [(reader.line_num, line) for line in reader]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise BufgymError(f"{source}: no rows that can be read: {error}") from None
-    for number, line in lines:
+        return [row for _, row in parsed(source, file, layout)]
+
+
+def parsed(source: Path, text: Iterable[str], layout: Layout) -> list[tuple[int, Row]]:
+    """Parse the lines of a CSV file to (number of the line, row); an error names the line and the cell."""
+    reader = csv.DictReader(text, strict=True)
+    try:
+        lines = [(reader.line_num, line) for line in reader]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BufgymError(f"{source}: no rows that can be read: {error}") from None
+    for number, line in lines:  # extra cells have the name None, and missing cells the value None
         if None in line or None in line.values():
             raise BufgymError(f"{source}, line {number}: must have {len(reader.fieldnames or ())} cells, as line 1 has")
     return [
-        {name: _parsed(source, number, name, text, layout) for name, text in line.items()} for number, line in lines
+        (number, {name: _parsed(source, number, name, cell, layout) for name, cell in line.items()})
+        for number, line in lines
     ]
 
 

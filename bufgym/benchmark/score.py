@@ -17,25 +17,26 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import (
-    UNKNOWN,
+    RESAMPLES,
+    SEED,
     Interval,
-    check_resampling,
     percentile_interval,
     ratio,
     stream,
     times_drawn,
 )
-from bufgym.benchmark.episodes import Cell, Numbers, Table
-from bufgym.ground.errors import BufgymError
+from bufgym.benchmark.episodes import Arrays, Cell, Numbers
 from bufgym.oracle.measure import BASELINE, TIE, normalised_score
+
+REFERENCE = "afr"
+"""Policy that improvements and differences compare with; without its rows they are NaN."""
 
 DISCRIMINATIVE = 0.01
 """A cell is discriminative, and counts, where the baseline's regret is at least this."""
@@ -46,65 +47,49 @@ class CellScore:
     """One policy in one cell."""
 
     scenario: str
-    """Its label."""
-    capacity: int
-    """L, messages."""
+    capacity: int  # L, messages
     policy: str
-    """Its name."""
-    episodes: int
-    """Number of episodes met."""
-    qoi: Interval
-    """Mean H."""
-    score: Interval
-    """See ``normalised_score``; NaN where a clairvoyant H is missing or no better than the baseline."""
-    regret: Interval
-    """See ``regret``; NaN where a clairvoyant H is missing."""
-    difference: Interval
-    """Mean H minus the reference's, paired; NaN without a reference."""
-    discriminative: bool
-    """Whether the cell counts in the standings."""
-    exact: bool
-    """Whether every clairvoyant H is certified to be exact, not just a bound."""
+    episodes: int  # number of episodes met
+    qoi: Interval  # mean H
+    score: Interval  # see ``normalised_score``; NaN where a clairvoyant H is missing or no better than the baseline
+    regret: Interval  # see ``regret``; NaN where a clairvoyant H is missing
+    difference: Interval  # mean H minus the reference's, paired; NaN without a reference
+    discriminative: bool  # whether the cell counts in the standings
+    exact: bool  # whether every clairvoyant H is certified to be exact, not just a bound
 
 
 @dataclass(frozen=True)
 class Standing:
-    """One policy over all discriminative cells, NaN without such cells. Resampling does not choose cells anew."""
+    """One policy in one cell, or over all."""
 
     policy: str
-    """Its name."""
-    score: Interval
-    """Mean of its scores in the discriminative cells."""
-    iqm: Interval
-    """Interquartile mean of its scores on (discriminative cell, trace), each computed on sums over seeds. Pairs without
-    possible gain have no score and are left out. In a resample a pair is weighted by its number of draws."""
-    regret: Interval
-    """Mean of its regrets in the discriminative cells."""
-    improvement: Interval
-    """Paired probability of improvement over the reference, mean over the discriminative cells: the share of episodes
-    with H above the reference's, plus half the share with the same H."""
-    cells: int
-    """How many cells are discriminative."""
-    ranked: bool
-    """Whether it competes with the others."""
+    ranked: bool  # whether it competes with the others
+    values: Mapping[str, Interval]  # by the key of a ``summary.Quantity``
+
+    def __getitem__(self, key: str) -> Interval:
+        return self.values[key]
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Result of ``scores``."""
+    """Scores of every policy, in each cell and over all discriminative cells.
 
-    standings: list[Standing]
-    """Ranked policies first, best score first."""
-    cells: list[CellScore]
-    """By scenario, capacity, policy."""
-    baseline: str
-    """The policy whose score is 0."""
-    reference: str
-    """The policy that improvements and differences compare with."""
-    confidence: float
-    """Confidence of the intervals."""
-    resamples: int
-    """Resamples of the bootstrap."""
+    ``standings`` have these values, NaN without discriminative cells. Resampling does not choose cells anew.
+
+    * ``score``, ``regret``: mean of the policy's scores and regrets in the discriminative cells.
+    * ``iqm``: interquartile mean of its scores on (discriminative cell, trace), each computed on sums over seeds. Pairs
+      without possible gain have no score and are left out. In a resample a pair is weighted by its number of draws.
+    * ``improvement``: paired probability of improvement over ``REFERENCE``, mean over the discriminative cells: the
+      share of episodes with H above the reference's, plus half the share with the same H.
+    """
+
+    standings: list[Standing]  # ranked policies first, best score first
+    cells: list[CellScore]  # by scenario, capacity, policy
+
+    @property
+    def counted(self) -> int:
+        """Number of discriminative cells."""
+        return len({(cell.scenario, cell.capacity) for cell in self.cells if cell.discriminative})
 
     @property
     def exact(self) -> bool:
@@ -120,70 +105,29 @@ def regret(h: Numbers, best: Numbers) -> Numbers:
     return 1 - ratio(h, best, best > 0)
 
 
-def interquartile_mean(x: ArrayLike) -> float:
-    """Mean of n numbers without the floor(n / 4) smallest and largest, as in rliable; NaN counts as missing. It equals
-    SciPy's ``trim_mean(x, 0.25)``, and is NaN without numbers."""
-    values = np.ravel(np.asarray(x, np.float64))[np.newaxis]
-    return float(_interquartile_means(values, np.ones_like(values))[0])
-
-
-def paired_difference(
-    h: ArrayLike, h_ref: ArrayLike, *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
-) -> Interval:
-    """Mean of H - H_ref over episodes that both met, given in the same order; NaN without episodes."""
-    values, reference = (np.asarray(numbers, np.float64) for numbers in (h, h_ref))
-    if values.ndim != 1 or values.shape != reference.shape:
-        raise BufgymError(
-            f"shapes {values.shape} and {reference.shape}: must be one H an episode, of the same episodes"
-        )
-    check_resampling(resamples, confidence)
-    if not len(values):
-        return UNKNOWN
-    weights = times_drawn(len(values), resamples, np.random.default_rng(seed))
-    return percentile_interval(weights @ (values - reference) / len(values), confidence)
-
-
-def scores(
-    rows: Sequence[Mapping[str, Any]],
-    *,
-    unranked: Collection[str] = (),
-    baseline: str = BASELINE,
-    reference: str = "afr",
-    resamples: int = 2000,
-    confidence: float = 0.95,
-    seed: int = 0,
-) -> Scores:
+def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = ()) -> Scores:
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Args:
         rows: from ``bufgym.benchmark.run``. Rows of a trained agent may have a "training_seed"; the H of an episode is
             then the mean over training seeds.
         unranked: policies that are shown but not ranked, such as an unbounded queue or the clairvoyant.
-        baseline: policy whose score is 0.
-        reference: policy that improvements and differences compare with; without its rows they are NaN.
-        resamples: resamples of the bootstrap.
-        confidence: confidence of the intervals, such as 0.95.
-        seed: seed of the draws.
 
     Raises:
         BufgymError: there are no rows, rows are incomplete or duplicate, a cell lacks the baseline, or policies met
             different episodes or disagree on the clairvoyant.
     """
-    check_resampling(resamples, confidence)
-    table = episodes.read(rows, baseline)
-    drawn = {name: times_drawn(len(e), resamples, stream(seed, name)) for name, e in table.episodes.items()}
-    base = _resampled(table, baseline, resamples, seed)
+    table = episodes.read(rows, BASELINE)
+    drawn = {name: times_drawn(len(e), RESAMPLES, stream(SEED, name)) for name, e in table.episodes.items()}
+    base = _resampled(table, BASELINE)
     samples = {cell: _Sample.of(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
     discriminative = [cell for cell in table.cells if samples[cell].discriminative]
-    compared: dict[Cell, Numbers] = {}
-    if reference in table.training_seeds:
-        compared = _resampled(table, reference, resamples, seed)
-    interval = partial(percentile_interval, confidence=confidence)
+    compared = _resampled(table, REFERENCE) if REFERENCE in table.training_seeds else {}
+    interval = percentile_interval
     cell_scores, standings = [], []
     for policy in table.training_seeds:
         by_cell = {
-            cell: _statistics(h, compared.get(cell), samples[cell])
-            for cell, h in _resampled(table, policy, resamples, seed).items()
+            cell: _statistics(h, compared.get(cell), samples[cell]) for cell, h in _resampled(table, policy).items()
         }
         if policy in table.unbounded:
             by_cell = {cell: s.without_bound() for cell, s in by_cell.items()}
@@ -196,12 +140,11 @@ def scores(
                 )
             )
         overall = _overall([by_cell[cell] for cell in discriminative], [samples[cell] for cell in discriminative])
-        score, iqm, regrets, improvement = map(interval, overall)
-        ranked = policy not in unranked
-        standings.append(Standing(policy, score, iqm, regrets, improvement, len(discriminative), ranked))
+        values = {key: interval(numbers) for key, numbers in overall.items()}
+        standings.append(Standing(policy, policy not in unranked, values))
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
-    standings.sort(key=lambda s: (not s.ranked, math.isnan(s.score.value), -s.score.value, s.policy))
-    return Scores(standings, cell_scores, baseline, reference, confidence, resamples)
+    standings.sort(key=lambda s: (not s.ranked, math.isnan(s["score"].value), -s["score"].value, s.policy))
+    return Scores(standings, cell_scores)
 
 
 # --- resampling: row 0 is always the sample itself, the others are its resamples --------------------------------------
@@ -211,17 +154,13 @@ def scores(
 class _Sample:
     """Drawn episodes of one cell, from which the statistics of every policy are computed."""
 
-    weights: Numbers
-    """Number of draws of each episode, [1 + resamples, episodes]."""
-    starts: NDArray[np.intp]
-    """First episode of each trace, [traces]."""
-    base: Numbers
-    """Sum of H of the baseline, [1 + resamples, traces]."""
-    best: Numbers
-    """Sum of H of the clairvoyant, same shape; NaN where unknown."""
+    weights: Numbers  # number of draws of each episode, [1 + resamples, episodes]
+    starts: NDArray[np.intp]  # first episode of each trace, [traces]
+    base: Numbers  # sum of H of the baseline, [1 + resamples, traces]
+    best: Numbers  # sum of H of the clairvoyant, same shape; NaN where unknown
 
     @classmethod
-    def of(cls, table: Table, cell: Cell, base: Numbers, weights: Numbers) -> _Sample:
+    def of(cls, table: Arrays, cell: Cell, base: Numbers, weights: Numbers) -> _Sample:
         """Make a sample; ``base`` is H of the baseline, [1 or 1 + resamples, episodes]."""
         starts = np.unique([trace for trace, _ in table.episodes[cell[0]]], return_index=True)[1]
         best = table.best[cell][np.newaxis]
@@ -245,8 +184,7 @@ class _Statistics(NamedTuple):
     regret: Numbers
     difference: Numbers
     improvement: Numbers
-    by_trace: Numbers
-    """Scores, [1 + resamples, traces]."""
+    by_trace: Numbers  # scores, [1 + resamples, traces]
 
     def without_bound(self) -> _Statistics:
         """Remove score and regret, for a policy that the clairvoyant's L does not bind."""
@@ -268,18 +206,14 @@ def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statisti
     return _Statistics(total / episodes, score, regret(total, best), difference, improvement, by_trace)
 
 
-def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> dict[str, Numbers]:
     """Compute score, IQM, regret and improvement over the discriminative cells, [1 + resamples] each."""
     if not cells:
-        none = np.full(1, np.nan)
-        return none, none, none, none
+        return dict.fromkeys(("score", "iqm", "regret", "improvement"), np.full(1, np.nan))
     values = np.hstack([cell.by_trace for cell in cells])
     weights = np.hstack([np.add.reduceat(sample.weights, sample.starts, axis=1) for sample in samples])
-    iqm = _interquartile_means(values, weights / weights[0])
-    score, regrets, improvement = (
-        np.mean([getattr(cell, name) for cell in cells], axis=0) for name in ("score", "regret", "improvement")
-    )
-    return score, iqm, regrets, improvement
+    means = {name: np.mean([getattr(c, name) for c in cells], axis=0) for name in ("score", "regret", "improvement")}
+    return {**means, "iqm": _interquartile_means(values, weights / weights[0])}
 
 
 def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
@@ -298,7 +232,7 @@ def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
     return ratio((kept * values).sum(axis=1), left, left > 0)
 
 
-def _resampled(table: Table, policy: str, resamples: int, seed: int) -> dict[Cell, Numbers]:
+def _resampled(table: Arrays, policy: str) -> dict[Cell, Numbers]:
     """H of each episode by cell, [1, episodes], or its means over drawn training seeds, [1 + resamples, episodes].
 
     A training seed is the same agent in every cell, so one draw serves all cells.
@@ -306,5 +240,5 @@ def _resampled(table: Table, policy: str, resamples: int, seed: int) -> dict[Cel
     trained = len(table.training_seeds[policy])
     if trained == 1:
         return {cell: table.qoi[policy, cell] for cell in table.cells}
-    weights = times_drawn(trained, resamples, stream(seed, f"training of {policy}")) / trained
+    weights = times_drawn(trained, RESAMPLES, stream(SEED, f"training of {policy}")) / trained
     return {cell: weights @ table.qoi[policy, cell] for cell in table.cells}

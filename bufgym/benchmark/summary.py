@@ -16,85 +16,56 @@ import numpy as np
 
 from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import (
+    RESAMPLES,
+    SEED,
     UNKNOWN,
     Interval,
-    check_resampling,
     percentile_interval,
     stream,
     times_drawn,
     written,
 )
 from bufgym.benchmark.episodes import Cell, Numbers
-from bufgym.benchmark.score import Scores
-from bufgym.benchmark.table import Rows, in_blocks
+from bufgym.benchmark.score import Scores, Standing
+from bufgym.benchmark.table import Rows, Table
 from bufgym.ground.errors import BufgymError
 
 
 class Quantity(NamedTuple):
     """One number that a summary shows of a policy."""
 
-    key: str
-    """Its name in ``Standing.values``."""
-    title: str
-    """Its heading."""
-    write: Callable[[float], str]
-    """Function that formats a number."""
-    about: str
-    """Definition, for the reader of a report."""
-    interval: bool = True
-    """Whether printed tables show the interval; a report always does."""
-    versus: str = ""
-    """Policy that it compares with, which has no value itself."""
-    total: bool = False
-    """Whether it is summed over cells instead of averaged."""
-    drawn: bool = False
-    """Whether a report draws it beside the ranking."""
-
-
-@dataclass(frozen=True)
-class Standing:
-    """One policy in one cell, or over all."""
-
-    policy: str
-    """Its name."""
-    ranked: bool
-    """Whether it competes with the others."""
-    values: Mapping[str, Interval]
-    """``Quantity.key`` -> value."""
-
-    def __getitem__(self, key: str) -> Interval:
-        return self.values[key]
+    key: str  # its name in ``Standing.values``
+    title: str  # its heading
+    write: Callable[[float], str]  # function that formats a number
+    about: str  # definition, for the reader of a report
+    interval: bool = True  # whether printed tables show the interval; a report always does
+    versus: str = ""  # policy that it compares with, which has no value itself
+    total: bool = False  # whether it is summed over cells instead of averaged
+    drawn: bool = False  # whether a report draws it beside the ranking
 
 
 @dataclass(frozen=True)
 class Summary:
     """Summary of a task's rows."""
 
-    quantities: tuple[Quantity, ...]
-    """Quantities shown, in this order."""
-    rank_by: str
-    """The key of the quantity that orders the policies, largest first."""
-    overall: list[Standing]
-    """Over all cells; ranked policies first, best first."""
+    quantities: tuple[Quantity, ...]  # quantities shown, in this order
+    rank_by: str  # the key of the quantity that orders the policies, largest first
+    overall: list[Standing]  # over all cells; ranked policies first, best first
     cells: dict[Cell, list[Standing]]
     """The same in each cell, cells in the order of the rows; empty where ``scores`` holds them."""
-    baseline: str
-    """The policy that the others are measured against."""
-    confidence: float
-    """Confidence of the intervals."""
-    resamples: int
-    """Resamples of the bootstrap."""
-    scores: Scores | None = None
-    """Scores between the baseline and the clairvoyant, where one is known."""
-    notes: tuple[str, ...] = ()
-    """Sentences about single policies, below the ranking."""
+    baseline: str  # the policy that the others are measured against
+    scores: Scores | None = None  # scores between the baseline and the clairvoyant, where one is known
+    notes: tuple[str, ...] = ()  # sentences about single policies, below the ranking
 
     @property
     def counted_cells(self) -> int:
         """Number of cells that ``overall`` covers; with scores only discriminative cells count."""
         if self.scores is None:
             return len(self.cells)
-        return len({(cell.scenario, cell.capacity) for cell in self.scores.cells if cell.discriminative})
+        return self.scores.counted
+
+    def __str__(self) -> str:
+        return plain(self)
 
     @property
     def standings(self) -> dict[str, Standing]:
@@ -135,9 +106,6 @@ def summarise(
     rank_by: str,
     baseline: str,
     unranked: Collection[str] = (),
-    resamples: int = 2000,
-    confidence: float = 0.95,
-    seed: int = 0,
 ) -> Summary:
     """Compare every policy with ``baseline``, by cell and over all cells.
 
@@ -148,18 +116,14 @@ def summarise(
         rank_by: the key of the quantity that orders the policies.
         baseline: the policy that the others are measured against.
         unranked: policies that come last, such as an unbounded queue.
-        resamples: resamples of the bootstrap.
-        confidence: confidence of the intervals, such as 0.95.
-        seed: seed of the draws.
 
     Raises:
         BufgymError: there are no runs, a cell lacks the baseline, or policies met different episodes.
     """
-    check_resampling(resamples, confidence)
     # ``read`` makes sure that all met the same episodes, and orders them.
     rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
     table = episodes.read(rows, baseline)
-    drawn = {name: times_drawn(len(e), resamples, stream(seed, name)) for name, e in table.episodes.items()}
+    drawn = {name: times_drawn(len(e), RESAMPLES, stream(SEED, name)) for name, e in table.episodes.items()}
     cells = list(dict.fromkeys((scenario, capacity) for scenario, capacity, *_ in runs))
 
     def numbers_of(policy: str, cell: Cell) -> Numbers:
@@ -180,13 +144,13 @@ def summarise(
             values = {}
             for quantity in quantities:
                 pooled = (np.sum if quantity.total else np.mean)([by_cell[cell][quantity.key] for cell in over], axis=0)
-                interval = percentile_interval(pooled, confidence)
+                interval = percentile_interval(pooled)
                 values[quantity.key] = Interval(interval.value, math.nan, math.nan) if alone else interval
             entries.append(Standing(policy, policy not in unranked, values))
         return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
 
     by_cell = {cell: standings([cell]) for cell in cells}
-    return Summary(quantities, rank_by, standings(cells), by_cell, baseline, confidence, resamples)
+    return Summary(quantities, rank_by, standings(cells), by_cell, baseline)
 
 
 # --- as text ---------------------------------------------------------------------------------------------------------
@@ -211,7 +175,12 @@ def title(cell: Cell, abouts: Mapping[str, str]) -> str:
 
 
 def plain(summary: Summary, abouts: Mapping[str, str] | None = None) -> str:
-    """Write aligned text: a block for each cell, and one over all cells if there are several."""
+    """Write ``table_of`` as aligned text."""
+    return table_of(summary, abouts).plain()
+
+
+def table_of(summary: Summary, abouts: Mapping[str, str] | None = None) -> Table:
+    """Make a block for each cell, and one over all cells if there are several."""
     blocks = [(title(cell, abouts or {}), standings) for cell, standings in summary.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", summary.overall))
@@ -221,4 +190,4 @@ def plain(summary: Summary, abouts: Mapping[str, str] | None = None) -> str:
         return [standing.policy, *(" ".join(filter(None, texts if both else texts[:1])) for texts, both in pairs)]
 
     head = ["policy", *(quantity.title for quantity in summary.quantities)]
-    return in_blocks(head, [(name, [line(standing) for standing in standings]) for name, standings in blocks])
+    return Table(head, [(name, [line(standing) for standing in standings]) for name, standings in blocks])

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import __version__, policies
-from bufgym.benchmark import cluster, manifest, sources, tasks
+from bufgym.benchmark import cluster, folder, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
 from bufgym.benchmark.run import bar, by_trace, check_distinct, run
@@ -44,23 +44,16 @@ class Sweep:
     """Settings of a suite's benchmark."""
 
     suite: str
-    """Its name."""
     specs: tuple[str, ...]
     """Policies, as ``bufgym.policies.get`` takes them; the task's baseline is added if it is missing."""
-    split: str = "test"
-    """"train", "validation" or "test"."""
-    capacities: tuple[int, ...] = ()
-    """L, messages; empty for the suite's own."""
-    seeds: int | None = None
-    """Episodes on each trace; None for the suite's own number."""
-    data: str | None = None
-    """Folder of recordings, for suites that need one."""
-    policy_file: str | None = None
-    """A Python file that registers policies, run wherever shards run."""
+    split: str = "test"  # "train", "validation" or "test"
+    capacities: tuple[int, ...] = ()  # L, messages; empty for the suite's own
+    seeds: int | None = None  # episodes on each trace; None for the suite's own number
+    data: str | None = None  # folder of recordings, for suites that need one
+    policy_file: str | None = None  # a Python file that registers policies, run wherever shards run
     sources: tuple[str, ...] = ()
     """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
-    folder: str = field(default_factory=os.getcwd)
-    """Folder of the sources."""
+    folder: str = field(default_factory=os.getcwd)  # folder of the sources
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
@@ -120,14 +113,10 @@ class Sweep:
 class Shard:
     """One piece of a sweep: one scenario on one trace, with some seeds."""
 
-    sweep: Sweep
-    """The whole sweep."""
-    label: str
-    """Label of the scenario."""
-    trace: int
-    """The number of the trace in the scenario."""
-    seeds: tuple[int, ...]
-    """Seeds of its episodes."""
+    sweep: Sweep  # the whole sweep
+    label: str  # label of the scenario
+    trace: int  # the number of the trace in the scenario
+    seeds: tuple[int, ...]  # seeds of its episodes
 
     @property
     def name(self) -> str:
@@ -208,7 +197,7 @@ def run_sweep(
     shards = sweep.shards()
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        manifest.claim(out, _manifest(sweep, shards, command))
+        folder.claim(out, _manifest(sweep, shards, command))
         if whole.exists():
             rows = read_rows(whole, layout)
         else:
@@ -226,7 +215,7 @@ def run_sweep(
                 sweep.policies, rows, lambda row: sweep.setting(row["scenario"], row["seed"] // SEEDS_PER_TRACE)
             )
             if example is not None:
-                manifest.write_json(out / "timeline.json", example)
+                folder.write_json(out / "timeline.json", example)
         shutil.rmtree(parts, ignore_errors=True)
         return rows
 
@@ -237,7 +226,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
     episodes = sum(len(shard.seeds) for shard in shards)
     code = sweep.policy_file and Path(sweep.policy_file).read_bytes()
     return {
-        "format": manifest.FORMAT,
+        "format": folder.FORMAT,
         "bufgym": __version__,
         "made": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "task": suite.kind,

@@ -1,7 +1,9 @@
-"""Tables as text: numbers, aligned columns, Markdown, and the table of ``bufgym bench``."""
+"""The one writer of tables, as text, Markdown and HTML, and the table of ``bufgym bench``."""
 
 from __future__ import annotations
 
+import html
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -43,32 +45,56 @@ def mean(numbers: Sequence[float | None]) -> float:
 # --- lines -----------------------------------------------------------------------------------------------------------
 
 
+class Table(NamedTuple):
+    """A table that is written as aligned text, Markdown or HTML. Names in it may be a stranger's."""
+
+    head: Sequence[str]
+    blocks: Sequence[tuple[str, Sequence[Sequence[str]]]]  # (title or nothing, lines of cells)
+    notes: Sequence[str] = ()
+    left: int = 1  # so many columns stand to the left, the others to the right
+
+    @property
+    def lines(self) -> list[Sequence[str]]:
+        """Lines of all blocks."""
+        return [line for _, block in self.blocks for line in block]
+
+    def plain(self) -> str:
+        """Aligned text: an empty line and the title before each block, all blocks in the same columns."""
+        lines = aligned([self.head, *self.lines])
+        out, at = lines[:1], 1
+        for k, (title, block) in enumerate(self.blocks):
+            out += [*([""] if k or title else []), *([printable(title)] if title else []), *lines[at : at + len(block)]]
+            at += len(block)
+        return "\n".join([*out, *self.notes])
+
+    def markdown(self) -> str:
+        """One Markdown table of all blocks, without their titles."""
+        lines = [[printable(cell).replace("|", "\\|") for cell in line] for line in self.lines]
+        rule = "|" + "---|" * self.left + "---:|" * (len(self.head) - self.left)
+        out = ["| " + " | ".join(self.head) + " |", rule, *("| " + " | ".join(line) + " |" for line in lines)]
+        return "\n".join([*out, *(["", *self.notes] if self.notes else [])])
+
+    def html(self) -> str:
+        """One HTML table of all blocks, without their titles."""
+        body = [self._row("td", line) for line in self.lines]
+        notes = [f"<p>{html.escape(note)}</p>" for note in self.notes]
+        return "\n".join(["<table>", self._row("th", self.head), *body, "</table>", *notes])
+
+    def _row(self, tag: str, line: Sequence[str]) -> str:
+        sides = ["left" if k < self.left else "right" for k in range(len(line))]
+        cells = zip(sides, map(html.escape, map(printable, line)), strict=True)
+        return "<tr>" + "".join(f'<{tag} style="text-align: {side}">{cell}</{tag}>' for side, cell in cells) + "</tr>"
+
+
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
     """Align rows of cells as lines of text: the first column to the left, the others to the right."""
     lines = [list(map(printable, line)) for line in lines]
-    widths = [max(len(line[c]) for line in lines) for c in range(len(lines[0]))]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     out = []
-    for line in lines:
-        padded = [cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True)]
-        out.append("  ".join([line[0].ljust(widths[0]), *padded]).rstrip())
+    for first, *rest in lines:
+        padded = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+        out.append("  ".join([first.ljust(widths[0]), *padded]).rstrip())
     return out
-
-
-def in_blocks(head: list[str], blocks: Sequence[tuple[str, list[list[str]]]]) -> str:
-    """Titled blocks of lines under one head, all in the same columns."""
-    lines = aligned([head, *(line for _, block in blocks for line in block)])
-    out, at = [lines[0]], 1
-    for title, block in blocks:
-        out += ["", printable(title), *lines[at : at + len(block)]]
-        at += len(block)
-    return "\n".join(out)
-
-
-def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:
-    """Lines of a Markdown table: ``left`` columns to the left, the others to the right."""
-    lines = [[printable(cell).replace("|", "\\|") for cell in line] for line in lines]
-    rule = "|" + "---|" * left + "---:|" * (len(head) - left)
-    return ["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(line) + " |" for line in lines)]
 
 
 def invalid(rows: Rows) -> list[str]:
@@ -87,11 +113,8 @@ class Column(NamedTuple):
     """One column of a table of means."""
 
     title: str
-    """Its heading."""
-    key: str
-    """Column of the rows that it averages."""
+    key: str  # column of the rows that it averages
     write: Callable[[float], str]
-    """Function that formats the mean."""
 
 
 COLUMNS = (
@@ -111,6 +134,8 @@ COLUMNS = (
 )
 
 
+SCORE = "score: 0 is Drop Oldest, the rule of ROS; 1 is the clairvoyant, which knows the whole link beforehand"
+"""The line below a table with scores."""
 REGRET_AT_MOST = "regret, at most"
 """Title of regrets if some rest on an uncertified bound."""
 UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exact here: it is at most this"
@@ -186,44 +211,22 @@ def unranked(rows: Rows) -> dict[str, str]:
     return reasons
 
 
-def plain(rows: Rows, floor: Rows = ()) -> str:
-    """Write aligned text with an empty line between capacities; ``floor`` as in ``means``."""
-    cells = _cells(rows, floor)
-    out = []
-    for k, line in enumerate(aligned(cells)):
-        if k > 1 and cells[k][1] != cells[k - 1][1]:
-            out.append("")
-        out.append(line)
-    return "\n".join([*out, *notes(rows)])
+def of(rows: Rows, floor: Rows = ()) -> Table:
+    """Make the table of ``means``, with one line for policies that are the ``same``.
 
-
-def markdown(rows: Rows, floor: Rows = ()) -> str:
-    """Write a Markdown table with numbers to the right; ``floor`` as in ``means``."""
-    head, *body = _cells(rows, floor)
-    lines = notes(rows)
-    return "\n".join([*markdown_table(head, body), *(["", *lines] if lines else [])])
-
-
-def notes(rows: Rows) -> list[str]:
-    """Write notes that a reader of the means needs."""
-    apart = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
-    return [*apart, *told_once(same(rows)), *([f"note: {UPPER_BOUND}"] if _inexact(rows) else []), *invalid(rows)]
-
-
-def _inexact(rows: Rows) -> bool:
-    """Whether a regret rests on an uncertified bound."""
-    return any(row.get("certified") is False and row.get("regret") is not None for row in rows)
-
-
-def _cells(rows: Rows, floor: Rows) -> list[list[str]]:
-    """Make titles and a line for each entry of ``means``, with one line for policies that are the ``same``. Score and
-    regret are left out if no row has them."""
+    Score and regret are left out if no row has them. ``floor`` is as in ``means``.
+    """
     others = {name for alike in same(rows).values() for name in alike}
     entries = [entry for entry in means(rows, floor) if entry["policy"] not in others]
     bounded = {key for key in ("score", "regret") if any(not math.isnan(entry[key]) for entry in entries)}
     columns = [c for c in COLUMNS if c.key in bounded or c.key not in ("score", "regret")]
-    titles = [REGRET_AT_MOST if c.key == "regret" and _inexact(rows) else c.title for c in columns]
-    return [titles, *([written(entry[c.key], c) for c in columns] for entry in entries)]
+    inexact = any(row.get("certified") is False and row.get("regret") is not None for row in rows)
+    titles = [REGRET_AT_MOST if c.key == "regret" and inexact else c.title for c in columns]
+    by_capacity = [list(block) for _, block in itertools.groupby(entries, lambda entry: entry["capacity"])]
+    blocks = [("", [[written(entry[c.key], c) for c in columns] for entry in block]) for block in by_capacity]
+    notes = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
+    notes += [*told_once(same(rows)), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(rows)]
+    return Table(titles, blocks, notes)
 
 
 def written(number: Any, column: Column) -> str:

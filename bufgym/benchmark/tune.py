@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import __version__, policies
-from bufgym.benchmark import table, tuned
+from bufgym.benchmark import tuned
 from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.benchmark.table import Table, decimal
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
@@ -33,10 +34,8 @@ from bufgym.scenario import suites
 class Grid:
     """Settings to try for one policy: every combination and the default."""
 
-    axes: Mapping[str, tuple[float, ...]]
-    """Values by parameter."""
-    why: str
-    """Source of the range."""
+    axes: Mapping[str, tuple[float, ...]]  # values by parameter
+    why: str  # source of the range
 
 
 GRIDS = {
@@ -112,24 +111,18 @@ def settings(policy: str) -> list[str]:
 class Tried:
     """One setting on the validation episodes."""
 
-    spec: str
-    """Setting as ``bufgym.policies.get`` takes it."""
-    score: Interval
-    """Mean over the discriminative cells; NaN where there is none."""
-    regret: Interval
-    """Mean over the same cells, or over all where none is discriminative."""
-    gain: Interval
-    """Paired gain over the default in score, or in regret if no cell is discriminative."""
+    spec: str  # setting as ``bufgym.policies.get`` takes it
+    score: Interval  # mean over the discriminative cells; NaN where there is none
+    regret: Interval  # mean over the same cells, or over all where none is discriminative
+    gain: Interval  # paired gain over the default in score, or in regret if no cell is discriminative
 
 
 @dataclass(frozen=True)
 class Choice:
     """Settings tried for one policy."""
 
-    policy: str
-    """Its plain name."""
-    tried: tuple[Tried, ...]
-    """Settings with their results, the default first."""
+    policy: str  # its plain name
+    tried: tuple[Tried, ...]  # settings with their results, the default first
 
     @property
     def default(self) -> Tried:
@@ -187,7 +180,7 @@ def compare(policy: str, rows: Sequence[Row], specs: Sequence[str]) -> Choice:
     """Score the settings ``specs`` of one policy, the default first; ``rows`` also hold the baseline."""
     rows = [row for row in rows if row["policy"] in (*specs, BASELINE)]
     scored = scores(rows)
-    discriminative = any(cell.discriminative for cell in scored.cells)
+    discriminative = scored.counted > 0
     gains = scores(_gains(rows, specs, discriminative))
     tried = []
     for spec in specs:
@@ -225,10 +218,10 @@ def _overall(scored: Scores, policy: str) -> tuple[Interval, Interval]:
     makes the interval a little too wide.
     """
     standing = next(s for s in scored.standings if s.policy == policy)
-    if standing.cells:
-        return standing.score, standing.regret
+    if scored.counted:
+        return standing["score"], standing["regret"]
     regrets = [cell.regret for cell in scored.cells if cell.policy == policy]
-    return standing.score, Interval(*(math.fsum(part) / len(regrets) for part in zip(*regrets, strict=True)))
+    return standing["score"], Interval(*(math.fsum(part) / len(regrets) for part in zip(*regrets, strict=True)))
 
 
 # --- what was chosen -------------------------------------------------------------------------------------------------
@@ -238,21 +231,19 @@ def plain(choices: Sequence[Choice]) -> str:
     """Write a table for each policy with every setting, best first."""
 
     def text(interval: Interval, digits: int) -> str:
-        return " ".join(filter(None, written(interval, lambda number: table.decimal(number, digits))))
+        return " ".join(filter(None, written(interval, lambda number: decimal(number, digits))))
 
     out = []
     for choice in choices:
-        lines = [["setting", "score", "regret", "better than the default", ""]]
+        lines = []
         for tried in sorted(choice.tried, key=lambda tried: -tried.gain.value):
             gain = "–" if tried is choice.default else text(tried.gain, 3)
-            lines.append([tried.spec, text(tried.score, 3), text(tried.regret, 4), gain, _mark(choice, tried)])
-        out += [f"{choice.policy}: {GRIDS[choice.policy].why}", *table.aligned(lines), ""]
+            marks = ("default", choice.default), ("best", choice.best), ("chosen", choice.chosen)
+            mark = ", ".join(mark for mark, marked in marks if marked is tried)
+            lines.append([tried.spec, text(tried.score, 3), text(tried.regret, 4), gain, mark])
+        head = ["setting", "score", "regret", "better than the default", ""]
+        out += [f"{choice.policy}: {GRIDS[choice.policy].why}", Table(head, [("", lines)]).plain(), ""]
     return "\n".join(out).rstrip()
-
-
-def _mark(choice: Choice, tried: Tried) -> str:
-    marks = ("default", choice.default), ("best", choice.best), ("chosen", choice.chosen)
-    return ", ".join(mark for mark, marked in marks if marked is tried)
 
 
 def write(suite: str, choices: Sequence[Choice], *, split: str, command: str) -> Path:

@@ -18,13 +18,15 @@ from bufgym.scenario import FleetScenario, Interruption
 _L = 2
 
 
+def _played(batch: Any, rows: int) -> None:
+    batch.reset(seed=0)
+    batch.step(np.full(rows, _L))
+
+
 def _environments() -> None:
-    small: dict[str, dict[str, Any]] = {"interruption": {"t_max": 5}, "lte": {"duration_s": 1.0}}
-    small["topics"] = small["lte"]
-    for name, parameters in small.items():
-        batches = SenderVectorEnv(2, name, _L, **parameters)
-        batches.reset(seed=0)
-        batches.step(np.full(2, _L))
+    short: dict[str, Any] = {"duration_s": 1.0}
+    for name, parameters in {"interruption": {"t_max": 5}, "lte": short, "topics": short}.items():
+        _played(SenderVectorEnv(2, name, _L, **parameters), 2)
     env = gymnasium.make("bufgym/Interruption-v0", capacity=_L)
     env.reset(seed=0)
     env.step(_L)
@@ -32,29 +34,20 @@ def _environments() -> None:
 
 def _bound() -> None:
     for size_cv in (0.0, 0.5):
-        run([policies.get("drop-oldest")], scenario.get("lte", duration_s=1.0, size_cv=size_cv), [_L], 1)
-
-
-def _policies() -> None:
-    run([policies.get(name) for name in policies.names(for_topics=False)], Interruption(t_max=5), [_L], 1)
-
-
-def _schedulers() -> None:
-    client = scenario.get("topics", duration_s=1.0)
-    run([policies.get(name) for name in policies.names(for_topics=True)], client, [_L], 1)
+        run(["drop-oldest"], scenario.get("lte", duration_s=1.0, size_cv=size_cv), [_L], 1)
 
 
 def _fleets() -> None:
-    batches = FleetVecEnv(1, 2, "lte", _L, parameters={"duration_s": 1.0})
-    batches.reset(seed=0)
-    batches.step(np.full(2, _L))
-    run([policies.get("drop-oldest")], FleetScenario.of(2, "lte", duration_s=1.0), [_L], 1)
+    _played(FleetVecEnv(1, 2, "lte", _L, parameters={"duration_s": 1.0}), 2)
+    run(["drop-oldest"], FleetScenario.of(2, "lte", duration_s=1.0), [_L], 1)
 
 
-PARTS: dict[str, Callable[[], None]] = {
-    "policies of one queue": _policies,
+PARTS: dict[str, Callable[[], object]] = {
+    "policies of one queue": lambda: run(list(policies.names(for_topics=False)), Interruption(t_max=5), [_L], 1),
     "environments": _environments,
-    "policies of several topics": _schedulers,
+    "policies of several topics": lambda: run(
+        list(policies.names(for_topics=True)), scenario.get("topics", duration_s=1.0), [_L], 1
+    ),
     "the clairvoyant": _bound,
     "fleets": _fleets,
 }

@@ -13,8 +13,6 @@ def add(commands: Commands) -> None:
     perf = command(commands, "perf", _perf, "measure bufgym's own speed on this machine")
     perf.add_argument("--json", metavar="FILE", help="also write the figures to FILE")
     perf.add_argument("--repeats", type=count, default=3, help="best of so many (%(default)s)")
-    perf.add_argument("--profile", action="store_true", help="profile the parts of a step instead")
-    perf.add_argument("--peers", action="store_true", help="beside CartPole of gymnasium, envpool, pufferlib, if here")
     perf.add_argument("--queue", action="store_true", help="measure a live queue's cost to a robot instead")
     perf.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
 
@@ -32,15 +30,7 @@ def _perf(options: argparse.Namespace) -> None:
 
         print(cost.report(1 if options.quick else 20))
         return
-    if options.profile:
-        print(perf.profile(sizes))
-        return
-    figures, absent = perf.measure(sizes), list[str]()
-    if options.peers:
-        peers, absent = perf.measure_peers(sizes, figures)
-        figures += peers
+    figures = perf.measure(sizes)
     print(perf.report(figures, sizes.repeats))
-    if absent:
-        print(f"Not here, so left out: {', '.join(absent)}")
     if options.json is not None:
         perf.write_json(figures, sizes, Path(options.json))

@@ -46,31 +46,23 @@ model.learn(65_536)
 # `as_policy` makes the model a policy like any other. All policies meet the same episodes.
 
 # %%
-from bufgym import policies
-from bufgym.benchmark import run, table
 from bufgym.scenario import Interruption
 
 mine = as_policy(model, "my-agent")
-scenario = Interruption(t_max=200)
-chosen = [mine, *map(policies.get, ("learned-motion", "afr", "drop-oldest"))]
-rows = run.run(chosen, scenario, capacities=[8], seeds=20)
-print(table.plain(rows))
+compared = bufgym.compare([mine, "learned-motion", "afr", "drop-oldest"], Interruption(t_max=200), seeds=20)
+print(compared)
 
 # %% [markdown]
 # The agent is trained for seconds only. `make train` trains longer, and the [guide](../guide/training.md) says how the
 # shipped agents were made.
 #
-# ## What did the server see?
+# ## The picture
 
 # %%
-from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+import matplotlib
 
-one = Interruption(law="fixed", t_max=60)
-episode = draw(one, seed=0)
-picture.save(
-    picture.play([mine, "afr", "drop-oldest"], episode, 8, one), episode, "first-agent.png", "60 messages, L = 8"
-)
+matplotlib.use("agg")
+compared.plot().figure.savefig("first-agent.png")
 
 # %% [markdown]
-# ![What the server saw of one interruption](first-agent.png)
+# ![The regret of the agent and of three other policies](first-agent.png)

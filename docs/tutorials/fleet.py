@@ -30,13 +30,12 @@ print({agent: round(info["qoi"], 2) for agent, info in infos.items()})
 # `bufgym fleet --suite fleet-v1` runs policies on 16 robots. Here are three of them on a cell of eight.
 
 # %%
-from bufgym import policies
-from bufgym.benchmark import run
+import bufgym
 from bufgym.scenario import FleetScenario
 
 cell = FleetScenario.of(8, "lte", duration_s=10.0)
 names = ["learned-motion", "afr", "drop-oldest"]
-rows = run.run([policies.get(name) for name in names], cell, capacities=[8], seeds=2)
+rows = bufgym.compare(names, cell, seeds=2).rows
 
 # %% [markdown]
 # ## The picture

@@ -81,14 +81,12 @@ for k in range(rounds):
 # `as_policy` makes the network a policy. The two links of the test were not in the training.
 
 # %%
-from bufgym import policies, scenario
-from bufgym.benchmark import run, table
 from bufgym.sb3 import as_policy
 
 mine = as_policy(pupil, "imitation")
-held_out = scenario.get("lte", traces=["lte-synthetic-6", "lte-synthetic-7"], duration_s=20.0)
-chosen = [mine, *map(policies.get, ("min-motion-gap", "afr", "drop-oldest"))]
-print(table.plain(run.run(chosen, held_out, capacities=[8], seeds=10)))
+held_out = {"traces": ["lte-synthetic-6", "lte-synthetic-7"], "duration_s": 20.0}
+compared = bufgym.compare([mine, "min-motion-gap", "afr", "drop-oldest"], "lte", **held_out)
+print(compared)
 
 # %% [markdown]
 # The pupil is above AFR, and far below 1, the clairvoyant's score. Where the link decides only later which message was
@@ -98,13 +96,10 @@ print(table.plain(run.run(chosen, held_out, capacities=[8], seeds=10)))
 # ## The picture
 
 # %%
-from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+import matplotlib
 
-episode = draw(held_out, seed=0)
-picture.save(
-    picture.play([mine, "clairvoyant", "afr", "drop-oldest"], episode, 8, held_out), episode, "imitation.png", "L = 8"
-)
+matplotlib.use("agg")
+compared.plot().figure.savefig("imitation.png")
 
 # %% [markdown]
-# ![What the server saw with the pupil, the clairvoyant, AFR and Drop Oldest](imitation.png)
+# ![The regret of the pupil and of three rules](imitation.png)

@@ -49,11 +49,9 @@ bufgym([*command.split(), "--seeds", "40", "--capacity", "20", "--jobs", "1", "-
 # sums them up: the score is 0 for Drop Oldest and 1 for the clairvoyant, with an interval over episodes.
 
 # %%
-from bufgym.benchmark import leaderboard, manifest
-from bufgym.benchmark.rows import read_rows
+from bufgym.benchmark import leaderboard
 
-unranked = manifest.read(folder / "rows" / "manifest.json")["unranked"]
-board = leaderboard.entries(read_rows(folder / "rows" / "rows.csv"), "interruption-v1", unranked)
+board = leaderboard.of_folder(folder / "rows")
 board.sort(key=lambda entry: -entry.values["score"].value)
 for entry in board:
     score = entry.values["score"]

@@ -28,12 +28,11 @@ def every_second(buffer, arrival, memory):
 # ## Against the others
 
 # %%
-from bufgym import policies, scenario
-from bufgym.benchmark import run, table
+import bufgym
 
 names = ["every-second", "min-motion-gap", "afr", "drop-oldest"]
-rows = run.run([policies.get(name) for name in names], scenario.get("lte", duration_s=20.0), capacities=[8], seeds=2)
-print(table.plain(rows))
+compared = bufgym.compare(names, "lte", duration_s=20.0, seeds=2)
+print(compared)
 
 # %% [markdown]
 # Put the function into a file, and every command takes it:
@@ -45,16 +44,14 @@ print(table.plain(rows))
 # ## The picture
 
 # %%
-from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+import matplotlib
 
-fading = picture.fading()
-episode = draw(fading, seed=0)
-picture.save(picture.play(names, episode, 8, fading), episode, "own-policy.png", "A fading link, L = 8")
+matplotlib.use("agg")
+compared.plot().figure.savefig("own-policy.png")
 
 # %% [markdown]
-# The policy thins one interruption evenly, but here it is hardly better than `drop-oldest`: while the link is slow,
+# The policy thins one interruption evenly, but not a slow link: while the link is slow,
 # messages leave at the head, and its place in the queue no longer fits. AFR moves its place with every departure. Give
 # `register` an `on_departure(buffer, memory)` that does the same, and try again.
 #
-# ![What the server saw under each policy](own-policy.png)
+# ![The regret of each policy](own-policy.png)

@@ -43,24 +43,28 @@ print(f"{uplink.mean_bytes_per_s / 1e6:.2f} MB/s on average")
 
 # %%
 from bufgym import policies
-from bufgym.benchmark.drops import by_topic, drops, write_drops
+from bufgym.benchmark import drops
 from bufgym.scenario import Uplink
 
 scenario = Uplink((uplink,), workload=recording, random_offset=False)
 names = ["min-gap", "afr", "drop-oldest"]
-counts = write_drops(drops([policies.get(name) for name in names], scenario, [8], seeds=1), Path("dropped.csv"))
-print(by_topic(counts, scenario, names, runs=1))
+dropped = drops.drops([policies.get(name) for name in names], scenario, [8], seeds=1)
+counts = drops.write_drops(dropped, Path("dropped.csv"))
+print(drops.by_topic(counts, scenario, names, runs=1))
 print(Path("dropped.csv").read_text().splitlines()[:3])
 
 # %% [markdown]
 # ## The picture
 
 # %%
-from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+import matplotlib
 
-episode = draw(scenario, seed=0)
-picture.save(picture.play(names, episode, 8, scenario), episode, "own-recording.png", "My drive over my link, L = 8")
+import bufgym
+
+matplotlib.use("agg")
+compared = bufgym.compare(names, scenario, seeds=1, about="My drive over my link")
+print(compared)
+compared.plot().figure.savefig("own-recording.png")
 
 # %% [markdown]
-# ![What the server saw of the recording](own-recording.png)
+# ![The regret of each policy on the recording](own-recording.png)

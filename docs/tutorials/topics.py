@@ -17,11 +17,10 @@ for topic in client.topics:
 # A scheduler is a policy that also chooses what the free socket sends. H is the weighted sum over the topics.
 
 # %%
-from bufgym import policies
-from bufgym.benchmark import run
+import bufgym
 
 names = ["learned-scheduler", "robofleet", "strict-priority", "fifo", "ros-native"]
-rows = run.run([policies.get(name) for name in names], client, capacities=[32], seeds=2)
+rows = bufgym.compare(names, client, capacity=32, seeds=2).rows
 for name in names:  # a row for each topic of a run; the run's weighted sum is in all of them
     h = [row["weighted_qoi"] for row in rows if row["policy"] == name and row["topic"] == client.topics[0].name]
     print(f"{name:18} H = {sum(h) / len(h):7.1f}")

@@ -19,14 +19,17 @@ def stubborn(buffer, arrival, memory):
 def test_a_scenario_by_name_or_made_and_policies_of_each_kind() -> None:
     done = bufgym.compare(["afr", stubborn], "interruption", capacity=[2, 4], seeds=3, t_max=20, progress=False)
     made = scenario.get("interruption", t_max=20)
-    rows = run([policies.get("afr"), policies.get(stubborn)], made, [2, 4], 3)
-    assert done.rows == rows and bufgym.compare(["afr", stubborn], made, capacity=[2, 4], seeds=3).rows == rows
+    rows = run([policies.get("afr"), policies.get(stubborn)], made, [2, 4], 3, label="interruption")
+    unnamed = [{**row, "scenario": ""} for row in rows]
+    assert done.rows == rows and bufgym.compare(["afr", stubborn], made, capacity=[2, 4], seeds=3).rows == unnamed
     # The score needs Drop Oldest on the same episodes, though it is no row.
     head, *lines = done.table().splitlines()
     assert head.split()[:5] == ["policy", "L", "score", "QoI", "regret"] and "drop-oldest" not in done.table()
-    assert [line.split()[0] for line in lines if line] == ["afr", "stubborn", "afr", "stubborn"]
+    assert [line.split()[0] for line in lines if line] == ["afr", "stubborn", "afr", "stubborn", "score:"]
     assert done.table("markdown").startswith("| policy | L |") and str(done).startswith("interruption\n\n")
-    assert "stubborn" in done._repr_html_()
+    page = done._repr_html_()
+    assert page.startswith("<p>interruption</p>\n<table>") and page.count("<tr>") == 5 and ">stubborn</td>" in page
+    assert "score: 0 is Drop Oldest" in done.table() and "<p>score: 0 is Drop Oldest" in page
 
 
 def test_a_suite_by_name() -> None:
@@ -45,7 +48,22 @@ def test_a_picture() -> None:
 def test_a_frame() -> None:
     frame = pytest.importorskip("pandas", reason="a frame needs pandas")
     done = bufgym.compare(["afr"], "interruption", seeds=2, progress=False)
-    assert isinstance(done.to_pandas(), frame.DataFrame) and done.to_pandas()["policy"].tolist() == ["afr", "afr"]
+    found = done.to_pandas()
+    assert isinstance(found, frame.DataFrame) and found["policy"].tolist() == ["afr", "afr"]
+    assert found["scenario"].tolist() == ["interruption", "interruption"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "policy", "baseline", "head"),
+    [("topics", "fifo", "robofleet", "QoI"), ("fleet", "min-gap", "afr", "team QoI")],
+)
+def test_topics_and_fleets_beside_their_baseline(kind: str, policy: str, baseline: str, head: str) -> None:
+    made = scenario.get("topics", duration_s=2.0)
+    if kind == "fleet":
+        made = scenario.FleetScenario.of(2, "lte", duration_s=2.0)
+    done = bufgym.compare([policy], made, capacity=4, seeds=1, about="mine")
+    assert {row["policy"] for row in done.rows} == {policy, baseline}
+    assert done.table().startswith("policy") and head in done.table() and done.to_pandas()["scenario"][0] == "mine"
 
 
 def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,7 +62,7 @@ def test_the_page_says_what_was_run_and_how_to_run_it_again(folder: Path) -> Non
     told += ['<html lang="en">', "<title>bufgym: tiny-v1, test</title>", "not ranked: it knows the future"]
     assert all(words in page for words in [*told, "Drop Oldest loses under 1 % there"])
     assert page.count(' flat"') == 2 * len(QOI)  # both capacities of the good link
-    assert set(embedded(page)) == {"ranking", "capacities", "outages", "delays", "timeline", "memory"}
+    assert set(embedded(page)) == {"ranking", "capacities", "outages", "delays", "timeline"}
     assert report.write(folder).read_text(encoding="utf-8") == page and len(page) < 8e6
 
 
@@ -201,6 +201,6 @@ def test_a_browser_draws_every_chart_without_network_or_complaint(folder: Path, 
         page.wait_for_function(f"(was) => {colour} !== was", arg=ink)
         page.select_option("#capacities select", "long")
         assert "<b>" in page.locator("#delays .ytick text").all_text_contents()
-    assert {chart for chart, *_ in sizes} == {"ranking", "capacities", "outages", "delays", "timeline", "memory"}
+    assert {chart for chart, *_ in sizes} == {"ranking", "capacities", "outages", "delays", "timeline"}
     assert all(wide > 200 and high > 100 and shapes > 0 for _, wide, high, shapes in sizes), sizes
     assert ink == ("rgb(27, 31, 36)" if scheme == "light" else "rgb(230, 233, 237)")

@@ -13,7 +13,7 @@ import pytest
 from bufgym import oracle, policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
-from bufgym.benchmark.tasks.timeline import choose, timeline
+from bufgym.benchmark.tasks.queue import choose, timeline
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.model import qoi

@@ -52,12 +52,12 @@ NOISY = runs({"base": [10, 100, 50, 20], "mine": [11, 108, 57, 23]})
 
 
 def test_intervals_are_paired_and_repeatable() -> None:
-    found = summary(NOISY, seed=1)
+    found = summary(NOISY)
     over = found.standings["mine"]["over"]
     assert over.value == pytest.approx(199 / 180)
     # No resample leaves the range of the single ratios.
     assert 1.08 <= over.low < over.value < over.high <= 1.15
-    assert summary(dict(reversed(NOISY.items())), seed=1).overall == found.overall
+    assert summary(dict(reversed(NOISY.items()))).overall == found.overall
 
 
 def test_over_all_cells_it_is_the_mean_of_theirs_or_their_sum() -> None:
@@ -84,17 +84,9 @@ def test_unranked_policies_come_last() -> None:
     assert [(standing.policy, standing.ranked) for standing in found] == [("base", True), ("endless", False)]
 
 
-@pytest.mark.parametrize(
-    ("numbers", "options", "message"),
-    [
-        (runs({"base": [1, 2], "mine": [1]}), {}, "mine at s, L = 4, trace t, seed 1: no row; every policy must meet"),
-        (NOISY, {"resamples": 0}, "resamples = 0"),
-        (NOISY, {"confidence": 95}, "confidence = 95"),
-    ],
-)
-def test_runs_that_cannot_be_summed_up(numbers: dict[Run, list[float]], options: dict[str, Any], message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        summary(numbers, **options)
+def test_runs_that_cannot_be_summed_up() -> None:
+    with pytest.raises(BufgymError, match="mine at s, L = 4, trace t, seed 1: no row; every policy must meet"):
+        summary(runs({"base": [1, 2], "mine": [1]}))
 
 
 def one(policy: str, seed: int, live: float, simulated: float, transport: str = "tcp") -> LiveRun:
@@ -115,12 +107,6 @@ def test_margins_by_hand() -> None:
         "random against afr, 2 episodes: regret lower by 3.00 % [2.00, 4.00] live, 4.00 % [4.00, 4.00] simulated: "
         "75.0 % [50.0, 100.0] of the simulator's margin is there live."
     )
-
-
-def test_an_episode_over_two_transports_is_one() -> None:
-    again = [one(policy, seed, 4.5, 4.5, "ros1") for policy in ("afr", "random") for seed in (0, 1)]
-    [margin] = margins([*AFR, one("random", 0, 4.1, 4.2), one("random", 1, 3.2, 3.2), *again])
-    assert margin.episodes == 2 and margin.live.value == pytest.approx(0.3 / 20)
 
 
 def test_nothing_is_said_of_a_single_episode_or_without_the_reference() -> None:

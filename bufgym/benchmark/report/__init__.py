@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from bufgym.benchmark.folder import Run, read
+from bufgym.benchmark.folder import SuiteRun, read
 from bufgym.benchmark.report import page, tables
 from bufgym.benchmark.summary import Summary
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 
-__all__ = ["markdown", "plain", "write"]
+__all__ = ["html", "markdown", "plain", "write"]
 
 
 def write(folder: str | Path) -> Path:
@@ -24,33 +24,37 @@ def write(folder: str | Path) -> Path:
         BufgymError: for a folder without a run, a broken file in it, rows that can't be scored, or where plotly or
             Jinja is not installed.
     """
-    run = read(Path(folder))
-    html = page.html(run, _summary(run))
+    run, summary = _read(folder)
+    text = page.html(run, summary)
     target = run.folder / "report.html"
     with replaced(target) as temporary:
-        temporary.write_text(html, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
     return target
 
 
 def markdown(folder: str | Path) -> str:
     """The command, the ranking and the tables of every cell as Markdown, for a README. Errors as for ``write``."""
-    run = read(Path(folder))
-    return tables.markdown(run, _summary(run))
+    return tables.markdown(*_read(folder))
+
+
+def html(folder: str | Path) -> str:
+    """The ranking as an HTML table, for a notebook. Errors as for ``write``."""
+    return tables.html(*_read(folder))
 
 
 def plain(folder: str | Path) -> str:
     """The summary as text, for a terminal. Errors as for ``write``."""
+    return tables.plain(*_read(folder))
+
+
+def _read(folder: str | Path) -> tuple[SuiteRun, Summary]:
+    """The run and its summary, scores in the order of the manifest's scenarios."""
     run = read(Path(folder))
-    return tables.plain(run, _summary(run))
-
-
-def _summary(run: Run) -> Summary:
-    """The summary, scores in the order of the manifest's scenarios."""
     try:
         summary = run.task.summary(run.rows, run.manifest["unranked"])
     except BufgymError as error:
         raise BufgymError(f"{run.rows_file}: {error}") from None
-    if summary.scores is None:
-        return summary
-    cells = sorted(summary.scores.cells, key=lambda c: (run.place(c.scenario), c.capacity, c.policy))
-    return replace(summary, scores=replace(summary.scores, cells=cells))
+    if summary.scores is not None:
+        cells = sorted(summary.scores.cells, key=lambda c: (run.place(c.scenario), c.capacity, c.policy))
+        summary = replace(summary, scores=replace(summary.scores, cells=cells))
+    return run, summary

@@ -10,41 +10,34 @@ from typing import Any
 import numpy as np
 
 from bufgym.benchmark.bootstrap import Interval, written
-from bufgym.benchmark.folder import Run
+from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.report import style
 from bufgym.benchmark.report.style import Figure
 from bufgym.benchmark.score import CellScore
 from bufgym.benchmark.summary import Quantity, Summary
-from bufgym.benchmark.table import REGRET_AT_MOST, percent
+from bufgym.benchmark.table import REGRET_AT_MOST, means, percent
 
 
 @dataclass(frozen=True)
 class Chart:
     """A chart on the page."""
 
-    id: str
-    """Id of its section."""
-    alt: str
-    """Alternative text for readers who can't see it."""
-    choices: list[tuple[str, list[str]]]
-    """Choices as (label, options), the default option first."""
-    panels: Mapping[tuple[str, ...], list[Figure]]
-    """One option of each choice -> figures shown side by side."""
+    id: str  # of its section
+    alt: str  # text for readers who can't see it
+    choices: list[tuple[str, list[str]]]  # (label, options), the default option first
+    panels: Mapping[tuple[str, ...], list[Figure]]  # one option of each choice -> figures shown side by side
 
 
 @dataclass(frozen=True)
 class Context:
     """Input of every chart."""
 
-    run: Run
-    """The run."""
+    run: SuiteRun
     summary: Summary
-    """Summary of its rows."""
-    colours: dict[str, str]
-    """Colours of highlighted policies."""
+    colours: dict[str, str]  # of highlighted policies
 
     @classmethod
-    def of(cls, run: Run, summary: Summary) -> Context:
+    def of(cls, run: SuiteRun, summary: Summary) -> Context:
         ranked = [standing.policy for standing in summary.overall if standing.ranked]
         return cls(run, summary, style.colours(ranked, summary.baseline))
 
@@ -188,7 +181,7 @@ def _curves(cells: Sequence[CellScore], at: Callable[[CellScore], float]) -> dic
 
 
 def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]) -> Figure:
-    """Draw lines and bands; highlighted lines are labelled at their right end."""
+    """Draw lines and bands; the legend names highlighted lines."""
     low, high = regret_range([cell.regret.value for curve in curves.values() for _, cell in curve])
     data: list[dict[str, Any]] = []
     for policy in context.order(list(curves)):
@@ -197,7 +190,8 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
         if out:
             band = [c.regret.low for _, c in curve] + [c.regret.high for _, c in curve][::-1]
             area: dict[str, Any] = {"fill": "toself", "fillcolor": colour, "opacity": 0.16, "line": {"width": 0}}
-            data.append(style.scatter(xs + xs[::-1], [max(y, low) for y in band], mode="lines", **area))
+            bounds = [max(y, low) for y in band]
+            data.append(style.scatter(xs + xs[::-1], bounds, mode="lines", showlegend=False, **area))
         data.append(
             style.scatter(
                 xs,
@@ -206,42 +200,22 @@ def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]
                 mode="lines+markers",
                 cliponaxis=False,
                 name=style.text(policy),
+                showlegend=out,
                 line={"color": colour, "width": 2 if out else 1, "dash": "dot" if policy == "clairvoyant" else "solid"},
                 opacity=1 if out else 0.55,
                 marker={"size": 6 if out else 4, "color": colour},
-                text=[f"{with_interval(c.regret, percent)}<br>QoI {with_interval(c.qoi, _fine)}" for _, c in curve],
+                text=[
+                    f"{with_interval(c.regret, percent)}<br>QoI {with_interval(c.qoi, '{:.2f}'.format)}"
+                    for _, c in curve
+                ],
             )
         )
     ticks = sorted({at for curve in curves.values() for at, _ in curve})
     across = style.axis(**x, showgrid=False, tickvals=ticks, ticktext=[f"{tick:g}" for tick in ticks])
     across["range"] = [math.log10(ticks[0]) - 0.03, math.log10(ticks[-1]) + 0.03]
     title = regret_title(cell for curve in curves.values() for _, cell in curve)
-    layout = style.layout(430, xaxis=across, yaxis=style.log_axis(title, low, high, style.short_percent))
-    layout["annotations"] = _end_labels(context, curves, (low, high), 370)
-    longest = max([len(policy) for policy in curves if policy in context.colours], default=0)
-    layout["margin"] = {**layout["margin"], "r": max(120, 7 * longest + 12)}
-    return {"data": data, "layout": layout}
-
-
-def _fine(number: float) -> str:
-    return f"{number:.2f}"
-
-
-def _end_labels(context: Context, curves: dict[str, Curve], span: tuple[float, float], pixels: int) -> list[Any]:
-    """Place names at the right ends of highlighted curves, moved apart where they would overlap."""
-    low, high = (math.log10(end) for end in span)
-    ends = {
-        p: math.log10(max(curve[-1][1].regret.value, span[0])) for p, curve in curves.items() if p in context.colours
-    }
-    scale = pixels / (high - low)
-    places = style.apart({policy: (y - low) * scale for policy, y in ends.items()}, 15)
-    labels = []
-    for policy, y in ends.items():
-        font = {"size": 12, "color": context.colour(policy)}
-        shift = places[policy] - (y - low) * scale
-        at = {"x": 1, "xref": "paper", "xanchor": "left", "xshift": 6, "y": y, "yshift": round(shift, 1)}
-        labels.append({**style.note(style.text(policy), **at), "font": font})
-    return labels
+    up = style.log_axis(title, low, high, style.short_percent)
+    return {"data": data, "layout": style.layout(430, xaxis=across, yaxis=up, showlegend=True)}
 
 
 def regret_title(cells: Iterable[CellScore]) -> str:
@@ -262,3 +236,73 @@ def middle_first(sizes: set[int]) -> list[int]:
     ordered = sorted(sizes)
     middle = ordered[len(ordered) // 2 : len(ordered) // 2 + 1]
     return middle + [size for size in ordered if size not in middle]
+
+
+# --- costs besides information: delay at the sender, age at the server ------------------------------------------------
+
+LONG = 8.0
+"""Ratio of largest to smallest value from which an axis is logarithmic."""
+
+
+def delays(context: Context) -> Chart | None:
+    """Regret, sojourn time and age of information side by side, for each scenario and capacity."""
+    cells: dict[tuple[str, int], dict[str, CellScore]] = {}
+    for cell in context.cells:
+        if not math.isnan(cell.regret.value):
+            cells.setdefault((cell.scenario, cell.capacity), {})[cell.policy] = cell
+    if not cells:
+        return None
+    scenarios = list(dict.fromkeys(scenario for scenario, _ in cells))
+    sizes = middle_first({capacity for _, capacity in cells})
+    panels: dict[tuple[str, ...], list[Figure]] = {}
+    for scenario in scenarios:
+        entries = means([row for row in context.run.rows if row["scenario"] == scenario])
+        for capacity in sizes:
+            scored = cells.get((scenario, capacity), {})
+            by_policy = {m["policy"]: m for m in entries if m["capacity"] == capacity and m["policy"] in scored}
+            panels[scenario, str(capacity)] = [_three(context, scored, by_policy)] if by_policy else []
+    choices = [("Scenario", scenarios), ("Capacity L", [str(size) for size in sizes])]
+    alt = "Regret, mean sojourn time and mean age of information of each policy"
+    return Chart("delays", alt, choices, panels)
+
+
+def _three(context: Context, cells: Mapping[str, CellScore], entries: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Three columns of dots over the same lanes, least regret on top."""
+    names = sorted(entries, key=lambda name: cells[name].regret.value, reverse=True)
+    data: list[dict[str, Any]] = []
+
+    def column(values: Sequence[float], title: str, words: Sequence[str]) -> None:
+        data.append(
+            style.scatter(
+                values,
+                [style.text(name) for name in names],
+                f"<b>%{{y}}</b><br>{title} %{{text}}",
+                cliponaxis=False,
+                xaxis=f"x{len(data) + 1}" if data else "x",
+                marker={"color": [context.colour(name) for name in names], "size": 9},
+                text=list(words),
+            )
+        )
+
+    low, high = regret_range([cells[name].regret.value for name in names])
+    regrets = [max(cells[name].regret.value, low) for name in names]
+    measure = regret_title(cells[name] for name in names)
+    column(regrets, measure, [with_interval(cells[name].regret, percent) for name in names])
+    place = {"domain": [0, 0.31], "tickangle": 0}
+    axes = {"xaxis": style.log_axis(measure, low / 1.15, high, style.short_percent, (1, 3), **place)}
+    for key, title, start in (
+        ("mean_sojourn_s", "mean sojourn time", 0.345),
+        ("mean_age_s", "mean age of information", 0.69),
+    ):
+        values = [entries[name][key] for name in names]
+        column(values, title, [f"{value:.3g} s" for value in values])
+        place = {"domain": [start, start + 0.31], "tickangle": 0}
+        axes[f"xaxis{len(data)}"] = _seconds_axis(f"{title}, s", values, **place)
+    return {"data": data, "layout": style.lanes(names, grid=True, **axes)}
+
+
+def _seconds_axis(title: str, values: Sequence[float], **changes: Any) -> dict[str, Any]:
+    positive = [value for value in values if value > 0]  # NaN where nothing was delivered
+    if positive and max(positive) / min(positive) >= LONG:
+        return style.log_axis(title, min(positive) / 1.3, max(positive) * 1.3, "{:g}".format, **changes)
+    return style.axis(title, rangemode="tozero", nticks=6, **changes)

@@ -9,19 +9,20 @@ from importlib.resources import files
 from typing import Any
 
 from bufgym.benchmark import table
-from bufgym.benchmark.folder import Run
-from bufgym.benchmark.report import charts, costs, tables
+from bufgym.benchmark.bootstrap import CONFIDENCE, RESAMPLES
+from bufgym.benchmark.folder import SuiteRun
+from bufgym.benchmark.report import charts, tables
 from bufgym.benchmark.report.charts import Chart, Context
 from bufgym.benchmark.report.timeline import timeline
-from bufgym.benchmark.score import DISCRIMINATIVE, CellScore
+from bufgym.benchmark.score import DISCRIMINATIVE, REFERENCE, CellScore
 from bufgym.benchmark.summary import Summary, title
 from bufgym.ground.errors import BufgymError, install
 
-CHARTS = (charts.ranking, charts.capacities, charts.outages, costs.delays, timeline, costs.memory)
+CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, timeline)
 """Functions that make the charts; each returns None if the run has nothing to show."""
 
 
-def html(run: Run, summary: Summary) -> str:
+def html(run: SuiteRun, summary: Summary) -> str:
     """Render the whole page in one self-contained file."""
     context = Context.of(run, summary)
     cells = list(dict.fromkeys((row["scenario"], row["capacity"]) for row in run.rows))
@@ -35,7 +36,9 @@ def html(run: Run, summary: Summary) -> str:
         episodes=len({(row["scenario"], row["trace"], row["seed"]) for row in run.rows}),
         scenarios=len({scenario for scenario, _ in cells}),
         sizes=sorted({capacity for _, capacity in cells}),
-        confidence=f"{summary.confidence:.0%}".replace("%", " %"),
+        confidence=f"{CONFIDENCE:.0%}".replace("%", " %"),
+        resamples=RESAMPLES,
+        versus=REFERENCE,
         threshold=f"{DISCRIMINATIVE:.0%}".replace("%", " %"),
         places=tables.ranking(run, summary),
         cells=[
@@ -43,7 +46,7 @@ def html(run: Run, summary: Summary) -> str:
             for cell, standings in summary.cells.items()
         ],
         best=next((s for s in summary.overall[:1] if s.ranked and not math.isnan(s[summary.rank_by].value)), None),
-        reference=None if summary.scores is None else summary.standings.get(summary.scores.reference),
+        reference=None if summary.scores is None else summary.standings.get(REFERENCE),
         heat=None if summary.scores is None else tables.heat_map(summary.scores),
         shade=_shade,
         colour=context.colour,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 Figure = dict[str, Any]
@@ -122,22 +122,3 @@ def line(axis: str, at: float) -> dict[str, Any]:
     ends = {f"{axis}0": at, f"{axis}1": at, f"{axis}ref": axis}
     whole = {f"{across}0": 0, f"{across}1": 1, f"{across}ref": f"{across} domain"}
     return {"type": "line", "layer": "below", **ends, **whole, "line": {"color": "var(--axis)", "width": 1.5}}
-
-
-def apart(targets: Mapping[str, float], gap: float) -> dict[str, float]:
-    """Positions at least ``gap`` apart, in the order of the targets and as a whole no higher nor lower."""
-    names = sorted(targets, key=lambda name: targets[name])
-    groups: list[tuple[float, list[str]]] = []  # (centre, names), bottom up; groups that touch become one
-    for name in names:
-        groups.append((targets[name], [name]))
-        while len(groups) > 1:
-            (below, first), (above, second) = groups[-2:]
-            if above - below >= gap * (len(first) + len(second)) / 2:
-                break
-            size = len(first) + len(second)
-            groups[-2:] = [((below * len(first) + above * len(second)) / size, first + second)]
-    return {
-        name: centre + (k - (len(members) - 1) / 2) * gap
-        for centre, members in groups
-        for k, name in enumerate(members)
-    }

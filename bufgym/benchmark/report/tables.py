@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
-from bufgym.benchmark import table
-from bufgym.benchmark.folder import Run
+from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.report import style
-from bufgym.benchmark.score import CellScore, Scores
-from bufgym.benchmark.summary import Standing, Summary, pair, title
+from bufgym.benchmark.score import CellScore, Scores, Standing
+from bufgym.benchmark.summary import Summary, pair, title
 from bufgym.benchmark.summary import plain as blocks
+from bufgym.benchmark.table import SCORE, UPPER_BOUND, Table, invalid, score
 
 NOTHING_SCORED = (
     "Nothing is scored here: on these episodes Drop Oldest's regret is under 1 % in every cell, so there is nothing to"
@@ -19,21 +19,16 @@ NOTHING_SCORED = (
 )
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """One line of a ranking."""
 
-    rank: int | None
-    """1 for the best; None for a policy that is not ranked."""
+    rank: int | None  # 1 for the best; None for a policy that is not ranked
     policy: str
-    """Its name."""
-    values: list[tuple[str, str]]
-    """(value, interval) as text, a pair for each quantity of the summary."""
-    reason: str
-    """Reason why it is not ranked; empty if it is."""
+    values: list[tuple[str, str]]  # (value, interval) as text, a pair for each quantity of the summary
+    reason: str  # why it is not ranked; empty if it is
 
 
-def ranking(run: Run, summary: Summary, standings: Sequence[Standing] | None = None) -> list[Place]:
+def ranking(run: SuiteRun, summary: Summary, standings: Sequence[Standing] | None = None) -> list[Place]:
     """Ranked policies best first, then the others with the manifest's reasons; by default over all cells."""
     places: list[Place] = []
     for standing in summary.overall if standings is None else standings:
@@ -44,18 +39,13 @@ def ranking(run: Run, summary: Summary, standings: Sequence[Standing] | None = N
     return places
 
 
-@dataclass(frozen=True)
-class HeatMap:
+class HeatMap(NamedTuple):
     """Scores of every policy in every cell."""
 
-    columns: list[tuple[str, list[int]]]
-    """(scenario, its capacities)."""
-    lines: list[tuple[str, list[CellScore]]]
-    """(policy, one cell for each column), ranked policies first."""
-    inexact: set[tuple[str, int]]
-    """Cells where the clairvoyant is an upper bound only."""
-    flat: set[tuple[str, int]]
-    """Cells that are not discriminative."""
+    columns: list[tuple[str, list[int]]]  # (scenario, its capacities)
+    lines: list[tuple[str, list[CellScore]]]  # (policy, one cell for each column), ranked policies first
+    inexact: set[tuple[str, int]]  # cells where the clairvoyant is an upper bound only
+    flat: set[tuple[str, int]]  # cells that are not discriminative
 
 
 def heat_map(scores: Scores) -> HeatMap:
@@ -74,23 +64,30 @@ def heat_map(scores: Scores) -> HeatMap:
     )
 
 
-def plain(run: Run, summary: Summary) -> str:
+def plain(run: SuiteRun, summary: Summary) -> str:
     """Write aligned text: the ranking, or a block for each cell if there are no scores, then the notes."""
     unranked = run.manifest["unranked"]
     notes = [f"{s.policy} has no rank: {unranked[s.policy]}." for s in summary.overall if not s.ranked]
-    notes += [*table.invalid(run.task.senders(run.rows)), *summary.notes]
+    notes += [*invalid(run.task.senders(run.rows)), *summary.notes]
     if summary.scores is None:
         return "\n".join([*intro(run), "", blocks(summary, run.abouts), "", *run.task.legend, *notes])
     if not any(cell.discriminative for cell in summary.scores.cells):
         notes.append(NOTHING_SCORED)
-    lines = [["policy", "rank", *(quantity.title for quantity in summary.quantities)]]
-    for place in ranking(run, summary):
-        lines.append([place.policy, "-" if place.rank is None else str(place.rank), *_texts(place)])
-    bound = [] if summary.scores.exact else [f"{table.UPPER_BOUND[0].upper()}{table.UPPER_BOUND[1:]}."]
-    return "\n".join([*table.aligned(lines), *bound, *notes])
+    bound = [] if summary.scores.exact else [f"{UPPER_BOUND[0].upper()}{UPPER_BOUND[1:]}."]
+    lines = [
+        [place.policy, "-" if place.rank is None else str(place.rank), *_texts(place)]
+        for place in ranking(run, summary)
+    ]
+    head = ["policy", "rank", *(quantity.title for quantity in summary.quantities)]
+    return Table(head, [("", lines)], [f"{SCORE}.", *bound, *notes]).plain()
 
 
-def intro(run: Run) -> list[str]:
+def html(run: SuiteRun, summary: Summary) -> str:
+    """The ranking as an HTML table."""
+    return _ranking(run, summary, summary.overall, str).html()
+
+
+def intro(run: SuiteRun) -> list[str]:
     """Describe the run in a few lines."""
     manifest = run.manifest
     lines = [f"Suite {manifest['suite']}, {manifest['split']}: {manifest['about']}.", manifest["episodes"]]
@@ -107,25 +104,28 @@ def _texts(place: Place) -> list[str]:
 # --- Markdown ---------------------------------------------------------------------------------------------------------
 
 
-def markdown(run: Run, summary: Summary) -> str:
+def markdown(run: SuiteRun, summary: Summary) -> str:
     """The command, the ranking, then a table for each scenario or cell."""
-    out = ["```", run.manifest["command"], "```", "", *_ranking(run, summary, summary.overall)]
+    out = ["```", run.manifest["command"], "```", "", _ranking(run, summary, summary.overall).markdown()]
     if summary.notes:
         out += ["", *(f"* {_plain(note)}" for note in summary.notes)]
     if summary.scores is not None:
         return "\n".join([*out, *_score_tables(summary.scores)]) + "\n"
     for cell, standings in summary.cells.items():
-        out += ["", f"{_plain(title(cell, run.abouts))}:", "", *_ranking(run, summary, standings)]
+        out += ["", f"{_plain(title(cell, run.abouts))}:", "", _ranking(run, summary, standings).markdown()]
     return "\n".join(out) + "\n"
 
 
-def _ranking(run: Run, summary: Summary, standings: Sequence[Standing]) -> list[str]:
+def _ranking(
+    run: SuiteRun, summary: Summary, standings: Sequence[Standing], escaped: Callable[[str], str] | None = None
+) -> Table:
     names = ["#", "policy", *(quantity.title for quantity in summary.quantities)]
     lines = []
     for place in ranking(run, summary, standings):
         rank = "–" if place.rank is None else str(place.rank)
-        lines.append([rank, _plain(place.policy) + (f" ({place.reason})" if place.reason else ""), *_texts(place)])
-    return table.markdown_table(names, lines, left=2)
+        policy = (escaped or _plain)(place.policy) + (f" ({place.reason})" if place.reason else "")
+        lines.append([rank, policy, *_texts(place)])
+    return Table(names, [("", lines)], left=2)
 
 
 def _score_tables(scores: Scores) -> list[str]:
@@ -134,10 +134,10 @@ def _score_tables(scores: Scores) -> list[str]:
     for scenario, sizes in heat.columns:
         head = ["policy", *(f"L = {size}{_marks(heat, scenario, size)}" for size in sizes)]
         lines = [
-            [_plain(policy), *(table.score(cell.score.value) for cell in cells if cell.scenario == scenario)]
+            [_plain(policy), *(score(cell.score.value) for cell in cells if cell.scenario == scenario)]
             for policy, cells in heat.lines
         ]
-        out += ["", f"Score, {_plain(scenario)}:", "", *table.markdown_table(head, lines)]
+        out += ["", f"Score, {_plain(scenario)}:", "", Table(head, [("", lines)]).markdown()]
     if heat.flat:
         out += ["", "\\* Drop Oldest loses under 1 % there: nothing to be gained, not counted in the ranking."]
     if heat.inexact:

@@ -93,8 +93,8 @@ class FleetTask(Task):
             Quantity("fairness", "fairness", four_digits, f"{jain} (Jain, Chiu and Hawe 1984)", interval=False),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
-        options |= {"rank_by": "gain", "baseline": self.baseline, "unranked": unranked}
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
+        options: Any = {"rank_by": "gain", "baseline": self.baseline, "unranked": unranked}
         return summarise(_runs(rows), _statistics, self.quantities(), **options)
 
     def describe(self, scenarios: Sequence[FleetScenario], episodes: int) -> str:

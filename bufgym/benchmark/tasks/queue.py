@@ -3,41 +3,75 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from bufgym.benchmark.rows import RUNS, Row
-from bufgym.benchmark.score import scores
-from bufgym.benchmark.summary import Quantity, Standing, Summary
+from bufgym.benchmark.score import REFERENCE, scores
+from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.benchmark.table import REGRET_AT_MOST, percent, score
-from bufgym.benchmark.tasks import bound, timeline
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
 from bufgym.ground.errors import BufgymError
-from bufgym.oracle.measure import BASELINE, TIE
+from bufgym.oracle import Plan, clairvoyant
+from bufgym.oracle.clairvoyant import privileged
+from bufgym.oracle.measure import BASELINE, TIE, regret
 from bufgym.policies import Policy, names
-from bufgym.scenario import Episode
+from bufgym.scenario import Episode, Scenario
+from bufgym.scenario.numbered import draw
 from bufgym.scenario.suites import Setting
+from bufgym.sim import NEVER, Senders, padded, run
 from bufgym.sim.metrics import outcome
+
+
+def best(
+    episode: Episode, capacity: int, scenario: Scenario, max_bytes: int | None = None, decide_at: str = "arrival"
+) -> Plan:
+    """Compute the clairvoyant's plan, which is only an upper bound if decisions wait for a full buffer."""
+    plan = clairvoyant(episode, capacity, scenario.value, max_bytes=max_bytes)
+    return plan if decide_at == "arrival" or plan.kept.all() else replace(plan, certified=False)
+
+
+def meet(
+    policy: Policy,
+    episodes: Sequence[Episode],
+    capacity: int,
+    scenario: Scenario,
+    plans: Sequence[Plan | None],
+    max_bytes: int | None = None,
+    decide_at: str = "arrival",
+) -> Senders:
+    """Run ``policy`` on the episodes and return the senders; the clairvoyant reuses known plans."""
+    memory = None
+    if policy.privileged is privileged and all(plan is not None for plan in plans):
+        memory = padded([plan.kept for plan in plans if plan is not None])
+    return run(policy, episodes, capacity, scenario.value, max_bytes=max_bytes, decide_at=decide_at, memory=memory)
+
+
+def columns(policy: Policy, h: float, plan: Plan | None) -> Row:
+    """Columns of a row besides the policy's ``Outcome``: clairvoyant, certified and regret, see ``rows.RUNS``."""
+    if plan is None:
+        return {"clairvoyant": None, "certified": None, "regret": None}
+    lost = None if policy.unbounded else regret(h, plan.qoi)
+    return {"clairvoyant": plan.qoi, "certified": plan.certified, "regret": lost}
 
 
 @dataclass(frozen=True)
 class QueueTask(Task):
     """One camera's messages in one queue; one row for each run."""
 
-    max_bytes: int | None = None
-    """B, bytes; None for no limit."""
-    decide_at: str = "arrival"
-    """"arrival", or "overflow" to ask only when the buffer is full."""
-    bound: bool = True
-    """Whether to find the clairvoyant's H for every episode and capacity, and every policy's regret."""
+    max_bytes: int | None = None  # B, bytes; None for no limit
+    decide_at: str = "arrival"  # or "overflow" to ask only when the buffer is full
+    bound: bool = True  # whether to find the clairvoyant's H for every episode and capacity, and every policy's regret
 
     kind = "queue"
     scenarios = ()  # any that no other task claims
     layout = RUNS
     needed = ("scenario", "trace", "seed", "capacity", "policy", "qoi", "mean_sojourn_s", "mean_age_s")
     baseline = BASELINE
-    reference = "afr"
+    reference = REFERENCE
     listed = ("score", "regret", "improvement")
 
     def default_policies(self, suite: str) -> list[str]:
@@ -61,42 +95,90 @@ class QueueTask(Task):
         self, policies: Sequence[Policy], scenario: Any, episodes: Sequence[Episode], capacity: int
     ) -> Iterator[list[Result]]:
         settings = self.max_bytes, self.decide_at
-        plans = [bound.best(e, capacity, scenario, *settings) if self.bound else None for e in episodes]
+        plans = [best(e, capacity, scenario, *settings) if self.bound else None for e in episodes]
         for policy in policies:
-            senders = bound.meet(policy, episodes, capacity, scenario, plans, *settings)
+            senders = meet(policy, episodes, capacity, scenario, plans, *settings)
             outcomes = [outcome(senders, i) for i in range(len(episodes))]
             yield [
-                [{**asdict(result), **bound.columns(policy, result.qoi, plan)}]
+                [{**asdict(result), **columns(policy, result.qoi, plan)}]
                 for result, plan in zip(outcomes, plans, strict=True)
             ]
 
-    def quantities(self, reference: str = "afr") -> tuple[Quantity, ...]:
+    def quantities(self) -> tuple[Quantity, ...]:
         means = "It is the mean over the discriminative cells"
         scale = f"0 is Drop Oldest and 1 the clairvoyant, which no policy can pass. {means}"
-        above = f"share of episodes with a larger H than under {reference}. Equal episodes count one half"
+        above = f"share of episodes with a larger H than under {REFERENCE}. Equal episodes count one half"
         return (
             Quantity("score", "score", score, scale, drawn=True),
             Quantity("iqm", "IQM", score, "interquartile mean of the scores on each discriminative cell and trace"),
             Quantity("regret", "regret", percent, f"share of the clairvoyant's H that was lost. {means}"),
-            Quantity("improvement", f"better than {reference}", score, above, versus=reference, drawn=True),
+            Quantity("improvement", f"better than {REFERENCE}", score, above, versus=REFERENCE, drawn=True),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
-        scored = scores(rows, unranked=unranked, **options)
-        quantities = self.quantities(scored.reference)
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
+        scored = scores(rows, unranked)
+        quantities = self.quantities()
         if not scored.exact:
             quantities = tuple(q._replace(title=REGRET_AT_MOST) if q.key == "regret" else q for q in quantities)
-        overall = [
-            Standing(s.policy, s.ranked, {quantity.key: getattr(s, quantity.key) for quantity in quantities})
-            for s in scored.standings
-        ]
-        return Summary(quantities, "score", overall, {}, scored.baseline, scored.confidence, scored.resamples, scored)
+        return Summary(quantities, "score", scored.standings, {}, self.baseline, scored)
 
     def example(
         self, policies: Sequence[Policy], rows: Sequence[Row], setting_of: Callable[[Row], Setting]
     ) -> dict[str, Any] | None:
-        row = timeline.choose(rows)
+        row = choose(rows)
         if row is None:
             return None
         setting = setting_of(row)
-        return {**timeline.timeline(policies, setting.scenario, row), "about": setting.about}
+        return {**timeline(policies, setting.scenario, row), "about": setting.about}
+
+
+# --- one episode in full: what each policy delivered and dropped on the very same link -------------------------------
+
+_STEP_S = 0.25  # between the points of the curve of the link's capacity
+
+
+def choose(rows: Sequence[Row]) -> Row | None:
+    """The row of the episode to show: at the middle capacity, the one on which Drop Oldest has the largest regret."""
+    capacities = sorted({row["capacity"] for row in rows})
+    middle = capacities[len(capacities) // 2]
+    candidates = [
+        row for row in rows if row["policy"] == BASELINE and row["capacity"] == middle and row["regret"] is not None
+    ]
+    return max(candidates, key=lambda row: (row["regret"], row["scenario"], row["trace"], row["seed"]), default=None)
+
+
+def timeline(policies: Sequence[Policy], scenario: Scenario, chosen: Row) -> dict[str, Any]:
+    """The episode of the row ``chosen`` under every policy; times in s, rates in bytes/s."""
+    episode = draw(scenario, chosen["seed"])
+    capacity = chosen["capacity"]
+    plan = best(episode, capacity, scenario)
+    arrivals = np.asarray(episode.arrivals)
+    lanes: dict[str, Any] = {}
+    last_us = int(arrivals["arrival_us"][-1])
+    for policy in policies:
+        senders = meet(policy, [episode], capacity, scenario, [plan])
+        log = np.asarray(senders.batch.log[0])[: len(arrivals)]
+        h = outcome(senders, 0).qoi
+        received = np.flatnonzero(log["transmitted_us"] != NEVER)
+        dropped = np.flatnonzero(log["dropped_us"] != NEVER)
+        lanes[policy.name] = {
+            "qoi": h,
+            "regret": columns(policy, h, plan)["regret"],
+            "received": [
+                [int(k), int(log["dequeued_us"][k]) / 1e6, int(log["transmitted_us"][k]) / 1e6] for k in received
+            ],
+            "dropped": [[int(k), int(log["dropped_us"][k]) / 1e6] for k in dropped],
+        }
+        if policy.ranked and len(received):
+            last_us = max(last_us, int(log["transmitted_us"][received].max()))
+    edges_us = np.arange(0, last_us + round(2e6 * _STEP_S), round(1e6 * _STEP_S))
+    carried = np.diff(episode.link.carried_by(edges_us))
+    offered_s = max(1, int(arrivals["arrival_us"][-1])) / 1e6
+    return {
+        **{key: chosen[key] for key in ("scenario", "capacity", "trace", "seed")},
+        "arrival_s": (arrivals["arrival_us"] / 1e6).tolist(),
+        "x": arrivals["x"].tolist(),
+        "rate": {"t_s": (edges_us[:-1] / 1e6).tolist(), "bytes_per_s": (carried / _STEP_S).tolist()},
+        "demand_bytes_per_s": float(arrivals["size_bytes"][:-1].sum() / offered_s),
+        "policies": lanes,
+    }

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 from bufgym.benchmark.bootstrap import UNKNOWN, Interval
 from bufgym.benchmark.episodes import Cell
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import Scores
-from bufgym.benchmark.summary import Quantity, Standing, Summary
+from bufgym.benchmark.score import REFERENCE, Scores, Standing
+from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.benchmark.table import mean
 from bufgym.benchmark.tasks.queue import QueueTask
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
 
@@ -24,23 +25,17 @@ LEAST_REGRET = 0.001
 class Ratios(NamedTuple):
     """Ratios, cell by cell, of a policy's regret to the lower regret of Drop Oldest and AFR."""
 
-    worst: float
-    """Largest ratio; NaN if no cell counts."""
-    cell: Cell | None
-    """Cell of the largest ratio."""
-    mean: float
-    """Mean ratio."""
-    cells: int
-    """Number of cells that count."""
+    worst: float  # largest ratio; NaN if no cell counts
+    cell: Cell | None  # cell of the largest ratio
+    mean: float  # mean ratio
+    cells: int  # number of cells that count
 
 
 def ratios(scored: Scores) -> dict[str, Ratios]:
     """Compute the ratios of each policy; empty if the reference did not run."""
     regrets = {(c.policy, (c.scenario, c.capacity)): c.regret.value for c in scored.cells}
     cells = dict.fromkeys(cell for _, cell in regrets)
-    yardsticks = {
-        cell: min(regrets.get((name, cell), math.nan) for name in (scored.reference, scored.baseline)) for cell in cells
-    }
+    yardsticks = {cell: min(regrets.get((name, cell), math.nan) for name in (REFERENCE, BASELINE)) for cell in cells}
     found = {}
     for policy in dict.fromkeys(policy for policy, _ in regrets):
         by_cell = {cell: regrets[policy, cell] / least for cell, least in yardsticks.items() if least > LEAST_REGRET}
@@ -58,12 +53,12 @@ class StressTask(QueueTask):
     kind = "stress"
     listed = ("worst", "ratio", "regret")
 
-    def quantities(self, reference: str = "afr") -> tuple[Quantity, ...]:
-        return (*_ratios(reference), *super().quantities(reference))
+    def quantities(self) -> tuple[Quantity, ...]:
+        return (*_ratios(), *super().quantities())
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
         """Rank by the worst cell, smallest ratio first; the notes name that cell."""
-        summary = QueueTask().summary(rows, unranked, **options)
+        summary = QueueTask().summary(rows, unranked)
         assert summary.scores is not None
         found = ratios(summary.scores)
 
@@ -86,7 +81,7 @@ class StressTask(QueueTask):
             if s.ranked and (cell := found[s.policy].cell) is not None
         )
         scored = replace(summary.scores, standings=sorted(summary.scores.standings, key=place))
-        quantities = (*_ratios(scored.reference), *summary.quantities)
+        quantities = (*_ratios(), *summary.quantities)
         return replace(summary, quantities=quantities, rank_by="worst", overall=overall, scores=scored, notes=notes)
 
     def example(
@@ -98,9 +93,9 @@ class StressTask(QueueTask):
         return super().example(policies, [row for row in rows if row["scenario"] in free], setting_of)
 
 
-def _ratios(reference: str) -> tuple[Quantity, ...]:
+def _ratios() -> tuple[Quantity, ...]:
     over = (
-        f"regret over the regret of the better of {reference} and Drop Oldest, where theirs is over {LEAST_REGRET:.1%}"
+        f"regret over the regret of the better of {REFERENCE} and Drop Oldest, where theirs is over {LEAST_REGRET:.1%}"
     )
     return (
         Quantity("worst", "worst cell", "{:.3f}".format, f"the largest {over}", interval=False),

@@ -21,24 +21,15 @@ Result = list[Row]
 class Task(ABC):
     """One kind of experiment: it plays every policy on the same episodes and summarizes the rows."""
 
-    kind: ClassVar[str]
-    """Its name: ``Suite.kind``."""
-    scenarios: ClassVar[tuple[type, ...]]
-    """The classes of its scenarios."""
-    layout: ClassVar[Layout]
-    """The columns of its rows."""
-    needed: ClassVar[tuple[str, ...]]
-    """Columns that a report needs."""
-    baseline: ClassVar[str]
-    """The policy that the others are measured against; it always runs."""
-    reference: ClassVar[str]
-    """Second policy that a row of the leaderboard is compared with."""
-    listed: ClassVar[tuple[str, ...]]
-    """Quantities that the leaderboard lists, by key."""
-    no_plan: ClassVar[str] = ""
-    """Reason why a privileged policy can't take part; empty if it can."""
-    legend: ClassVar[tuple[str, ...]] = ()
-    """Lines under a printed summary."""
+    kind: ClassVar[str]  # its name: ``Suite.kind``
+    scenarios: ClassVar[tuple[type, ...]]  # the classes of its scenarios
+    layout: ClassVar[Layout]  # the columns of its rows
+    needed: ClassVar[tuple[str, ...]]  # columns that a report needs
+    baseline: ClassVar[str]  # the policy that the others are measured against; it always runs
+    reference: ClassVar[str]  # second policy that a row of the leaderboard is compared with
+    listed: ClassVar[tuple[str, ...]]  # quantities that the leaderboard lists, by key
+    no_plan: ClassVar[str] = ""  # reason why a privileged policy can't take part; empty if it can
+    legend: ClassVar[tuple[str, ...]] = ()  # lines under a printed summary
 
     @abstractmethod
     def default_policies(self, suite: str) -> list[str]:
@@ -72,13 +63,12 @@ class Task(ABC):
         """Quantities that its summary shows."""
 
     @abstractmethod
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
         """Compare every policy with the baseline.
 
         Args:
             rows: rows of ``run``.
             unranked: policies that are shown but not ranked.
-            options: ``resamples``, ``confidence`` and ``seed``, as in ``summarise``.
         """
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:

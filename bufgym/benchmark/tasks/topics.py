@@ -12,7 +12,7 @@ from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
-from bufgym.benchmark.table import Column, Rows, decimal, in_blocks, mean, percent, score, written
+from bufgym.benchmark.table import Column, Rows, Table, decimal, mean, percent, score, written
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, names
@@ -100,12 +100,12 @@ class TopicsTask(Task):
             Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), **options: Any) -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
         runs = by_run(rows, "topic", "weighted_qoi")
         priorities = {max(row["priority"] for row in run.values()) for run in runs.values()}
         first = f"priority {priorities.pop():g}" if len(priorities) == 1 else "first"
         numbers = {key: _numbers(list(run.values())) for key, run in runs.items()}
-        options |= {"rank_by": "relative", "baseline": self.baseline, "unranked": unranked}
+        options: Any = {"rank_by": "relative", "baseline": self.baseline, "unranked": unranked}
         return summarise(numbers, _statistics, self.quantities(first), **options)
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
@@ -248,4 +248,4 @@ def by_topic(rows: Rows, policy: str) -> str:
         )
         for cell, topics in cells.items()
     ]
-    return in_blocks([column.title for column in TOPIC_COLUMNS], blocks)
+    return Table([column.title for column in TOPIC_COLUMNS], blocks).plain()
