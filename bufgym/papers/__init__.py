@@ -29,8 +29,8 @@ NEEDS_DATA: dict[str, str] = {name: texts["needs"] for name, texts in statements
 TAKES_DATA = (*NEEDS_DATA, *(name for name, texts in statements().items() if "data" in texts))
 """Figures with an option ``data``, whether they need it or only show more with it."""
 
-STORE = "frame-runs.jsonl"
-"""File of finished runs on frames. Each run takes minutes; figures share them, and they survive a kill."""
+STORE = "frame-runs"
+"""Folder of finished runs on frames. Each run takes minutes; figures share them, and they survive a kill."""
 
 
 def figure(name: str, **options: Any) -> Figure:

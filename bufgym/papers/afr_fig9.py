@@ -125,7 +125,7 @@ def with_images_us(decisions: int) -> tuple[float, float] | None:
     try:
         from bufgym.papers.perception import orb, room
 
-        times_ms = orb.decision_ms(room.room(0, frames=decisions + orb.COMPARED), decisions)
+        times_ms = orb.decision_ms(room.made_up_room(0, frames=decisions + orb.COMPARED), decisions)
     except (BufgymError, ImportError):
         return None
     return 1e3 * float(np.median(times_ms)), 1e3 * float(np.percentile(times_ms, 99))

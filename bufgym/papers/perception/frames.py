@@ -7,7 +7,6 @@ Cameras look along z, x is right and y down, as in OpenCV. A pixel (u, v) with d
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -57,6 +56,11 @@ class Camera:
     def fov_deg(self) -> float:
         """Horizontal field of view, degrees."""
         return float(np.degrees(2 * np.arctan(self.width / (2 * self.fx))))
+
+    @property
+    def lens(self) -> Float64Array:
+        """The same for kernels, float64[4]: fx, fy, cx, cy."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def every(self, stride: int) -> Camera:
         """The camera of every ``stride``-th pixel of every ``stride``-th row, the first among them.
@@ -116,22 +120,33 @@ class Sequence(ABC):
         poses = Poses(self.time_us, self.poses[:, :3, 3], quaternions(self.poses[:, :3, :3]))
         return motion_from_poses(poses, settings, name=self.name)
 
+    def first(self, frames: int) -> Sequence:
+        """Select the recording's first frames, or all if there are no more."""
+        return self if len(self) <= frames else _Part(self, frames)
+
     def reduced(self, stride: int) -> Sequence:
         """Every ``stride``-th pixel of every ``stride``-th row. No averaging: that would invent depths at edges."""
-        return self if stride == 1 else _Reduced(self, stride)
+        return self if stride == 1 else _Part(self, len(self), stride)
 
-    def loaded(self, frames: Iterable[int] | None = None) -> Sequence:
+    def loaded(self) -> Sequence:
         """The same with its depths in memory, for those who use them again and again; pictures stay where they are."""
-        return _Loaded(self, range(len(self)) if frames is None else frames)
+        part = _Part(self, len(self))
+        part.held = [self.depth(k) for k in range(len(self))]
+        return part
 
 
-class _Reduced(Sequence):
-    def __init__(self, whole: Sequence, stride: int) -> None:
-        self.name, self.time_us, self.poses = whole.name, whole.time_us, whole.poses
-        self.camera = whole.camera.every(stride)
+class _Part(Sequence):
+    """The first ``frames`` of a recording, and of each every ``stride``-th pixel."""
+
+    def __init__(self, whole: Sequence, frames: int, stride: int = 1) -> None:
+        self.name, self.camera = whole.name, whole.camera.every(stride)
+        self.time_us, self.poses = whole.time_us[:frames], whole.poses[:frames]
+        self.held: list[Depth] = []
         self._whole, self._stride = whole, stride
 
     def depth(self, k: int) -> Depth:
+        if self.held:
+            return self.held[k]
         return np.ascontiguousarray(self._whole.depth(k)[:: self._stride, :: self._stride])
 
     def image(self, k: int) -> Image:
@@ -139,22 +154,6 @@ class _Reduced(Sequence):
 
     def size_bytes(self, k: int) -> int:
         return self._whole.size_bytes(k)  # it is still the whole frame that is sent
-
-
-class _Loaded(Sequence):
-    def __init__(self, stored: Sequence, frames: Iterable[int]) -> None:
-        self.name, self.time_us, self.poses, self.camera = stored.name, stored.time_us, stored.poses, stored.camera
-        self._stored = stored
-        self._depths = {k: stored.depth(k) for k in frames}
-
-    def depth(self, k: int) -> Depth:
-        return self._depths[k] if k in self._depths else self._stored.depth(k)
-
-    def image(self, k: int) -> Image:
-        return self._stored.image(k)
-
-    def size_bytes(self, k: int) -> int:
-        return self._stored.size_bytes(k)
 
 
 def encoded_bytes(depth: Depth, image: Image) -> int:

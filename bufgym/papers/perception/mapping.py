@@ -80,9 +80,11 @@ def grid_of(sequence: Sequence, voxel_m: float = VOXEL_M) -> Grid:
     return Grid((x, y, z), (int(count[0]), int(count[1]), int(count[2])), voxel_m)
 
 
-def points_of(depth: npt.NDArray[np.float32], camera: Camera, stride: int = 1) -> Float64Array:
+def points_of(
+    depth: npt.NDArray[np.float32], camera: Camera, stride: int = 1, near_m: float = tsdf.NEAR_M, far_m: float = FAR_M
+) -> Float64Array:
     """The points of a depth image of every ``stride``-th pixel, in the camera's frame, float64[m, 3]."""
-    v, u = np.nonzero((depth >= tsdf.NEAR_M) & (depth <= FAR_M))
+    v, u = np.nonzero((depth > 0) & (depth >= near_m) & (depth <= far_m))
     z = depth[v, u].astype(np.float64)
     x, y = (stride * u - camera.cx) * z / camera.fx, (stride * v - camera.cy) * z / camera.fy
     return np.stack([x, y, z], axis=1)
@@ -107,13 +109,9 @@ class Map:
         self, depth: npt.NDArray[np.float32], camera: Camera, pose: Float64Array, most_weight: float = math.inf
     ) -> None:
         """Fuse one frame seen from ``pose``, camera to world; weights grow up to ``most_weight``."""
-        to_camera = np.linalg.inv(pose)
-        grid = self.grid
-        origin_m, reach_m = np.array(grid.origin_m), grid.truncation_m
-        lens = lens_of(camera)
-        tsdf.integrate(
-            depth, FAR_M, lens, to_camera, origin_m, grid.voxel_m, reach_m, most_weight, self.tsdf, self.weight
-        )
+        to_camera, grid = np.linalg.inv(pose), self.grid
+        place = np.array(grid.origin_m), grid.voxel_m, grid.truncation_m
+        tsdf.integrate(depth, FAR_M, camera.lens, to_camera, *place, most_weight, self.tsdf, self.weight)
 
     def points(self) -> Float64Array:
         """Points where the surface crosses edges between voxels, float64[m, 3], world coordinates, m."""
@@ -122,11 +120,6 @@ class Map:
         points = np.empty((count, 3))
         tsdf.surface(self.tsdf, self.weight, origin_m, voxel_m, points)
         return points
-
-
-def lens_of(camera: Camera) -> Float64Array:
-    """Make the kernels' lens, float64[4]."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 def fuse(sequence: Sequence, frames: Iterable[int], grid: Grid | None = None) -> Map:
@@ -166,7 +159,7 @@ def distances(points: Float64Array, reference: Float64Array) -> Float64Array:
     return np.asarray(nearest, np.float64)
 
 
-def error(found: Map, reference: Map) -> MapError:
+def map_error(found: Map, reference: Map) -> MapError:
     """Measure the map's distance from the reference, usually the map of all frames.
 
     Raises:

@@ -76,11 +76,6 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode) -> Policy:
     return Policy("orbbuf-images", on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
 
 
-def orbbuf_with_images(sequence: Sequence, episode: Episode) -> Policy:
-    """`orbbuf` by the ORB features of the frames, which must be the episode's messages in their order."""
-    return orbbuf_by(OrbSimilarity(sequence.grey), episode)
-
-
 COMPARED: Final = 3
 """Further images that the last of so many decisions compares."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bufgym import policies, sim
 from bufgym.model.link import Link
-from bufgym.papers.perception.frames import Depth, Image, Sequence
+from bufgym.papers.perception.frames import Sequence
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
 from bufgym.scenario.arrivals import messages
@@ -20,29 +20,6 @@ from bufgym.traces import Trace
 
 SIZED_EVERY = 10
 """Distance between frames that are encoded; sizes between them are interpolated."""
-
-
-class First(Sequence):
-    """A recording that ends early."""
-
-    def __init__(self, whole: Sequence, frames: int) -> None:
-        self.name, self.camera = whole.name, whole.camera
-        self.time_us, self.poses = whole.time_us[:frames], whole.poses[:frames]
-        self._whole = whole
-
-    def depth(self, k: int) -> Depth:
-        return self._whole.depth(k)
-
-    def image(self, k: int) -> Image:
-        return self._whole.image(k)
-
-    def size_bytes(self, k: int) -> int:
-        return self._whole.size_bytes(k)
-
-
-def first(sequence: Sequence, frames: int) -> Sequence:
-    """Select the recording's first frames, or all if there are no more."""
-    return sequence if len(sequence) <= frames else First(sequence, frames)
 
 
 @lru_cache(maxsize=8)

@@ -10,7 +10,7 @@ This V depends on two frames, while the paper's depends on the distance between 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel
 from bufgym.papers.perception.frames import Sequence
-from bufgym.traces.trace import Float64Array
+from bufgym.papers.perception.mapping import points_of
 
 AGREE: Final = 0.05
 """Largest relative difference of agreeing depths, ten times a Kinect's noise at 3 m."""
@@ -31,14 +31,7 @@ LEAST_VIEWS: Final = 3
 
 
 @kernel
-def seen_share(
-    depths: NDArray[np.float32],
-    poses: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    i: int,
-    j: int,
-    stride: int,
-) -> float:
+def seen_share(depths: Any, poses: Any, lens: Any, i: int, j: int, stride: int) -> float:
     """Part of frame j that frame i has seen, in [0, 1]; 0 if frame i measured none of it.
 
     Args:
@@ -80,13 +73,7 @@ def seen_share(
 
 
 @kernel
-def _all_shares(
-    depths: NDArray[np.float32],
-    poses: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    stride: int,
-    seen: NDArray[np.float32],
-) -> None:
+def _all_shares(depths: Any, poses: Any, lens: Any, stride: int, seen: Any) -> None:
     """Write ``seen_share`` of every frame and each later one."""
     for i in range(len(depths)):
         for j in range(i + 1, len(depths)):
@@ -98,11 +85,9 @@ def seen_shares(sequence: Sequence) -> NDArray[np.float32]:
 
     About 10 us a pair: some seconds for a thousand frames.
     """
-    camera = sequence.camera
     depths = np.stack([sequence.depth(k) for k in range(len(sequence))])
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    seen = np.eye(len(sequence), dtype=np.float32)
-    _all_shares(depths, np.ascontiguousarray(sequence.poses), lens, max(1, camera.width // POINTS_ACROSS), seen)
+    seen, stride = np.eye(len(sequence), dtype=np.float32), max(1, sequence.camera.width // POINTS_ACROSS)
+    _all_shares(depths, np.ascontiguousarray(sequence.poses), sequence.camera.lens, stride, seen)
     return seen
 
 
@@ -160,14 +145,7 @@ class Coverage:
 
 def _cells(sequence: Sequence, k: int, cell_m: float) -> NDArray[np.int64]:
     """Cell of each point that frame k measured, 20 bits for each of x, y and z, int64[points]."""
-    x, y, z = np.floor(world_points(sequence, k) / cell_m).astype(np.int64).T + 2**19
+    pose = sequence.poses[k]
+    world = points_of(sequence.depth(k), sequence.camera, near_m=0.0, far_m=np.inf) @ pose[:3, :3].T + pose[:3, 3]
+    x, y, z = np.floor(world / cell_m).astype(np.int64).T + 2**19
     return np.asarray((x << 40) + (y << 20) + z, np.int64)
-
-
-def world_points(sequence: Sequence, k: int) -> Float64Array:
-    """World coordinates of the points that frame k measured, float64[points, 3], m."""
-    depth, camera, pose = sequence.depth(k), sequence.camera, sequence.poses[k]
-    v, u = np.nonzero(depth > 0)
-    z = depth[v, u].astype(np.float64)
-    local = np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], axis=1)
-    return np.asarray(local @ pose[:3, :3].T + pose[:3, 3], np.float64)

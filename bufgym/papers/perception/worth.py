@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import reward_term
-from bufgym.papers.perception import room, streams, tracking, views
+from bufgym.papers.perception import streams, tracking, views
 from bufgym.papers.perception.frames import Sequence
 from bufgym.papers.perception.mapping import Grid, grid_of
+from bufgym.papers.perception.room import made_up_room
 from bufgym.policies.registry import Memory
 from bufgym.scenario import Uplink
 from bufgym.scenario.draws import shipped
@@ -61,7 +62,7 @@ class Scene(NamedTuple):
 @functools.cache
 def recording() -> Sequence:
     """Make the recording of the room, not yet rendered."""
-    return room.room(SEED, frames=FRAMES)
+    return made_up_room(SEED, frames=FRAMES)
 
 
 @functools.cache

@@ -38,10 +38,10 @@ class Wall(Sequence):
 
 def test_sizes_first_frames_and_fades() -> None:
     assert streams.sizes(Wall([0.0] * 4), every=2).tolist() == [1000, 2000, 3000, 4000]
-    part = streams.first(Wall([0, 1, 2]), 2)
+    part = Wall([0, 1, 2]).first(2)
     assert (len(part), part.poses[1, 0, 3], part.depth(1)[0, 0], part.size_bytes(1)) == (2, 1, 2, 2000)
     whole = Wall([0, 1])
-    assert streams.first(whole, 5) is whole
+    assert whole.first(5) is whole
     # Two seconds carry 150 bytes wherever they begin; what comes after them is the two seconds again.
     for offset_us, first in ((0, 100), (1_000_000, 50), (2_000_000, 100)):
         link = streams.fading(2_000_000, TRACE, offset_us)
@@ -56,7 +56,7 @@ def test_what_arrives_over_a_slow_link() -> None:
 
     def received(policy: str, frames: int, bytes_per_s: float, L: int, seed: int = 0) -> tuple[int, ...]:
         link = streams.fading(10_000_000, Trace.constant(bytes_per_s, 10.0, name="link"))
-        return streams.received(policy, streams.episode(streams.first(wall, frames), size[:frames], link, seed), L)
+        return streams.received(policy, streams.episode(wall.first(frames), size[:frames], link, seed), L)
 
     assert received("drop-oldest", 9, 1e6, 1) == tuple(range(9))
     # In transmission: 0 until 0.1 s, as 3 comes; 3 replaces 2 before the next is taken, and so on.
@@ -111,7 +111,7 @@ def test_with_motion_for_images_it_decides_as_orbbuf() -> None:
 
 def test_images_are_like_themselves_less_like_what_moved_and_hardly_like_others() -> None:
     pytest.importorskip("cv2")
-    from bufgym.papers.perception.room import room
+    from bufgym.papers.perception.room import made_up_room
 
     # Squares of noise, which have corners.
     noise = np.random.default_rng(0).integers(0, 255, (2, 30, 40), np.uint8).repeat(8, 1).repeat(8, 2)
@@ -123,4 +123,4 @@ def test_images_are_like_themselves_less_like_what_moved_and_hardly_like_others(
     assert similar(0, 2) < 0.3
     assert similar(0, 3) == similar(3, 0) == 0  # no features, no likeness
     assert similar(1, 0) == similar(0, 1)
-    assert (decision_ms(room(0, frames=5).reduced(4), 2) > 0).all()
+    assert (decision_ms(made_up_room(0, frames=5).reduced(4), 2) > 0).all()

@@ -128,7 +128,7 @@ def test_the_rows_of_one_figure_are_renewed(
 
 def test_what_is_cited_is_in_the_references() -> None:
     keys = set(re.findall(r"^@\w+\{(\w+),", (CLAIMS.parent / "references.bib").read_text(encoding="utf-8"), re.M))
-    texts = [CLAIMS, *(CLAIMS.parent.parent / "bufgym" / "reproduce").glob("*.py")]
+    texts = [CLAIMS, *(CLAIMS.parent.parent / "bufgym" / "papers").glob("*.py")]
     cited = {key for path in texts for key in re.findall(r"\[([a-z]+20\d\d\w+)\]", path.read_text(encoding="utf-8"))}
     assert {"wang2022afr", "sikand2021robofleet", "vanderhooft2016http2"} <= cited <= keys
 

@@ -7,7 +7,7 @@ import pytest
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception.frames import Camera
-from bufgym.papers.perception.mapping import COVERED_M, Grid, Map, error, fuse, grid_of
+from bufgym.papers.perception.mapping import COVERED_M, Grid, Map, fuse, grid_of, map_error
 
 pytestmark = pytest.mark.kernels
 CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
@@ -67,7 +67,7 @@ def test_the_kernels_do_what_their_twins_do(seed: int) -> None:
 def test_the_error_of_a_shifted_plane() -> None:
     """A wall 2 cm off is 2 cm off both ways and covered; 6 cm off it is uncovered."""
     reference = fuse(wall(1.0), [0], AHEAD)
-    near, far = (error(fuse(wall(1.0 + shift_m), [0], AHEAD), reference) for shift_m in (0.02, 0.06))
+    near, far = (map_error(fuse(wall(1.0 + shift_m), [0], AHEAD), reference) for shift_m in (0.02, 0.06))
     assert (near.to_reference_m, near.from_reference_m, near.rmse_m) == pytest.approx((0.02,) * 3, abs=1e-5)
     assert far.rmse_m == pytest.approx(0.06, abs=1e-5)
     assert (near.uncovered, far.uncovered) == (0, 1) and COVERED_M < 0.06
@@ -75,7 +75,7 @@ def test_the_error_of_a_shifted_plane() -> None:
     grid = Grid((-0.5, -0.2, 0.4), (11, 5, 12), 0.1)
     half = wall(1.0)
     half.depth(0)[:, 4:] = 0
-    found = error(fuse(half, [0], grid), fuse(wall(1.0), [0], grid))
+    found = map_error(fuse(half, [0], grid), fuse(wall(1.0), [0], grid))
     # Pixels 0 to 3 see x < 0; of the points at 0 to 0.5 m each is as far away as it lies from that at -0.1 m.
     assert (found.to_reference_m, found.uncovered) == (0, pytest.approx(6 / 11))
     assert found.from_reference_m == pytest.approx(np.sqrt((0.01 + 0.04 + 0.09 + 0.16 + 0.25 + 0.36) / 11), abs=1e-6)
@@ -86,7 +86,7 @@ def test_errors() -> None:
         (lambda: Grid((0.0, 0.0, 0.0), (2, 2, 2), 0.0), r"voxel_m = 0\.0: must be a finite number above 0"),
         (lambda: Grid((0.0, 0.0, 0.0), (1000, 1000, 1000)), "grid of 1000 x 1000 x 1000 voxels"),
         (lambda: grid_of(wall(0.0)), "held: no frame holds a depth"),
-        (lambda: error(Map.empty(AHEAD), fuse(wall(1.0), [0], AHEAD)), "the map holds no surface"),
+        (lambda: map_error(Map.empty(AHEAD), fuse(wall(1.0), [0], AHEAD)), "the map holds no surface"),
     ):
         with pytest.raises(BufgymError, match=says):
             make()
