@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
-from bufgym.papers.figure import COLOURS, Figure, legend_below, whole
+from bufgym.papers.figure import COLOURS, Figure, legend_below
 from bufgym.papers.rows import Rows
-from bufgym.scenario.checks import above_0
 
 VIEW_ANGLE = math.radians(60)
 """The camera's field of view."""
@@ -69,7 +68,6 @@ class GeometryFigure(Figure):
     wall_m: float = 1.5
     """Distance to the corridor's side wall, and to the other wall at the start."""
 
-    RULES = {"base": above_0, "turn_degrees": above_0, "step_m": above_0, "wall_m": above_0}
     SIZE_INCHES = (10.0, 3.9)
 
     def motions(self) -> dict[str, Motion]:
@@ -119,8 +117,6 @@ class Reproduction(GeometryFigure):
 
     shown: int = 4
     """Number of messages drawn."""
-
-    RULES = {"shown": whole()}
 
     def draw(self, rows: Rows, figure: Any) -> None:
         panels = figure.subplots(1, 3)

@@ -8,7 +8,7 @@ doubles. The counter c now rejects every second arrival, and the next pass begin
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,22 +28,18 @@ PAPER_DROPS = {9: 1, 10: 3, 11: 5, 12: 7, 13: 9, 14: 11, 15: 13, 16: 15, 17: 17,
 """T -> the message that the figure strikes out; 17 is the newcomer itself."""
 
 
-@dataclass(frozen=True)
-class Step:
-    """AFR's decision on one arrival and its state afterwards."""
+class Step(NamedTuple):
+    """AFR's decision on arrival T, counted from the link's stop, and its state afterwards: rate, counter, position.
+
+    ``dropped`` is T if the newcomer was rejected, None if nothing was dropped. ``kept`` is the queue, oldest first.
+    """
 
     T: int
-    """Number of the arrival, counted from the link's stop."""
     dropped: int | None
-    """Number of the dropped message: T if the newcomer was rejected, None if nothing was dropped."""
     r: int
-    """Dropping rate."""
     c: int
-    """Counter."""
     p: int
-    """Dropping position."""
     kept: tuple[int, ...]
-    """Numbers of the queued messages, oldest first."""
 
 
 def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[Step]:
@@ -79,12 +75,13 @@ class Reproduction(Figure):
     last_T: int = PAPER_T[1]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.last_T < self.capacity:
             raise BufgymError(f"last_T = {self.last_T}: must be at least L = {self.capacity}")
 
     def simulate(self) -> Rows:
         return Rows(
-            {"T": s.T, "dropped": s.dropped, "r": s.r, "c": s.c, "p": s.p, "kept": " ".join(map(str, s.kept))}
+            s._asdict() | {"kept": " ".join(map(str, s.kept))}
             for s in steps(self.capacity, self.last_T)
             if s.T >= self.capacity
         )

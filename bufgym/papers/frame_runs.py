@@ -24,7 +24,7 @@ import numpy as np
 
 from bufgym import traces
 from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES, STYLES
-from bufgym.papers.figure import COLOURS, Figure, several, whole
+from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.frame_tasks import IMAGES, OFFSETS, SEVEN_SCENES, Kind, Stage, Task, carry_out, stage
 from bufgym.papers.perception import streams, views
 from bufgym.papers.rows import Row, Rows
@@ -77,7 +77,7 @@ class FrameFigure(Figure):
     store: Path | None = None
     """Folder of the finished tasks' results; None keeps nothing."""
 
-    RULES = {"frames": whole(30), "capacities": several(whole()), "offsets": whole(1, OFFSETS)}
+    RULES = {"frames": whole(30), "offsets": whole(1, OFFSETS), "jobs": whole(-1)}
 
     @property
     def _folder(self) -> str | None:

@@ -20,9 +20,9 @@ from bufgym import __version__
 from bufgym.benchmark import cluster
 from bufgym.benchmark.run import bar
 from bufgym.ground.errors import BufgymError
+from bufgym.papers.extra import library
 from bufgym.papers.perception import frames as depth_frames
 from bufgym.papers.perception import mapping, orb, streams, tracking, views
-from bufgym.papers.perception.extra import library
 from bufgym.papers.perception.room import made_up_room
 from bufgym.papers.rows import Row
 from bufgym.scenario import Episode

@@ -15,7 +15,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from bufgym import policies, sim
 from bufgym.benchmark.run import draw
 from bufgym.model.topics import Topic
-from bufgym.papers.figure import COLOURS, Figure, at_least_0, several, whole
+from bufgym.papers.figure import COLOURS, Figure, at_least_0, whole
 from bufgym.papers.rows import Rows
 from bufgym.scenario import Client, Stream
-from bufgym.scenario.checks import above_0
 from bufgym.traces import Trace
 
 POINTS = 10_000
@@ -202,16 +201,7 @@ class ClientFigure(Figure):
     live: float = 0.0
     """Speed-up of a run on real sockets; 0 simulates."""
 
-    RULES = {
-        "live": at_least_0,
-        "round_trip_ms": at_least_0,
-        "queue_size": whole(),
-        "queue_sizes": several(whole()),
-        "rate_hz": above_0,
-        "rates_hz": several(above_0),
-        "mbit_per_s": above_0,
-        "duration_s": above_0,
-    }
+    RULES = {"live": at_least_0, "round_trip_ms": at_least_0}
 
     @functools.cached_property
     def watchers(self) -> list[Callable[[float], None]]:
@@ -236,27 +226,21 @@ class ClientFigure(Figure):
         return sent
 
 
-Kind = TypeVar("Kind", bound=ClientFigure)
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+Run = TypeVar("Run", bound=Callable[..., Any])
 
 
-def played_once(
-    run: Callable[Concatenate[Kind, Arguments], Result],
-) -> Callable[Concatenate[Kind, Arguments], Result]:
-    """Keep the result of each run of a figure, because live runs are slow and the picture needs them again."""
+def played_once(run: Run) -> Run:
+    """Keep the result of each live run of a figure, because it is slow and the picture needs it again."""
 
     @functools.wraps(run)
-    def once(figure: Kind, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+    def once(figure: ClientFigure, *arguments: Any) -> Any:
         if not figure.live:
-            return run(figure, *arguments, **named)
-        key = arguments, tuple(named.items())
-        if key not in figure.played:
-            figure.played[key] = run(figure, *arguments, **named)
-        result: Result = figure.played[key]
-        return result
+            return run(figure, *arguments)
+        if arguments not in figure.played:
+            figure.played[arguments] = run(figure, *arguments)
+        return figure.played[arguments]
 
-    return once
+    return cast(Run, once)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.encodings import ENCODINGS, KINDS, Content, content, encode
-from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
+from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
 from bufgym.papers.rows import Rows, table
 
 PAPER = {
@@ -55,6 +55,7 @@ class Reproduction(Figure):
     seed: int = 0
     """Seed of every message's content."""
 
+    RULES = {"points": whole(1, 10**6), "point_step": whole(16, 256)}
     SIZE_INCHES = (9.0, 4.8)
 
     @cached_property

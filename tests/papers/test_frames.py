@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.perception.extra import library
+from bufgym.papers.extra import library
 from bufgym.papers.perception.frames import Camera, encoded_bytes, open_sequence
 
 LAYOUTS = {"tum": frame_cases.tum, "7-scenes": frame_cases.seven_scenes, "packed": frame_cases.packed}
@@ -97,7 +97,7 @@ def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(BufgymError, match="no such folder"):
         open_sequence(tmp_path / "desk")
     monkeypatch.setitem(sys.modules, "rvl", None)
-    with pytest.raises(BufgymError, match=r"bufgym\.papers\.perception needs rvl: pip install .*(rvl|perception)"):
+    with pytest.raises(BufgymError, match=r"bufgym\.papers needs rvl: pip install .*(rvl|perception)"):
         library("rvl")
 
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.perception import icp
+from bufgym.papers.perception import icp, tracking
 from bufgym.papers.perception.frames import Camera, Sequence
 from bufgym.papers.perception.mapping import Grid, Map, fuse
 from bufgym.papers.perception.room import Room, made_up_room
-from bufgym.papers.perception import tracking
 from bufgym.papers.perception.tracking import Tracker, difference, smoothed, track
 from bufgym.papers.perception.tsdf import raycast
 

@@ -10,25 +10,26 @@ from typing import TYPE_CHECKING
 from bufgym.ground.modules import on_demand
 
 if TYPE_CHECKING:
-    from bufgym.papers.perception.frames import Camera, Sequence, open_sequence
-    from bufgym.papers.perception.mapping import Grid, Map, fuse, grid_of, map_error, points_of
+    from bufgym.papers.perception.frames import Sequence, open_sequence
+    from bufgym.papers.perception.mapping import fuse, grid_of, map_error, points_of
     from bufgym.papers.perception.orb import OrbSimilarity, orbbuf_by
     from bufgym.papers.perception.room import made_up_room
-    from bufgym.papers.perception.tracking import Track, Tracker, difference, jumped, track
+    from bufgym.papers.perception.tracking import Tracker, difference, jumped, track
     from bufgym.papers.perception.views import Coverage, seen_shares
 
+# fmt: off
 __all__ = [
-    *("Camera", "Coverage", "Grid", "Map", "OrbSimilarity", "Sequence", "Track", "Tracker", "difference", "fuse"),
-    *("grid_of", "jumped", "made_up_room", "map_error", "open_sequence", "orbbuf_by", "points_of", "seen_shares"),
-    "track",
+    "Coverage", "OrbSimilarity", "Sequence", "Tracker", "difference", "fuse", "grid_of", "jumped", "made_up_room",
+    "map_error", "open_sequence", "orbbuf_by", "points_of", "seen_shares", "track",
 ]
+# fmt: on
 
 _MODULES = {
-    "frames": ("Camera", "Sequence", "open_sequence"),
-    "mapping": ("Grid", "Map", "fuse", "grid_of", "map_error", "points_of"),
+    "frames": ("Sequence", "open_sequence"),
+    "mapping": ("fuse", "grid_of", "map_error", "points_of"),
     "orb": ("OrbSimilarity", "orbbuf_by"),
     "room": ("made_up_room",),
-    "tracking": ("Track", "Tracker", "difference", "jumped", "track"),
+    "tracking": ("Tracker", "difference", "jumped", "track"),
     "views": ("Coverage", "seen_shares"),
 }
 __getattr__ = on_demand(__name__, **{name: module for module, names in _MODULES.items() for name in names})

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
-from bufgym.papers.perception.extra import library
+from bufgym.papers.extra import library
 from bufgym.papers.perception.frames import Image, Sequence
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode

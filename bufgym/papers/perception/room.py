@@ -139,7 +139,7 @@ def _walk(time_us: Int64Array) -> Float64Array:
 
 
 def furnished(rng: np.random.Generator, way: Float64Array) -> Scene:
-    """Draw furniture along the walls and on the floor, and pictures and balls above; ``way`` float64[n, 3] stays free."""
+    """Draw furniture along walls and on the floor, and pictures and balls above; ``way`` float64[n, 3] stays free."""
     size_m = np.array(SIZE_M)
     boxes = [np.array([*size_m / 2, *size_m / 2, 1.0, 0.0])]
     balls: list[Float64Array] = []

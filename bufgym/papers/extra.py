@@ -1,4 +1,4 @@
-"""Libraries of the extra ``perception``, imported where they are used."""
+"""Libraries of the extras, imported where they are used."""
 
 from __future__ import annotations
 
@@ -15,4 +15,4 @@ def library(name: str, extra: str = "perception") -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] != name.split(".")[0]:
             raise
-        raise BufgymError(f"bufgym.papers.perception needs {error.name}: {install(extra)}") from None
+        raise BufgymError(f"bufgym.papers needs {error.name}: {install(extra)}") from None
