@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,18 +54,17 @@ STYLES = {
     "min-motion-gap": ("min-motion-gap (not in the paper)", COLOURS["orange"], "v"),
 }
 """Policy -> label, colour, marker."""
+COLUMNS = {"L": "capacity", "policy": "policy", "run": "seed", "H": "qoi", "H_clairvoyant": "clairvoyant"}
+COLUMNS |= {"regret": "regret", "longest_gap_views": "longest_gap", "longest_gap_s": "longest_gap_s"}
+"""Column of the figures -> column of the benchmark's rows."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """Scenario that the policies meet in one part of a figure."""
+class Setting(NamedTuple):
+    """Scenario that the policies meet in one part of a figure; the camera is "time" where x is the frame index."""
 
     camera: str
-    """Name of the recording; "time" where x is the frame index."""
     size_kb: float
-    """Size of a frame, kB."""
     uplink: Uplink
-    """Uplink scenario."""
 
 
 @dataclass(frozen=True)
@@ -128,16 +128,9 @@ class StreamFigure(LinkFigure):
         """List every frame size with every camera, and with time-based QoI if ``timed``."""
         settings = []
         for size_kb in sorted({self.size_kb, *self.sweep_kb}):
-            uplink = Uplink(
-                traces=(self.link,),
-                rate_hz=RATE_HZ,
-                jitter=JITTER,
-                size_bytes=round(1000 * size_kb),
-                size_cv=self.size_cv,
-                duration_s=self.frames / RATE_HZ,
-                link_offset_s=(0.0, 0.0),
-                value=time_value(),
-            )
+            sizes = {"size_bytes": round(1000 * size_kb), "size_cv": self.size_cv}
+            times = {"duration_s": self.frames / RATE_HZ, "link_offset_s": (0.0, 0.0)}
+            uplink = Uplink((self.link,), rate_hz=RATE_HZ, jitter=JITTER, value=time_value(), **sizes, **times)
             for camera in self.cameras:
                 moving = replace(uplink, motion=(camera,), value=motion_value())
                 settings.append(Setting(camera.name, size_kb, moving))
@@ -151,20 +144,8 @@ class StreamFigure(LinkFigure):
         rows = Rows()
         for setting in settings:
             for row in run(chosen, setting.uplink, self.capacities, runs, bound=bound):
-                rows.append(
-                    {
-                        "size_kb": setting.size_kb,
-                        "camera": setting.camera,
-                        "L": row["capacity"],
-                        "policy": row["policy"],
-                        "run": row["seed"],
-                        "H": row["qoi"],
-                        "H_clairvoyant": row["clairvoyant"],
-                        "regret": row["regret"],
-                        "longest_gap_views": row["longest_gap"],
-                        "longest_gap_s": row["longest_gap_s"],
-                    }
-                )
+                found = {column: row[name] for column, name in COLUMNS.items()}
+                rows.append({"size_kb": setting.size_kb, "camera": setting.camera, **found})
         return rows
 
     def about(self) -> str:

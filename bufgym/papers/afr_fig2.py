@@ -120,24 +120,18 @@ class Reproduction(GeometryFigure):
 
     def draw(self, rows: Rows, figure: Any) -> None:
         panels = figure.subplots(1, 3)
-        colours = [COLOURS[name] for name in ("afr", "random", "orange", "drop-oldest", "pink", "sky")]
-        for axes, motion in zip(panels, self.motions().values(), strict=True):
+        for axes, (name, motion) in zip(panels, self.motions().items(), strict=True):
+            for k in range(self.shown):
+                left, right = motion.view(k)
+                if name == "turn":
+                    x, y = np.sin([left, right]), np.cos([left, right])
+                    x, y = [0, *x, 0], [0, *y, 0]
+                else:
+                    away = self.wall_m if name == "corridor" else right / math.tan(VIEW_ANGLE / 2)
+                    x, y = [left, (left + right) / 2, right], [0, -away, 0]
+                    axes.axhline(0, color=COLOURS["oracle"], linewidth=3)
+                axes.plot(x, y, color=list(COLOURS.values())[k % 6], linewidth=1.4, label=f"message {k}")
             axes.set_title(motion.label, loc="left", fontsize=10)
             axes.set(aspect="equal", xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
-        wall, turn, corridor = panels
-        for k in range(self.shown):
-            style = {"color": colours[k % len(colours)], "linewidth": 1.4}
-            edge = self.motions()["wall"].view(k)[1]
-            distance = edge / math.tan(VIEW_ANGLE / 2)
-            wall.plot([-edge, 0, edge], [0, -distance, 0], label=f"message {k}", **style)
-            left, right = self.motions()["turn"].view(k)
-            arc = np.linspace(left, right, 30)
-            radius = 1 + 0.06 * k
-            turn.plot([0, *(radius * np.sin(arc)), 0], [0, *(radius * np.cos(arc)), 0], **style)
-            left, right = self.motions()["corridor"].view(k)
-            corridor.plot([left, (left + right) / 2, right], [0, -self.wall_m, 0], **style)
-            corridor.plot([left, right], [0.06 * (k + 1)] * 2, **style)
-        for axes in (wall, corridor):
-            axes.axhline(0, color=COLOURS["oracle"], linewidth=3)
-        legend_below(figure, self.shown, wall)
+        legend_below(figure, self.shown, panels[0])

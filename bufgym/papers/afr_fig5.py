@@ -142,8 +142,6 @@ class Reproduction(Figure):
         peaks = equal_lengths(rows)
         heights = [rows[T - 1]["afr"] for T in peaks]
         axes.plot(peaks, heights, "o", color=COLOURS["afr"], markersize=6, label="AFR = oracle-ideal")
-        for place in zip(peaks, heights, strict=True):
-            axes.annotate(f"T = {place[0]}", place, (-5, 7), textcoords="offset points", ha="right")
         finish(
             axes,
             "Information gained in one interruption, L = 8, V(d) = 1 − 0.618$^d$",

@@ -114,9 +114,9 @@ class Sequence(ABC):
         """
         return encoded_bytes(self.depth(k), self.image(k))
 
-    def motion(self, settings: MotionSettings | None = None) -> Motion:
-        """How far the scene has moved on, by the true poses; by default with this camera's field of view."""
-        settings = settings or MotionSettings(fov_deg=self.camera.fov_deg)
+    def motion(self) -> Motion:
+        """How far the scene has moved on, by the true poses and this camera's field of view."""
+        settings = MotionSettings(fov_deg=self.camera.fov_deg)
         poses = Poses(self.time_us, self.poses[:, :3, 3], quaternions(self.poses[:, :3, :3]))
         return motion_from_poses(poses, settings, name=self.name)
 

@@ -63,7 +63,7 @@ class Grid:
         return TRUNCATION_VOXELS * self.voxel_m
 
 
-def grid_of(sequence: Sequence, voxel_m: float = VOXEL_M) -> Grid:
+def grid_of(sequence: Sequence) -> Grid:
     """Grid of the box around all points of a recording, with a margin of the truncation."""
     stride = _BOX_STRIDE if min(sequence.camera.width, sequence.camera.height) >= 4 * _BOX_STRIDE else 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -74,10 +74,10 @@ def grid_of(sequence: Sequence, voxel_m: float = VOXEL_M) -> Grid:
             low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
     if not np.isfinite(low).all():
         raise BufgymError(f"{sequence.name}: no frame holds a depth from {tsdf.NEAR_M} to {FAR_M} m")
-    margin = TRUNCATION_VOXELS * voxel_m
-    count = np.ceil((high - low + 2 * margin) / voxel_m).astype(int) + 1
+    margin = TRUNCATION_VOXELS * VOXEL_M
+    count = np.ceil((high - low + 2 * margin) / VOXEL_M).astype(int) + 1
     x, y, z = (low - margin).tolist()
-    return Grid((x, y, z), (int(count[0]), int(count[1]), int(count[2])), voxel_m)
+    return Grid((x, y, z), (int(count[0]), int(count[1]), int(count[2])))
 
 
 def points_of(

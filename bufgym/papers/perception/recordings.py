@@ -152,7 +152,8 @@ def _packed(folder: Path, depth: Path) -> Sequence:
         except (zipfile.BadZipFile, OSError) as error:
             raise BufgymError(f"{path}: truncated, or no zip archive ({error})") from None
         files.append([Member(archive, path / f"{k:04d}.{kind}") for k in range(len(lines))])
-    return Recording(folder.name, camera, _at_30_hz(len(lines)), poses, *files)
+    depths, images = files
+    return Recording(folder.name, camera, _at_30_hz(len(lines)), poses, depths, images)
 
 
 def _tum(folder: Path) -> Sequence:

@@ -23,19 +23,19 @@ SIZED_EVERY = 10
 
 
 @lru_cache(maxsize=8)
-def sizes(sequence: Sequence, every: int = SIZED_EVERY) -> NDArray[np.int64]:
+def sizes(sequence: Sequence) -> NDArray[np.int64]:
     """Bytes of each frame as it is sent, int64[frames]."""
-    return between([sequence.size_bytes(int(k)) for k in encoded(len(sequence), every)], len(sequence), every)
+    return between([sequence.size_bytes(int(k)) for k in encoded(len(sequence))], len(sequence))
 
 
-def encoded(frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
-    """Select the frames whose sizes are measured: one in ``every``, and the last."""
-    return np.unique(np.append(np.arange(0, frames, every), frames - 1))
+def encoded(frames: int) -> NDArray[np.int64]:
+    """Select the frames whose sizes are measured: one in ``SIZED_EVERY``, and the last."""
+    return np.unique(np.append(np.arange(0, frames, SIZED_EVERY), frames - 1))
 
 
-def between(measured: Seq[int], frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
+def between(measured: Seq[int], frames: int) -> NDArray[np.int64]:
     """Interpolate all frames' sizes from the measured sizes of ``encoded``, int64[frames]."""
-    return np.rint(np.interp(np.arange(frames), encoded(frames, every), measured)).astype(np.int64)
+    return np.rint(np.interp(np.arange(frames), encoded(frames), measured)).astype(np.int64)
 
 
 def fading(stream_us: int, trace: Trace, offset_us: int = 0) -> Link:

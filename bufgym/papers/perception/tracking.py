@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import icp, tsdf
@@ -56,12 +55,8 @@ MOST_ERROR_DEG: Final = 5.0
 class Track:
     """Result of tracking."""
 
-    frames: npt.NDArray[np.int64]
-    """int64[m], indices of the frames that arrived."""
     poses: Float64Array
-    """float64[m, 4, 4], the poses found, camera to world; NaN from the failure on."""
-    error_m: Float64Array
-    """float64[m], distance from the true position, drift included, m; NaN from the failure on."""
+    """float64[m, 4, 4], the poses found for the frames that arrived, camera to world; NaN from the failure on."""
     where: int | None
     """The frame (index of the sequence) at which tracking failed; None if it never did."""
     model: Map
@@ -101,17 +96,16 @@ def track(
     if not len(arrived) or (np.diff(arrived) <= 0).any() or arrived[0] < 0 or arrived[-1] >= len(sequence):
         raise BufgymError(f"frames: must be at least one index below {len(sequence)}, increasing")
     poses = np.full((len(arrived), 4, 4), np.nan)
-    error_m = np.full(len(arrived), np.nan)
     truth = sequence.poses[arrived]
-    poses[0], error_m[0] = truth[0], 0.0
+    poses[0] = truth[0]
     tracker = Tracker(sequence.camera, grid or grid_of(sequence))
     tracker.add(sequence.depth(int(arrived[0])), poses[0])
     for n, k in enumerate(arrived.tolist()[1:], 1):
         pose = tracker.follow(sequence.depth(k), smooth(k) if smooth else None)
         if pose is None or jumped(poses[n - 1], pose, truth[n - 1], truth[n]):
-            return Track(arrived, poses, error_m, k, tracker.model)
-        poses[n], error_m[n] = pose, difference(pose, truth[n])[0]
-    return Track(arrived, poses, error_m, None, tracker.model)
+            return Track(poses, k, tracker.model)
+        poses[n] = pose
+    return Track(poses, None, tracker.model)
 
 
 def jumped(before: Float64Array, pose: Float64Array, true_before: Float64Array, truth: Float64Array) -> bool:
