@@ -128,9 +128,16 @@ class StreamFigure(LinkFigure):
         """List every frame size with every camera, and with time-based QoI if ``timed``."""
         settings = []
         for size_kb in sorted({self.size_kb, *self.sweep_kb}):
-            sizes = {"size_bytes": round(1000 * size_kb), "size_cv": self.size_cv}
-            times = {"duration_s": self.frames / RATE_HZ, "link_offset_s": (0.0, 0.0)}
-            uplink = Uplink((self.link,), rate_hz=RATE_HZ, jitter=JITTER, value=time_value(), **sizes, **times)
+            uplink = Uplink(
+                traces=(self.link,),
+                rate_hz=RATE_HZ,
+                jitter=JITTER,
+                size_bytes=round(1000 * size_kb),
+                size_cv=self.size_cv,
+                duration_s=self.frames / RATE_HZ,
+                link_offset_s=(0.0, 0.0),
+                value=time_value(),
+            )
             for camera in self.cameras:
                 moving = replace(uplink, motion=(camera,), value=motion_value())
                 settings.append(Setting(camera.name, size_kb, moving))

@@ -124,8 +124,7 @@ class Reproduction(GeometryFigure):
             for k in range(self.shown):
                 left, right = motion.view(k)
                 if name == "turn":
-                    x, y = np.sin([left, right]), np.cos([left, right])
-                    x, y = [0, *x, 0], [0, *y, 0]
+                    x, y = [0, math.sin(left), math.sin(right), 0], [0, math.cos(left), math.cos(right), 0]
                 else:
                     away = self.wall_m if name == "corridor" else right / math.tan(VIEW_ANGLE / 2)
                     x, y = [left, (left + right) / 2, right], [0, -away, 0]

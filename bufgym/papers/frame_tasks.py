@@ -23,6 +23,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.papers.extra import library
 from bufgym.papers.perception import frames as depth_frames
 from bufgym.papers.perception import mapping, orb, streams, tracking, views
+from bufgym.papers.perception.recordings import open_sequence
 from bufgym.papers.perception.room import made_up_room
 from bufgym.papers.rows import Row
 from bufgym.scenario import Episode
@@ -52,7 +53,7 @@ class Stage:
         elif data is None:
             raise BufgymError(f"recording {name}: needs a folder of recordings (--data DIR) with {SEVEN_SCENES}")
         else:
-            whole_size = depth_frames.open_sequence(Path(data) / SEVEN_SCENES)
+            whole_size = open_sequence(Path(data) / SEVEN_SCENES)
         self.whole = whole_size.first(frames)
         self.sequence = self.whole.reduced(self.whole.camera.width // WIDTH).loaded()
         self.small = self.sequence.reduced(WIDTH // VIEW_WIDTH).loaded()

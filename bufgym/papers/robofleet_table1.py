@@ -63,7 +63,8 @@ class Reproduction(Figure):
         """Map each kind to the message that is encoded."""
         messages = fitted(self.beams, self.seed)
         for kind in KINDS:
-            parameters = {"points": self.points, "point_step": self.point_step} if kind == "PointCloud2" else {}
+            cloud = {"points": self.points, "point_step": self.point_step}
+            parameters: dict[str, Any] = cloud if kind == "PointCloud2" else {}
             messages.setdefault(kind, content(kind, seed=self.seed, **parameters))
         return messages
 

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 from bufgym.ground.modules import on_demand
 
 if TYPE_CHECKING:
-    from bufgym.papers.perception.frames import Sequence, open_sequence
+    from bufgym.papers.perception.frames import Sequence
     from bufgym.papers.perception.mapping import fuse, grid_of, map_error, points_of
     from bufgym.papers.perception.orb import OrbSimilarity, orbbuf_by
+    from bufgym.papers.perception.recordings import open_sequence
     from bufgym.papers.perception.room import made_up_room
     from bufgym.papers.perception.tracking import Tracker, difference, jumped, track
     from bufgym.papers.perception.views import Coverage, seen_shares
@@ -25,7 +26,8 @@ __all__ = [
 # fmt: on
 
 _MODULES = {
-    "frames": ("Sequence", "open_sequence"),
+    "frames": ("Sequence",),
+    "recordings": ("open_sequence",),
     "mapping": ("fuse", "grid_of", "map_error", "points_of"),
     "orb": ("OrbSimilarity", "orbbuf_by"),
     "room": ("made_up_room",),

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from os import PathLike
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -34,11 +32,7 @@ JPEG_QUALITY: Final = 50
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; all in pixels.
-
-    Raises:
-        BufgymError: a size or a focal length that is not above 0.
-    """
+    """A pinhole camera; all in pixels."""
 
     width: int
     height: int
@@ -46,11 +40,6 @@ class Camera:
     fy: float
     cx: float
     cy: float
-
-    def __post_init__(self) -> None:
-        for name in ("width", "height", "fx", "fy"):
-            if not getattr(self, name) > 0:
-                raise BufgymError(f"{name} = {getattr(self, name)}: must be above 0")
 
     @property
     def fov_deg(self) -> float:
@@ -168,14 +157,3 @@ def encoded_bytes(depth: Depth, image: Image) -> int:
         image = cv2.resize(image, (depth_mm.shape[1], depth_mm.shape[0]))
     picture = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return len(rvl.compress(depth_mm)) + len(picture)
-
-
-def open_sequence(path: str | PathLike[str]) -> Sequence:
-    """The recording in a folder: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives (see `recordings`).
-
-    Raises:
-        BufgymError: no such folder, none of these layouts, a missing list or pose file; the message names the file.
-    """
-    from bufgym.papers.perception import recordings
-
-    return recordings.opened(Path(path))

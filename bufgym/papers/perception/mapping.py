@@ -40,7 +40,7 @@ class Grid:
     """Positions of the voxels.
 
     Raises:
-        BufgymError: no voxel, too many, or a size that is not above 0.
+        BufgymError: no voxel, or too many.
     """
 
     origin_m: tuple[float, float, float]
@@ -51,8 +51,6 @@ class Grid:
     """Edge of a voxel, m."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.voxel_m) and self.voxel_m > 0):
-            raise BufgymError(f"voxel_m = {self.voxel_m}: must be a finite number above 0")
         if min(self.shape) < 2 or math.prod(self.shape) > MOST_VOXELS:
             size = " x ".join(str(count) for count in self.shape)
             raise BufgymError(f"grid of {size} voxels: must be at least 2 a side and {MOST_VOXELS} in all")
@@ -115,11 +113,7 @@ class Map:
 
     def points(self) -> Float64Array:
         """Points where the surface crosses edges between voxels, float64[m, 3], world coordinates, m."""
-        origin_m, voxel_m = np.array(self.grid.origin_m), self.grid.voxel_m
-        count = tsdf.surface(self.tsdf, self.weight, origin_m, voxel_m, np.empty((0, 3)))
-        points = np.empty((count, 3))
-        tsdf.surface(self.tsdf, self.weight, origin_m, voxel_m, points)
-        return points
+        return np.array(self.grid.origin_m) + self.grid.voxel_m * tsdf.surface(self.tsdf, self.weight)
 
 
 def fuse(sequence: Sequence, frames: Iterable[int], grid: Grid | None = None) -> Map:

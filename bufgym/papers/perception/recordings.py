@@ -15,6 +15,7 @@ import re
 import zipfile
 from collections.abc import Sequence as Seq
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -117,8 +118,13 @@ def _named(file: File) -> Path:
     return file.path if isinstance(file, Member) else file
 
 
-def opened(folder: Path) -> Sequence:
-    """Open the recording in a folder, whose files tell the layout."""
+def open_sequence(path: str | PathLike[str]) -> Sequence:
+    """Open the recording in a folder, whose files tell the layout: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives.
+
+    Raises:
+        BufgymError: no such folder, none of these layouts, a missing list or pose file; the message names the file.
+    """
+    folder = Path(path)
     if not folder.is_dir():
         raise BufgymError(f"{folder}: no such folder")
     if (folder / "depth.txt").is_file():

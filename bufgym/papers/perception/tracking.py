@@ -134,7 +134,7 @@ class Tracker:
         model_camera = camera.every(self._stride)
         self._model_lens = model_camera.lens
         shape, model_shape = ((c.height, c.width, 3) for c in (camera, model_camera))
-        self._points, self._normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._normals = np.zeros(shape, np.float32)
         self._seen, self._seen_normals = np.zeros(model_shape, np.float32), np.zeros(model_shape, np.float32)
         self._jacobian, self._sums = np.zeros(8), np.zeros((8, 8))
         self._hint: Depth = np.zeros(model_shape[:2], np.float32)
@@ -156,7 +156,7 @@ class Tracker:
 
     def _aligned(self, smooth: Depth) -> Float64Array | None:
         model, grid, lens, pose = self.model, self.model.grid, self._lens, self.pose
-        icp.unproject(smooth, FAR_M, lens, self._points)
+        self._points = icp.unproject(smooth, FAR_M, lens)
         icp.orient(self._points, np.zeros(3), SAME_SURFACE, self._normals)
         place = np.array(grid.origin_m), grid.voxel_m, grid.truncation_m, FAR_M, self._model_lens, pose
         tsdf.raycast(model.tsdf, model.weight, *place, self._hint, self._seen)
