@@ -9,7 +9,7 @@ The paper does not state the size of a frame. A size of about 160 kB reproduces 
 
 The ten runs differ in three ways: where in the camera's recording they begin, the jitter of each frame within a tenth
 of its period, and the uniform draws of Random. Every policy meets the same ten runs. In all of them the link begins at
-the trace's start. Frames have equal sizes by default, because the clairvoyant is exact only for equal sizes.
+the trace's start. Frames have equal sizes, because the clairvoyant is exact only for equal sizes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from bufgym import policies, traces
 from bufgym.benchmark.run import run
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.figure import COLOURS, Figure, at_least_0, whole
+from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.rows import Rows
 from bufgym.scenario import Uplink
 from bufgym.scenario.suites import CAPACITIES, RATE_HZ, motion_value, time_value
@@ -105,14 +105,10 @@ class StreamFigure(LinkFigure):
 
     motion: str | Sequence[str] = CAMERAS
     """TUM RGB-D sequences in ``data`` (tum_rgbd/*.groundtruth.txt.gz), shipped motions or files."""
-    size_cv: float = 0.0
-    """Coefficient of variation of the frame sizes. Above 0 the clairvoyant is only an upper bound."""
     capacities: Sequence[int] = CAPACITIES
     runs: int = PAPER_RUNS
     sweep_kb: Sequence[float] = SWEEP_KB
     """Further frame sizes, kB."""
-
-    RULES = {"size_cv": at_least_0}
 
     @cached_property
     def cameras(self) -> list[Motion]:
@@ -133,7 +129,7 @@ class StreamFigure(LinkFigure):
                 rate_hz=RATE_HZ,
                 jitter=JITTER,
                 size_bytes=round(1000 * size_kb),
-                size_cv=self.size_cv,
+                size_cv=0.0,
                 duration_s=self.frames / RATE_HZ,
                 link_offset_s=(0.0, 0.0),
                 value=time_value(),
@@ -157,10 +153,9 @@ class StreamFigure(LinkFigure):
 
     def about(self) -> str:
         """Describe the scenario in sentences."""
-        sizes = "equal in size" if self.size_cv == 0 else f"sizes with cv {self.size_cv:g} (regret is an upper bound)"
         return (
-            f"{self.frames} frames of {self.size_bytes / 1000:g} kB at {RATE_HZ:g} Hz, {sizes}, over {self.link.name} "
-            f"from its start: it carries {self.share_carried():.0%} of the demand. {self.runs} runs each, which differ "
+            f"{self.frames} frames of {self.size_bytes / 1000:g} kB at {RATE_HZ:g} Hz, equal in size, over "
+            f"{self.link.name} from its start: it carries {self.share_carried():.0%} of the demand. {self.runs} runs each, which differ "
             f"by their start on the camera's recording, by arrival jitter (up to {JITTER:.0%} of a period), and by "
             "Random's uniform draws."
         )

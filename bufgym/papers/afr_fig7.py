@@ -72,16 +72,17 @@ class Reproduction(FrameFigure):
             facts[key] = None
             facts |= {f"{key}_{what}": "not run" for what in ("change", "paper", "slam", "lack")}
             if {"afr", other} <= set(self.policies):
-                shown = {name: rows.where(recording=name) for name in self.recordings}
-                found = {name: change(some, "rmse_mm", "afr", other) for name, some in shown.items()}
-                first = {name: change(some.where(k=0), "rmse_mm", "afr", other) for name, some in shown.items()}
-                slam = {name: change(some, "slam_rmse_mm", "afr", other) for name, some in shown.items()}
-                lack = {name: change(some, "slam_uncovered", "afr", other) for name, some in shown.items()}
-                facts[key] = found[main].high < 0 and found[main].low <= paper
-                facts[f"{key}_change"] = "; ".join(f"{name} {spelled(i)}" for name, i in found.items())
-                facts[f"{key}_paper"] = "; ".join(f"{name} {i.value:+.1%}" for name, i in first.items())
-                facts[f"{key}_slam"] = "; ".join(f"{name} {spelled(i)}" for name, i in slam.items())
-                facts[f"{key}_lack"] = "; ".join(f"{name} {spelled(i)}" for name, i in lack.items())
+                found = change(rows.where(recording=main), "rmse_mm", "afr", other)
+                facts[key] = found.high < 0 and found.low <= paper
+                for what, column in {"change": "rmse_mm", "slam": "slam_rmse_mm", "lack": "slam_uncovered"}.items():
+                    facts[f"{key}_{what}"] = "; ".join(
+                        f"{name} {spelled(change(rows.where(recording=name), column, 'afr', other))}"
+                        for name in self.recordings
+                    )
+                facts[f"{key}_paper"] = "; ".join(
+                    f"{name} {change(rows.where(recording=name, k=0), 'rmse_mm', 'afr', other).value:+.1%}"
+                    for name in self.recordings
+                )
         if "drop-oldest" in self.policies and "afr" in self.policies:
             facts["moves"] = self.where_it_moves(rows.where(recording=main))
         return facts

@@ -25,8 +25,9 @@ import numpy as np
 from bufgym import traces
 from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES, STYLES
 from bufgym.papers.figure import COLOURS, Figure, whole
-from bufgym.papers.frame_tasks import IMAGES, OFFSETS, SEVEN_SCENES, Kind, Stage, Task, carry_out, stage
+from bufgym.papers.frame_tasks import SEVEN_SCENES, Kind, Task, carry_out, stage
 from bufgym.papers.perception import streams, views
+from bufgym.papers.perception.stage import IMAGES, OFFSETS, Stage
 from bufgym.papers.rows import Row, Rows
 from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
 from bufgym.traces import Trace

@@ -94,10 +94,10 @@ def surface(tsdf: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[n
         near = tuple(slice(None, -1) if other == axis else slice(None) for other in range(3))
         far = tuple(slice(1, None) if other == axis else slice(None) for other in range(3))
         crossed[(*near, axis)] = known[near] & known[far] & ((tsdf[near] < 0) != (tsdf[far] < 0))
-    *place, axis = np.nonzero(crossed)
-    a, b = tsdf[*place], tsdf[*(index + (axis == other) for other, index in enumerate(place))]
+    *place, along = np.nonzero(crossed)
+    a, b = tsdf[*place], tsdf[*(index + (along == axis) for axis, index in enumerate(place))]
     points = np.stack(place, axis=1).astype(np.float64)
-    points[np.arange(len(axis)), axis] += a / (a - b)
+    points[np.arange(len(along)), along] += a / (a - b)
     return points
 
 
