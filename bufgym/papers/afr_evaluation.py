@@ -155,9 +155,9 @@ class StreamFigure(LinkFigure):
         """Describe the scenario in sentences."""
         return (
             f"{self.frames} frames of {self.size_bytes / 1000:g} kB at {RATE_HZ:g} Hz, equal in size, over "
-            f"{self.link.name} from its start: it carries {self.share_carried():.0%} of the demand. {self.runs} runs each, which differ "
-            f"by their start on the camera's recording, by arrival jitter (up to {JITTER:.0%} of a period), and by "
-            "Random's uniform draws."
+            f"{self.link.name} from its start: it carries {self.share_carried():.0%} of the demand. {self.runs} runs "
+            f"each, which differ by their start on the camera's recording, by arrival jitter (up to {JITTER:.0%} of a "
+            "period), and by Random's uniform draws."
         )
 
 

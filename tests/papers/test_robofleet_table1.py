@@ -80,29 +80,6 @@ def test_json_by_hand_and_read_back_with_infinity_as_null_and_bytes_two_ways() -
     assert base64.b64decode(data[0]) == image["data"].tobytes() and data[1] == image["data"].tolist()
 
 
-def same(ours: Any, theirs: Any) -> None:
-    """Every field that rosbags read is the one we wrote."""
-    if isinstance(ours, dict):
-        for name in theirs.__dataclass_fields__:
-            if not name.startswith("_") and not name.isupper():  # constants of the definition are in capitals
-                same(ours[name], getattr(theirs, name))
-    elif isinstance(ours, list):
-        assert len(ours) == len(theirs)
-        for mine, its in zip(ours, theirs, strict=True):
-            same(mine, its)
-    elif isinstance(ours, np.ndarray):
-        np.testing.assert_array_equal(ours, theirs)
-    else:
-        assert ours == theirs
-
-
-def test_ros_reads_what_was_written() -> None:
-    for kind, (type_name, *_) in KINDS.items():
-        message = content(kind, seed=3)
-        same(message, stores()["ros1"].deserialize_ros1(encode(kind, message, "ros1"), type_name))
-        same(message, stores()["cdr"].deserialize_cdr(encode(kind, message, "cdr"), type_name))
-
-
 def test_flatbuffers_read_by_the_released_slots() -> None:
     """Of a scan, by the library's own table: metadata 0, header 1, numbers from 2 on, ranges 9."""
     scan = content("LaserScan", beams=37, seed=1)
