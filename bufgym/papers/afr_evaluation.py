@@ -59,7 +59,7 @@ COLUMNS |= {"regret": "regret", "longest_gap_views": "longest_gap", "longest_gap
 """Column of the figures -> column of the benchmark's rows."""
 
 
-class Setting(NamedTuple):
+class StreamSetting(NamedTuple):
     """Scenario that the policies meet in one part of a figure; the camera is "time" where x is the frame index."""
 
     camera: str
@@ -120,7 +120,7 @@ class StreamFigure(LinkFigure):
         """Size of a frame in the main part of the figure, kB."""
         return self.size_bytes / 1000
 
-    def settings(self, *, timed: bool) -> list[Setting]:
+    def settings(self, *, timed: bool) -> list[StreamSetting]:
         """List every frame size with every camera, and with time-based QoI if ``timed``."""
         settings = []
         for size_kb in sorted({self.size_kb, *self.sweep_kb}):
@@ -136,12 +136,12 @@ class StreamFigure(LinkFigure):
             )
             for camera in self.cameras:
                 moving = replace(uplink, motion=(camera,), value=motion_value())
-                settings.append(Setting(camera.name, size_kb, moving))
+                settings.append(StreamSetting(camera.name, size_kb, moving))
             if timed:
-                settings.append(Setting("time", size_kb, uplink))
+                settings.append(StreamSetting("time", size_kb, uplink))
         return settings
 
-    def play(self, settings: Sequence[Setting], runs: int, *, bound: bool) -> Rows:
+    def play(self, settings: Sequence[StreamSetting], runs: int, *, bound: bool) -> Rows:
         """Return a row for each setting, policy and run; ``bound`` adds the clairvoyant's H and the regret."""
         chosen = [policies.get(name) for name in STYLES]
         rows = Rows()

@@ -32,7 +32,7 @@ MESSAGES = 20
 
 
 @dataclass(frozen=True)
-class Motion:
+class CameraMotion:
     """One motion of the camera."""
 
     label: str
@@ -70,7 +70,7 @@ class GeometryFigure(Figure):
 
     SIZE_INCHES = (10.0, 3.9)
 
-    def motions(self) -> dict[str, Motion]:
+    def motions(self) -> dict[str, CameraMotion]:
         """Map a column name to its motion."""
         half, width = math.tan(VIEW_ANGLE / 2), 2 * self.wall_m * math.tan(VIEW_ANGLE / 2)
         turn = math.radians(self.turn_degrees)
@@ -80,14 +80,14 @@ class GeometryFigure(Figure):
             return -edge, edge
 
         return {
-            "wall": Motion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
-            "turn": Motion(
+            "wall": CameraMotion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
+            "turn": CameraMotion(
                 "turning in place",
                 lambda k: (k * turn - VIEW_ANGLE / 2, k * turn + VIEW_ANGLE / 2),
                 1,
                 qoi.saturating(VIEW_ANGLE / turn),
             ),
-            "corridor": Motion(
+            "corridor": CameraMotion(
                 "along a corridor, looking at its side",
                 lambda k: (k * self.step_m - width / 2, k * self.step_m + width / 2),
                 1,

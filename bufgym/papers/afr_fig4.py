@@ -27,7 +27,7 @@ PAPER_DROPS = {9: 1, 10: 3, 11: 5, 12: 7, 13: 9, 14: 11, 15: 13, 16: 15, 17: 17,
 """T -> the message that the figure strikes out; 17 is the newcomer itself."""
 
 
-class Step(NamedTuple):
+class AfrStep(NamedTuple):
     """AFR's decision on arrival T, counted from the link's stop, and its state afterwards: rate, counter, position.
 
     ``dropped`` is T if the newcomer was rejected, None if nothing was dropped. ``kept`` is the queue, oldest first.
@@ -41,10 +41,10 @@ class Step(NamedTuple):
     kept: tuple[int, ...]
 
 
-def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[Step]:
+def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[AfrStep]:
     """Run the simulator and return AFR's decisions 1..``last_T`` with L = ``capacity``."""
     afr = policies.get(policy)
-    watched: list[Step] = []
+    watched: list[AfrStep] = []
 
     def watch(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
         decision = afr.on_arrival(buffer, arrival, memory)
@@ -56,7 +56,7 @@ def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr"
             if decision >= 0:
                 dropped = kept.pop(decision)
             kept.append(T)
-        watched.append(Step(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
+        watched.append(AfrStep(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
         return decision
 
     # Runs uncompiled so that the watcher sees each decision; the transition function is the same.

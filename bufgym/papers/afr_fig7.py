@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.papers.correlation import spearman
 from bufgym.papers.figure import heat_table
-from bufgym.papers.frame_runs import POLICIES, FrameFigure, Setting
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import Rows
 
@@ -92,7 +92,7 @@ class Reproduction(FrameFigure):
         moved, won = [], []
         x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
         for k in rows.distinct("k"):
-            kept = [self.kept(Setting(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
+            kept = [self.kept(FrameRun(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
             moved.append(float(np.mean([np.diff(x[list(frames)]).max() for frames in kept])))
             won.append(rows.mean("rmse_mm", k=k, policy="afr") / rows.mean("rmse_mm", k=k, policy="drop-oldest") - 1)
         return f"{spearman(np.array(moved), np.array(won)):+.2f}"
@@ -138,7 +138,7 @@ class Reproduction(FrameFigure):
             every = (on.reference if poses == "true poses" else on.tracked_reference).points()
             few = _some(len(every))
             for axes, policy in zip(line, self.shown, strict=True):
-                kept = self.kept(Setting(recording, 0, L, policy))
+                kept = self.kept(FrameRun(recording, 0, L, policy))
                 made = on.map_of(kept) if poses == "true poses" else on.track_of(kept).model
                 # Distances run from the reference's points to the map, so that missing parts stand out.
                 far_mm = np.minimum(1e3 * mapping.distances(every[few], made.points()), limit_mm)

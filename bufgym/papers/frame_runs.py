@@ -25,7 +25,7 @@ import numpy as np
 from bufgym import traces
 from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES, STYLES
 from bufgym.papers.figure import COLOURS, Figure, whole
-from bufgym.papers.frame_tasks import SEVEN_SCENES, Kind, Task, carry_out, stage
+from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views
 from bufgym.papers.perception.stage import IMAGES, OFFSETS, Stage
 from bufgym.papers.rows import Row, Rows
@@ -53,7 +53,7 @@ def fade() -> Trace:
     return Trace.steps([(21, 2.2e6), (3, 0.4e6), (30, 2.2e6)], name="fade")
 
 
-class Setting(NamedTuple):
+class FrameRun(NamedTuple):
     """One run: the recording, the fade's offset k, the queue size L and the policy."""
 
     recording: str
@@ -100,27 +100,27 @@ class FrameFigure(Figure):
         """The recording, opened once."""
         return stage(recording, self._folder, self.frames)
 
-    def settings(self) -> list[Setting]:
+    def settings(self) -> list[FrameRun]:
         """Every run, in the order of the rows."""
-        return list(starmap(Setting, product(self.recordings, range(self.offsets), self.capacities, self.policies)))
+        return list(starmap(FrameRun, product(self.recordings, range(self.offsets), self.capacities, self.policies)))
 
     @cached_property
-    def _results(self) -> dict[Task, Row]:
+    def _results(self) -> dict[FrameTask, Row]:
         return {}
 
-    def done(self, *tasks: Task) -> list[Row]:
+    def done(self, *tasks: FrameTask) -> list[Row]:
         """Results of these tasks."""
         missing = [task for task in tasks if task not in self._results]
         jobs = self.jobs if len(missing) > 1 else 1
         self._results.update(carry_out(missing, self._folder, self.link, self.store, jobs))
         return [self._results[task] for task in tasks]
 
-    def task(self, kind: Kind, setting: Setting) -> Task:
+    def task(self, kind: Kind, setting: FrameRun) -> FrameTask:
         """Make the task of this kind for a run."""
         about = (setting.policy, self.link.name, setting.k, setting.L) if kind == "kept" else self.kept(setting)
-        return Task(kind, setting.recording, self.frames, about)
+        return FrameTask(kind, setting.recording, self.frames, about)
 
-    def kept(self, setting: Setting) -> tuple[int, ...]:
+    def kept(self, setting: FrameRun) -> tuple[int, ...]:
         """The frames that arrive in this run."""
         (row,) = self.done(self.task("kept", setting))
         return cast(tuple[int, ...], row["kept"])
@@ -136,7 +136,7 @@ class FrameFigure(Figure):
             rows.append(functools.reduce(operator.or_, found, row))
         return rows
 
-    def information(self, setting: Setting) -> Row:
+    def information(self, setting: FrameRun) -> Row:
         """Compute H of the run's frames by time, motion and measured overlap, and their coverage of the scene."""
         kept, on = self.kept(setting), self.stage(setting.recording)
         x = on.episode(self.link, 0).arrivals["x"][list(kept)]

@@ -37,7 +37,7 @@ def stage(name: str, data: str | None, frames: int) -> Stage:
     return Stage(open_sequence(Path(data) / SEVEN_SCENES).first(frames))
 
 
-class Task(NamedTuple):
+class FrameTask(NamedTuple):
     """A question about a recording: the map or the track of some frames, or the frames that a policy keeps."""
 
     kind: Kind
@@ -47,7 +47,7 @@ class Task(NamedTuple):
     """Frames of a map or track; for the kind "kept" the policy, the link's name, the fade's offset k and L."""
 
 
-def carried_out(version: str, task: Task, data: str | None, link: Trace) -> tuple[Task, Row]:
+def carried_out(version: str, task: FrameTask, data: str | None, link: Trace) -> tuple[FrameTask, Row]:
     """Carry out one task; return it and its result."""
     on, about = stage(task.recording, data, task.frames), cast(Any, task.about)
     if task.kind == "kept":
@@ -56,7 +56,9 @@ def carried_out(version: str, task: Task, data: str | None, link: Trace) -> tupl
     return task, on.mapped(about) if task.kind == "map" else on.tracked(about)
 
 
-def carry_out(tasks: Iterable[Task], data: str | None, link: Trace, store: Path | None, jobs: int) -> dict[Task, Row]:
+def carry_out(
+    tasks: Iterable[FrameTask], data: str | None, link: Trace, store: Path | None, jobs: int
+) -> dict[FrameTask, Row]:
     """Carry out each task once, in ``jobs`` processes; the folder ``store`` keeps results for later calls."""
     remembered = library("joblib", "bench").Memory(store, verbose=0).cache(carried_out, ignore=["data", "link"])
     calls = [(f"{__version__} {WIDTH}", task, data, link) for task in dict.fromkeys(tasks)]

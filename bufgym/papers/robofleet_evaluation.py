@@ -52,7 +52,7 @@ MBIT = 125_000
 
 
 @dataclass(frozen=True)
-class Program:
+class SendingProgram:
     """A sending program: its policy and its operator's settings of the topics."""
 
     policy: str
@@ -75,13 +75,15 @@ class Program:
 
 
 PROGRAMS = {
-    "robofleet": Program("robofleet", "Robofleet, n_T = 1", "n_T = 1", COLOURS["afr"], "o"),
-    "no-drop": Program("robofleet", "Robofleet, all no_drop", "no_drop", COLOURS["drop-oldest"], "s", all_no_drop=True),
-    "no-drop-released": Program(
+    "robofleet": SendingProgram("robofleet", "Robofleet, n_T = 1", "n_T = 1", COLOURS["afr"], "o"),
+    "no-drop": SendingProgram(
+        "robofleet", "Robofleet, all no_drop", "no_drop", COLOURS["drop-oldest"], "s", all_no_drop=True
+    ),
+    "no-drop-released": SendingProgram(
         "robofleet-released", "released, all no_drop", "released", COLOURS["orange"], "^", all_no_drop=True
     ),
-    "rosbridge": Program("rosbridge", "rosbridge", "rosbridge", COLOURS["random"], "D"),
-    "ros-native": Program("ros-native", "native ROS", "native ROS", COLOURS["pink"], "v", queued=True),
+    "rosbridge": SendingProgram("rosbridge", "rosbridge", "rosbridge", COLOURS["random"], "D"),
+    "ros-native": SendingProgram("ros-native", "native ROS", "native ROS", COLOURS["pink"], "v", queued=True),
 }
 SHORT = {name: program.short for name, program in PROGRAMS.items()}
 

@@ -34,6 +34,8 @@ KIND_COLOURS = {
 PAPER_RATIO = 5.0
 ABOUT = (4.0, 6.0)
 """Range of ratios that we accept as "about 5 times"."""
+FACTOR = 2.0
+"""Ratio to the nominal latency up to which a latency counts as nominal."""
 BEFORE_S = 10.0
 WATCHED = 12.0
 """Time watched after the link's return, in dropout lengths; at least ``LEAST_WATCHED_S``."""
@@ -48,8 +50,6 @@ class Reproduction(CloudFigure):
     links_mbit_per_s: Sequence[float] = (12, 25, 50, 100)
     kinds: Sequence[str] = tuple(RATES_HZ)
     """Kinds of messages, with one topic in each run."""
-    factor: float = 2.0
-    """Ratio to the nominal latency up to which a latency counts as nominal."""
     silence_s: float = 0.0
     """Silence after the link's return, as TCP may wait for its next retransmission."""
 
@@ -61,8 +61,6 @@ class Reproduction(CloudFigure):
         super().__post_init__()
         if not self.kinds or isinstance(self.kinds, str) or not set(self.kinds) <= set(RATES_HZ):
             raise BufgymError(f"kinds = {self.kinds!r}: must be some of {', '.join(RATES_HZ)}")
-        if self.factor <= 1:
-            raise BufgymError(f"factor = {self.factor!r}: must be above 1")
 
     @played_once
     def run(self, kind: str, mbit: float, dropout_s: float, name: str, seed: int) -> tuple[float, Sent]:
@@ -81,7 +79,7 @@ class Reproduction(CloudFigure):
         ):
             away_s, sent = self.run(kind, mbit, dropout_s, name, seed)
             key = {"message": kind, "link_mbit_per_s": mbit, "dropout_s": dropout_s, "run": seed, "sender": name}
-            rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, self.factor)})
+            rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, FACTOR)})
         return rows
 
     def claims(self, rows: Rows) -> dict[str, Any]:
@@ -97,6 +95,7 @@ class Reproduction(CloudFigure):
         }
         return {
             "paper_ratio": PAPER_RATIO,
+            "factor": FACTOR,
             "about_from": ABOUT[0],
             "about_to": ABOUT[1],
             "watched": WATCHED,

@@ -8,7 +8,7 @@ import pytest
 
 from bufgym.papers import afr_fig7, afr_fig8, afr_overlap, frame_tasks
 from bufgym.papers.correlation import spearman, spearman_over
-from bufgym.papers.frame_tasks import Task, carry_out
+from bufgym.papers.frame_tasks import FrameTask, carry_out
 from bufgym.papers.rows import Rows
 from bufgym.traces import Trace
 
@@ -25,7 +25,7 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path, monkeypatch: pytest.
             return {"rmse_mm": float(len(about))}
 
     monkeypatch.setattr(frame_tasks, "stage", lambda *place: Counted())
-    one, two, three = (Task("map", "room", 40, kept) for kept in ((0, 1), (0, 1, 2), (0, 5, 6)))
+    one, two, three = (FrameTask("map", "room", 40, kept) for kept in ((0, 1), (0, 1, 2), (0, 5, 6)))
     found = carry_out([one, one, two], None, LINK, tmp_path, 1)
     assert found == {one: {"rmse_mm": 2.0}, two: {"rmse_mm": 3.0}} and len(asked) == 2
     assert carry_out([one, three], "elsewhere", LINK, tmp_path, 1)[one] == {"rmse_mm": 2.0}

@@ -6,12 +6,12 @@ import pytest
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception.frames import Camera, Depth
-from bufgym.papers.perception.mapping import COVERED_M, FAR_M, Grid, Map, fuse, grid_of, map_error
+from bufgym.papers.perception.mapping import COVERED_M, FAR_M, Map, VoxelGrid, fuse, grid_of, map_error
 from bufgym.papers.perception.tsdf import NEAR_M
 
 pytestmark = pytest.mark.kernels
 CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
-AHEAD = Grid((0.0, 0.0, 0.4), (2, 2, 12), 0.1)
+AHEAD = VoxelGrid((0.0, 0.0, 0.4), (2, 2, 12), 0.1)
 """Columns of voxels straight ahead, at 0.4, 0.5 ... 1.5 m; the truncation is 0.3 m."""
 
 
@@ -45,7 +45,7 @@ def test_flat_walls_as_worked_by_hand() -> None:
 
 
 def slow_integrate(
-    grid: Grid, depth: Depth, camera: Camera, pose: np.ndarray, tsdf: np.ndarray, weight: np.ndarray
+    grid: VoxelGrid, depth: Depth, camera: Camera, pose: np.ndarray, tsdf: np.ndarray, weight: np.ndarray
 ) -> None:
     """Every voxel asks the pixel that sees it how far the surface is behind it."""
     to_camera = np.linalg.inv(pose)
@@ -73,7 +73,7 @@ def test_the_kernels_do_what_their_twins_do(seed: int) -> None:
     pose[:3, :3] *= np.linalg.det(pose[:3, :3])
     pose[:3, 3] = rng.normal(size=3) * 0.3
     depth = rng.uniform(0.2, 1.5, (6, 8)).astype(np.float32)
-    grid = Grid((-0.8, -0.8, -0.8), (9, 8, 7), 0.2)
+    grid = VoxelGrid((-0.8, -0.8, -0.8), (9, 8, 7), 0.2)
     found, slow = Map.empty(grid), Map.empty(grid)
     for _ in range(2):
         found.add(depth, CAMERA, pose)
@@ -91,7 +91,7 @@ def test_the_error_of_a_shifted_plane() -> None:
     assert far.rmse_m == pytest.approx(0.06, abs=1e-5)
     assert (near.uncovered, far.uncovered) == (0, 1) and COVERED_M < 0.06
     # Half the wall was never seen: nothing that is there is wrong.
-    grid = Grid((-0.5, -0.2, 0.4), (11, 5, 12), 0.1)
+    grid = VoxelGrid((-0.5, -0.2, 0.4), (11, 5, 12), 0.1)
     half = wall(1.0)
     half.depth(0)[:, 4:] = 0
     found = map_error(fuse(half, [0], grid), fuse(wall(1.0), [0], grid))
@@ -102,7 +102,7 @@ def test_the_error_of_a_shifted_plane() -> None:
 
 def test_errors() -> None:
     for make, says in (
-        (lambda: Grid((0.0, 0.0, 0.0), (1000, 1000, 1000)), "grid of 1000 x 1000 x 1000 voxels"),
+        (lambda: VoxelGrid((0.0, 0.0, 0.0), (1000, 1000, 1000)), "grid of 1000 x 1000 x 1000 voxels"),
         (lambda: grid_of(wall(0.0)), "held: no frame holds a depth"),
         (lambda: map_error(Map.empty(AHEAD), fuse(wall(1.0), [0], AHEAD)), "the map holds no surface"),
     ):

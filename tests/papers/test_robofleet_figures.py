@@ -71,15 +71,6 @@ def test_copies_follow_one_another_and_a_link_that_stays_away_is_never_recovered
         recovery_s(sent, 0.01, 2.05, 2)
 
 
-def test_what_became_of_messages_is_told_apart() -> None:
-    received_s = np.array([0.5, np.nan, 3.5, 3.2])
-    sent = Sent(np.array([0, 1, 0, 1]), np.zeros(4, int), np.arange(4.0), received_s)
-    assert sent.received.arrival_s.tolist() == [0.0, 3.0, 2.0]  # in the order of receipt
-    assert sent.on(0).received.latency_s.tolist() == [0.5, 1.5]
-    assert len(sent.between(1, 3)) == 2
-    assert sent.received_hz(2) == 0.5
-
-
 def test_sizes_are_table1s() -> None:
     assert all(BYTES[kind] == PAPER[kind] for kind in set(BYTES) & set(PAPER))
     pytest.importorskip("rosbags")

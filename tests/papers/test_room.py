@@ -7,7 +7,7 @@ import pytest
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import rays
 from bufgym.papers.perception.rays import BASELINE_M
-from bufgym.papers.perception.room import FREE_M, Room, Scene, made_up_room
+from bufgym.papers.perception.room import FREE_M, Furniture, MadeUpRoom, made_up_room
 
 # In the middle of a room of 6 x 4 x 2 m, looking along +x: z of the camera is the world's x, x its -y, y its -z.
 LOOKING = np.array([[0.0, 0, 1, 3], [-1, 0, 0, 2], [0, -1, 0, 1], [0, 0, 0, 1]])
@@ -16,10 +16,10 @@ SMALL = 20
 """32 x 24 pixels."""
 
 
-def scene(*things: list[float], balls: int | None = None, stride: int = SMALL) -> Room:
+def scene(*things: list[float], balls: int | None = None, stride: int = SMALL) -> MadeUpRoom:
     all_things = np.array(EMPTY + list(things))
-    where = Scene(all_things, len(all_things) if balls is None else balls)
-    return Room("test", where, np.array([0], np.int64), LOOKING[None], 3, stride)
+    where = Furniture(all_things, len(all_things) if balls is None else balls)
+    return MadeUpRoom("test", where, np.array([0], np.int64), LOOKING[None], 3, stride)
 
 
 def test_a_wall_ahead_is_three_metres_away_in_every_pixel() -> None:

@@ -9,8 +9,8 @@ import pytest
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import icp, tracking
 from bufgym.papers.perception.frames import Camera, Sequence
-from bufgym.papers.perception.mapping import Grid, Map, fuse
-from bufgym.papers.perception.room import Room, made_up_room
+from bufgym.papers.perception.mapping import Map, VoxelGrid, fuse
+from bufgym.papers.perception.room import MadeUpRoom, made_up_room
 from bufgym.papers.perception.tracking import Tracker, difference, smoothed, track
 from bufgym.papers.perception.tsdf import raycast
 
@@ -62,7 +62,7 @@ def test_the_normal_equations_of_a_wall_that_is_five_centimetres_off() -> None:
 def test_the_model_is_seen_where_it_is() -> None:
     """A wall at 1 m, fused, then looked at from 20 cm behind; with and without a hint where it is."""
     sequence = frame_cases.Held(CAMERA, [np.full((6, 8), 1.0, np.float32)], [np.eye(4)])
-    grid = Grid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
+    grid = VoxelGrid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
     found = fuse(sequence, [0], grid)
     behind = np.eye(4)
     behind[2, 3] = -0.2
@@ -85,9 +85,9 @@ def test_a_known_movement_is_found_again() -> None:
     moved[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     moved[:3, 3] = 0.03, 0.02, 0.01
     poses = np.stack([still.poses[0], still.poses[0] @ moved])
-    sequence = Room("moved", still.scene, still.time_us, poses, 0, stride=4)
+    sequence = MadeUpRoom("moved", still.scene, still.time_us, poses, 0, stride=4)
     depths = [sequence.true_depth(k) for k in range(2)]
-    grid = Grid((-0.2, -0.2, -0.2), (136, 116, 76))
+    grid = VoxelGrid((-0.2, -0.2, -0.2), (136, 116, 76))
     tracker = Tracker(sequence.camera, grid)
     tracker.add(depths[0], poses[0])
     pose = tracker.follow(depths[1])
@@ -116,7 +116,7 @@ def test_it_follows_every_frame_and_fails_at_a_gap(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.kernels
 def test_a_single_wall_leaves_the_way_along_it_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    grid = Grid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
+    grid = VoxelGrid((-1.2, -0.9, 0.0), (49, 37, 28), 0.05)
     monkeypatch.setattr(tracking, "APART_M", 10.0)
     monkeypatch.setattr(tracking, "LEAST_PAIRS", 0.0)
     tracker = Tracker(CAMERA, grid)

@@ -36,7 +36,7 @@ _BOX_STRIDE: Final = 8
 
 
 @dataclass(frozen=True)
-class Grid:
+class VoxelGrid:
     """Positions of the voxels.
 
     Raises:
@@ -61,8 +61,8 @@ class Grid:
         return TRUNCATION_VOXELS * self.voxel_m
 
 
-def grid_of(sequence: Sequence) -> Grid:
-    """Grid of the box around all points of a recording, with a margin of the truncation."""
+def grid_of(sequence: Sequence) -> VoxelGrid:
+    """VoxelGrid of the box around all points of a recording, with a margin of the truncation."""
     stride = _BOX_STRIDE if min(sequence.camera.width, sequence.camera.height) >= 4 * _BOX_STRIDE else 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for k in range(0, len(sequence), _BOX_STRIDE):
@@ -75,7 +75,7 @@ def grid_of(sequence: Sequence) -> Grid:
     margin = TRUNCATION_VOXELS * VOXEL_M
     count = np.ceil((high - low + 2 * margin) / VOXEL_M).astype(int) + 1
     x, y, z = (low - margin).tolist()
-    return Grid((x, y, z), (int(count[0]), int(count[1]), int(count[2])))
+    return VoxelGrid((x, y, z), (int(count[0]), int(count[1]), int(count[2])))
 
 
 def points_of(
@@ -92,14 +92,14 @@ def points_of(
 class Map:
     """A truncated signed distance function."""
 
-    grid: Grid
+    grid: VoxelGrid
     tsdf: npt.NDArray[np.float32]
     """float32[grid.shape], -1..1, in units of the truncation."""
     weight: npt.NDArray[np.float32]
     """float32[grid.shape], number of frames averaged in each voxel."""
 
     @staticmethod
-    def empty(grid: Grid) -> Map:
+    def empty(grid: VoxelGrid) -> Map:
         """Make an empty map."""
         return Map(grid, np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32))
 
@@ -116,7 +116,7 @@ class Map:
         return np.array(self.grid.origin_m) + self.grid.voxel_m * tsdf.surface(self.tsdf, self.weight)
 
 
-def fuse(sequence: Sequence, frames: Iterable[int], grid: Grid | None = None) -> Map:
+def fuse(sequence: Sequence, frames: Iterable[int], grid: VoxelGrid | None = None) -> Map:
     """Fuse these frames into a map, in the given order with their true poses.
 
     Args:

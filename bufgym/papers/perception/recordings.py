@@ -49,7 +49,7 @@ _ENDS: Final = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
 """First bytes of an image file -> last bytes of a complete one."""
 
 
-class Member(NamedTuple):
+class ZippedFile(NamedTuple):
     """An image file in an archive."""
 
     archive: zipfile.ZipFile
@@ -67,11 +67,11 @@ class Member(NamedTuple):
             raise BufgymError(f"{self.path}: damaged ({error})") from None
 
 
-File = Path | Member
+File = Path | ZippedFile
 
 
 @dataclass(eq=False)
-class Recording(Sequence):
+class ImageFiles(Sequence):
     """Frames in image files of their own."""
 
     name: str
@@ -98,7 +98,7 @@ class Recording(Sequence):
         return image
 
     def _decoded(self, file: File) -> np.ndarray:
-        data = file.content() if isinstance(file, Member) else read_whole(file, _MOST_IMAGE_BYTES)
+        data = file.content() if isinstance(file, ZippedFile) else read_whole(file, _MOST_IMAGE_BYTES)
         end = next((end for begin, end in _ENDS.items() if data.startswith(begin)), None)
         if end is None:
             raise BufgymError(f"{_named(file)}: must be a PNG or JPEG image")
@@ -115,7 +115,7 @@ class Recording(Sequence):
 
 
 def _named(file: File) -> Path:
-    return file.path if isinstance(file, Member) else file
+    return file.path if isinstance(file, ZippedFile) else file
 
 
 def open_sequence(path: str | PathLike[str]) -> Sequence:
@@ -132,7 +132,7 @@ def open_sequence(path: str | PathLike[str]) -> Sequence:
     if poses := sorted(folder.glob("frame-*.pose.txt")):
         matrix = np.stack([_pose(file, read_utf8(file, _MOST_TEXT_BYTES)) for file in poses])
         depths, images = ([Path(f"{str(p).removesuffix('pose.txt')}{kind}.png") for p in poses] for kind in _KINDS)
-        return Recording(folder.name, SEVEN_SCENES_CAMERA, _at_30_hz(len(poses)), matrix, depths, images)
+        return ImageFiles(folder.name, SEVEN_SCENES_CAMERA, _at_30_hz(len(poses)), matrix, depths, images)
     if archives := sorted(folder.glob("depth_*_mm.zip")):
         return _packed(folder, archives[0])
     rule = "holds no recording: must hold depth.txt (TUM), frame-*.pose.txt (7-Scenes) or depth_*_mm.zip"
@@ -157,9 +157,9 @@ def _packed(folder: Path, depth: Path) -> Sequence:
             raise BufgymError(f"{path}: no such file") from None
         except (zipfile.BadZipFile, OSError) as error:
             raise BufgymError(f"{path}: truncated, or no zip archive ({error})") from None
-        files.append([Member(archive, path / f"{k:04d}.{kind}") for k in range(len(lines))])
+        files.append([ZippedFile(archive, path / f"{k:04d}.{kind}") for k in range(len(lines))])
     depths, images = files
-    return Recording(folder.name, camera, _at_30_hz(len(lines)), poses, depths, images)
+    return ImageFiles(folder.name, camera, _at_30_hz(len(lines)), poses, depths, images)
 
 
 def _tum(folder: Path) -> Sequence:
@@ -179,7 +179,7 @@ def _tum(folder: Path) -> Sequence:
     chosen = np.flatnonzero(kept)
     files = [folder / depths[k] for k in chosen], [folder / images[nearest[k]] for k in chosen]
     time_us, matrix = depth_us[kept] - depth_us[kept][0], matrices(poses.at(depth_us[kept] - start_us))
-    return Recording(folder.name, TUM_CAMERA, time_us, matrix, *files, TUM_UNITS_PER_M)
+    return ImageFiles(folder.name, TUM_CAMERA, time_us, matrix, *files, TUM_UNITS_PER_M)
 
 
 def _listed(path: Path) -> tuple[Int64Array, list[str]]:

@@ -39,7 +39,7 @@ _TRIES: Final = 60
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Furniture:
     """Walls and furniture of a room. The floor is z = 0 and one corner is the origin."""
 
     things: Float64Array
@@ -49,11 +49,11 @@ class Scene:
     """Index of the first ball."""
 
 
-class Room(Sequence):
+class MadeUpRoom(Sequence):
     """The recording of a made-up room."""
 
     def __init__(
-        self, name: str, scene: Scene, time_us: Int64Array, poses: Float64Array, seed: int, stride: int = 1
+        self, name: str, scene: Furniture, time_us: Int64Array, poses: Float64Array, seed: int, stride: int = 1
     ) -> None:
         """``seed`` is of noise and texture; every ``stride``-th pixel of every ``stride``-th row is rendered."""
         self.name, self.scene, self.time_us, self.poses = name, scene, time_us, poses
@@ -84,14 +84,14 @@ class Room(Sequence):
 
     def reduced(self, stride: int) -> Sequence:
         self.camera.every(stride)  # checks it
-        return Room(self.name, self.scene, self.time_us, self.poses, self._seed, self._stride * stride)
+        return MadeUpRoom(self.name, self.scene, self.time_us, self.poses, self._seed, self._stride * stride)
 
     def size_bytes(self, k: int) -> int:
-        whole = Room(self.name, self.scene, self.time_us, self.poses, self._seed)
+        whole = MadeUpRoom(self.name, self.scene, self.time_us, self.poses, self._seed)
         return encoded_bytes(*whole.rendered(k))
 
 
-def made_up_room(seed: int, *, frames: int = 794) -> Room:
+def made_up_room(seed: int, *, frames: int = 794) -> MadeUpRoom:
     """Make a recording of a made-up room, 640x480; `Sequence.reduced` renders fewer pixels.
 
     Args:
@@ -106,7 +106,7 @@ def made_up_room(seed: int, *, frames: int = 794) -> Room:
     rng = stream(seed)
     time_us = np.rint(np.arange(frames) * (US_PER_S / SEVEN_SCENES_HZ)).astype(np.int64)
     poses = _walk(time_us)
-    return Room(f"room-{seed}", furnished(rng, poses[:, :3, 3]), time_us, poses, seed)
+    return MadeUpRoom(f"room-{seed}", furnished(rng, poses[:, :3, 3]), time_us, poses, seed)
 
 
 def _walk(time_us: Int64Array) -> Float64Array:
@@ -138,7 +138,7 @@ def _walk(time_us: Int64Array) -> Float64Array:
     return matrices(at.at(np.rint(nearest * US_PER_S).astype(np.int64)))
 
 
-def furnished(rng: np.random.Generator, way: Float64Array) -> Scene:
+def furnished(rng: np.random.Generator, way: Float64Array) -> Furniture:
     """Draw furniture along walls and on the floor, and pictures and balls above; ``way`` float64[n, 3] stays free."""
     size_m = np.array(SIZE_M)
     boxes = [np.array([*size_m / 2, *size_m / 2, 1.0, 0.0])]
@@ -153,7 +153,7 @@ def furnished(rng: np.random.Generator, way: Float64Array) -> Scene:
             if not near.any():
                 (balls if ball else boxes).append(thing)
                 break
-    return Scene(np.array(boxes + balls), len(boxes))
+    return Furniture(np.array(boxes + balls), len(boxes))
 
 
 def _box(rng: np.random.Generator, size_m: Float64Array, n: int) -> Float64Array:

@@ -32,8 +32,8 @@ class Stage:
         self.small = self.sequence.reduced(WIDTH // VIEW_WIDTH).loaded()
 
     @cached_property
-    def grid(self) -> mapping.Grid:
-        """Grid of every map."""
+    def grid(self) -> mapping.VoxelGrid:
+        """VoxelGrid of every map."""
         return mapping.grid_of(self.sequence)
 
     @cached_property

@@ -21,7 +21,7 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import icp, tsdf
 from bufgym.papers.perception.frames import Camera, Depth, Sequence
-from bufgym.papers.perception.mapping import FAR_M, Grid, Map, grid_of
+from bufgym.papers.perception.mapping import FAR_M, Map, VoxelGrid, grid_of
 from bufgym.traces.poses import rotations
 from bufgym.traces.trace import Float64Array
 
@@ -78,7 +78,7 @@ def smoothed(depth: Depth) -> Depth:
 def track(
     sequence: Sequence,
     frames: Iterable[int],
-    grid: Grid | None = None,
+    grid: VoxelGrid | None = None,
     smooth: Callable[[int], Depth] | None = None,
 ) -> Track:
     """Follow the camera through the frames that arrived, until that fails.
@@ -125,7 +125,7 @@ def difference(pose: Float64Array, truth: Float64Array) -> tuple[float, float]:
 class Tracker:
     """A growing model and the camera's pose in it."""
 
-    def __init__(self, camera: Camera, grid: Grid) -> None:
+    def __init__(self, camera: Camera, grid: VoxelGrid) -> None:
         self.model = Map.empty(grid)
         self.pose = np.eye(4)
         self._camera, self._lens = camera, camera.lens
