@@ -48,8 +48,6 @@ LOOKS = {
 COUNTED_HZ = 10.0
 SPIKE = 2.0
 """Ratio to a topic's highest latency before the zone; the topic is affected until its last latency beyond that."""
-KEPT = 2.0
-"""Ratio up to which a median latency counts as kept in the zone, after allowing for slower transmission."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,6 @@ class Reproduction(ClientFigure):
             "from_s": self.zone_s[0],
             "topics": "; ".join(_rules_of(kind) for kind in TOPICS),
             "demand": sum(BYTES[kind][1] * hz for kind, (hz, _) in TOPICS.items()) / MBIT,
-            "kept": KEPT,
             "shown": self.shown,
             "native_lost": native.mean("lost_in_zone") / native.mean("arrived_in_zone"),
             "pose_mbit": BYTES["PoseStamped"][0] * TOPICS["PoseStamped"][0] / MBIT,
