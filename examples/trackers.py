@@ -3,7 +3,7 @@
     pip install small_gicp
     python examples/trackers.py [--recording FOLDER] [--frames 600] [--every 1 2 4 6 8 10]
 
-All follow the rule of `bufgym.papers.perception.tracking`: a tracker is lost at the first step that is more than
+All follow the rule of `bufgym.papers.perception.track`: a tracker is lost at the first step that is more than
 10 cm or 5 degrees off, or that it refuses. FOLDER is any that `open_sequence` reads; by default the made-up room.
 """
 
@@ -17,10 +17,16 @@ import cv2
 import numpy as np
 import small_gicp
 
-from bufgym.papers.perception.frames import Sequence, open_sequence
-from bufgym.papers.perception.mapping import grid_of, points_of
-from bufgym.papers.perception.room import room
-from bufgym.papers.perception.tracking import Tracker, TrackingSettings, difference
+from bufgym.papers.perception import (
+    Sequence,
+    Tracker,
+    difference,
+    grid_of,
+    jumped,
+    made_up_room,
+    open_sequence,
+    points_of,
+)
 
 WIDTH = 160
 Follow = Callable[[np.ndarray], "np.ndarray | None"]
@@ -30,7 +36,7 @@ Follow = Callable[[np.ndarray], "np.ndarray | None"]
 def ours(sequence: Sequence, depth: np.ndarray, pose: np.ndarray) -> Follow:
     """Track frame to model on a voxel grid."""
     tracker = Tracker(sequence.camera, grid_of(sequence))
-    tracker.begin(depth, pose)
+    tracker.add(depth, pose)
     return tracker.follow
 
 
@@ -87,9 +93,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=600, help="the first so many")
     parser.add_argument("--every", type=int, nargs="+", default=[1, 2, 4, 6, 8, 10], help="keep every n-th")
     options = parser.parse_args()
-    whole = open_sequence(options.recording) if options.recording else room(0)
-    count = min(options.frames, len(whole))
-    sequence = whole.reduced(whole.camera.width // WIDTH).loaded(range(count))
+    whole = open_sequence(options.recording) if options.recording else made_up_room(0)
+    sequence = whole.first(options.frames).reduced(whole.camera.width // WIDTH).loaded()
+    count = len(sequence)
     print(f"{whole.name}, {count} frames; frames followed before it is lost (of), drift at the end, ms a frame")
     for every in options.every:
         for name, start in TRACKERS.items():
@@ -98,7 +104,6 @@ def main() -> None:
 
 def row(sequence: Sequence, frames: list[int], start: Callable[..., Follow]) -> str:
     """One tracker's line."""
-    settings = TrackingSettings()
     before, true_before = sequence.poses[frames[0]], sequence.poses[frames[0]]
     follow = start(sequence, sequence.depth(frames[0]), before)
     done, took_s, drift_m = 1, 0.0, 0.0
@@ -109,8 +114,7 @@ def row(sequence: Sequence, frames: list[int], start: Callable[..., Follow]) -> 
         if pose is None:
             break
         truth = sequence.poses[k]
-        off_m, off_deg = difference(np.linalg.inv(before) @ pose, np.linalg.inv(true_before) @ truth)
-        if off_m > settings.most_error_m or off_deg > settings.most_error_deg:
+        if jumped(before, pose, true_before, truth):
             break
         before, true_before, done = pose, truth, done + 1
         drift_m = difference(pose, truth)[0]

@@ -20,6 +20,8 @@ from bufgym.ground.errors import BufgymError
 from bufgym.papers.figure import Figure, report, save_picture, statements
 from bufgym.papers.rows import Rows
 
+__all__ = ["FIGURES", "NEEDS_DATA", "TAKES_DATA", "figure", "run", "run_live"]
+
 FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items() if "title" in texts}
 """Name of a figure -> its title."""
 
@@ -29,12 +31,12 @@ NEEDS_DATA: dict[str, str] = {name: texts["needs"] for name, texts in statements
 TAKES_DATA = (*NEEDS_DATA, *(name for name, texts in statements().items() if "data" in texts))
 """Figures with an option ``data``, whether they need it or only show more with it."""
 
-STORE = "frame-runs.jsonl"
-"""File of finished runs on frames. Each run takes minutes; figures share them, and they survive a kill."""
+STORE = "frame-runs"
+"""Folder of finished runs on frames. Each run takes minutes; figures share them, and they survive a kill."""
 
 
-def figure(name: str, **options: Any) -> Figure:
-    """Make the figure ``name`` with these options.
+def figure(name: str, out: Path | None = None, **options: Any) -> Figure:
+    """Make the figure ``name`` with these options; a figure on frames keeps its finished runs in the folder ``out``.
 
     Raises:
         BufgymError: an unknown name or option, or an option's value that cannot be used.
@@ -44,6 +46,8 @@ def figure(name: str, **options: Any) -> Figure:
     for option in options:
         if option not in known:
             raise BufgymError(f"{name}: no option {option!r}; it has: {', '.join(known)}")
+    if out is not None and "store" in known:
+        options.setdefault("store", out / STORE)
     reproduction: Figure = kind(**options)
     return reproduction
 
@@ -54,14 +58,6 @@ def _kind(name: str) -> Any:
     return importlib.import_module(f"bufgym.papers.{name.replace('-', '_')}").Reproduction
 
 
-def kept_under(out: Path | None, name: str, **options: Any) -> Figure:
-    """Make the figure ``name``; a figure on frames keeps its finished runs in the folder ``out``."""
-    made = figure(name, **options)
-    if out is not None and getattr(made, "store", out) is None:
-        return figure(name, **options, store=out / STORE)
-    return made
-
-
 def run(name: str, out: Path | None = None, **options: Any) -> str:
     """Reproduce one figure; return a text that compares our numbers with the paper's.
 
@@ -70,10 +66,9 @@ def run(name: str, out: Path | None = None, **options: Any) -> str:
         out: folder for ``<name>.csv`` and ``<name>.png``, made if absent; None saves nothing.
         options: fields of that figure's ``Reproduction``, such as ``runs`` for afr-fig5.
     """
-    reproduction = kept_under(out, name, **options)
+    reproduction = figure(name, out, **options)
     rows = reproduction.simulate()
-    lines = report(name, reproduction, rows)
-    return "\n".join([*lines, *_saved(reproduction, rows, out, name)])
+    return "\n".join([*report(name, reproduction, rows), *_saved(reproduction, rows, out, name)])
 
 
 def _saved(reproduction: Figure, rows: Rows, out: Path | None, stem: str) -> Iterator[str]:

@@ -9,7 +9,7 @@ The paper does not state the size of a frame. A size of about 160 kB reproduces 
 
 The ten runs differ in three ways: where in the camera's recording they begin, the jitter of each frame within a tenth
 of its period, and the uniform draws of Random. Every policy meets the same ten runs. In all of them the link begins at
-the trace's start. Frames have equal sizes by default, because the clairvoyant is exact only for equal sizes.
+the trace's start. Frames have equal sizes, because the clairvoyant is exact only for equal sizes.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +26,9 @@ from numpy.typing import NDArray
 from bufgym import policies, traces
 from bufgym.benchmark.run import run
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.figure import COLOURS, Figure, at_least_0, several, whole
+from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.rows import Rows
 from bufgym.scenario import Uplink
-from bufgym.scenario.checks import above_0
 from bufgym.scenario.suites import CAPACITIES, RATE_HZ, motion_value, time_value
 from bufgym.traces import Motion, Trace
 
@@ -54,18 +54,17 @@ STYLES = {
     "min-motion-gap": ("min-motion-gap (not in the paper)", COLOURS["orange"], "v"),
 }
 """Policy -> label, colour, marker."""
+COLUMNS = {"L": "capacity", "policy": "policy", "run": "seed", "H": "qoi", "H_clairvoyant": "clairvoyant"}
+COLUMNS |= {"regret": "regret", "longest_gap_views": "longest_gap", "longest_gap_s": "longest_gap_s"}
+"""Column of the figures -> column of the benchmark's rows."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """Scenario that the policies meet in one part of a figure."""
+class StreamSetting(NamedTuple):
+    """Scenario that the policies meet in one part of a figure; the camera is "time" where x is the frame index."""
 
     camera: str
-    """Name of the recording; "time" where x is the frame index."""
     size_kb: float
-    """Size of a frame, kB."""
     uplink: Uplink
-    """Uplink scenario."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ class LinkFigure(Figure):
     frames: int = PAPER_FRAMES
     size_bytes: int = FRAME_BYTES
 
-    RULES = {"frames": whole(2), "size_bytes": whole()}
+    RULES = {"frames": whole(2)}
 
     @cached_property
     def link(self) -> Trace:
@@ -106,14 +105,10 @@ class StreamFigure(LinkFigure):
 
     motion: str | Sequence[str] = CAMERAS
     """TUM RGB-D sequences in ``data`` (tum_rgbd/*.groundtruth.txt.gz), shipped motions or files."""
-    size_cv: float = 0.0
-    """Coefficient of variation of the frame sizes. Above 0 the clairvoyant is only an upper bound."""
     capacities: Sequence[int] = CAPACITIES
     runs: int = PAPER_RUNS
     sweep_kb: Sequence[float] = SWEEP_KB
     """Further frame sizes, kB."""
-
-    RULES = {"size_cv": at_least_0, "sweep_kb": several(above_0)}
 
     @cached_property
     def cameras(self) -> list[Motion]:
@@ -125,7 +120,7 @@ class StreamFigure(LinkFigure):
         """Size of a frame in the main part of the figure, kB."""
         return self.size_bytes / 1000
 
-    def settings(self, *, timed: bool) -> list[Setting]:
+    def settings(self, *, timed: bool) -> list[StreamSetting]:
         """List every frame size with every camera, and with time-based QoI if ``timed``."""
         settings = []
         for size_kb in sorted({self.size_kb, *self.sweep_kb}):
@@ -134,48 +129,35 @@ class StreamFigure(LinkFigure):
                 rate_hz=RATE_HZ,
                 jitter=JITTER,
                 size_bytes=round(1000 * size_kb),
-                size_cv=self.size_cv,
+                size_cv=0.0,
                 duration_s=self.frames / RATE_HZ,
                 link_offset_s=(0.0, 0.0),
                 value=time_value(),
             )
             for camera in self.cameras:
                 moving = replace(uplink, motion=(camera,), value=motion_value())
-                settings.append(Setting(camera.name, size_kb, moving))
+                settings.append(StreamSetting(camera.name, size_kb, moving))
             if timed:
-                settings.append(Setting("time", size_kb, uplink))
+                settings.append(StreamSetting("time", size_kb, uplink))
         return settings
 
-    def play(self, settings: Sequence[Setting], runs: int, *, bound: bool) -> Rows:
+    def play(self, settings: Sequence[StreamSetting], runs: int, *, bound: bool) -> Rows:
         """Return a row for each setting, policy and run; ``bound`` adds the clairvoyant's H and the regret."""
         chosen = [policies.get(name) for name in STYLES]
         rows = Rows()
         for setting in settings:
             for row in run(chosen, setting.uplink, self.capacities, runs, bound=bound):
-                rows.append(
-                    {
-                        "size_kb": setting.size_kb,
-                        "camera": setting.camera,
-                        "L": row["capacity"],
-                        "policy": row["policy"],
-                        "run": row["seed"],
-                        "H": row["qoi"],
-                        "H_clairvoyant": row["clairvoyant"],
-                        "regret": row["regret"],
-                        "longest_gap_views": row["longest_gap"],
-                        "longest_gap_s": row["longest_gap_s"],
-                    }
-                )
+                found = {column: row[name] for column, name in COLUMNS.items()}
+                rows.append({"size_kb": setting.size_kb, "camera": setting.camera, **found})
         return rows
 
     def about(self) -> str:
         """Describe the scenario in sentences."""
-        sizes = "equal in size" if self.size_cv == 0 else f"sizes with cv {self.size_cv:g} (regret is an upper bound)"
         return (
-            f"{self.frames} frames of {self.size_bytes / 1000:g} kB at {RATE_HZ:g} Hz, {sizes}, over {self.link.name} "
-            f"from its start: it carries {self.share_carried():.0%} of the demand. {self.runs} runs each, which differ "
-            f"by their start on the camera's recording, by arrival jitter (up to {JITTER:.0%} of a period), and by "
-            "Random's uniform draws."
+            f"{self.frames} frames of {self.size_bytes / 1000:g} kB at {RATE_HZ:g} Hz, equal in size, over "
+            f"{self.link.name} from its start: it carries {self.share_carried():.0%} of the demand. {self.runs} runs "
+            f"each, which differ by their start on the camera's recording, by arrival jitter (up to {JITTER:.0%} of a "
+            "period), and by Random's uniform draws."
         )
 
 

@@ -29,7 +29,7 @@ class Reproduction(Figure):
     seed: int = 0
     """Seed of Random's draws."""
 
-    RULES = {"capacity": whole(), "last_T": whole(2), "seed": whole(0)}
+    RULES = {"last_T": whole(2)}
     SIZE_INCHES = (10.0, 4.2)
 
     def simulate(self) -> Rows:

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
-from bufgym.papers.figure import COLOURS, Figure, legend_below, whole
+from bufgym.papers.figure import COLOURS, Figure, legend_below
 from bufgym.papers.rows import Rows
-from bufgym.scenario.checks import above_0
 
 VIEW_ANGLE = math.radians(60)
 """The camera's field of view."""
@@ -33,7 +32,7 @@ MESSAGES = 20
 
 
 @dataclass(frozen=True)
-class Motion:
+class CameraMotion:
     """One motion of the camera."""
 
     label: str
@@ -69,10 +68,9 @@ class GeometryFigure(Figure):
     wall_m: float = 1.5
     """Distance to the corridor's side wall, and to the other wall at the start."""
 
-    RULES = {"base": above_0, "turn_degrees": above_0, "step_m": above_0, "wall_m": above_0}
     SIZE_INCHES = (10.0, 3.9)
 
-    def motions(self) -> dict[str, Motion]:
+    def motions(self) -> dict[str, CameraMotion]:
         """Map a column name to its motion."""
         half, width = math.tan(VIEW_ANGLE / 2), 2 * self.wall_m * math.tan(VIEW_ANGLE / 2)
         turn = math.radians(self.turn_degrees)
@@ -82,14 +80,14 @@ class GeometryFigure(Figure):
             return -edge, edge
 
         return {
-            "wall": Motion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
-            "turn": Motion(
+            "wall": CameraMotion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
+            "turn": CameraMotion(
                 "turning in place",
                 lambda k: (k * turn - VIEW_ANGLE / 2, k * turn + VIEW_ANGLE / 2),
                 1,
                 qoi.saturating(VIEW_ANGLE / turn),
             ),
-            "corridor": Motion(
+            "corridor": CameraMotion(
                 "along a corridor, looking at its side",
                 lambda k: (k * self.step_m - width / 2, k * self.step_m + width / 2),
                 1,
@@ -120,28 +118,19 @@ class Reproduction(GeometryFigure):
     shown: int = 4
     """Number of messages drawn."""
 
-    RULES = {"shown": whole()}
-
     def draw(self, rows: Rows, figure: Any) -> None:
         panels = figure.subplots(1, 3)
-        colours = [COLOURS[name] for name in ("afr", "random", "orange", "drop-oldest", "pink", "sky")]
-        for axes, motion in zip(panels, self.motions().values(), strict=True):
+        for axes, (name, motion) in zip(panels, self.motions().items(), strict=True):
+            for k in range(self.shown):
+                left, right = motion.view(k)
+                if name == "turn":
+                    x, y = [0, math.sin(left), math.sin(right), 0], [0, math.cos(left), math.cos(right), 0]
+                else:
+                    away = self.wall_m if name == "corridor" else right / math.tan(VIEW_ANGLE / 2)
+                    x, y = [left, (left + right) / 2, right], [0, -away, 0]
+                    axes.axhline(0, color=COLOURS["oracle"], linewidth=3)
+                axes.plot(x, y, color=list(COLOURS.values())[k % 6], linewidth=1.4, label=f"message {k}")
             axes.set_title(motion.label, loc="left", fontsize=10)
             axes.set(aspect="equal", xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
-        wall, turn, corridor = panels
-        for k in range(self.shown):
-            style = {"color": colours[k % len(colours)], "linewidth": 1.4}
-            edge = self.motions()["wall"].view(k)[1]
-            distance = edge / math.tan(VIEW_ANGLE / 2)
-            wall.plot([-edge, 0, edge], [0, -distance, 0], label=f"message {k}", **style)
-            left, right = self.motions()["turn"].view(k)
-            arc = np.linspace(left, right, 30)
-            radius = 1 + 0.06 * k
-            turn.plot([0, *(radius * np.sin(arc)), 0], [0, *(radius * np.cos(arc)), 0], **style)
-            left, right = self.motions()["corridor"].view(k)
-            corridor.plot([left, (left + right) / 2, right], [0, -self.wall_m, 0], **style)
-            corridor.plot([left, right], [0.06 * (k + 1)] * 2, **style)
-        for axes in (wall, corridor):
-            axes.axhline(0, color=COLOURS["oracle"], linewidth=3)
-        legend_below(figure, self.shown, wall)
+        legend_below(figure, self.shown, panels[0])

@@ -8,13 +8,12 @@ doubles. The counter c now rejects every second arrival, and the next pass begin
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
 from bufgym.papers.rows import Rows, table
@@ -28,28 +27,24 @@ PAPER_DROPS = {9: 1, 10: 3, 11: 5, 12: 7, 13: 9, 14: 11, 15: 13, 16: 15, 17: 17,
 """T -> the message that the figure strikes out; 17 is the newcomer itself."""
 
 
-@dataclass(frozen=True)
-class Step:
-    """AFR's decision on one arrival and its state afterwards."""
+class AfrStep(NamedTuple):
+    """AFR's decision on arrival T, counted from the link's stop, and its state afterwards: rate, counter, position.
+
+    ``dropped`` is T if the newcomer was rejected, None if nothing was dropped. ``kept`` is the queue, oldest first.
+    """
 
     T: int
-    """Number of the arrival, counted from the link's stop."""
     dropped: int | None
-    """Number of the dropped message: T if the newcomer was rejected, None if nothing was dropped."""
     r: int
-    """Dropping rate."""
     c: int
-    """Counter."""
     p: int
-    """Dropping position."""
     kept: tuple[int, ...]
-    """Numbers of the queued messages, oldest first."""
 
 
-def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[Step]:
+def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr") -> list[AfrStep]:
     """Run the simulator and return AFR's decisions 1..``last_T`` with L = ``capacity``."""
     afr = policies.get(policy)
-    watched: list[Step] = []
+    watched: list[AfrStep] = []
 
     def watch(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
         decision = afr.on_arrival(buffer, arrival, memory)
@@ -61,7 +56,7 @@ def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr"
             if decision >= 0:
                 dropped = kept.pop(decision)
             kept.append(T)
-        watched.append(Step(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
+        watched.append(AfrStep(T, dropped, int(memory[R]), int(memory[C]), int(memory[P]), tuple(kept)))
         return decision
 
     # Runs uncompiled so that the watcher sees each decision; the transition function is the same.
@@ -73,40 +68,23 @@ def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr"
 
 @dataclass(frozen=True)
 class Reproduction(Figure):
-    """Fig. 4 for L = ``capacity`` and T from L to ``last_T``; the paper has L = 8 and T from 8 to 18."""
-
-    capacity: int = PAPER_L
-    last_T: int = PAPER_T[1]
-
-    def __post_init__(self) -> None:
-        if self.last_T < self.capacity:
-            raise BufgymError(f"last_T = {self.last_T}: must be at least L = {self.capacity}")
+    """Fig. 4 for the paper's L = 8 and T from 8 to 18."""
 
     def simulate(self) -> Rows:
-        return Rows(
-            {"T": s.T, "dropped": s.dropped, "r": s.r, "c": s.c, "p": s.p, "kept": " ".join(map(str, s.kept))}
-            for s in steps(self.capacity, self.last_T)
-            if s.T >= self.capacity
-        )
-
-    @property
-    def paper_drops(self) -> dict[int, int]:
-        """Map T to the message that the paper's figure strikes out; empty for another L than the paper's."""
-        return PAPER_DROPS if self.capacity == PAPER_L else {}
+        kept = (step for step in steps() if step.T >= PAPER_L)
+        return Rows(step._asdict() | {"kept": " ".join(map(str, step.kept))} for step in kept)
 
     def tables(self, rows: Rows) -> list[str]:
         lines: list[list[object]] = [["T", "drops", "paper", "r", "c", "p", "kept"]]
         for row in rows:
             T, dropped = row["T"], row["dropped"]
             note = "  (newcomer rejected by the counter)" if dropped == T else ""
-            cells = [T, dropped or "-", self.paper_drops.get(T, "-"), row["r"], row["c"], row["p"]]
-            lines.append([*cells, row["kept"] + note])
+            lines.append([T, dropped or "-", PAPER_DROPS.get(T, "-"), row["r"], row["c"], row["p"], row["kept"] + note])
         return table(lines, left=7)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
-        drops = self.paper_drops
-        same = [row["dropped"] == drops[row["T"]] for row in rows if row["T"] in drops]
-        return {"drops": all(same) if same else None, "same": sum(same), "compared": len(same)}
+        same = [row["dropped"] == PAPER_DROPS[row["T"]] for row in rows if row["T"] in PAPER_DROPS]
+        return {"drops": all(same), "same": sum(same), "compared": len(same)}
 
     def size_inches(self, rows: Rows) -> tuple[float, float]:
         return 7.5, 0.34 * len(rows) + 1.6
@@ -119,18 +97,18 @@ class Reproduction(Figure):
             if row["dropped"] is not None:
                 cross = {"color": COLOURS["drop-oldest"], "markersize": 8, "markeredgewidth": 2}
                 axes.plot(row["dropped"], row["T"], "x", **cross)
-            state, place = "r={r} c={c} p={p}".format(**row), (self.last_T + 0.8, row["T"])
+            state, place = "r={r} c={c} p={p}".format(**row), (PAPER_T[1] + 0.8, row["T"])
             axes.annotate(state, place, va="center", fontsize=8, backgroundcolor="white")
         axes.plot([], [], "o", color=COLOURS["afr"], label="kept")
         axes.plot([], [], "x", color=COLOURS["drop-oldest"], markeredgewidth=2, label="dropped at this T")
         finish(
             axes,
-            f"AFR, L = {self.capacity}: messages kept as the interruption grows",
-            xlim=(0.3, self.last_T + 3.6),
+            f"AFR, L = {PAPER_L}: messages kept as the interruption grows",
+            xlim=(0.3, PAPER_T[1] + 3.6),
             xlabel="message",
             ylabel="T, messages since the link stopped",
-            xticks=range(1, self.last_T + 1, 1 if self.last_T <= 24 else 4),
-            yticks=[row["T"] for row in rows][:: 1 if len(rows) <= 24 else 4],
+            xticks=range(1, PAPER_T[1] + 1),
+            yticks=[row["T"] for row in rows],
         )
         axes.invert_yaxis()
         legend_below(figure, 2)

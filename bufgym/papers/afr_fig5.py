@@ -21,7 +21,7 @@ from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import Rows, listed, table
+from bufgym.papers.rows import Rows, listed
 from bufgym.scenario import Episode, Interruption
 
 PAPER_L = 8
@@ -82,7 +82,7 @@ class Reproduction(Figure):
     last_T: int = 80
     seed: int = 0
 
-    RULES = {"runs": whole(2), "last_T": whole()}
+    RULES = {"runs": whole(2)}
 
     def simulate(self) -> Rows:
         v = qoi.exponential(0.618)
@@ -107,8 +107,8 @@ class Reproduction(Figure):
 
     def tables(self, rows: Rows) -> list[str]:
         shown = sorted({1, 8, 9, 17, 18, 25, 35, 36, 50, 71, 72, self.last_T} & set(rows.distinct("T")))
-        lines = [[T, *(f"{number:.4f}" for number in list(rows[T - 1].values())[1:])] for T in shown]
-        return table([["T", *CURVES, "sd random"], *lines], left=0)
+        numbers = {name: (name, ".4f") for name in CURVES} | {"sd random": ("random_sd", ".4f")}
+        return Rows(rows[T - 1] for T in shown).listing({"T": ("T", "")} | numbers, left=0)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
         afr_mean, oldest_mean = (mean_score(policy, PAPER_L, *MEAN_OVER) for policy in ("afr", "drop-oldest"))
@@ -142,8 +142,6 @@ class Reproduction(Figure):
         peaks = equal_lengths(rows)
         heights = [rows[T - 1]["afr"] for T in peaks]
         axes.plot(peaks, heights, "o", color=COLOURS["afr"], markersize=6, label="AFR = oracle-ideal")
-        for place in zip(peaks, heights, strict=True):
-            axes.annotate(f"T = {place[0]}", place, (-5, 7), textcoords="offset points", ha="right")
         finish(
             axes,
             "Information gained in one interruption, L = 8, V(d) = 1 − 0.618$^d$",

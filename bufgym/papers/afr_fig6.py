@@ -14,7 +14,6 @@ import numpy as np
 from bufgym.papers.afr_evaluation import LinkFigure
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.rows import Rows, listed
-from bufgym.scenario.checks import above_0
 from bufgym.scenario.suites import RATE_HZ
 
 PAPER_LOW = [21, 23]
@@ -29,7 +28,6 @@ class Reproduction(LinkFigure):
 
     show_s: float = 60.0
 
-    RULES = {"show_s": above_0}
     SIZE_INCHES = (7.5, 5.2)
 
     def simulate(self) -> Rows:
@@ -85,26 +83,17 @@ class Reproduction(LinkFigure):
         }
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        near, whole = figure.subplots(2, 1, height_ratios=[2, 1])
+        panels = figure.subplots(2, 1, height_ratios=[2, 1])
         rates, edges = rows.column("bytes_per_s") / 1e6, np.append(rows.column("start_s"), rows[-1]["end_s"])
-        until_s = min(self.show_s, edges[-1])
-        dark, light = ({"color": COLOURS["drop-oldest"], "alpha": a, "linewidth": 0} for a in (0.35, 0.13))
-        light["color"] = COLOURS["other"]
-        for axes, right_s in ((near, until_s), (whole, edges[-1])):
+        for axes, until_s in zip(panels, (min(self.show_s, edges[-1]), edges[-1]), strict=True):
             axes.stairs(rates, edges, color=COLOURS["afr"], linewidth=1.2, label=self.link.name)
             demand = self.demand / 1e6
             axes.axhline(demand, color=COLOURS["drop-oldest"], linewidth=1.4, label=f"demand {demand:g} MB/s")
-            axes.axvspan(0, self.frames / RATE_HZ, label="stream", **light)
-            for row in rows.where(under_500KBps=True):
-                axes.axvspan(row["start_s"], row["end_s"], **dark)
-            top = max(rates.max(), demand)
-            finish(axes, xlim=(0, right_s), ylim=(0, 1.06 * top), ylabel="MB/s")
-        for k, row in enumerate(rows.where(under_500KBps=True, streamed=True)):
-            side, place = ("right", "start_s") if k == 0 else ("left", "end_s")
-            text = f"second {row['second']}\n{row['bytes_per_s'] / 1e3:.0f} KB/s"
-            shift = {"xytext": (-3 if k == 0 else 3, 8), "textcoords": "offset points", "fontsize": 8}
-            near.annotate(text, (row[place], demand), ha=side, **shift)
-        near.axvspan(-2, -1, label="under 500 KB/s", **dark)
-        near.set_title(f"{self.link.name}: the first {until_s:.0f} s, and all of it", loc="left", fontsize=10)
-        whole.set_xlabel("time since the trace's start, s")
-        legend_below(figure, 3, near)
+            axes.axvspan(0, self.frames / RATE_HZ, color=COLOURS["other"], alpha=0.13, linewidth=0, label="stream")
+            for k, row in enumerate(rows.where(under_500KBps=True)):
+                label = "under 500 KB/s" if k == 0 else None
+                axes.axvspan(row["start_s"], row["end_s"], color=COLOURS["drop-oldest"], alpha=0.35, label=label)
+            finish(axes, xlim=(0, until_s), ylim=(0, 1.06 * max(rates.max(), demand)), ylabel="MB/s")
+        panels[0].set_title(f"{self.link.name}: the first {self.show_s:g} s, and all of it", loc="left", fontsize=10)
+        panels[1].set_xlabel("time since the trace's start, s")
+        legend_below(figure, 4, panels[1])

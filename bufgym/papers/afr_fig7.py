@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.papers.correlation import spearman
 from bufgym.papers.figure import heat_table
-from bufgym.papers.frame_runs import POLICIES, FrameFigure, Setting
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import Rows
 
@@ -72,16 +72,17 @@ class Reproduction(FrameFigure):
             facts[key] = None
             facts |= {f"{key}_{what}": "not run" for what in ("change", "paper", "slam", "lack")}
             if {"afr", other} <= set(self.policies):
-                shown = {name: rows.where(recording=name) for name in self.recordings}
-                found = {name: change(some, "rmse_mm", "afr", other) for name, some in shown.items()}
-                first = {name: change(some.where(k=0), "rmse_mm", "afr", other) for name, some in shown.items()}
-                slam = {name: change(some, "slam_rmse_mm", "afr", other) for name, some in shown.items()}
-                lack = {name: change(some, "slam_uncovered", "afr", other) for name, some in shown.items()}
-                facts[key] = found[main].high < 0 and found[main].low <= paper
-                facts[f"{key}_change"] = "; ".join(f"{name} {spelled(i)}" for name, i in found.items())
-                facts[f"{key}_paper"] = "; ".join(f"{name} {i.value:+.1%}" for name, i in first.items())
-                facts[f"{key}_slam"] = "; ".join(f"{name} {spelled(i)}" for name, i in slam.items())
-                facts[f"{key}_lack"] = "; ".join(f"{name} {spelled(i)}" for name, i in lack.items())
+                found = change(rows.where(recording=main), "rmse_mm", "afr", other)
+                facts[key] = found.high < 0 and found.low <= paper
+                for what, column in {"change": "rmse_mm", "slam": "slam_rmse_mm", "lack": "slam_uncovered"}.items():
+                    facts[f"{key}_{what}"] = "; ".join(
+                        f"{name} {spelled(change(rows.where(recording=name), column, 'afr', other))}"
+                        for name in self.recordings
+                    )
+                facts[f"{key}_paper"] = "; ".join(
+                    f"{name} {change(rows.where(recording=name, k=0), 'rmse_mm', 'afr', other).value:+.1%}"
+                    for name in self.recordings
+                )
         if "drop-oldest" in self.policies and "afr" in self.policies:
             facts["moves"] = self.where_it_moves(rows.where(recording=main))
         return facts
@@ -91,7 +92,7 @@ class Reproduction(FrameFigure):
         moved, won = [], []
         x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
         for k in rows.distinct("k"):
-            kept = [self.kept(Setting(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
+            kept = [self.kept(FrameRun(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
             moved.append(float(np.mean([np.diff(x[list(frames)]).max() for frames in kept])))
             won.append(rows.mean("rmse_mm", k=k, policy="afr") / rows.mean("rmse_mm", k=k, policy="drop-oldest") - 1)
         return f"{spearman(np.array(moved), np.array(won)):+.2f}"
@@ -137,7 +138,7 @@ class Reproduction(FrameFigure):
             every = (on.reference if poses == "true poses" else on.tracked_reference).points()
             few = _some(len(every))
             for axes, policy in zip(line, self.shown, strict=True):
-                kept = self.kept(Setting(recording, 0, L, policy))
+                kept = self.kept(FrameRun(recording, 0, L, policy))
                 made = on.map_of(kept) if poses == "true poses" else on.track_of(kept).model
                 # Distances run from the reference's points to the map, so that missing parts stand out.
                 far_mm = np.minimum(1e3 * mapping.distances(every[few], made.points()), limit_mm)

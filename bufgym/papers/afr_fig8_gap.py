@@ -18,9 +18,8 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.afr_evaluation import STYLES, StreamFigure
-from bufgym.papers.figure import finish, legend_below, several
-from bufgym.papers.rows import Rows, table
-from bufgym.scenario.checks import above_0
+from bufgym.papers.figure import finish, legend_below
+from bufgym.papers.rows import Rows
 from bufgym.scenario.suites import RATE_HZ
 
 MORE_RUNS = 100
@@ -40,8 +39,6 @@ class Reproduction(StreamFigure):
     more_runs: int = MORE_RUNS
     """Runs of the second count; its first ``runs`` runs are the first count."""
 
-    RULES = {"threshold": above_0, "others": several(above_0)}
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.runs > self.more_runs:
@@ -59,23 +56,16 @@ class Reproduction(StreamFigure):
         return Rows(row for row in rows if row["run"] < self.runs)
 
     def tables(self, rows: Rows) -> list[str]:
-        """List failures in % per camera: the first runs by L, and all runs by threshold and frame size."""
+        """List failures in % per camera: all runs by L, and by threshold and frame size."""
         lines: list[str] = []
         for camera in rows.distinct("camera"):
-            played = rows.where(camera=camera, size_kb=self.size_kb)
-            few, half = self.first(played), float(np.median(played.column("longest_gap_views", policy="drop-oldest")))
-            sizes = rows.where(camera=camera).distinct("size_kb")
-            heads = [*self.capacities, "|", *(f"> {limit:g}" for limit in self.thresholds), "|"]
-            cells: list[list[object]] = [["L", *heads, *(f"{kb:g} kB" for kb in sizes)]]
-            for policy in STYLES:
-                rates = [f"{failures(few, self.threshold, policy=policy, L=L):.0f}" for L in self.capacities]
-                many = [f"{failures(played, limit, policy=policy):.1f}" for limit in self.thresholds]
-                swept = [rows.where(camera=camera, size_kb=kb, policy=policy) for kb in sizes]
-                cells.append(
-                    [policy, *rates, "|", *many, "|", *(f"{failures(runs, self.threshold):.1f}" for runs in swept)]
-                )
-            others = ", ".join(f"{p} {failures(played, half, policy=p):.1f} %" for p in STYLES if p != "drop-oldest")
-            lines += [camera, *table(cells), f"At {half:.2f} Drop Oldest fails in half of the runs, and {others}", ""]
+            shown, main = rows.where(camera=camera), rows.where(camera=camera, size_kb=self.size_kb)
+            for limit in self.thresholds:
+                lines += [f"{camera}, gap above {limit:g} views, by L:", *_failing(main, limit).pivot(*_BY_L), ""]
+            lines += [f"{camera}, by the size of a frame in kB:", *_failing(shown, self.threshold).pivot(*_BY_SIZE)]
+            half = float(np.median(main.column("longest_gap_views", policy="drop-oldest")))
+            others = ", ".join(f"{p} {failures(main, half, policy=p):.1f} %" for p in STYLES if p != "drop-oldest")
+            lines += [f"At {half:.2f} Drop Oldest fails in half of the runs, and {others}", ""]
         return lines[:-1]
 
     def worst(self, rows: Rows, above: int) -> float:
@@ -128,24 +118,26 @@ class Reproduction(StreamFigure):
 
     def draw(self, rows: Rows, figure: Any) -> None:
         played = rows.where(camera=self.cameras[0].name, size_kb=self.size_kb)
-        ticks = np.arange(len(self.capacities))
         panels = figure.subplots(1, len(self.thresholds), squeeze=False, sharey=True)[0]
         for axes, limit in zip(panels, self.thresholds, strict=True):
-            for k, (policy, (label, colour, marker)) in enumerate(STYLES.items()):
-                few, many = (
-                    [failures(some, limit, policy=policy, L=L) for L in self.capacities]
-                    for some in (self.first(played), played)
-                )
-                # Marks stand side by side, so that equal rates stay visible.
-                aside = ticks + 0.09 * (k - (len(STYLES) - 1) / 2)
-                axes.plot(aside, few, marker, color=colour, markersize=5, label=label)
-                axes.plot(ticks, many, color=colour, linewidth=1)
-            axes.set_xticks(ticks, [str(L) for L in self.capacities])
+            for policy, (label, colour, marker) in STYLES.items():
+                many = [failures(played, limit, policy=policy, L=L) for L in self.capacities]
+                axes.plot(self.capacities, many, marker=marker, color=colour, markersize=5, linewidth=1, label=label)
             finish(axes, f"gap above {limit:g} views", ylim=(-4, 104), xlabel="queue size L")
+            axes.set_xticks(self.capacities)
         panels[0].set_ylabel("runs that fail, %")
-        title = f"{self.cameras[0].name}, {self.size_kb:g} kB: marks {self.runs} runs, lines {self.more_runs} runs"
+        title = f"{self.cameras[0].name}, {self.size_kb:g} kB, {self.more_runs} runs"
         figure.suptitle(title, fontsize=10)
         legend_below(figure, 5, panels[0])
+
+
+_BY_L = ("policy", "L", "fails", ".1f")
+_BY_SIZE = ("policy", "size_kb", "fails", ".1f")
+
+
+def _failing(rows: Rows, threshold: float) -> Rows:
+    """Add a column with 100 for each run that fails, else 0."""
+    return Rows(row | {"fails": 100 * (row["longest_gap_views"] > threshold)} for row in rows)
 
 
 def _swept(rates: dict[float, float]) -> str:

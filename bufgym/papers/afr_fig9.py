@@ -23,7 +23,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT, compile_for, records
 from bufgym.model.buffer import ACCEPT, MESSAGE, Buffer
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import Rows, listed, table
+from bufgym.papers.rows import Rows, listed
 from bufgym.policies.registry import Policy, signatures
 from bufgym.scenario import Interruption
 
@@ -125,7 +125,7 @@ def with_images_us(decisions: int) -> tuple[float, float] | None:
     try:
         from bufgym.papers.perception import orb, room
 
-        times_ms = orb.decision_ms(room.room(0, frames=decisions + orb.COMPARED), decisions)
+        times_ms = orb.decision_ms(room.made_up_room(0, frames=decisions + orb.COMPARED), decisions)
     except (BufgymError, ImportError):
         return None
     return 1e3 * float(np.median(times_ms)), 1e3 * float(np.percentile(times_ms, 99))
@@ -141,7 +141,7 @@ class Reproduction(Figure):
     images: int = 30
     """Decisions of ORBBuf by images; 0 for none."""
 
-    RULES = {"capacity": whole(), "decisions": whole(), "calls": whole(), "images": whole(0)}
+    RULES = {"images": whole(0)}
 
     def simulate(self) -> Rows:
         buffer, arrivals = full_queue(self.capacity, 400)
@@ -159,12 +159,8 @@ class Reproduction(Figure):
         return rows
 
     def tables(self, rows: Rows) -> list[str]:
-        lines = [["policy", "inside", "called", "p99", "paper"]]
-        for row in rows:
-            median, p99 = row["called_median_us"], row["called_p99_us"]
-            inside = "-" if row["inside_us"] is None else f"{row['inside_us']:.4f}"
-            lines.append([row["policy"], inside, f"{median:.2f}", f"{p99:.2f}", row["paper"]])
-        return table(lines)
+        called = {"called": ("called_median_us", ".2f"), "p99": ("called_p99_us", ".2f"), "paper": ("paper", "")}
+        return rows.listing({"policy": ("policy", ""), "inside": ("inside_us", ".4f")} | called)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
         fast = [row for row in rows if row["paper"].startswith("<")]
@@ -186,25 +182,20 @@ class Reproduction(Figure):
         return 7.0, 0.34 * len(rows) + 2.2
 
     def draw(self, rows: Rows, figure: Any) -> None:
-        """Draw the paper's four policies above and ours below."""
-        papers = Rows(row for row in rows if row["policy"] in PAPER)
-        others = Rows(row for row in rows if row["policy"] not in PAPER)
-        panels = figure.subplots(2, 1, sharex=True, height_ratios=[len(papers), max(1, len(others))])
-        for axes, shown, title in zip(panels, (papers, others), ("the paper's four", "not in the paper"), strict=True):
-            at = np.arange(len(shown))
-            inside, median, p99 = (shown.column(f"{name}_us") for name in ("inside", "called_median", "called_p99"))
-            axes.plot(inside, at, "o", color=COLOURS["afr"], label=f"inside a {HOW}")
-            axes.hlines(at, median, p99, color=COLOURS["random"], linewidth=1.5)
-            axes.plot(median, at, "s", color=COLOURS["random"], label="called from Python, median to p99")
-            finish(axes, f"One decision on a full queue, L = {self.capacity}: {title}", xscale="log")
-            axes.set_yticks(at, shown.distinct("policy"))
-            axes.set_ylim(len(shown) - 0.4, -0.6)
-        of_paper = (("<", "<", 10.0, "paper: under 10 us"), ("~", "D", 10e3, "paper: ORBBuf, features recomputed"))
-        for sign, marker, us, label in of_paper:
-            lines = [i for i, row in enumerate(papers) if row["paper"].startswith(sign)]
-            panels[0].plot([us] * len(lines), lines, marker, color=COLOURS["drop-oldest"], label=label)
-        panels[1].set_xlabel("time of one decision, us")
-        legend_below(figure, 2, panels[0])
+        axes, at = figure.add_subplot(), np.arange(len(rows))
+        inside, median, p99 = (rows.column(f"{name}_us") for name in ("inside", "called_median", "called_p99"))
+        axes.plot(inside, at, "o", color=COLOURS["afr"], label=f"inside a {HOW}")
+        axes.hlines(at, median, p99, color=COLOURS["random"], linewidth=1.5)
+        axes.plot(median, at, "s", color=COLOURS["random"], label="called from Python, median to p99")
+        for sign, us, label in (("<", 10.0, "paper: under 10 us"), ("~", 10e3, "paper: ORBBuf, features recomputed")):
+            lines = [i for i, row in enumerate(rows) if row["paper"].startswith(sign)]
+            axes.plot([us] * len(lines), lines, "<D"[sign == "~"], color=COLOURS["drop-oldest"], label=label)
+        finish(
+            axes, f"One decision on a full queue, L = {self.capacity}", xscale="log", xlabel="time of one decision, us"
+        )
+        axes.set_yticks(at, rows.distinct("policy"))
+        axes.invert_yaxis()
+        legend_below(figure, 2)
 
 
 def _yes(claim: bool) -> str:

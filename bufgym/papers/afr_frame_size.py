@@ -105,22 +105,14 @@ class Reproduction(StreamFigure):
         fewest, most = np.array([self.recalculations(rows, kb) for kb in sizes]).T
         left.fill_between(sizes, fewest, most, color=COLOURS["pink"], alpha=0.5, label="ORBBuf's evictions, all L")
         left.axhline(PAPER_RECALCULATIONS, color=COLOURS["oracle"], linestyle="--", label="paper, about 400")
-        rates = np.array([self.rates_hz(rows, kb) for kb in sizes])
-        for k, (label, line) in enumerate((("afr", "-"), ("afr-paper", "--"))):
-            for second, s in enumerate(SECONDS):
-                colour = COLOURS["afr" if second == 0 else "drop-oldest"]
-                right.plot(
-                    sizes, rates[:, 2 * k + second], line, marker="o", color=colour, label=f"{label}, second {s}"
-                )
+        looks = [(policy, line, s) for policy, line in (("afr", "-"), ("afr-paper", "--")) for s in SECONDS]
+        for (policy, line, s), hz in zip(looks, np.array([self.rates_hz(rows, kb) for kb in sizes]).T, strict=True):
+            colour = COLOURS["afr" if s == SECONDS[0] else "drop-oldest"]
+            right.plot(sizes, hz, line, marker="o", color=colour, label=f"{policy}, second {s}")
         right.axhline(PAPER_HZ, color=COLOURS["oracle"], linestyle=":", label="paper, 8 Hz")
-        finish(left, "Recalculations in 794 frames", xlabel="size of a frame, kB", ylabel="evictions")
-        finish(
-            right,
-            f"Frames kept, L = {min(self.capacities)}",
-            xlabel="size of a frame, kB",
-            ylabel="frames/s",
-            ylim=(0, 12),
-        )
+        finish(left, "Recalculations in 794 frames", ylabel="evictions")
+        finish(right, f"Frames kept, L = {min(self.capacities)}", ylabel="frames/s", ylim=(0, 12))
         for axes in (left, right):
             axes.axvline(FRAME_BYTES / 1000, color=COLOURS["other"], linewidth=1)
+            axes.set_xlabel("size of a frame, kB")
             axes.legend(frameon=False, fontsize=8)

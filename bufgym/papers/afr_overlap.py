@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.papers.afr_theorems import gaps_of
-from bufgym.papers.figure import COLOURS, finish, legend_below, several, whole
+from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import FrameFigure
 from bufgym.papers.perception.views import overlap_information
-from bufgym.papers.rows import Row, Rows, table
-from bufgym.scenario.checks import above_0
+from bufgym.papers.rows import Row, Rows
 
 NOISE = 0.05
 """Violation of a rule that still counts as keeping it, because depth has noise and edges."""
@@ -42,7 +41,6 @@ class Reproduction(FrameFigure):
     motions: Sequence[float] = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5)
     """Distances d in fields of view."""
 
-    RULES = {"capacity": whole(), "distances": several(whole()), "motions": several(above_0)}
     SIZE_INCHES = (11.0, 3.8)
 
     def simulate(self) -> Rows:
@@ -62,11 +60,12 @@ class Reproduction(FrameFigure):
 
     def tables(self, rows: Rows) -> list[str]:
         lines: list[str] = []
-        heads = ["d", "mean V", "10 %", "90 %", "Eq. 5 broken", "Eq. 6 broken", "by"]
+        heads = ("mean V", "10 %", "90 %", "Eq. 5 broken", "Eq. 6 broken", "by")
+        columns = {"d": ("d", "g")} | {head: (name, ".3f") for head, name in zip(heads, _RULES, strict=True)}
         for recording, by in rows.distinct("recording", "by"):
             shown = rows.where(recording=recording, by=by)
-            cells = [heads, *([f"{row['d']:g}", *(f"{row[name]:.3f}" for name in _RULES)] for row in shown)]
-            lines += [f"{recording}, d in {'frames' if by == 'frames' else 'fields of view'}:", *table(cells), ""]
+            unit = "frames" if by == "frames" else "fields of view"
+            lines += [f"{recording}, d in {unit}:", *shown.listing(columns), ""]
         return lines[:-1]
 
     def claims(self, rows: Rows) -> dict[str, Any]:
@@ -83,8 +82,8 @@ class Reproduction(FrameFigure):
         facts["excess"] = float(rows.column("excess_6").max())
         facts["rising"] = bool((rows.column("broken_5") < NOISE).all())
         facts["concave"] = bool((rows.column("broken_6") < NOISE).all())
-        facts["mean_concave"] = _concave_in_the_mean(rows)
-        facts["mean_breaks"] = _breaks_in_the_mean(rows)
+        broken = [f"{r['recording']} d = {r['d']:g} ({r['by']})" for r in rows if r["V_twice"] > 2 * r["V"]]
+        facts |= {"mean_concave": not broken, "mean_breaks": ", ".join(broken) or "nowhere"}
         if played:
             behind = {r: played.mean("behind", recording=r) for r in played.distinct("recording")}
             facts["matters"] = max(behind.values()) <= NOISE
@@ -174,12 +173,3 @@ def best_gain(v: NDArray[np.float64], L: int) -> float:
     for _ in range(L):
         reached = np.maximum(reached, (reached[:, None] + step).max(axis=0))
     return float(reached[-1])
-
-
-def _concave_in_the_mean(rows: Rows) -> bool:
-    return all(row["V_twice"] <= 2 * row["V"] for row in rows)
-
-
-def _breaks_in_the_mean(rows: Rows) -> str:
-    broken = [f"{r['recording']} d = {r['d']:g} ({r['by']})" for r in rows if r["V_twice"] > 2 * r["V"]]
-    return ", ".join(broken) or "nowhere"

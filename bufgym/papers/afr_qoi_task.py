@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from bufgym.papers.correlation import spearman_over
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import POLICIES, FrameFigure
-from bufgym.papers.rows import Rows, listed, table
+from bufgym.papers.rows import Row, Rows, listed, table
 
 MEASURES = {
     "H_time": "time",
@@ -54,38 +55,34 @@ class Reproduction(FrameFigure):
             shown = self.runs.where(recording=recording)
             offset = np.array(shown.column("k"), np.int64)
             cell = [(row["k"], row["L"]) for row in shown]
-            for scope in (ACROSS, WITHIN):
-                for measure in MEASURES:
-                    for task in TASKS:
-                        a, b = shown.column(measure), shown.column(task)
-                        if scope == WITHIN:
-                            a, b = _less_mean(a, cell), _less_mean(b, cell)
-                        found = spearman_over(a, b, offset, f"{recording} {measure} {task} {scope}")
-                        rows.append(
-                            {
-                                "recording": recording,
-                                "scope": scope,
-                                "measure": MEASURES[measure],
-                                "task": TASKS[task],
-                                "spearman": found.value,
-                                "low": found.low,
-                                "high": found.high,
-                                "runs": len(a),
-                            }
-                        )
+            for scope, measure, task in product((ACROSS, WITHIN), MEASURES, TASKS):
+                a, b = shown.column(measure), shown.column(task)
+                if scope == WITHIN:
+                    a, b = _less_mean(a, cell), _less_mean(b, cell)
+                found = spearman_over(a, b, offset, f"{recording} {measure} {task} {scope}")
+                names = {"scope": scope, "measure": MEASURES[measure], "task": TASKS[task]}
+                interval = {"spearman": found.value, "low": found.low, "high": found.high}
+                rows.append({"recording": recording, **names, **interval, "runs": len(a)})
         return rows
 
     def tables(self, rows: Rows) -> list[str]:
         lines: list[str] = []
         for recording, scope in rows.distinct("recording", "scope"):
             shown = rows.where(recording=recording, scope=scope)
-            cells: list[list[object]] = [["", *TASKS.values()]]
-            for measure in MEASURES.values():
-                cells.append([measure, *(_spelled(shown.where(measure=measure, task=t)) for t in TASKS.values())])
-            lines += [f"{recording}, {scope}: Spearman's correlation [95 %]", *table(cells), ""]
+            cells = [[m, *map(_spelled, shown.where(measure=m))] for m in MEASURES.values()]
+            lines += [
+                f"{recording}, {scope}: Spearman's correlation [95 %]",
+                *table([["", *TASKS.values()], *cells]),
+                "",
+            ]
         for recording in rows.distinct("recording"):
             shown = self.runs.where(recording=recording)
-            lines += [f"{recording}, mean of all runs (of failures: their part):", *table(_means(shown)), ""]
+            cells = [
+                [POLICIES[policy][0], *(f"{shown.mean(column, policy=policy):.3f}" for column in (*MEASURES, *TASKS))]
+                for policy in ranked(shown, "rmse_mm")
+            ]
+            heads = ["policy", *MEASURES.values(), *TASKS.values()]
+            lines += [f"{recording}, mean of all runs (of failures: their part):", *table([heads, *cells]), ""]
             for column in (*MEASURES, "rmse_mm"):
                 order = " > ".join(POLICIES[policy][0] for policy in ranked(shown, column))
                 lines.append(f"best first by {(MEASURES | TASKS)[column]}: {order}")
@@ -100,7 +97,7 @@ class Reproduction(FrameFigure):
                 known = [row for row in shown if not np.isnan(row["spearman"])]
                 if known:
                     row = min(known, key=lambda row: float(row["spearman"]))
-                    best[recording, task] = f"{row['measure']} ({_spelled(Rows([row]))})"
+                    best[recording, task] = f"{row['measure']} ({_spelled(row)})"
                     reached.append(shown.where(measure="motion")[0]["low"] <= row["spearman"])
         asked = rows.where(scope=ACROSS, task="map error")
         wrong = [f"{row['measure']} on {row['recording']}" for row in asked if not row["high"] < 0]
@@ -144,15 +141,6 @@ def ranked(runs: Rows, column: str) -> list[str]:
     return sorted(runs.distinct("policy"), key=lambda policy: sign * runs.mean(column, policy=policy))
 
 
-def _means(runs: Rows) -> list[list[object]]:
-    """List the means of every policy, with the best maps first."""
-    cells: list[list[object]] = [["policy", *MEASURES.values(), *TASKS.values()]]
-    for policy in ranked(runs, "rmse_mm"):
-        means = [f"{runs.mean(column, policy=policy):.3f}" for column in (*MEASURES, *TASKS)]
-        cells.append([POLICIES[policy][0], *means])
-    return cells
-
-
 def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.float64]:
     """Subtract from each number the mean of its cell."""
     _, place = np.unique(np.array(cell), axis=0, return_inverse=True)
@@ -160,8 +148,7 @@ def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.floa
     return np.asarray(numbers - means[place], np.float64)
 
 
-def _spelled(rows: Rows) -> str:
-    (row,) = rows
+def _spelled(row: Row) -> str:
     if np.isnan(row["spearman"]):
         return "-"
     return f"{row['spearman']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"

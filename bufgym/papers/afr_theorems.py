@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from bufgym import policies, sim
 from bufgym.model import qoi
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import Row, Rows, table
+from bufgym.papers.rows import Row, Rows
 from bufgym.scenario import Interruption
 from bufgym.sim import metrics
 
@@ -88,7 +88,7 @@ class Reproduction(Figure):
     max_capacity: int = 32
     last_T: int = 400
 
-    RULES = {"max_capacity": whole(), "last_T": whole(2)}
+    RULES = {"last_T": whole(2)}
 
     def simulate(self) -> Rows:
         """Return a row for each L: comparisons, violations by statement, and AFR's worst ratio to oracle-ideal."""
@@ -118,10 +118,9 @@ class Reproduction(Figure):
         return rows
 
     def tables(self, rows: Rows) -> list[str]:
-        lines: list[list[object]] = [["L", "paper's bound", "sharper bound", "worst of every V and T", "at T"]]
-        for row in rows:
-            lines.append([row["L"], *(f"{row[n]:.4f}" for n in ("paper_bound", "sharper_bound", "worst")), row["at_T"]])
-        return table(lines, left=0)
+        bounds = {"paper's bound": ("paper_bound", ".4f"), "sharper bound": ("sharper_bound", ".4f")}
+        worst = {"worst of every V and T": ("worst", ".4f"), "at T": ("at_T", "")}
+        return rows.listing({"L": ("L", "")} | bounds | worst, left=0)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
         v = qoi.exponential(0.618)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from bufgym.papers.afr_theorems import extremes, gaps_of
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import Row, Rows, table
+from bufgym.papers.rows import Row, Rows
 
 ROUNDING = 1e-9
 """Relative tolerance; the expectations are sums of some ten thousand products."""
@@ -100,15 +100,8 @@ class Reproduction(Figure):
         rows = Rows()
         for L in range(1, self.max_capacity + 1):
             random = expected_extremes(L, self.last_T)
-            row: Row = {
-                "L": L,
-                "cases": 0,
-                "violations": 0,
-                "highest_ratio": 0.0,
-                "at_T": 0,
-                "at_D": 0,
-                "lowest_ratio": 1.0,
-            }
+            row: Row = {"L": L, "cases": 0, "violations": 0, "highest_ratio": 0.0, "at_T": 0, "at_D": 0}
+            row["lowest_ratio"] = 1.0
             for T, gaps in enumerate(gaps_of("afr", L, range(1, self.last_T + 1)), start=1):
                 if T > L:
                     afr, expected = extremes(gaps)[:T], random[T, :T]
@@ -125,13 +118,9 @@ class Reproduction(Figure):
         return rows
 
     def tables(self, rows: Rows) -> list[str]:
-        lines = [["L", "cases", "E[Random] above AFR", "highest E[Random] / AFR", "at T", "at D"]]
-        for row in rows:
-            ratio = f"{row['highest_ratio']:.6f}"
-            lines.append(
-                [*(str(row[n]) for n in ("L", "cases", "violations")), ratio, str(row["at_T"]), str(row["at_D"])]
-            )
-        return table(lines, left=0)
+        counts = {"L": ("L", ""), "cases": ("cases", ""), "E[Random] above AFR": ("violations", "")}
+        highest = {"highest E[Random] / AFR": ("highest_ratio", ".6f"), "at T": ("at_T", ""), "at D": ("at_D", "")}
+        return rows.listing(counts | highest, left=0)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
         L, T, D = COUNTEREXAMPLE
@@ -160,20 +149,14 @@ class Reproduction(Figure):
             style = {"linewidth": 1.3, "alpha": 1 - 0.25 * k}
             gained = [afr[T - 1][min(D, T + 1) - 1] / D for T in lengths]
             expected = [random[T, min(D, T + 1) - 1] / D for T in lengths]
-            left.plot(lengths, gained, color=COLOURS["afr"], label="AFR" if k == 0 else "", **style)
-            left.plot(lengths, expected, color=COLOURS["random"], label="" if k else "Random, expectation", **style)
-            left.annotate(f"D = {D}", (self.last_T, gained[-1]), (4, -3), textcoords="offset points", fontsize=8)
+            left.plot(lengths, gained, color=COLOURS["afr"], label=f"AFR, D = {D}", **style)
+            left.plot(lengths, expected, color=COLOURS["random"], label=f"Random, expectation, D = {D}", **style)
         title = f"L = {DRAWN_L}, V(d) = min(1, d / D)"
         finish(left, title, xlabel="T, messages during the interruption", ylabel="information gained, H − 1")
-        left.set(xlim=(0, 1.12 * self.last_T), ylim=(0, DRAWN_L + 2))
-        left.legend(loc="lower right", frameon=False)
-        looks = {"highest_ratio": ("^", "drop-oldest", "highest"), "lowest_ratio": ("v", "afr", "lowest")}
-        for name, (marker, colour, label) in looks.items():
-            words = f"{label} of all T and D"
-            right.plot(rows.column("L"), rows.column(name), marker, color=COLOURS[colour], markersize=4.5, label=words)
+        for which, marker, colour in (("highest", "^", "drop-oldest"), ("lowest", "v", "afr")):
+            ratio, label = rows.column(f"{which}_ratio"), f"{which} of all T and D"
+            right.plot(rows.column("L"), ratio, marker, color=COLOURS[colour], markersize=4.5, label=label)
         right.axhline(1, color=COLOURS["oracle"], linestyle="--", linewidth=1)
-        right.annotate(
-            "L = 1: Random ahead", (1, rows[0]["highest_ratio"]), (8, -3), textcoords="offset points", fontsize=8
-        )
         finish(right, f"E[Random] / AFR, T ≤ {self.last_T}", xlabel="L, messages", ylabel="ratio of information gained")
-        right.legend(loc="lower right", frameon=False)
+        for axes in (left, right):
+            axes.legend(loc="lower right", frameon=False, fontsize=8)

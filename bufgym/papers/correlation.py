@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
-from bufgym.papers.perception.extra import library
+from bufgym.papers.extra import library
 
 RESAMPLES = 1000
 CONFIDENCE = 0.95

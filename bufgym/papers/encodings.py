@@ -19,23 +19,19 @@ from __future__ import annotations
 
 import base64
 import functools
-import importlib
-import inspect
 import json
 import math
-from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.extra import library
 
 Content = dict[str, Any]
 """Fields of a message by their ROS 2 names. Nested messages are Contents or lists of them; arrays are numpy's."""
 
 ENCODINGS: Final = ("ros1", "cdr", "robofleet", "robofleet-bare", "json", "json-numbers")
-MAX_BYTES: Final = 2**28
-"""Size limit of a message; its JSON is already 1 GB."""
 
 _STATUS_TYPE: Final = "amrl_msgs/msg/RobofleetStatus"
 _STATUS_FIELDS: Final = "string status\nbool is_ok\nfloat32 battery_level\nstring location\n"
@@ -45,34 +41,60 @@ _TIME: Final = "builtin_interfaces/msg/Time"
 # --- messages --------------------------------------------------------------------------------------------------------
 
 
-def laser_scan(
-    beams: int = 1080, intensities: int = 0, no_return: float = 0.0, frame_id: str = "laser", seed: int = 0
-) -> Content:
-    """A scan of 270 degrees; a share ``no_return`` of the ``beams`` meets nothing and reads infinity."""
-    _whole("beams", beams, 4)
-    _whole("intensities", intensities, 4)
-    if not 0 <= no_return <= 1:
-        raise BufgymError(f"no_return = {no_return!r}: must be from 0 to 1")
-    uniform = _uniform(seed)
+class Kind(NamedTuple):
+    """A kind of message."""
+
+    type: str
+    """Its ROS type."""
+    frame_id: str | None
+    """The frame_id of its header by default; None if it has no header."""
+
+
+KINDS: Final = {
+    "LaserScan": Kind("sensor_msgs/msg/LaserScan", "laser"),
+    "NavSatFix": Kind("sensor_msgs/msg/NavSatFix", "gps"),
+    "CompressedImage": Kind("sensor_msgs/msg/CompressedImage", "cam"),
+    "PointCloud2": Kind("sensor_msgs/msg/PointCloud2", "lidar"),
+    "PoseStamped": Kind("geometry_msgs/msg/PoseStamped", "map"),
+    "Odometry": Kind("nav_msgs/msg/Odometry", "odom"),
+    "RobofleetStatus": Kind(_STATUS_TYPE, None),
+}
+
+
+def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters: Any) -> Content:
+    """Build a message of ``kind`` with seeded content; ``parameters`` go to its builder, such as ``beams``."""
+    uniform = np.random.Generator(np.random.PCG64(seed))
+    build = {
+        "LaserScan": _laser_scan,
+        "NavSatFix": _nav_sat_fix,
+        "CompressedImage": _compressed_image,
+        "PointCloud2": _point_cloud2,
+        "PoseStamped": lambda uniform: {"pose": _pose(uniform)},
+        "Odometry": _odometry,
+        "RobofleetStatus": _robofleet_status,
+    }[kind]
+    fields: Content = build(uniform, **parameters)
+    if KINDS[kind].frame_id is None:
+        return fields
+    stamp = {"sec": 1_600_000_000, "nanosec": 123_456_789}
+    name = KINDS[kind].frame_id if frame_id is None else frame_id
+    return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **fields}
+
+
+def _laser_scan(uniform: np.random.Generator, beams: int = 1080) -> Content:
+    """A scan of 270 degrees."""
     ranges = uniform.uniform(0.1, 30.0, beams).astype(np.float32)
-    ranges[uniform.permutation(beams)[: round(no_return * beams)]] = np.inf
     width = 1.5 * math.pi
     limits = {"angle_min": -width / 2, "angle_max": width / 2, "angle_increment": width / max(1, beams - 1)}
     timing = {"time_increment": 0.025 / max(1, beams), "scan_time": 0.025, "range_min": 0.1, "range_max": 30.0}
-    return {
-        "header": _header(frame_id),
-        **{name: float(np.float32(value)) for name, value in (limits | timing).items()},
-        "ranges": ranges,
-        "intensities": uniform.uniform(0, 4000, intensities).astype(np.float32),
-    }
+    numbers = {name: float(np.float32(value)) for name, value in (limits | timing).items()}
+    return {**numbers, "ranges": ranges, "intensities": np.zeros(0, np.float32)}
 
 
-def nav_sat_fix(frame_id: str = "gps", seed: int = 0) -> Content:
+def _nav_sat_fix(uniform: np.random.Generator) -> Content:
     """A fix with 7 decimals of a degree, 3 of a metre, and a diagonal covariance."""
-    uniform = _uniform(seed)
     east, north, up = np.round(uniform.uniform(0.5, 9.0, 3), 4)
     return {
-        "header": _header(frame_id),
         "status": {"status": 0, "service": 1},
         "latitude": round(30.28 + uniform.uniform(0, 0.01), 7),
         "longitude": round(-97.73 - uniform.uniform(0, 0.01), 7),
@@ -82,24 +104,20 @@ def nav_sat_fix(frame_id: str = "gps", seed: int = 0) -> Content:
     }
 
 
-def compressed_image(data_bytes: int = 75_000, format: str = "jpeg", frame_id: str = "cam", seed: int = 0) -> Content:
+def _compressed_image(uniform: np.random.Generator, data_bytes: int = 75_000, format: str = "jpeg") -> Content:
     """A JPEG-like image: markers at both ends, and between them noise in which 0 follows each 255, as in JPEG."""
-    _whole("data_bytes", data_bytes, 1, least=4)
-    data = _uniform(seed).integers(0, 256, data_bytes).astype(np.uint8)
+    data = uniform.integers(0, 256, data_bytes).astype(np.uint8)
     data[1:][data[:-1] == 255] = 0
     data[:2], data[-2:] = (0xFF, 0xD8), (0xFF, 0xD9)
-    return {"header": _header(frame_id), "format": _text("format", format), "data": data}
+    return {"format": format, "data": data}
 
 
-def point_cloud2(points: int = 10_000, point_step: int = 16, frame_id: str = "lidar", seed: int = 0) -> Content:
+def _point_cloud2(uniform: np.random.Generator, points: int = 10_000, point_step: int = 16) -> Content:
     """Points x, y, z and intensity, each a float32, then zeros up to ``point_step`` bytes a point."""
-    _whole("point_step", point_step, 1, least=16)
-    _whole("points", points, point_step)
     cloud = np.zeros((points, point_step), np.uint8)
-    cloud[:, :16] = _uniform(seed).uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
+    cloud[:, :16] = uniform.uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
     names = ("x", "y", "z", "intensity")
     return {
-        "header": _header(frame_id),
         "height": 1,
         "width": points,
         "fields": [{"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate(names)],
@@ -111,69 +129,40 @@ def point_cloud2(points: int = 10_000, point_step: int = 16, frame_id: str = "li
     }
 
 
-def pose_stamped(frame_id: str = "map", seed: int = 0) -> Content:
-    """A pose on the ground, in the full precision of float64."""
-    return {"header": _header(frame_id), "pose": _pose(_uniform(seed))}
-
-
-def odometry(frame_id: str = "odom", child_frame_id: str = "base_link", seed: int = 0) -> Content:
+def _odometry(uniform: np.random.Generator) -> Content:
     """A pose and a twist on the ground, each with a diagonal covariance."""
-    uniform = _uniform(seed)
     ahead, turning = uniform.uniform(0, 2), uniform.uniform(-1, 1)
     twist = {"linear": {"x": ahead, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turning}}
     return {
-        "header": _header(frame_id),
-        "child_frame_id": _text("child_frame_id", child_frame_id),
+        "child_frame_id": "base_link",
         "pose": {"pose": _pose(uniform), "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
         "twist": {"twist": twist, "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
     }
 
 
-def robofleet_status(status: str = "autonomous", location: str = "building 1, floor 2", seed: int = 0) -> Content:
+def _pose(uniform: np.random.Generator) -> Content:
+    """A pose on the ground, in the full precision of float64."""
+    x, y, yaw = uniform.uniform(-50, 50), uniform.uniform(-50, 50), uniform.uniform(-math.pi, math.pi)
+    turn = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+    return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}
+
+
+def _robofleet_status(uniform: np.random.Generator) -> Content:
     """A robot's report to the fleet about its own state."""
-    battery = float(np.float32(_uniform(seed).uniform(0, 1)))
-    status, location = _text("status", status), _text("location", location)
-    return {"status": status, "is_ok": True, "battery_level": battery, "location": location}
-
-
-KINDS: Final[dict[str, tuple[str, Callable[..., Content]]]] = {
-    "LaserScan": ("sensor_msgs/msg/LaserScan", laser_scan),
-    "NavSatFix": ("sensor_msgs/msg/NavSatFix", nav_sat_fix),
-    "CompressedImage": ("sensor_msgs/msg/CompressedImage", compressed_image),
-    "PointCloud2": ("sensor_msgs/msg/PointCloud2", point_cloud2),
-    "PoseStamped": ("geometry_msgs/msg/PoseStamped", pose_stamped),
-    "Odometry": ("nav_msgs/msg/Odometry", odometry),
-    "RobofleetStatus": (_STATUS_TYPE, robofleet_status),
-}
-"""Kind -> its ROS type and the function that builds its content."""
-
-
-def content(kind: str, **parameters: Any) -> Content:
-    """Build a message of ``kind`` with seeded content; ``parameters`` go to its builder, such as ``beams``."""
-    build = _kind(kind)[1]
-    known = inspect.signature(build).parameters
-    for name in parameters:
-        if name not in known:
-            raise BufgymError(f"{kind}: no parameter {name!r}; it has: {', '.join(known)}")
-    return build(**parameters)
+    battery = float(np.float32(uniform.uniform(0, 1)))
+    return {"status": "autonomous", "is_ok": True, "battery_level": battery, "location": "building 1, floor 2"}
 
 
 # --- encodings -------------------------------------------------------------------------------------------------------
 
 
 def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topic") -> bytes:
-    """Encode ``message`` as bytes.
-
-    Args:
-        kind: a key of ``KINDS``.
-        message: what ``content`` returns.
-        encoding: one of ``ENCODINGS``.
-        topic: goes into the flatbuffer and the JSON.
+    """Encode ``message``, made by ``content``, as bytes; ``topic`` goes into the flatbuffer and the JSON.
 
     Raises:
-        BufgymError: an unknown kind or encoding; rosbags or flatbuffers is not installed (extra ``robofleet``).
+        BufgymError: an unknown encoding; rosbags or flatbuffers is not installed (extra ``robofleet``).
     """
-    type_name, topic = _kind(kind)[0], _text("topic", topic)
+    type_name = KINDS[kind].type
     if encoding in ("ros1", "cdr"):
         store = stores()[encoding]
         serialize = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
@@ -187,16 +176,10 @@ def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topi
     raise BufgymError(f"unknown encoding {encoding!r}; known: {', '.join(ENCODINGS)}")
 
 
-def sizes(kind: str, topic: str = "/robot/topic", **parameters: Any) -> dict[str, int]:
-    """Count the bytes of a message of ``kind`` in each of ``ENCODINGS``; arguments as in ``content``."""
-    message = content(kind, **parameters)
-    return {encoding: len(encode(kind, message, encoding, topic)) for encoding in ENCODINGS}
-
-
 @functools.cache
 def stores() -> dict[str, Any]:
     """ "ros1" and "cdr" -> the message definitions of ROS 1 Noetic and ROS 2 Humble, with Robofleet's status."""
-    typesys = _library("rosbags.typesys")
+    typesys = library("rosbags.typesys", "ros")
     made = {"ros1": typesys.get_typestore(typesys.Stores.ROS1_NOETIC)}
     made["cdr"] = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     for store in made.values():
@@ -219,7 +202,7 @@ def _typed(store: Any, type_name: str, value: Content) -> Any:
 
 
 def _flatbuffer(type_name: str, message: Content, topic: str | None) -> bytes:
-    builder = _library("flatbuffers").Builder(1024)
+    builder = library("flatbuffers", "robofleet").Builder(1024)
     metadata = 0
     if topic is not None:
         texts = [builder.CreateString(text) for text in (type_name.replace("/msg/", "/"), topic)]
@@ -279,51 +262,3 @@ def _json(value: Any, numbers: bool) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return int(value) if numbers and isinstance(value, float) and value.is_integer() else value
-
-
-# --- small parts -----------------------------------------------------------------------------------------------------
-
-
-def _library(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        extra = "ros" if name.startswith("rosbags") else "robofleet"
-        raise BufgymError(f"encoding messages needs {error.name}: {install(extra)}") from None
-
-
-def _kind(kind: str) -> tuple[str, Callable[..., Content]]:
-    if kind not in KINDS:
-        raise BufgymError(f"unknown kind of message {kind!r}; known: {', '.join(KINDS)}")
-    return KINDS[kind]
-
-
-def _whole(name: str, number: int, bytes_each: int, least: int = 0) -> None:
-    if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= MAX_BYTES // bytes_each:
-        raise BufgymError(f"{name} = {number!r}: must be a whole number from {least} to {MAX_BYTES // bytes_each}")
-
-
-def _text(name: str, text: str) -> str:
-    if not isinstance(text, str) or not text.isascii() or len(text) > 255:
-        raise BufgymError(f"{name} = {text!r}: must be a text of at most 255 ASCII letters")
-    return text
-
-
-def _uniform(seed: int) -> np.random.Generator:
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise BufgymError(f"seed = {seed!r}: must be a whole number >= 0")
-    return np.random.Generator(np.random.PCG64(seed))
-
-
-def _header(frame_id: str) -> Content:
-    return {
-        "seq": 4711,
-        "stamp": {"sec": 1_600_000_000, "nanosec": 123_456_789},
-        "frame_id": _text("frame_id", frame_id),
-    }
-
-
-def _pose(uniform: np.random.Generator) -> Content:
-    x, y, yaw = uniform.uniform(-50, 50), uniform.uniform(-50, 50), uniform.uniform(-math.pi, math.pi)
-    turn = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
-    return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}

@@ -13,13 +13,15 @@ import math
 import textwrap
 import tomllib
 from abc import ABC, abstractmethod
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from bufgym.ground.errors import BufgymError, install
 from bufgym.papers.rows import Rows
+from bufgym.scenario.checks import above_0
 
 COLOURS = {
     "afr": "#0072b2",
@@ -74,6 +76,15 @@ def several(rule: Rule) -> Rule:
     return check
 
 
+RULES_BY_KIND = {
+    "int": whole(),
+    "float": above_0,
+    "Sequence[int]": several(whole()),
+    "Sequence[float]": several(above_0),
+}
+"""Annotation of an option -> its rule."""
+
+
 # --- the protocol ----------------------------------------------------------------------------------------------------
 
 
@@ -81,17 +92,15 @@ def several(rule: Rule) -> Rule:
 class Figure(ABC):
     """A figure, table or theorem of a paper; the fields of a subclass are its options."""
 
-    RULES = {"runs": whole()}
-    """Option -> its rule; a subclass adds its own."""
+    RULES: ClassVar[dict[str, Rule]] = {"seed": whole(0)}
+    """Option -> its rule, where it is not that of ``RULES_BY_KIND``; a subclass adds its own."""
     SIZE_INCHES = (7.0, 4.5)
 
     def __post_init__(self) -> None:
-        rules: dict[str, Rule] = {}
-        for kind in reversed(type(self).__mro__):
-            rules |= vars(kind).get("RULES", {})
+        own = ChainMap(*(vars(kind).get("RULES", {}) for kind in type(self).__mro__))
         for option in fields(self):
-            if option.name in rules:
-                rules[option.name](option.name, getattr(self, option.name))
+            if rule := own.get(option.name, RULES_BY_KIND.get(str(option.type))):
+                rule(option.name, getattr(self, option.name))
 
     @abstractmethod
     def simulate(self) -> Rows:

@@ -11,31 +11,23 @@ link, so the fade comes earlier by as much. k runs from 0, the paper's alignment
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product, starmap
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from bufgym import traces
 from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES, STYLES
-from bufgym.papers.figure import COLOURS, Figure, several, whole
-from bufgym.papers.frame_tasks import (
-    IMAGES,
-    OFFSETS,
-    SEVEN_SCENES,
-    SLOW,
-    Kind,
-    Stage,
-    Store,
-    Task,
-    carried_out,
-    carry_out,
-    stage,
-)
+from bufgym.papers.figure import COLOURS, Figure, whole
+from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views
+from bufgym.papers.perception.stage import IMAGES, OFFSETS, Stage
 from bufgym.papers.rows import Row, Rows
 from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
 from bufgym.traces import Trace
@@ -61,7 +53,7 @@ def fade() -> Trace:
     return Trace.steps([(21, 2.2e6), (3, 0.4e6), (30, 2.2e6)], name="fade")
 
 
-class Setting(NamedTuple):
+class FrameRun(NamedTuple):
     """One run: the recording, the fade's offset k, the queue size L and the policy."""
 
     recording: str
@@ -84,9 +76,13 @@ class FrameFigure(Figure):
     jobs: int = -1
     """Parallel processes; -1 starts one per core."""
     store: Path | None = None
-    """File of the finished tasks' results; None keeps nothing."""
+    """Folder of the finished tasks' results; None keeps nothing."""
 
-    RULES = {"frames": whole(30), "capacities": several(whole()), "offsets": whole(1, OFFSETS)}
+    RULES = {"frames": whole(30), "offsets": whole(1, OFFSETS), "jobs": whole(-1)}
+
+    @property
+    def _folder(self) -> str | None:
+        return None if self.data is None else str(self.data)
 
     @property
     def recordings(self) -> list[str]:
@@ -102,58 +98,45 @@ class FrameFigure(Figure):
 
     def stage(self, recording: str) -> Stage:
         """The recording, opened once."""
-        return stage(recording, None if self.data is None else str(self.data), self.frames)
+        return stage(recording, self._folder, self.frames)
 
-    def settings(self) -> list[Setting]:
+    def settings(self) -> list[FrameRun]:
         """Every run, in the order of the rows."""
-        return [
-            Setting(recording, k, L, policy)
-            for recording in self.recordings
-            for k in range(self.offsets)
-            for L in self.capacities
-            for policy in self.policies
-        ]
+        return list(starmap(FrameRun, product(self.recordings, range(self.offsets), self.capacities, self.policies)))
 
     @cached_property
-    def done(self) -> Store:
-        """Results of the finished tasks."""
-        return Store(self.store)
-
-    def task(self, kind: Kind, setting: Setting) -> Task:
-        """Make the task of this kind for a run."""
-        data = None if self.data is None else str(self.data)
-        about = (setting.k, setting.L) if kind == "kept" else self.kept(setting)
-        return Task(kind, setting.recording, data, self.frames, about, setting.policy, self.link)
-
-    def kept(self, setting: Setting) -> tuple[int, ...]:
-        """The frames that arrive in this run."""
-        if setting not in self._kept:
-            task = self.task("kept", setting)
-            if setting.policy in SLOW:
-                carry_out([task], self.done, 1)
-                self._kept[setting] = tuple(self.done[task]["kept"])
-            else:
-                self._kept[setting] = carried_out(task)[1]["kept"]
-        return self._kept[setting]
-
-    @cached_property
-    def _kept(self) -> dict[Setting, tuple[int, ...]]:
+    def _results(self) -> dict[FrameTask, Row]:
         return {}
+
+    def done(self, *tasks: FrameTask) -> list[Row]:
+        """Results of these tasks."""
+        missing = [task for task in tasks if task not in self._results]
+        jobs = self.jobs if len(missing) > 1 else 1
+        self._results.update(carry_out(missing, self._folder, self.link, self.store, jobs))
+        return [self._results[task] for task in tasks]
+
+    def task(self, kind: Kind, setting: FrameRun) -> FrameTask:
+        """Make the task of this kind for a run."""
+        about = (setting.policy, self.link.name, setting.k, setting.L) if kind == "kept" else self.kept(setting)
+        return FrameTask(kind, setting.recording, self.frames, about)
+
+    def kept(self, setting: FrameRun) -> tuple[int, ...]:
+        """The frames that arrive in this run."""
+        (row,) = self.done(self.task("kept", setting))
+        return cast(tuple[int, ...], row["kept"])
 
     def play(self, *kinds: Kind) -> Rows:
         """Return a row for each run: its frame count, its information by each V and its results of these tasks."""
         settings = self.settings()
-        carry_out([self.task("kept", one) for one in settings if one.policy in SLOW], self.done, self.jobs)
-        carry_out([self.task(kind, setting) for kind in kinds for setting in settings], self.done, self.jobs)
+        self.done(*(self.task("kept", setting) for setting in settings))
+        parts = [self.done(*(self.task(kind, setting) for setting in settings)) for kind in kinds]
         rows = Rows()
-        for setting in settings:
+        for setting, *found in zip(settings, *parts, strict=True):
             row: Row = setting._asdict() | {"received": len(self.kept(setting))} | self.information(setting)
-            for kind in kinds:
-                row |= self.done[self.task(kind, setting)]
-            rows.append(row)
+            rows.append(functools.reduce(operator.or_, found, row))
         return rows
 
-    def information(self, setting: Setting) -> Row:
+    def information(self, setting: FrameRun) -> Row:
         """Compute H of the run's frames by time, motion and measured overlap, and their coverage of the scene."""
         kept, on = self.kept(setting), self.stage(setting.recording)
         x = on.episode(self.link, 0).arrivals["x"][list(kept)]

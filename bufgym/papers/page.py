@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers import FIGURES, TAKES_DATA, kept_under
+from bufgym.papers import FIGURES, TAKES_DATA, figure
 from bufgym.papers.figure import facts_of, source, statements
 
 PAPERS = {
@@ -43,7 +43,7 @@ compares all rows.
 
 
 def claim_rows(name: str, out: Path | None = None, **options: Any) -> list[str]:
-    """Return the Markdown rows of one section of ``afr.toml`` or ``robofleet.toml``; ``out`` as in ``kept_under``.
+    """Return the Markdown rows of one section of ``afr.toml`` or ``robofleet.toml``; ``out`` as in ``figure``.
 
     Raises:
         BufgymError: the figure cannot be made, for example without recordings.
@@ -51,21 +51,14 @@ def claim_rows(name: str, out: Path | None = None, **options: Any) -> list[str]:
     texts = statements()[name]
     facts: dict[str, Any] = {}
     if name in FIGURES:
-        reproduction = kept_under(out, name, **options)
+        reproduction = figure(name, out, **options)
         facts = facts_of(reproduction, reproduction.simulate())
     command = f"`{name}`{' †' if texts.get('fast') else ''}" if name in FIGURES else ""
     lines = []
     for claim, text in texts.get("claims", {}).items():
         ours = " ".join(text["ours"].format(**facts).split())
-        cells = [
-            source(text),
-            text["says"].format(**facts),
-            command,
-            ours,
-            VERDICTS[facts.get(claim)],
-            text.get("why", ""),
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
+        cells = [source(text), text["says"].format(**facts), command, ours, VERDICTS[facts.get(claim)]]
+        lines.append("| " + " | ".join([*cells, text.get("why", "")]) + " |")
     return lines
 
 

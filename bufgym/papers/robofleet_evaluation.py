@@ -15,7 +15,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from bufgym import policies, sim
 from bufgym.benchmark.run import draw
 from bufgym.model.topics import Topic
-from bufgym.papers.figure import COLOURS, Figure, at_least_0, several, whole
+from bufgym.papers.figure import COLOURS, Figure, at_least_0, whole
 from bufgym.papers.rows import Rows
 from bufgym.scenario import Client, Stream
-from bufgym.scenario.checks import above_0
 from bufgym.traces import Trace
 
 POINTS = 10_000
@@ -53,7 +52,7 @@ MBIT = 125_000
 
 
 @dataclass(frozen=True)
-class Program:
+class SendingProgram:
     """A sending program: its policy and its operator's settings of the topics."""
 
     policy: str
@@ -76,13 +75,15 @@ class Program:
 
 
 PROGRAMS = {
-    "robofleet": Program("robofleet", "Robofleet, n_T = 1", "n_T = 1", COLOURS["afr"], "o"),
-    "no-drop": Program("robofleet", "Robofleet, all no_drop", "no_drop", COLOURS["drop-oldest"], "s", all_no_drop=True),
-    "no-drop-released": Program(
+    "robofleet": SendingProgram("robofleet", "Robofleet, n_T = 1", "n_T = 1", COLOURS["afr"], "o"),
+    "no-drop": SendingProgram(
+        "robofleet", "Robofleet, all no_drop", "no_drop", COLOURS["drop-oldest"], "s", all_no_drop=True
+    ),
+    "no-drop-released": SendingProgram(
         "robofleet-released", "released, all no_drop", "released", COLOURS["orange"], "^", all_no_drop=True
     ),
-    "rosbridge": Program("rosbridge", "rosbridge", "rosbridge", COLOURS["random"], "D"),
-    "ros-native": Program("ros-native", "native ROS", "native ROS", COLOURS["pink"], "v", queued=True),
+    "rosbridge": SendingProgram("rosbridge", "rosbridge", "rosbridge", COLOURS["random"], "D"),
+    "ros-native": SendingProgram("ros-native", "native ROS", "native ROS", COLOURS["pink"], "v", queued=True),
 }
 SHORT = {name: program.short for name, program in PROGRAMS.items()}
 
@@ -202,16 +203,7 @@ class ClientFigure(Figure):
     live: float = 0.0
     """Speed-up of a run on real sockets; 0 simulates."""
 
-    RULES = {
-        "live": at_least_0,
-        "round_trip_ms": at_least_0,
-        "queue_size": whole(),
-        "queue_sizes": several(whole()),
-        "rate_hz": above_0,
-        "rates_hz": several(above_0),
-        "mbit_per_s": above_0,
-        "duration_s": above_0,
-    }
+    RULES = {"live": at_least_0, "round_trip_ms": at_least_0}
 
     @functools.cached_property
     def watchers(self) -> list[Callable[[float], None]]:
@@ -236,27 +228,21 @@ class ClientFigure(Figure):
         return sent
 
 
-Kind = TypeVar("Kind", bound=ClientFigure)
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+Run = TypeVar("Run", bound=Callable[..., Any])
 
 
-def played_once(
-    run: Callable[Concatenate[Kind, Arguments], Result],
-) -> Callable[Concatenate[Kind, Arguments], Result]:
-    """Keep the result of each run of a figure, because live runs are slow and the picture needs them again."""
+def played_once(run: Run) -> Run:
+    """Keep the result of each live run of a figure, because it is slow and the picture needs it again."""
 
     @functools.wraps(run)
-    def once(figure: Kind, /, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+    def once(figure: ClientFigure, *arguments: Any) -> Any:
         if not figure.live:
-            return run(figure, *arguments, **named)
-        key = arguments, tuple(named.items())
-        if key not in figure.played:
-            figure.played[key] = run(figure, *arguments, **named)
-        result: Result = figure.played[key]
-        return result
+            return run(figure, *arguments)
+        if arguments not in figure.played:
+            figure.played[arguments] = run(figure, *arguments)
+        return figure.played[arguments]
 
-    return once
+    return cast(Run, once)
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,17 @@ link, for one topic of each kind, at the rates of the paper's Fig. 6 and 7.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.figure import COLOURS, at_least_0, finish, legend_below, several
-from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, CloudFigure, Sent, played_once, stream
-from bufgym.papers.rows import Rows, table
-from bufgym.scenario.checks import above_0
+from bufgym.papers.figure import COLOURS, at_least_0, finish, legend_below
+from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, SHORT, CloudFigure, Sent, played_once, stream
+from bufgym.papers.rows import Rows
 from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")
@@ -35,6 +34,8 @@ KIND_COLOURS = {
 PAPER_RATIO = 5.0
 ABOUT = (4.0, 6.0)
 """Range of ratios that we accept as "about 5 times"."""
+FACTOR = 2.0
+"""Ratio to the nominal latency up to which a latency counts as nominal."""
 BEFORE_S = 10.0
 WATCHED = 12.0
 """Time watched after the link's return, in dropout lengths; at least ``LEAST_WATCHED_S``."""
@@ -49,19 +50,10 @@ class Reproduction(CloudFigure):
     links_mbit_per_s: Sequence[float] = (12, 25, 50, 100)
     kinds: Sequence[str] = tuple(RATES_HZ)
     """Kinds of messages, with one topic in each run."""
-    factor: float = 2.0
-    """Ratio to the nominal latency up to which a latency counts as nominal."""
     silence_s: float = 0.0
     """Silence after the link's return, as TCP may wait for its next retransmission."""
-    shown_s: float | None = None
-    """Dropout shown in the left panel; by default the one nearest to 10 s."""
 
-    RULES = {
-        "dropouts_s": several(above_0),
-        "links_mbit_per_s": several(above_0),
-        "silence_s": at_least_0,
-        "factor": above_0,
-    }
+    RULES = {"silence_s": at_least_0}
     LIVE = {"dropouts_s": (2, 4), "links_mbit_per_s": (6,), "kinds": ("CompressedImage",), "runs": 1, "live": 4.0}
     SIZE_INCHES = (11.0, 4.8)
 
@@ -69,10 +61,6 @@ class Reproduction(CloudFigure):
         super().__post_init__()
         if not self.kinds or isinstance(self.kinds, str) or not set(self.kinds) <= set(RATES_HZ):
             raise BufgymError(f"kinds = {self.kinds!r}: must be some of {', '.join(RATES_HZ)}")
-        if self.factor <= 1:
-            raise BufgymError(f"factor = {self.factor!r}: must be above 1")
-        if self.shown_s is not None and self.shown_s not in self.dropouts_s:
-            raise BufgymError(f"shown_s = {self.shown_s!r}: must be one of dropouts_s")
 
     @played_once
     def run(self, kind: str, mbit: float, dropout_s: float, name: str, seed: int) -> tuple[float, Sent]:
@@ -91,7 +79,7 @@ class Reproduction(CloudFigure):
         ):
             away_s, sent = self.run(kind, mbit, dropout_s, name, seed)
             key = {"message": kind, "link_mbit_per_s": mbit, "dropout_s": dropout_s, "run": seed, "sender": name}
-            rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, self.factor)})
+            rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, FACTOR)})
         return rows
 
     def claims(self, rows: Rows) -> dict[str, Any]:
@@ -101,9 +89,13 @@ class Reproduction(CloudFigure):
         less = sum(r < ABOUT[0] for r in ratios.values())
         finite = [cell for cell in cells.values() if min(cell) > 0 and math.isfinite(cell[0])]
         nearer = [abs(math.log(cell[2] / cell[0])) < abs(math.log(cell[1] / cell[2])) for cell in finite]
-        lengths = {group: ", ".join(f"{d:g} s" for *g, d in about if tuple(g) == group) for group in groups(about)}
+        lengths = {
+            group: ", ".join(f"{d:g} s" for *g, d in about if (*g,) == group)
+            for group in dict.fromkeys((kind, mbit) for kind, mbit, _ in about)
+        }
         return {
             "paper_ratio": PAPER_RATIO,
+            "factor": FACTOR,
             "about_from": ABOUT[0],
             "about_to": ABOUT[1],
             "watched": WATCHED,
@@ -118,58 +110,39 @@ class Reproduction(CloudFigure):
         }
 
     def tables(self, rows: Rows) -> list[str]:
-        cells = by_cell(rows)
-        dropouts = list(self.dropouts_s)
-        lines = [["", "load", "Robofleet", "native ROS", *(f"{d:g} s" for d in dropouts), "5x at"]]
-        for kind, mbit in groups(cells):
-            json = stream(kind, RATES_HZ[kind], points=self.points).encodings["json"]
-            group = [cells[kind, mbit, dropout] for dropout in dropouts]
-            ratios = [ratio(cell) for cell in group]
-            own, native = (f"{min(c[k] for c in group):.3f} to {max(c[k] for c in group):.3f}" for k in (0, 2))
-            load = f"{json * RATES_HZ[kind] / (mbit * MBIT):.0%}"
-            length = length_for(dropouts, ratios)
-            lines.append([f"{kind}, {mbit:g} Mbit/s", load, own, native, *(f"{r:.1f}" for r in ratios), length])
-        return table(lines)
+        lines = ["Recovery of rosbridge to Robofleet's, by the length of the dropout in s:"]
+        cells = Rows(
+            {"topic": f"{kind}, {mbit:g} Mbit/s", "dropout_s": dropout_s, "ratio": ratio(cell)}
+            for (kind, mbit, dropout_s), cell in by_cell(rows).items()
+        )
+        lines += [*cells.pivot("topic", "dropout_s", "ratio", ".1f"), "", "Recovery, s, mean over links:"]
+        for kind in self.kinds:
+            lines += [kind, *rows.where(message=kind).pivot("sender", "dropout_s", "recovery_s", ".3f", SHORT)]
+        return lines
 
     def draw(self, rows: Rows, figure: Any) -> None:
         left, right = figure.subplots(1, 2)
-        shown_s = min(self.dropouts_s, key=lambda s: abs(s - 10)) if self.shown_s is None else self.shown_s
+        shown_s = min(self.dropouts_s, key=lambda s: abs(s - 10))
         kind, mbit = self.kinds[0], max(self.links_mbit_per_s)
         for name in reversed(SENDERS):
             away_s, sent = self.run(kind, mbit, shown_s, name, 0)
-            received = sent.received
+            received, style = sent.received, PROGRAMS[name].style | {"markersize": 3, "linewidth": 0}
             at_s = received.received_s - away_s - shown_s
-            style = PROGRAMS[name].style | {"markersize": 3}
-            for part in ((-shown_s - 3 < at_s) & (at_s < 0), (0 <= at_s) & (at_s < shown_s + 3)):
-                left.plot(at_s[part], received.latency_s[part], **style)
-            left.plot([], [], label=PROGRAMS[name].label, **style)
-        left.axvspan(-shown_s, 0, color=COLOURS["other"], alpha=0.2, linewidth=0)
-        left.annotate("no link", (-shown_s / 2, 0.02), xycoords=("data", "axes fraction"), ha="center", fontsize=8)
+            near = np.abs(at_s) < shown_s + 3
+            left.plot(at_s[near], received.latency_s[near], label=PROGRAMS[name].label, **style)
+        left.axvspan(-shown_s, 0, color=COLOURS["other"], alpha=0.2, linewidth=0, label="no link")
         title = f"{kind}, {mbit:g} Mbit/s, dropout of {shown_s:g} s"
         finish(left, title, yscale="log", xlabel="receipt, s after the link's return", ylabel="latency, s")
         left.legend(loc="upper left", frameon=False)
-        self._draw_ratios(right, by_cell(rows))
-        legend_below(figure, 4, right)
-
-    def _draw_ratios(self, axes: Any, cells: Cells) -> None:
-        links = list(self.links_mbit_per_s)
-        for kind, mbit in groups(cells):
-            k = links.index(mbit)
-            style = {"color": KIND_COLOURS[kind], "marker": "osD^vPX*"[k % 8], "markersize": 4.5, "linewidth": 1.2}
+        cells = by_cell(rows)
+        for kind, (k, mbit) in product(self.kinds, enumerate(self.links_mbit_per_s)):
             ratios = [ratio(cells[kind, mbit, dropout]) for dropout in self.dropouts_s]
-            axes.plot(self.dropouts_s, ratios, alpha=0.4 + 0.6 * (k + 1) / len(links), **style)
-        axes.axhspan(*ABOUT, color=COLOURS["other"], alpha=0.35, linewidth=0, label="paper, about 5")
-        for kind in self.kinds:
-            axes.plot([], [], color=KIND_COLOURS[kind], label=kind)
-        for k, mbit in enumerate(links):
-            label = f"{mbit:g} Mbit/s"
-            axes.plot([], [], color=COLOURS["oracle"], marker="osD^vPX*"[k % 8], linestyle="", label=label)
+            style = {"color": KIND_COLOURS[kind], "marker": "osD^vPX*"[k % 8], "markersize": 4.5, "linewidth": 1.2}
+            right.plot(self.dropouts_s, ratios, label=f"{kind}, {mbit:g} Mbit/s", **style)
+        right.axhspan(*ABOUT, color=COLOURS["other"], alpha=0.35, linewidth=0, label="paper, about 5")
         title = "Rosbridge's recovery time to Robofleet's"
-        finish(axes, title, xscale="log", yscale="log", xlabel="length of the dropout, s")
-        lengths = sorted(self.dropouts_s)
-        axes.set_xticks(lengths, [f"{d:g}" for d in lengths])
-        axes.set_xticks([], minor=True)
-        axes.set_yticks([1, 5, 10, 50, 100, 500], ["1", "5", "10", "50", "100", "500"])
+        finish(right, title, xscale="log", yscale="log", xlabel="length of the dropout, s")
+        legend_below(figure, 4, right)
 
 
 def recovery_s(sent: Sent, away_s: float, back_s: float, factor: float) -> float:
@@ -200,17 +173,6 @@ def ratio(cell: Sequence[float]) -> float:
     return cell[1] / cell[0] if cell[0] > 0 and math.isfinite(cell[0]) else math.nan
 
 
-def length_for(dropouts_s: Sequence[float], ratios: Sequence[float], target: float = PAPER_RATIO) -> str:
-    """Interpolate linearly the dropout length at which the ratio is ``target``."""
-    finite = sorted((d, r) for d, r in zip(dropouts_s, ratios, strict=True) if math.isfinite(r))
-    for (d, r), (e, q) in pairwise(finite):
-        if r <= target <= q:
-            return f"{d + (e - d) * (target - r) / (q - r) if q > r else d:.3g} s"
-    if not finite:
-        return "none"
-    return f"< {finite[0][0]:g} s" if finite[0][1] > target else f"> {finite[-1][0]:g} s"
-
-
 def by_cell(rows: Rows) -> Cells:
     """Average the recovery of each of ``SENDERS`` for each message kind, link and dropout."""
     return {
@@ -220,8 +182,3 @@ def by_cell(rows: Rows) -> Cells:
         )
         for kind, mbit, dropout in rows.distinct("message", "link_mbit_per_s", "dropout_s")
     }
-
-
-def groups(cells: Iterable[tuple[str, float, float]]) -> list[tuple[str, float]]:
-    """List the distinct (kind, Mbit/s) of these cells."""
-    return list(dict.fromkeys((kind, mbit) for kind, mbit, _ in cells))

@@ -17,7 +17,7 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.encodings import ENCODINGS, KINDS, Content, content, encode
-from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
+from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
 from bufgym.papers.rows import Rows, table
 
 PAPER = {
@@ -55,6 +55,7 @@ class Reproduction(Figure):
     seed: int = 0
     """Seed of every message's content."""
 
+    RULES = {"points": whole(1, 10**6), "point_step": whole(16, 256)}
     SIZE_INCHES = (9.0, 4.8)
 
     @cached_property
@@ -62,7 +63,8 @@ class Reproduction(Figure):
         """Map each kind to the message that is encoded."""
         messages = fitted(self.beams, self.seed)
         for kind in KINDS:
-            parameters = {"points": self.points, "point_step": self.point_step} if kind == "PointCloud2" else {}
+            cloud = {"points": self.points, "point_step": self.point_step}
+            parameters: dict[str, Any] = cloud if kind == "PointCloud2" else {}
             messages.setdefault(kind, content(kind, seed=self.seed, **parameters))
         return messages
 

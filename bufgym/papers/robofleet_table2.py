@@ -14,14 +14,16 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
 from bufgym.papers.encodings import content, encode
+from bufgym.papers.extra import library
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, several, whole
 from bufgym.papers.rows import Rows, listed
 
@@ -62,10 +64,8 @@ class Reproduction(Figure):
 
     async def _measured(self, program: str, count: int) -> dict[str, float]:
         """Run one process; return the costs that it reports."""
-        listening = {"bufgym": _relay, "json": _sink, "nothing": _nobody}[program]
-        port, close = await listening()
-        words = [program, str(port), str(count), str(self.rate_hz), str(self.seconds)]
-        try:
+        async with {"bufgym": _relay, "json": _sink, "nothing": _nobody}[program]() as port:
+            words = [program, str(port), str(count), str(self.rate_hz), str(self.seconds)]
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", __name__, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE
             )
@@ -75,8 +75,6 @@ class Reproduction(Figure):
             except TimeoutError:
                 process.kill()
                 raise BufgymError(f"robofleet-table2: {program} does not end") from None
-        finally:
-            await close()
         if process.returncode:
             raise BufgymError(f"robofleet-table2: {program}: {fault.decode(errors='replace').strip()[-200:]}")
         found: dict[str, float] = json.loads(said)
@@ -119,42 +117,34 @@ class Reproduction(Figure):
 
 # --- what they send to -----------------------------------------------------------------------------------------------
 
-Close = Callable[[], Awaitable[None]]
 
-
-async def _relay() -> tuple[int, Close]:
+@asynccontextmanager
+async def _relay() -> AsyncIterator[int]:
+    """Serve our relay; yields its port."""
     from bufgym.relay.config import Config, Rule
     from bufgym.relay.server import Server
 
     server = Server(Config(port=0, rules=(Rule(address="127.0.0.1", send=True),)))
-    return await server.start(), server.close
+    yield await server.start()
+    await server.close()
 
 
-async def _sink() -> tuple[int, Close]:
-    """Start a server that reads and discards."""
-    try:
-        from websockets.asyncio.server import serve
-    except ModuleNotFoundError:
-        raise BufgymError(f"robofleet-table2 needs websockets: {install('relay')}") from None
+@asynccontextmanager
+async def _sink() -> AsyncIterator[int]:
+    """Serve a reader that discards; yields its port."""
 
     async def read(socket: Any) -> None:
         async for _ in socket:
             pass
 
-    server = await serve(read, "127.0.0.1", 0, compression=None, max_size=2**26)
-
-    async def close() -> None:
-        server.close()
-        await server.wait_closed()
-
-    return int(next(iter(server.sockets)).getsockname()[1]), close
+    serve = library("websockets.asyncio.server", "relay").serve
+    async with serve(read, "127.0.0.1", 0, compression=None, max_size=2**26) as server:
+        yield int(next(iter(server.sockets)).getsockname()[1])
 
 
-async def _nobody() -> tuple[int, Close]:
-    async def close() -> None:
-        pass
-
-    return 0, close
+@asynccontextmanager
+async def _nobody() -> AsyncIterator[int]:
+    yield 0
 
 
 # --- the processes ---------------------------------------------------------------------------------------------------

@@ -55,6 +55,13 @@ class Rows(list[Row]):
             lines.append([label(key), *(format(number, spec) for number in means)])
         return table(lines)
 
+    def listing(self, columns: Mapping[str, tuple[str, str]], left: int = 1) -> list[str]:
+        """Tabulate with a line per row; ``columns`` maps a head to a column and the format of its numbers."""
+        cells = (
+            ["-" if row[name] is None else format(row[name], spec) for name, spec in columns.values()] for row in self
+        )
+        return table([list(columns), *cells], left)
+
     def save(self, path: Path) -> Path:
         """Write the rows as CSV; return the path."""
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,3 +4,34 @@
 map and measures its error. `tracking` follows the camera by the frames alone and finds where that fails. The extra
 `perception` is needed; modules are imported on demand.
 """
+
+from typing import TYPE_CHECKING
+
+from bufgym.ground.modules import on_demand
+
+if TYPE_CHECKING:
+    from bufgym.papers.perception.frames import Sequence
+    from bufgym.papers.perception.mapping import fuse, grid_of, map_error, points_of
+    from bufgym.papers.perception.orb import OrbSimilarity, orbbuf_by
+    from bufgym.papers.perception.recordings import open_sequence
+    from bufgym.papers.perception.room import made_up_room
+    from bufgym.papers.perception.tracking import Tracker, difference, jumped, track
+    from bufgym.papers.perception.views import Coverage, seen_shares
+
+# fmt: off
+__all__ = [
+    "Coverage", "OrbSimilarity", "Sequence", "Tracker", "difference", "fuse", "grid_of", "jumped", "made_up_room",
+    "map_error", "open_sequence", "orbbuf_by", "points_of", "seen_shares", "track",
+]
+# fmt: on
+
+_MODULES = {
+    "frames": ("Sequence",),
+    "recordings": ("open_sequence",),
+    "mapping": ("fuse", "grid_of", "map_error", "points_of"),
+    "orb": ("OrbSimilarity", "orbbuf_by"),
+    "room": ("made_up_room",),
+    "tracking": ("Tracker", "difference", "jumped", "track"),
+    "views": ("Coverage", "seen_shares"),
+}
+__getattr__ = on_demand(__name__, **{name: module for module, names in _MODULES.items() for name in names})

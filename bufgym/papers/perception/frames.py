@@ -7,17 +7,14 @@ Cameras look along z, x is right and y down, as in OpenCV. A pixel (u, v) with d
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from os import PathLike
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.perception.extra import library
+from bufgym.papers.extra import library
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, quaternions
 from bufgym.traces.trace import Float64Array, Int64Array
@@ -35,11 +32,7 @@ JPEG_QUALITY: Final = 50
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; all in pixels.
-
-    Raises:
-        BufgymError: a size or a focal length that is not above 0.
-    """
+    """A pinhole camera; all in pixels."""
 
     width: int
     height: int
@@ -48,15 +41,15 @@ class Camera:
     cx: float
     cy: float
 
-    def __post_init__(self) -> None:
-        for name in ("width", "height", "fx", "fy"):
-            if not getattr(self, name) > 0:
-                raise BufgymError(f"{name} = {getattr(self, name)}: must be above 0")
-
     @property
     def fov_deg(self) -> float:
         """Horizontal field of view, degrees."""
         return float(np.degrees(2 * np.arctan(self.width / (2 * self.fx))))
+
+    @property
+    def lens(self) -> Float64Array:
+        """The same for kernels, float64[4]: fx, fy, cx, cy."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def every(self, stride: int) -> Camera:
         """The camera of every ``stride``-th pixel of every ``stride``-th row, the first among them.
@@ -110,28 +103,39 @@ class Sequence(ABC):
         """
         return encoded_bytes(self.depth(k), self.image(k))
 
-    def motion(self, settings: MotionSettings | None = None) -> Motion:
-        """How far the scene has moved on, by the true poses; by default with this camera's field of view."""
-        settings = settings or MotionSettings(fov_deg=self.camera.fov_deg)
+    def motion(self) -> Motion:
+        """How far the scene has moved on, by the true poses and this camera's field of view."""
+        settings = MotionSettings(fov_deg=self.camera.fov_deg)
         poses = Poses(self.time_us, self.poses[:, :3, 3], quaternions(self.poses[:, :3, :3]))
         return motion_from_poses(poses, settings, name=self.name)
 
+    def first(self, frames: int) -> Sequence:
+        """Select the recording's first frames, or all if there are no more."""
+        return self if len(self) <= frames else _Part(self, frames)
+
     def reduced(self, stride: int) -> Sequence:
         """Every ``stride``-th pixel of every ``stride``-th row. No averaging: that would invent depths at edges."""
-        return self if stride == 1 else _Reduced(self, stride)
+        return self if stride == 1 else _Part(self, len(self), stride)
 
-    def loaded(self, frames: Iterable[int] | None = None) -> Sequence:
+    def loaded(self) -> Sequence:
         """The same with its depths in memory, for those who use them again and again; pictures stay where they are."""
-        return _Loaded(self, range(len(self)) if frames is None else frames)
+        part = _Part(self, len(self))
+        part.held = [self.depth(k) for k in range(len(self))]
+        return part
 
 
-class _Reduced(Sequence):
-    def __init__(self, whole: Sequence, stride: int) -> None:
-        self.name, self.time_us, self.poses = whole.name, whole.time_us, whole.poses
-        self.camera = whole.camera.every(stride)
+class _Part(Sequence):
+    """The first ``frames`` of a recording, and of each every ``stride``-th pixel."""
+
+    def __init__(self, whole: Sequence, frames: int, stride: int = 1) -> None:
+        self.name, self.camera = whole.name, whole.camera.every(stride)
+        self.time_us, self.poses = whole.time_us[:frames], whole.poses[:frames]
+        self.held: list[Depth] = []
         self._whole, self._stride = whole, stride
 
     def depth(self, k: int) -> Depth:
+        if self.held:
+            return self.held[k]
         return np.ascontiguousarray(self._whole.depth(k)[:: self._stride, :: self._stride])
 
     def image(self, k: int) -> Image:
@@ -139,22 +143,6 @@ class _Reduced(Sequence):
 
     def size_bytes(self, k: int) -> int:
         return self._whole.size_bytes(k)  # it is still the whole frame that is sent
-
-
-class _Loaded(Sequence):
-    def __init__(self, stored: Sequence, frames: Iterable[int]) -> None:
-        self.name, self.time_us, self.poses, self.camera = stored.name, stored.time_us, stored.poses, stored.camera
-        self._stored = stored
-        self._depths = {k: stored.depth(k) for k in frames}
-
-    def depth(self, k: int) -> Depth:
-        return self._depths[k] if k in self._depths else self._stored.depth(k)
-
-    def image(self, k: int) -> Image:
-        return self._stored.image(k)
-
-    def size_bytes(self, k: int) -> int:
-        return self._stored.size_bytes(k)
 
 
 def encoded_bytes(depth: Depth, image: Image) -> int:
@@ -169,14 +157,3 @@ def encoded_bytes(depth: Depth, image: Image) -> int:
         image = cv2.resize(image, (depth_mm.shape[1], depth_mm.shape[0]))
     picture = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return len(rvl.compress(depth_mm)) + len(picture)
-
-
-def open_sequence(path: str | PathLike[str]) -> Sequence:
-    """The recording in a folder: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives (see `recordings`).
-
-    Raises:
-        BufgymError: no such folder, none of these layouts, a missing list or pose file; the message names the file.
-    """
-    from bufgym.papers.perception import recordings
-
-    return recordings.opened(Path(path))

@@ -10,6 +10,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bufgym.ground.kernel import kernel
 
 
@@ -30,17 +33,12 @@ def smooth(depth: Any, radius: int, same_surface: float, result: Any) -> None:
             result[v, u] = total / count if count else 0.0
 
 
-@kernel
-def unproject(depth: Any, far_m: float, lens: Any, vertices: Any) -> None:
-    """Write the points of a depth image in the camera's frame, float32[height, width, 3], NaN without a point."""
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            z = depth[v, u]
-            if z <= 0.0 or z > far_m:
-                z = math.nan
-            vertices[v, u, 0] = (u - lens[2]) / lens[0] * z
-            vertices[v, u, 1] = (v - lens[3]) / lens[1] * z
-            vertices[v, u, 2] = z
+def unproject(depth: NDArray[np.float32], far_m: float, lens: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Find the points of a depth image in the camera's frame, float32[height, width, 3], NaN without a point."""
+    v, u = np.indices(depth.shape)
+    z = np.where((depth > 0) & (depth <= far_m), depth, np.nan).astype(np.float64)
+    points = np.stack([(u - lens[2]) / lens[0] * z, (v - lens[3]) / lens[1] * z, z], axis=2)
+    return points.astype(np.float32)
 
 
 @kernel

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
+from bufgym.papers.extra import library
 from bufgym.papers.perception import tsdf
-from bufgym.papers.perception.extra import library
 from bufgym.papers.perception.frames import Camera, Sequence
 from bufgym.traces.trace import Float64Array
 
@@ -36,11 +36,11 @@ _BOX_STRIDE: Final = 8
 
 
 @dataclass(frozen=True)
-class Grid:
+class VoxelGrid:
     """Positions of the voxels.
 
     Raises:
-        BufgymError: no voxel, too many, or a size that is not above 0.
+        BufgymError: no voxel, or too many.
     """
 
     origin_m: tuple[float, float, float]
@@ -51,8 +51,6 @@ class Grid:
     """Edge of a voxel, m."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.voxel_m) and self.voxel_m > 0):
-            raise BufgymError(f"voxel_m = {self.voxel_m}: must be a finite number above 0")
         if min(self.shape) < 2 or math.prod(self.shape) > MOST_VOXELS:
             size = " x ".join(str(count) for count in self.shape)
             raise BufgymError(f"grid of {size} voxels: must be at least 2 a side and {MOST_VOXELS} in all")
@@ -63,8 +61,8 @@ class Grid:
         return TRUNCATION_VOXELS * self.voxel_m
 
 
-def grid_of(sequence: Sequence, voxel_m: float = VOXEL_M) -> Grid:
-    """Grid of the box around all points of a recording, with a margin of the truncation."""
+def grid_of(sequence: Sequence) -> VoxelGrid:
+    """VoxelGrid of the box around all points of a recording, with a margin of the truncation."""
     stride = _BOX_STRIDE if min(sequence.camera.width, sequence.camera.height) >= 4 * _BOX_STRIDE else 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for k in range(0, len(sequence), _BOX_STRIDE):
@@ -74,15 +72,17 @@ def grid_of(sequence: Sequence, voxel_m: float = VOXEL_M) -> Grid:
             low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
     if not np.isfinite(low).all():
         raise BufgymError(f"{sequence.name}: no frame holds a depth from {tsdf.NEAR_M} to {FAR_M} m")
-    margin = TRUNCATION_VOXELS * voxel_m
-    count = np.ceil((high - low + 2 * margin) / voxel_m).astype(int) + 1
+    margin = TRUNCATION_VOXELS * VOXEL_M
+    count = np.ceil((high - low + 2 * margin) / VOXEL_M).astype(int) + 1
     x, y, z = (low - margin).tolist()
-    return Grid((x, y, z), (int(count[0]), int(count[1]), int(count[2])), voxel_m)
+    return VoxelGrid((x, y, z), (int(count[0]), int(count[1]), int(count[2])))
 
 
-def points_of(depth: npt.NDArray[np.float32], camera: Camera, stride: int = 1) -> Float64Array:
+def points_of(
+    depth: npt.NDArray[np.float32], camera: Camera, stride: int = 1, near_m: float = tsdf.NEAR_M, far_m: float = FAR_M
+) -> Float64Array:
     """The points of a depth image of every ``stride``-th pixel, in the camera's frame, float64[m, 3]."""
-    v, u = np.nonzero((depth >= tsdf.NEAR_M) & (depth <= FAR_M))
+    v, u = np.nonzero((depth > 0) & (depth >= near_m) & (depth <= far_m))
     z = depth[v, u].astype(np.float64)
     x, y = (stride * u - camera.cx) * z / camera.fx, (stride * v - camera.cy) * z / camera.fy
     return np.stack([x, y, z], axis=1)
@@ -92,14 +92,14 @@ def points_of(depth: npt.NDArray[np.float32], camera: Camera, stride: int = 1) -
 class Map:
     """A truncated signed distance function."""
 
-    grid: Grid
+    grid: VoxelGrid
     tsdf: npt.NDArray[np.float32]
     """float32[grid.shape], -1..1, in units of the truncation."""
     weight: npt.NDArray[np.float32]
     """float32[grid.shape], number of frames averaged in each voxel."""
 
     @staticmethod
-    def empty(grid: Grid) -> Map:
+    def empty(grid: VoxelGrid) -> Map:
         """Make an empty map."""
         return Map(grid, np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32))
 
@@ -107,29 +107,16 @@ class Map:
         self, depth: npt.NDArray[np.float32], camera: Camera, pose: Float64Array, most_weight: float = math.inf
     ) -> None:
         """Fuse one frame seen from ``pose``, camera to world; weights grow up to ``most_weight``."""
-        to_camera = np.linalg.inv(pose)
-        grid = self.grid
-        origin_m, reach_m = np.array(grid.origin_m), grid.truncation_m
-        lens = lens_of(camera)
-        tsdf.integrate(
-            depth, FAR_M, lens, to_camera, origin_m, grid.voxel_m, reach_m, most_weight, self.tsdf, self.weight
-        )
+        to_camera, grid = np.linalg.inv(pose), self.grid
+        place = np.array(grid.origin_m), grid.voxel_m, grid.truncation_m
+        tsdf.integrate(depth, FAR_M, camera.lens, to_camera, *place, most_weight, self.tsdf, self.weight)
 
     def points(self) -> Float64Array:
         """Points where the surface crosses edges between voxels, float64[m, 3], world coordinates, m."""
-        origin_m, voxel_m = np.array(self.grid.origin_m), self.grid.voxel_m
-        count = tsdf.surface(self.tsdf, self.weight, origin_m, voxel_m, np.empty((0, 3)))
-        points = np.empty((count, 3))
-        tsdf.surface(self.tsdf, self.weight, origin_m, voxel_m, points)
-        return points
+        return np.array(self.grid.origin_m) + self.grid.voxel_m * tsdf.surface(self.tsdf, self.weight)
 
 
-def lens_of(camera: Camera) -> Float64Array:
-    """Make the kernels' lens, float64[4]."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-
-
-def fuse(sequence: Sequence, frames: Iterable[int], grid: Grid | None = None) -> Map:
+def fuse(sequence: Sequence, frames: Iterable[int], grid: VoxelGrid | None = None) -> Map:
     """Fuse these frames into a map, in the given order with their true poses.
 
     Args:
@@ -166,7 +153,7 @@ def distances(points: Float64Array, reference: Float64Array) -> Float64Array:
     return np.asarray(nearest, np.float64)
 
 
-def error(found: Map, reference: Map) -> MapError:
+def map_error(found: Map, reference: Map) -> MapError:
     """Measure the map's distance from the reference, usually the map of all frames.
 
     Raises:

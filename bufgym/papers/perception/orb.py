@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
-from bufgym.papers.perception.extra import library
+from bufgym.papers.extra import library
 from bufgym.papers.perception.frames import Image, Sequence
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode
@@ -74,11 +74,6 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode) -> Policy:
 
     about = "ORBBuf by what two images have in common; it sees the images, as no other policy does."
     return Policy("orbbuf-images", on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
-
-
-def orbbuf_with_images(sequence: Sequence, episode: Episode) -> Policy:
-    """`orbbuf` by the ORB features of the frames, which must be the episode's messages in their order."""
-    return orbbuf_by(OrbSimilarity(sequence.grey), episode)
 
 
 COMPARED: Final = 3

@@ -8,10 +8,14 @@ things that the projector does not reach are missing. Noise is a stateless hash 
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
+import numpy as np
+
 from bufgym.ground.kernel import kernel
+from bufgym.traces.trace import Float64Array as Array
 
 BASELINE_M = 0.075
 """Distance from the camera to the projector along x, m."""
@@ -27,6 +31,9 @@ GRAZING = 0.12
 """Cosine of the angle to the surface's normal below which the dots are too stretched."""
 SLACK = 1e-3
 """Margin around the bounds of things, in pixels and m, so that rounding hides none."""
+
+ANYWHERE = (-math.inf, math.inf, -math.inf, math.inf, -math.inf)
+"""Bounds of a thing that may be seen in every pixel."""
 
 _MASK = 0xFFFFFFFF
 
@@ -97,67 +104,26 @@ def _hit_ball(ball: Any, ox: float, oy: float, oz: float, dx: float, dy: float, 
     return float(t)
 
 
-@kernel
-def cull(things: Any, balls: int, lens: Any, width: int, height: int, to_camera: Any, seen: Any) -> int:
-    """Write to ``seen`` int64[n] which things the camera may see, by the balls around them; returns how many.
-
-    The room itself, things[0], is always among them.
-    """
-    m, count = to_camera, 0
-    left = math.sqrt(1.0 + ((lens[2] + 1.0) / lens[0]) ** 2)
-    right = math.sqrt(1.0 + ((width - lens[2]) / lens[0]) ** 2)
-    top = math.sqrt(1.0 + ((lens[3] + 1.0) / lens[1]) ** 2)
-    bottom = math.sqrt(1.0 + ((height - lens[3]) / lens[1]) ** 2)
-    for n in range(things.shape[0]):
-        t = things[n]
-        radius = t[3] if n >= balls else math.sqrt(t[3] * t[3] + t[4] * t[4] + t[5] * t[5])
-        x = m[0, 0] * t[0] + m[0, 1] * t[1] + m[0, 2] * t[2] + m[0, 3]
-        y = m[1, 0] * t[0] + m[1, 1] * t[1] + m[1, 2] * t[2] + m[1, 3]
-        z = m[2, 0] * t[0] + m[2, 1] * t[1] + m[2, 2] * t[2] + m[2, 3]
-        if n and (
-            z < -radius
-            or -x > z * (lens[2] + 1.0) / lens[0] + radius * left
-            or x > z * (width - lens[2]) / lens[0] + radius * right
-            or -y > z * (lens[3] + 1.0) / lens[1] + radius * top
-            or y > z * (height - lens[3]) / lens[1] + radius * bottom
-        ):
-            continue
-        seen[count] = n
-        count += 1
-    return count
-
-
-@kernel
-def bound(
-    things: Any, balls: int, seen: Any, count: int, lens: Any, to_camera: Any, aside_m: float, bounds: Any
-) -> None:
-    """Write to ``bounds`` float64[n, 5] the range of columns and rows of each thing, and its least depth.
+def bounds(things: Array, balls: int, lens: Array, to_camera: Array, aside_m: float) -> Array:
+    """Find the range of columns and rows of each thing, and its least depth, float64[n, 5].
 
     The eye is ``aside_m`` right of the camera and looks in the same direction. A box is bounded by its corners and a
-    ball by the corners of a cube. A thing that reaches behind the eye, as the room does, may be anywhere.
+    ball by the corners of a cube. A thing that reaches behind the eye, as the room does, may be anywhere; one that is
+    behind it altogether is nowhere.
     """
-    m = to_camera
-    for i in range(count):
-        t = things[seen[i]]
-        ball = seen[i] >= balls
-        half_y, half_z = (t[3], t[3]) if ball else (t[4], t[5])
-        c, s = (1.0, 0.0) if ball else (t[6], t[7])
-        left, right, top, bottom, near = math.inf, -math.inf, math.inf, -math.inf, math.inf
-        for corner in range(8):
-            a = t[3] if corner & 1 else -t[3]
-            b = half_y if corner & 2 else -half_y
-            wx, wy, wz = t[0] + c * a - s * b, t[1] + s * a + c * b, t[2] + (half_z if corner & 4 else -half_z)
-            z = m[2, 0] * wx + m[2, 1] * wy + m[2, 2] * wz + m[2, 3]
-            near = min(near, z)
-            if z > 0.0:
-                u = lens[0] * (m[0, 0] * wx + m[0, 1] * wy + m[0, 2] * wz + m[0, 3] - aside_m) / z + lens[2]
-                v = lens[1] * (m[1, 0] * wx + m[1, 1] * wy + m[1, 2] * wz + m[1, 3]) / z + lens[3]
-                left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
-        if near <= SLACK:
-            left, right, top, bottom, near = -math.inf, math.inf, -math.inf, math.inf, -math.inf
-        bounds[i, 0], bounds[i, 1] = left - SLACK, right + SLACK
-        bounds[i, 2], bounds[i, 3] = top - SLACK, bottom + SLACK
-        bounds[i, 4] = near - SLACK
+    half, turn = things[:, 3:6].copy(), things[:, 6:8].copy()
+    half[balls:], turn[balls:] = things[balls:, 3:4], (1.0, 0.0)
+    a, b, up = np.moveaxis(half[:, None] * list(itertools.product((-1, 1), repeat=3)), 2, 0)
+    c, s = turn.T[:, :, None]
+    world = things[:, None, :3] + np.stack([c * a - s * b, s * a + c * b, up], axis=2)
+    x, y, z = np.moveaxis(world @ to_camera[:3, :3].T + to_camera[:3, 3], 2, 0)
+    with np.errstate(all="ignore"):
+        u, v = lens[0] * (x - aside_m) / z + lens[2], lens[1] * y / z + lens[3]
+    ranges = [u.min(axis=1) - SLACK, u.max(axis=1) + SLACK, v.min(axis=1) - SLACK, v.max(axis=1) + SLACK]
+    found = np.stack([*ranges, z.min(axis=1) - SLACK], axis=1)
+    found[z.min(axis=1) <= SLACK] = ANYWHERE
+    found[z.max(axis=1) < -SLACK, 1] = -np.inf
+    return np.ascontiguousarray(found)
 
 
 @kernel
@@ -171,8 +137,6 @@ def _within(bounds: Any, i: int, u: float, v: float, z: float) -> bool:
 def render(
     things: Any,
     balls: int,
-    seen: Any,
-    count: int,
     bounds: Any,
     lens: Any,
     stride: int,
@@ -188,8 +152,7 @@ def render(
 
     Args:
         things: float64[n, 8], boxes and from number ``balls`` on balls; the first box is the room, seen from inside.
-        seen, count: things that the camera may see, from `cull`.
-        bounds: float64[2, n, 5], their bounds for the camera and for the projector, from `bound`.
+        bounds: float64[2, n, 5], their bounds for the camera and for the projector, from `bounds`.
         lens: lens of the whole camera.
         to_world: float64[4, 4], camera to world.
         noisy: measure as a Kinect does; otherwise the true depth of every pixel.
@@ -208,10 +171,9 @@ def render(
             dy = m[1, 0] * a + m[1, 1] * b + m[1, 2]
             dz = m[2, 0] * a + m[2, 1] * b + m[2, 2]
             z, thing = math.inf, 0
-            for i in range(count):
-                if not _within(bounds[0], i, u, v, z):
+            for n in range(things.shape[0]):
+                if not _within(bounds[0], n, u, v, z):
                     continue
-                n = seen[i]
                 hit = _distance(things, balls, n, ox, oy, oz, dx, dy, dz, face)
                 if 0.0 < hit < z:
                     z, thing = hit, n
@@ -229,10 +191,9 @@ def render(
                 continue
             # Does the projector reach the place? The ray from it has length 1 at the place.
             lit, lit_u = True, u - lens[0] * BASELINE_M / z
-            for i in range(1, count):
-                if not _within(bounds[1], i, lit_u, v, z):
+            for n in range(1, things.shape[0]):
+                if not _within(bounds[1], n, lit_u, v, z):
                     continue
-                n = seen[i]
                 hit = _distance(things, balls, n, lx, ly, lz, x - lx, y - ly, w - lz, face)
                 if 0.0 < hit < 0.995:
                     lit = False

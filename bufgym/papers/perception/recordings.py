@@ -11,20 +11,21 @@ Frames are read when they are asked for.
 
 from __future__ import annotations
 
-import functools
 import re
 import zipfile
-from abc import abstractmethod
+from collections.abc import Sequence as Seq
+from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8, read_whole
-from bufgym.papers.perception.extra import library
+from bufgym.papers.extra import library
 from bufgym.papers.perception.frames import Camera, Depth, Image, Sequence
-from bufgym.traces.formats.text import Line, open_text
+from bufgym.traces.formats.text import open_text
 from bufgym.traces.formats.trajectories import read_poses, seconds
 from bufgym.traces.poses import Poses, rotations
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
@@ -42,93 +43,143 @@ POSE_GAP_S: Final = 0.1
 
 _MOST_IMAGE_BYTES: Final = 16 * 2**20
 _MOST_TEXT_BYTES: Final = 2**26
+_KINDS: Final = ("depth", "color")
 _ROTATION_TOLERANCE: Final = 0.01
 _ENDS: Final = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
 """First bytes of an image file -> last bytes of a complete one."""
 
 
-def opened(folder: Path) -> Sequence:
-    """Open the recording in a folder, whose files tell the layout."""
-    if not folder.is_dir():
-        raise BufgymError(f"{folder}: no such folder")
-    if (folder / "depth.txt").is_file():
-        return Tum(folder)
-    if any(folder.glob("frame-*.pose.txt")):
-        return SevenScenes(folder)
-    if any(folder.glob("depth_*_mm.zip")):
-        return PackedSevenScenes(folder)
-    rule = "holds no recording: must hold depth.txt (TUM), frame-*.pose.txt (7-Scenes) or depth_*_mm.zip"
-    raise BufgymError(f"{folder}: {rule}")
+class ZippedFile(NamedTuple):
+    """An image file in an archive."""
+
+    archive: zipfile.ZipFile
+    path: Path
+
+    def content(self) -> bytes:
+        """Read the file."""
+        try:
+            if self.archive.getinfo(self.path.name).file_size > _MOST_IMAGE_BYTES:
+                raise BufgymError(f"{self.path}: must be at most {_MOST_IMAGE_BYTES} bytes")
+            return self.archive.read(self.path.name)
+        except KeyError:
+            raise BufgymError(f"{self.path}: no such file, but a pose") from None
+        except (zipfile.BadZipFile, OSError, EOFError) as error:
+            raise BufgymError(f"{self.path}: damaged ({error})") from None
 
 
-class _Files(Sequence):
+File = Path | ZippedFile
+
+
+@dataclass(eq=False)
+class ImageFiles(Sequence):
     """Frames in image files of their own."""
 
-    units_per_m = MM_PER_M
-
-    @abstractmethod
-    def _bytes(self, kind: Literal["depth", "image"], k: int) -> tuple[object, bytes]:
-        """Read a file; return its name for messages and its content."""
+    name: str
+    camera: Camera
+    time_us: Int64Array
+    poses: Float64Array
+    depths: Seq[File]
+    """The depth's file of each frame."""
+    images: Seq[File]
+    """The picture's."""
+    units_per_m: float = MM_PER_M
 
     def depth(self, k: int) -> Depth:
-        file, data = self._bytes("depth", k)
-        units = _decoded(file, data, self.camera)
+        units = self._decoded(self.depths[k])
         if units.dtype != np.uint16 or units.ndim != 2:
-            raise BufgymError(f"{file}: must be a depth image, 16 bits a pixel, one channel")
+            raise BufgymError(f"{_named(self.depths[k])}: must be a depth image, 16 bits a pixel, one channel")
         units[units == 65535] = 0  # some recorders write that for "nothing measured"
         return (units / self.units_per_m).astype(np.float32)
 
     def image(self, k: int) -> Image:
-        file, data = self._bytes("image", k)
-        image = _decoded(file, data, self.camera)
+        image = self._decoded(self.images[k])
         if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)):
-            raise BufgymError(f"{file}: must be a picture, 8 bits, one channel or three")
+            raise BufgymError(f"{_named(self.images[k])}: must be a picture, 8 bits, one channel or three")
         return image
 
+    def _decoded(self, file: File) -> np.ndarray:
+        data = file.content() if isinstance(file, ZippedFile) else read_whole(file, _MOST_IMAGE_BYTES)
+        end = next((end for begin, end in _ENDS.items() if data.startswith(begin)), None)
+        if end is None:
+            raise BufgymError(f"{_named(file)}: must be a PNG or JPEG image")
+        pixels = None
+        if end in data[-64:]:  # of a cut file the library would guess the rest, or write to the terminal
+            cv2 = library("cv2")
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if pixels is None:
+            raise BufgymError(f"{_named(file)}: truncated or damaged: must be a whole image")
+        if pixels.shape[:2] != (self.camera.height, self.camera.width):
+            size, rule = f"{pixels.shape[1]} x {pixels.shape[0]}", f"must be {self.camera.width} x {self.camera.height}"
+            raise BufgymError(where(str(_named(file)), None, size, rule, field="size"))
+        return np.asarray(pixels)
 
-def _decoded(file: object, data: bytes, camera: Camera) -> np.ndarray:
-    end = next((end for begin, end in _ENDS.items() if data.startswith(begin)), None)
-    if end is None:
-        raise BufgymError(f"{file}: must be a PNG or JPEG image")
-    pixels = None
-    if end in data[-64:]:  # of a cut file the library would guess the rest, or write to the terminal
-        cv2 = library("cv2")
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise BufgymError(f"{file}: truncated or damaged: must be a whole image")
-    if pixels.shape[:2] != (camera.height, camera.width):
-        size = f"{pixels.shape[1]} x {pixels.shape[0]}"
-        raise BufgymError(where(str(file), None, size, f"must be {camera.width} x {camera.height}", field="size"))
-    return np.asarray(pixels)
+
+def _named(file: File) -> Path:
+    return file.path if isinstance(file, ZippedFile) else file
 
 
-class Tum(_Files):
+def open_sequence(path: str | PathLike[str]) -> Sequence:
+    """Open the recording in a folder, whose files tell the layout: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives.
+
+    Raises:
+        BufgymError: no such folder, none of these layouts, a missing list or pose file; the message names the file.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise BufgymError(f"{folder}: no such folder")
+    if (folder / "depth.txt").is_file():
+        return _tum(folder)
+    if poses := sorted(folder.glob("frame-*.pose.txt")):
+        matrix = np.stack([_pose(file, read_utf8(file, _MOST_TEXT_BYTES)) for file in poses])
+        depths, images = ([Path(f"{str(p).removesuffix('pose.txt')}{kind}.png") for p in poses] for kind in _KINDS)
+        return ImageFiles(folder.name, SEVEN_SCENES_CAMERA, _at_30_hz(len(poses)), matrix, depths, images)
+    if archives := sorted(folder.glob("depth_*_mm.zip")):
+        return _packed(folder, archives[0])
+    rule = "holds no recording: must hold depth.txt (TUM), frame-*.pose.txt (7-Scenes) or depth_*_mm.zip"
+    raise BufgymError(f"{folder}: {rule}")
+
+
+def _packed(folder: Path, depth: Path) -> Sequence:
+    """One sequence of 7-Scenes in two archives, reduced to every second pixel of every second row."""
+    size = re.fullmatch(r"depth_(\d+)x(\d+)_mm", depth.stem)
+    stride = SEVEN_SCENES_CAMERA.width // max(1, int(size[1])) if size else 0
+    camera = SEVEN_SCENES_CAMERA.every(max(1, stride))
+    if size is None or (camera.width, camera.height) != (int(size[1]), int(size[2])):
+        raise BufgymError(f"{depth}: its name must give a size that divides 640x480, as depth_320x240_mm.zip")
+    truth = folder / "poses_camera_to_world.txt"
+    lines = read_utf8(truth, _MOST_TEXT_BYTES).splitlines()
+    poses = np.stack([_pose(truth, line, number) for number, line in enumerate(lines, 1)])
+    files = []
+    for path, kind in ((depth, "png"), (folder / f"gray_{size[1]}x{size[2]}.zip", "jpg")):
+        try:
+            archive = zipfile.ZipFile(path)
+        except FileNotFoundError:
+            raise BufgymError(f"{path}: no such file") from None
+        except (zipfile.BadZipFile, OSError) as error:
+            raise BufgymError(f"{path}: truncated, or no zip archive ({error})") from None
+        files.append([ZippedFile(archive, path / f"{k:04d}.{kind}") for k in range(len(lines))])
+    depths, images = files
+    return ImageFiles(folder.name, camera, _at_30_hz(len(lines)), poses, depths, images)
+
+
+def _tum(folder: Path) -> Sequence:
     """TUM RGB-D: a frame for each depth image that has a picture and a pose."""
-
-    units_per_m = TUM_UNITS_PER_M
-
-    def __init__(self, folder: Path) -> None:
-        self.name, self.camera = folder.name, TUM_CAMERA
-        self._folder = folder
-        depth_us, depths = _listed(folder / "depth.txt")
-        image_us, images = _listed(folder / "rgb.txt")
-        truth = folder / "groundtruth.txt"
-        poses, start_us = read_poses(truth, format="tum"), _first_us(truth)
-        nearest = np.clip(np.searchsorted(image_us, depth_us), 1, len(image_us) - 1)
-        nearest -= depth_us - image_us[nearest - 1] < image_us[nearest] - depth_us
-        kept = np.abs(image_us[nearest] - depth_us) <= SAME_MOMENT_S * US_PER_S
-        kept &= (depth_us >= start_us) & (depth_us <= start_us + poses.time_us[-1])
-        for gap_start, gap_end in poses.gaps(POSE_GAP_S):
-            kept &= (depth_us <= start_us + gap_start) | (depth_us >= start_us + gap_end)
-        if kept.sum() < 2:
-            raise BufgymError(f"{folder}: {kept.sum()} depth images have a picture and a pose: must be at least 2")
-        self._files = [(depths[k], images[nearest[k]]) for k in np.flatnonzero(kept)]
-        self.time_us = depth_us[kept] - depth_us[kept][0]
-        self.poses = matrices(poses.at(depth_us[kept] - start_us))
-
-    def _bytes(self, kind: Literal["depth", "image"], k: int) -> tuple[object, bytes]:
-        path = self._folder / self._files[k][kind == "image"]
-        return path, read_whole(path, _MOST_IMAGE_BYTES)
+    depth_us, depths = _listed(folder / "depth.txt")
+    image_us, images = _listed(folder / "rgb.txt")
+    truth = folder / "groundtruth.txt"
+    poses, start_us = read_poses(truth, format="tum"), _first_us(truth)
+    nearest = np.clip(np.searchsorted(image_us, depth_us), 1, len(image_us) - 1)
+    nearest -= depth_us - image_us[nearest - 1] < image_us[nearest] - depth_us
+    kept = np.abs(image_us[nearest] - depth_us) <= SAME_MOMENT_S * US_PER_S
+    kept &= (depth_us >= start_us) & (depth_us <= start_us + poses.time_us[-1])
+    for gap_start, gap_end in poses.gaps(POSE_GAP_S):
+        kept &= (depth_us <= start_us + gap_start) | (depth_us >= start_us + gap_end)
+    if kept.sum() < 2:
+        raise BufgymError(f"{folder}: {kept.sum()} depth images have a picture and a pose: must be at least 2")
+    chosen = np.flatnonzero(kept)
+    files = [folder / depths[k] for k in chosen], [folder / images[nearest[k]] for k in chosen]
+    time_us, matrix = depth_us[kept] - depth_us[kept][0], matrices(poses.at(depth_us[kept] - start_us))
+    return ImageFiles(folder.name, TUM_CAMERA, time_us, matrix, *files, TUM_UNITS_PER_M)
 
 
 def _listed(path: Path) -> tuple[Int64Array, list[str]]:
@@ -142,18 +193,13 @@ def _listed(path: Path) -> tuple[Int64Array, list[str]]:
             time, name = line.columns(2)
             if Path(name).is_absolute() or ".." in Path(name).parts:
                 raise line.error(name, "must be a path inside the folder", "file")
-            times.append(_later(line, time, times))
+            times.append(seconds(line, time))
+            if times[-2:] != sorted(set(times[-2:])):
+                raise line.error(time, "must be after the line above", "time in s")
             names.append(name)
     if len(times) < 2:
         raise BufgymError(f"{path}: lists {len(times)} images: must list at least 2")
     return np.array(times, np.int64), names
-
-
-def _later(line: Line, time: str, times: list[int]) -> int:
-    time_us = seconds(line, time)
-    if times and time_us <= times[-1]:
-        raise line.error(time, "must be after the line above", "time in s")
-    return time_us
 
 
 def _first_us(path: Path) -> int:
@@ -167,65 +213,6 @@ def matrices(poses: Poses) -> Float64Array:
     result = np.tile(np.eye(4), (len(poses.time_us), 1, 1))
     result[:, :3, :3], result[:, :3, 3] = rotations(poses.quaternion), poses.position_m
     return result
-
-
-class SevenScenes(_Files):
-    """Microsoft's 7-Scenes: three files a frame, the pose a 4x4 matrix."""
-
-    def __init__(self, folder: Path) -> None:
-        self.name, self.camera = folder.name, SEVEN_SCENES_CAMERA
-        self._folder = folder
-        self._stems = [path.name.removesuffix(".pose.txt") for path in sorted(folder.glob("frame-*.pose.txt"))]
-        files = [folder / f"{stem}.pose.txt" for stem in self._stems]
-        self.poses = np.stack([_pose(file, read_utf8(file, _MOST_TEXT_BYTES)) for file in files])
-        self.time_us = _at_30_hz(len(self._stems))
-
-    def _bytes(self, kind: Literal["depth", "image"], k: int) -> tuple[object, bytes]:
-        path = self._folder / f"{self._stems[k]}.{'depth' if kind == 'depth' else 'color'}.png"
-        return path, read_whole(path, _MOST_IMAGE_BYTES)
-
-
-class PackedSevenScenes(_Files):
-    """One sequence of 7-Scenes in two archives, reduced to every second pixel of every second row."""
-
-    def __init__(self, folder: Path) -> None:
-        depth = next(iter(sorted(folder.glob("depth_*_mm.zip"))))
-        size = re.fullmatch(r"depth_(\d+)x(\d+)_mm", depth.stem)
-        stride = SEVEN_SCENES_CAMERA.width // max(1, int(size[1])) if size else 0
-        self.camera = SEVEN_SCENES_CAMERA.every(max(1, stride))
-        if size is None or (self.camera.width, self.camera.height) != (int(size[1]), int(size[2])):
-            raise BufgymError(f"{depth}: its name must give a size that divides 640x480, as depth_320x240_mm.zip")
-        self.name = folder.name
-        self._archives = {"depth": depth, "image": folder / f"gray_{size[1]}x{size[2]}.zip"}
-        truth = folder / "poses_camera_to_world.txt"
-        lines = read_utf8(truth, _MOST_TEXT_BYTES).splitlines()
-        self.poses = np.stack([_pose(truth, line, number) for number, line in enumerate(lines, 1)])
-        self.time_us = _at_30_hz(len(lines))
-
-    @functools.cached_property
-    def _open(self) -> dict[str, zipfile.ZipFile]:
-        return {kind: _archive(path) for kind, path in self._archives.items()}
-
-    def _bytes(self, kind: Literal["depth", "image"], k: int) -> tuple[object, bytes]:
-        archive, member = self._open[kind], f"{k:04d}.{'png' if kind == 'depth' else 'jpg'}"
-        file = self._archives[kind] / member
-        try:
-            if archive.getinfo(member).file_size > _MOST_IMAGE_BYTES:
-                raise BufgymError(f"{file}: must be at most {_MOST_IMAGE_BYTES} bytes")
-            return file, archive.read(member)
-        except KeyError:
-            raise BufgymError(f"{file}: no such file, but a pose {k + 1}") from None
-        except (zipfile.BadZipFile, OSError, EOFError) as error:
-            raise BufgymError(f"{file}: damaged ({error})") from None
-
-
-def _archive(path: Path) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(path)
-    except FileNotFoundError:
-        raise BufgymError(f"{path}: no such file") from None
-    except (zipfile.BadZipFile, OSError) as error:
-        raise BufgymError(f"{path}: truncated, or no zip archive ({error})") from None
 
 
 def _pose(path: Path, text: str, line: int | None = None) -> Float64Array:

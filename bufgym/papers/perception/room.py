@@ -14,26 +14,23 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import rays
 from bufgym.papers.perception.frames import Depth, Image, Sequence, encoded_bytes
-from bufgym.papers.perception.mapping import lens_of
-from bufgym.papers.perception.recordings import SEVEN_SCENES_CAMERA, matrices
+from bufgym.papers.perception.recordings import SEVEN_SCENES_CAMERA, SEVEN_SCENES_HZ, matrices
 from bufgym.traces.generate.draws import stream
-from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
+from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, quaternions
 from bufgym.traces.shipped import load_motion
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 SIZE_M: Final = (5.0, 4.2, 2.6)
-"""Length, width and height of the room, m; larger where a given trajectory needs it."""
+"""Length, width and height of the room, m."""
 EYE_M: Final = 1.3
 """Mean height of the camera, m."""
 FREE_M: Final = 0.45
 """Least distance of things from the camera's path, m."""
-WALL_M: Final = 1.2
-"""Least distance of walls from a given trajectory, m."""
 BOXES: Final = 80
 BALLS: Final = 8
 MOTION: Final = "drive-0"
-"""Shipped recording whose motion the camera follows without a given trajectory."""
+"""Shipped recording whose motion the camera follows."""
 PACE: Final = 0.5
 """Its speed. The view then changes as fast as in 7-Scenes, 11.6 fields of view in 1000 frames."""
 
@@ -42,7 +39,7 @@ _TRIES: Final = 60
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Furniture:
     """Walls and furniture of a room. The floor is z = 0 and one corner is the origin."""
 
     things: Float64Array
@@ -52,20 +49,13 @@ class Scene:
     """Index of the first ball."""
 
 
-class Room(Sequence):
+class MadeUpRoom(Sequence):
     """The recording of a made-up room."""
 
     def __init__(
-        self, name: str, scene: Scene, time_us: Int64Array, poses: Float64Array, seed: int, stride: int = 1
+        self, name: str, scene: Furniture, time_us: Int64Array, poses: Float64Array, seed: int, stride: int = 1
     ) -> None:
-        """
-        Args:
-            name: name in tables.
-            scene: walls and furniture.
-            time_us, poses: times and poses of the frames, as in `Sequence`.
-            seed: seed of noise and texture.
-            stride: step between the pixels and rows rendered.
-        """
+        """``seed`` is of noise and texture; every ``stride``-th pixel of every ``stride``-th row is rendered."""
         self.name, self.scene, self.time_us, self.poses = name, scene, time_us, poses
         self.camera = SEVEN_SCENES_CAMERA.every(stride)
         self._seed, self._stride = seed, stride
@@ -87,72 +77,42 @@ class Room(Sequence):
         shape = (self.camera.height, self.camera.width)
         depth, grey = np.empty(shape, np.float32), np.empty(shape, np.uint8)
         whole, scene, pose = SEVEN_SCENES_CAMERA, self.scene, self.poses[k]
-        lens, seen = lens_of(whole), np.empty(len(scene.things), np.int64)
-        to_camera = np.linalg.inv(pose)
-        count = rays.cull(scene.things, scene.balls, lens, whole.width, whole.height, to_camera, seen)
-        bounds = np.empty((2, len(scene.things), 5))
-        for eye, aside_m in enumerate((0.0, rays.BASELINE_M)):
-            rays.bound(scene.things, scene.balls, seen, count, lens, to_camera, aside_m, bounds[eye])
-        stride, seed, face = self._stride, self._seed, np.empty(6)
-        rays.render(
-            scene.things, scene.balls, seen, count, bounds, lens, stride, pose, seed, k, noisy, face, depth, grey
-        )
+        things, lens, to_camera = (scene.things, scene.balls), whole.lens, np.linalg.inv(pose)
+        bounds = np.stack([rays.bounds(*things, lens, to_camera, aside_m) for aside_m in (0.0, rays.BASELINE_M)])
+        rays.render(*things, bounds, lens, self._stride, pose, self._seed, k, noisy, np.empty(6), depth, grey)
         return depth, grey
 
     def reduced(self, stride: int) -> Sequence:
         self.camera.every(stride)  # checks it
-        return Room(self.name, self.scene, self.time_us, self.poses, self._seed, self._stride * stride)
+        return MadeUpRoom(self.name, self.scene, self.time_us, self.poses, self._seed, self._stride * stride)
 
     def size_bytes(self, k: int) -> int:
-        whole = Room(self.name, self.scene, self.time_us, self.poses, self._seed)
+        whole = MadeUpRoom(self.name, self.scene, self.time_us, self.poses, self._seed)
         return encoded_bytes(*whole.rendered(k))
 
 
-def room(
-    seed: int,
-    poses: Poses | None = None,
-    *,
-    frames: int = 794,
-    rate_hz: float = 30.0,
-    motion: Motion | None = None,
-) -> Room:
+def made_up_room(seed: int, *, frames: int = 794) -> MadeUpRoom:
     """Make a recording of a made-up room, 640x480; `Sequence.reduced` renders fewer pixels.
 
     Args:
         seed: seed of furniture, texture and noise.
-        poses: where the camera is, z up (such as TUM's); moved into the middle of the room, which grows to hold it. By
-            default it walks round in the room and looks at the walls, turning this way and that.
-        frames: number of frames, if the trajectory is long enough; by default as many as AFR's recording has.
-        rate_hz: rate of the camera.
-        motion: speed of the camera without `poses`; by default the shipped recording `drive-0` at half speed.
+        frames: number of frames, 30 a second; by default as many as AFR's recording has.
 
     Raises:
-        BufgymError: a seed below 0, less than 2 frames, a rate that is not above 0.
+        BufgymError: a seed below 0, less than 2 frames.
     """
-    if frames < 2 or not rate_hz > 0:
-        raise BufgymError(f"frames = {frames}, rate_hz = {rate_hz}: must be at least 2, and above 0")
+    if frames < 2:
+        raise BufgymError(f"frames = {frames}: must be at least 2")
     rng = stream(seed)
-    time_us = np.rint(np.arange(frames) * (US_PER_S / rate_hz)).astype(np.int64)
-    if poses is None:
-        size_m = np.array(SIZE_M)
-        recorded, pace = (motion, 1.0) if motion else (load_motion(MOTION), PACE)
-        matrix = _walk(time_us, recorded, pace, size_m)
-    else:
-        time_us = time_us[time_us <= poses.time_us[-1]]
-        if len(time_us) < 2:
-            raise BufgymError(f"the trajectory lasts {poses.time_us[-1]} us: must hold at least 2 frames")
-        matrix = matrices(poses.at(time_us))
-        place = matrix[:, :3, 3]
-        low, high = place.min(axis=0), place.max(axis=0)
-        size_m = np.maximum(SIZE_M, high - low + 2 * WALL_M)
-        matrix[:, :3, 3] += size_m / 2 - (low + high) / 2
-    return Room(f"room-{seed}", furnished(rng, size_m, matrix[:, :3, 3]), time_us, matrix, seed)
+    time_us = np.rint(np.arange(frames) * (US_PER_S / SEVEN_SCENES_HZ)).astype(np.int64)
+    poses = _walk(time_us)
+    return MadeUpRoom(f"room-{seed}", furnished(rng, poses[:, :3, 3]), time_us, poses, seed)
 
 
-def _walk(time_us: Int64Array, motion: Motion, pace: float, size_m: Float64Array) -> Float64Array:
-    """Poses on a closed path through the room, float64[n, 4, 4], at the pace of the motion's coordinate."""
+def _walk(time_us: Int64Array) -> Float64Array:
+    """Poses on a closed path through the room, looking at its walls, float64[n, 4, 4]."""
     phase = np.linspace(0, 2 * np.pi, _LAP_POINTS + 1)
-    centre = size_m / 2
+    size_m, centre = np.array(SIZE_M), np.array(SIZE_M) / 2
     place = np.stack(
         [
             centre[0] + (size_m[0] / 2 - 1.7) * np.cos(phase),
@@ -172,20 +132,15 @@ def _walk(time_us: Int64Array, motion: Motion, pace: float, size_m: Float64Array
     way = motion_from_poses(
         Poses(np.arange(len(phase), dtype=np.int64), place, quaternions(lap[:, :3, :3])), settings
     ).coordinate
-    gone = np.mod(motion.at(time_us) * pace, way[-1])
+    gone = np.mod(load_motion(MOTION).at(time_us) * PACE, way[-1])
     nearest = np.interp(gone, way, np.arange(len(way)))
     at = Poses(np.arange(len(way), dtype=np.int64) * US_PER_S, place, quaternions(lap[:, :3, :3]))
     return matrices(at.at(np.rint(nearest * US_PER_S).astype(np.int64)))
 
 
-def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array) -> Scene:
-    """Furnish a room of this size with furniture along the walls and on the floor, and pictures and balls above.
-
-    Args:
-        rng: generator, used in a fixed order.
-        size_m: float64[3].
-        way: float64[n, 3], the camera's path, which stays free.
-    """
+def furnished(rng: np.random.Generator, way: Float64Array) -> Furniture:
+    """Draw furniture along walls and on the floor, and pictures and balls above; ``way`` float64[n, 3] stays free."""
+    size_m = np.array(SIZE_M)
     boxes = [np.array([*size_m / 2, *size_m / 2, 1.0, 0.0])]
     balls: list[Float64Array] = []
     for n in range(BOXES + BALLS):
@@ -198,7 +153,7 @@ def furnished(rng: np.random.Generator, size_m: Float64Array, way: Float64Array)
             if not near.any():
                 (balls if ball else boxes).append(thing)
                 break
-    return Scene(np.array(boxes + balls), len(boxes))
+    return Furniture(np.array(boxes + balls), len(boxes))
 
 
 def _box(rng: np.random.Generator, size_m: Float64Array, n: int) -> Float64Array:

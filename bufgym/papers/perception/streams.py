@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bufgym import policies, sim
 from bufgym.model.link import Link
-from bufgym.papers.perception.frames import Depth, Image, Sequence
+from bufgym.papers.perception.frames import Sequence
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
 from bufgym.scenario.arrivals import messages
@@ -22,43 +22,20 @@ SIZED_EVERY = 10
 """Distance between frames that are encoded; sizes between them are interpolated."""
 
 
-class First(Sequence):
-    """A recording that ends early."""
-
-    def __init__(self, whole: Sequence, frames: int) -> None:
-        self.name, self.camera = whole.name, whole.camera
-        self.time_us, self.poses = whole.time_us[:frames], whole.poses[:frames]
-        self._whole = whole
-
-    def depth(self, k: int) -> Depth:
-        return self._whole.depth(k)
-
-    def image(self, k: int) -> Image:
-        return self._whole.image(k)
-
-    def size_bytes(self, k: int) -> int:
-        return self._whole.size_bytes(k)
-
-
-def first(sequence: Sequence, frames: int) -> Sequence:
-    """Select the recording's first frames, or all if there are no more."""
-    return sequence if len(sequence) <= frames else First(sequence, frames)
-
-
 @lru_cache(maxsize=8)
-def sizes(sequence: Sequence, every: int = SIZED_EVERY) -> NDArray[np.int64]:
+def sizes(sequence: Sequence) -> NDArray[np.int64]:
     """Bytes of each frame as it is sent, int64[frames]."""
-    return between([sequence.size_bytes(int(k)) for k in encoded(len(sequence), every)], len(sequence), every)
+    return between([sequence.size_bytes(int(k)) for k in encoded(len(sequence))], len(sequence))
 
 
-def encoded(frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
-    """Select the frames whose sizes are measured: one in ``every``, and the last."""
-    return np.unique(np.append(np.arange(0, frames, every), frames - 1))
+def encoded(frames: int) -> NDArray[np.int64]:
+    """Select the frames whose sizes are measured: one in ``SIZED_EVERY``, and the last."""
+    return np.unique(np.append(np.arange(0, frames, SIZED_EVERY), frames - 1))
 
 
-def between(measured: Seq[int], frames: int, every: int = SIZED_EVERY) -> NDArray[np.int64]:
+def between(measured: Seq[int], frames: int) -> NDArray[np.int64]:
     """Interpolate all frames' sizes from the measured sizes of ``encoded``, int64[frames]."""
-    return np.rint(np.interp(np.arange(frames), encoded(frames, every), measured)).astype(np.int64)
+    return np.rint(np.interp(np.arange(frames), encoded(frames), measured)).astype(np.int64)
 
 
 def fading(stream_us: int, trace: Trace, offset_us: int = 0) -> Link:

@@ -3,6 +3,11 @@
 The model begins with the first frame at its true pose. Each further frame is aligned, coarse to fine, with the model as
 seen from the frame before, and then fused into it at the pose found. There is no model of motion and no relocation. A
 camera that moves too far between two frames that arrived is lost, as it is for the robot's server.
+
+The papers do not define a tracking failure. Here a run fails at the first frame where the alignment finds too few
+pairs, so that the tracker knows that it is lost. It also fails where the step from the frame before is too far from
+the true step, so that the tracker is lost without knowing. Slow drift is no failure, because it depends on the
+recording's camera model.
 """
 
 from __future__ import annotations
@@ -12,12 +17,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import icp, tsdf
 from bufgym.papers.perception.frames import Camera, Depth, Sequence
-from bufgym.papers.perception.mapping import FAR_M, Grid, Map, grid_of, lens_of
+from bufgym.papers.perception.mapping import FAR_M, Map, VoxelGrid, grid_of
 from bufgym.traces.poses import rotations
 from bufgym.traces.trace import Float64Array
 
@@ -35,49 +39,24 @@ SMOOTH_RADIUS: Final = 2
 """Depths are smoothed over 5x5 pixels, within one surface, before normals are taken."""
 MOST_WEIGHT: Final = 64.0
 """Limit on frames in the model's running mean, which forgets as in KinectFusion."""
-
-
-@dataclass(frozen=True)
-class TrackingSettings:
-    """Criteria for pairs of points and for a tracking failure.
-
-    The papers do not define a tracking failure. Here a run fails at the first frame where the alignment finds too few
-    pairs, so that the tracker knows that it is lost. It also fails where the step from the frame before is too far from
-    the true step, so that the tracker is lost without knowing. Slow drift is no failure, because it depends on the
-    recording's camera model.
-    """
-
-    apart_m: float = 0.1
-    """Pairs farther apart than this are none, m."""
-    apart_deg: float = 30.0
-    """Nor are pairs whose normals differ by more, degrees."""
-    least_pairs: float = 0.3
-    """Lost if fewer of the frame's points than this share have a pair."""
-    most_error_m: float = 0.1
-    """Lost if one step is off by more, m."""
-    most_error_deg: float = 5.0
-    """Lost if the turn of one step is off by more, degrees."""
-
-    def __post_init__(self) -> None:
-        for name in ("apart_m", "apart_deg", "most_error_m", "most_error_deg"):
-            if not getattr(self, name) > 0:
-                raise BufgymError(f"{name} = {getattr(self, name)}: must be above 0")
-        if not 0 <= self.least_pairs <= 1:
-            raise BufgymError(f"least_pairs = {self.least_pairs}: must be from 0 to 1")
+APART_M: Final = 0.1
+"""Pairs farther apart than this are none, m."""
+APART_DEG: Final = 30.0
+"""Nor are pairs whose normals differ by more, degrees."""
+LEAST_PAIRS: Final = 0.3
+"""Lost if fewer of the frame's points than this share have a pair."""
+MOST_ERROR_M: Final = 0.1
+"""Lost if one step is off by more, m."""
+MOST_ERROR_DEG: Final = 5.0
+"""Lost if the turn of one step is off by more, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """Result of tracking."""
 
-    frames: npt.NDArray[np.int64]
-    """int64[m], indices of the frames that arrived."""
     poses: Float64Array
-    """float64[m, 4, 4], the poses found, camera to world; NaN from the failure on."""
-    error_m: Float64Array
-    """float64[m], distance from the true position, drift included, m; NaN from the failure on."""
-    error_deg: Float64Array
-    """float64[m], the same of the orientation, degrees."""
+    """float64[m, 4, 4], the poses found for the frames that arrived, camera to world; NaN from the failure on."""
     where: int | None
     """The frame (index of the sequence) at which tracking failed; None if it never did."""
     model: Map
@@ -99,8 +78,7 @@ def smoothed(depth: Depth) -> Depth:
 def track(
     sequence: Sequence,
     frames: Iterable[int],
-    grid: Grid | None = None,
-    settings: TrackingSettings | None = None,
+    grid: VoxelGrid | None = None,
     smooth: Callable[[int], Depth] | None = None,
 ) -> Track:
     """Follow the camera through the frames that arrived, until that fails.
@@ -109,36 +87,31 @@ def track(
         sequence: the recording; `Sequence.reduced` to about 160x120 is meant.
         frames: indices of the frames that arrived, in order.
         grid: grid of the model; by default `grid_of` the whole recording.
-        settings: by default `TrackingSettings()`.
         smooth: returns `smoothed` of frame k, for callers that cache it.
 
     Raises:
         BufgymError: no frame, or frames that are not in order.
     """
-    settings = settings or TrackingSettings()
     arrived = np.array(list(frames), np.int64)
     if not len(arrived) or (np.diff(arrived) <= 0).any() or arrived[0] < 0 or arrived[-1] >= len(sequence):
         raise BufgymError(f"frames: must be at least one index below {len(sequence)}, increasing")
     poses = np.full((len(arrived), 4, 4), np.nan)
-    errors = np.full((2, len(arrived)), np.nan)
     truth = sequence.poses[arrived]
-    poses[0], errors[:, 0] = truth[0], 0.0
-    tracker = Tracker(sequence.camera, grid or grid_of(sequence), settings)
-    tracker.begin(sequence.depth(int(arrived[0])), poses[0])
+    poses[0] = truth[0]
+    tracker = Tracker(sequence.camera, grid or grid_of(sequence))
+    tracker.add(sequence.depth(int(arrived[0])), poses[0])
     for n, k in enumerate(arrived.tolist()[1:], 1):
         pose = tracker.follow(sequence.depth(k), smooth(k) if smooth else None)
-        if pose is None or _jumped(poses[n - 1], pose, truth[n - 1], truth[n], settings):
-            return Track(arrived, poses, errors[0], errors[1], k, tracker.model)
-        poses[n], errors[:, n] = pose, difference(pose, truth[n])
-    return Track(arrived, poses, errors[0], errors[1], None, tracker.model)
+        if pose is None or jumped(poses[n - 1], pose, truth[n - 1], truth[n]):
+            return Track(poses, k, tracker.model)
+        poses[n] = pose
+    return Track(poses, None, tracker.model)
 
 
-def _jumped(
-    before: Float64Array, pose: Float64Array, true_before: Float64Array, truth: Float64Array, settings: TrackingSettings
-) -> bool:
+def jumped(before: Float64Array, pose: Float64Array, true_before: Float64Array, truth: Float64Array) -> bool:
     """Whether the step between two poses is too far from the true step."""
     off_m, off_deg = difference(np.linalg.inv(before) @ pose, np.linalg.inv(true_before) @ truth)
-    return off_m > settings.most_error_m or off_deg > settings.most_error_deg
+    return off_m > MOST_ERROR_M or off_deg > MOST_ERROR_DEG
 
 
 def difference(pose: Float64Array, truth: Float64Array) -> tuple[float, float]:
@@ -152,24 +125,19 @@ def difference(pose: Float64Array, truth: Float64Array) -> tuple[float, float]:
 class Tracker:
     """A growing model and the camera's pose in it."""
 
-    def __init__(self, camera: Camera, grid: Grid, settings: TrackingSettings | None = None) -> None:
-        self.settings = settings or TrackingSettings()
+    def __init__(self, camera: Camera, grid: VoxelGrid) -> None:
         self.model = Map.empty(grid)
         self.pose = np.eye(4)
-        self._camera, self._lens = camera, lens_of(camera)
+        self._camera, self._lens = camera, camera.lens
         stride = max(1, camera.width // MODEL_WIDTH)
         self._stride = 1 if camera.height % stride or camera.width % stride else stride
         model_camera = camera.every(self._stride)
-        self._model_lens = lens_of(model_camera)
+        self._model_lens = model_camera.lens
         shape, model_shape = ((c.height, c.width, 3) for c in (camera, model_camera))
-        self._points, self._normals = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._normals = np.zeros(shape, np.float32)
         self._seen, self._seen_normals = np.zeros(model_shape, np.float32), np.zeros(model_shape, np.float32)
         self._jacobian, self._sums = np.zeros(8), np.zeros((8, 8))
         self._hint: Depth = np.zeros(model_shape[:2], np.float32)
-
-    def begin(self, depth: Depth, pose: Float64Array) -> None:
-        """Start with the first frame at a known pose."""
-        self._fuse(depth, pose)
 
     def follow(self, depth: Depth, smooth: Depth | None = None) -> Float64Array | None:
         """Find the pose of the next frame, camera to world, and add it to the model; None if it is lost.
@@ -178,29 +146,20 @@ class Tracker:
         """
         pose = self._aligned(smoothed(depth) if smooth is None else smooth)
         if pose is not None:
-            self._fuse(depth, pose)
+            self.add(depth, pose)
         return pose
 
-    def _fuse(self, depth: Depth, pose: Float64Array) -> None:
+    def add(self, depth: Depth, pose: Float64Array) -> None:
+        """Fuse a frame at a known pose."""
         self.pose, self._hint = pose, np.ascontiguousarray(depth[:: self._stride, :: self._stride])
         self.model.add(depth, self._camera, pose, MOST_WEIGHT)
 
     def _aligned(self, smooth: Depth) -> Float64Array | None:
         model, grid, lens, pose = self.model, self.model.grid, self._lens, self.pose
-        icp.unproject(smooth, FAR_M, lens, self._points)
+        self._points = icp.unproject(smooth, FAR_M, lens)
         icp.orient(self._points, np.zeros(3), SAME_SURFACE, self._normals)
-        tsdf.raycast(
-            model.tsdf,
-            model.weight,
-            np.array(grid.origin_m),
-            grid.voxel_m,
-            grid.truncation_m,
-            FAR_M,
-            self._model_lens,
-            pose,
-            self._hint,
-            self._seen,
-        )
+        place = np.array(grid.origin_m), grid.voxel_m, grid.truncation_m, FAR_M, self._model_lens, pose
+        tsdf.raycast(model.tsdf, model.weight, *place, self._hint, self._seen)
         icp.orient(self._seen, np.ascontiguousarray(pose[:3, 3]), SAME_SURFACE, self._seen_normals)
         to_model_camera = np.asarray(np.linalg.inv(pose), np.float64)
         for stride, most_steps in LEVELS:
@@ -215,21 +174,12 @@ class Tracker:
 
     def _step(self, stride: int, pose: Float64Array, to_model_camera: Float64Array) -> Float64Array | None:
         """The rotation and translation that bring the points into the model's planes; None if too few have a pair."""
+        model = self._seen, self._seen_normals, to_model_camera, self._model_lens
+        limits = APART_M, float(np.cos(np.radians(APART_DEG)))
         points = icp.normal_equations(
-            self._points,
-            self._normals,
-            stride,
-            pose,
-            self._seen,
-            self._seen_normals,
-            to_model_camera,
-            self._model_lens,
-            self.settings.apart_m,
-            float(np.cos(np.radians(self.settings.apart_deg))),
-            self._jacobian,
-            self._sums,
+            self._points, self._normals, stride, pose, *model, *limits, self._jacobian, self._sums
         )
-        if self._sums[7, 7] < max(6.0, self.settings.least_pairs * points):
+        if self._sums[7, 7] < max(6.0, LEAST_PAIRS * points):
             return None
         try:
             return np.asarray(np.linalg.solve(self._sums[:6, :6], -self._sums[:6, 6]), np.float64)

@@ -12,6 +12,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bufgym.ground.kernel import kernel
 
 NEAR_M = 0.3
@@ -83,33 +86,19 @@ def _clipped(low: float, high: float, start: float, step: float) -> tuple[float,
     return (low, high) if start >= 0.0 else (1.0, 0.0)
 
 
-@kernel
-def surface(tsdf: Any, weight: Any, origin_m: Any, voxel_m: float, points: Any) -> int:
-    """Write the crossings of the surface with edges between seen voxels to ``points`` float64[m, 3], while it has room.
-
-    Returns the number of crossings.
-    """
-    count = 0
-    for i in range(tsdf.shape[0]):
-        for j in range(tsdf.shape[1]):
-            for k in range(tsdf.shape[2]):
-                a = tsdf[i, j, k]
-                if weight[i, j, k] == 0.0 or a >= 1.0:
-                    continue
-                for axis in range(3):
-                    ni, nj, nk = i + (axis == 0), j + (axis == 1), k + (axis == 2)
-                    if ni == tsdf.shape[0] or nj == tsdf.shape[1] or nk == tsdf.shape[2]:
-                        continue
-                    b = tsdf[ni, nj, nk]
-                    if weight[ni, nj, nk] == 0.0 or b >= 1.0 or (a < 0.0) == (b < 0.0):
-                        continue
-                    if count < points.shape[0]:
-                        share = a / (a - b)
-                        points[count, 0] = origin_m[0] + voxel_m * (i + share * (axis == 0))
-                        points[count, 1] = origin_m[1] + voxel_m * (j + share * (axis == 1))
-                        points[count, 2] = origin_m[2] + voxel_m * (k + share * (axis == 2))
-                    count += 1
-    return count
+def surface(tsdf: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Crossings of the surface with edges between seen voxels, float64[m, 3], in voxels."""
+    known = (weight > 0) & (tsdf < 1)
+    crossed = np.zeros((*tsdf.shape, 3), np.bool_)
+    for axis in range(3):
+        near = tuple(slice(None, -1) if other == axis else slice(None) for other in range(3))
+        far = tuple(slice(1, None) if other == axis else slice(None) for other in range(3))
+        crossed[(*near, axis)] = known[near] & known[far] & ((tsdf[near] < 0) != (tsdf[far] < 0))
+    *place, along = np.nonzero(crossed)
+    a, b = tsdf[*place], tsdf[*(index + (along == axis) for axis, index in enumerate(place))]
+    points = np.stack(place, axis=1).astype(np.float64)
+    points[np.arange(len(along)), along] += a / (a - b)
+    return points
 
 
 @kernel

@@ -10,7 +10,7 @@ This V depends on two frames, while the paper's depends on the distance between 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel
 from bufgym.papers.perception.frames import Sequence
-from bufgym.traces.trace import Float64Array
+from bufgym.papers.perception.mapping import points_of
 
 AGREE: Final = 0.05
 """Largest relative difference of agreeing depths, ten times a Kinect's noise at 3 m."""
@@ -31,66 +31,47 @@ LEAST_VIEWS: Final = 3
 
 
 @kernel
-def seen_share(
-    depths: NDArray[np.float32],
-    poses: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    i: int,
-    j: int,
-    stride: int,
-) -> float:
-    """Part of frame j that frame i has seen, in [0, 1]; 0 if frame i measured none of it.
+def _all_shares(depths: Any, poses: Any, lens: Any, stride: int, result: Any) -> None:
+    """Write the part of frame j that frame i has seen, for every i and each later j; 0 if frame i measured none of it.
 
     Args:
         depths: float32[frames, height, width], m.
         poses: float64[frames, 4, 4], camera to world.
-        lens: fx, fy, cx, cy of both, pixels.
-        i, j: the two frames.
+        lens: float64[4], fx, fy, cx, cy of all, pixels.
         stride: step between the pixels and rows of frame j that are looked for.
+        result: float32[frames, frames], written.
     """
     height, width = depths.shape[1], depths.shape[2]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
-    seen, known = 0, 0
-    for v in range(stride // 2, height, stride):
-        for u in range(stride // 2, width, stride):
-            z = float(depths[j, v, u])
-            if z <= 0.0:
-                continue
-            x, y = (u - cx) * z / fx, (v - cy) * z / fy
-            # To the world by pose j, relative to camera i's position ...
-            dx = poses[j, 0, 0] * x + poses[j, 0, 1] * y + poses[j, 0, 2] * z + poses[j, 0, 3] - poses[i, 0, 3]
-            dy = poses[j, 1, 0] * x + poses[j, 1, 1] * y + poses[j, 1, 2] * z + poses[j, 1, 3] - poses[i, 1, 3]
-            dz = poses[j, 2, 0] * x + poses[j, 2, 1] * y + poses[j, 2, 2] * z + poses[j, 2, 3] - poses[i, 2, 3]
-            # ... and into camera i's axes by the transposed rotation.
-            away = poses[i, 0, 2] * dx + poses[i, 1, 2] * dy + poses[i, 2, 2] * dz
-            if away <= 0.0:
-                known += 1
-                continue
-            right = poses[i, 0, 0] * dx + poses[i, 1, 0] * dy + poses[i, 2, 0] * dz
-            down = poses[i, 0, 1] * dx + poses[i, 1, 1] * dy + poses[i, 2, 1] * dz
-            across, along = right / away * fx + cx + 0.5, down / away * fy + cy + 0.5
-            if not (0.0 <= across < width and 0.0 <= along < height):
-                known += 1
-                continue
-            measured = float(depths[i, int(along), int(across)])
-            if measured > 0.0:
-                known += 1
-                seen += abs(measured - away) <= AGREE * away
-    return seen / known if known > 0 else 0.0
-
-
-@kernel
-def _all_shares(
-    depths: NDArray[np.float32],
-    poses: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    stride: int,
-    seen: NDArray[np.float32],
-) -> None:
-    """Write ``seen_share`` of every frame and each later one."""
     for i in range(len(depths)):
         for j in range(i + 1, len(depths)):
-            seen[i, j] = seen_share(depths, poses, lens, i, j, stride)
+            seen, known = 0, 0
+            for v in range(stride // 2, height, stride):
+                for u in range(stride // 2, width, stride):
+                    z = float(depths[j, v, u])
+                    if z <= 0.0:
+                        continue
+                    x, y = (u - cx) * z / fx, (v - cy) * z / fy
+                    # To the world by pose j, relative to camera i's position ...
+                    dx = poses[j, 0, 0] * x + poses[j, 0, 1] * y + poses[j, 0, 2] * z + poses[j, 0, 3] - poses[i, 0, 3]
+                    dy = poses[j, 1, 0] * x + poses[j, 1, 1] * y + poses[j, 1, 2] * z + poses[j, 1, 3] - poses[i, 1, 3]
+                    dz = poses[j, 2, 0] * x + poses[j, 2, 1] * y + poses[j, 2, 2] * z + poses[j, 2, 3] - poses[i, 2, 3]
+                    # ... and into camera i's axes by the transposed rotation.
+                    away = poses[i, 0, 2] * dx + poses[i, 1, 2] * dy + poses[i, 2, 2] * dz
+                    if away <= 0.0:
+                        known += 1
+                        continue
+                    right = poses[i, 0, 0] * dx + poses[i, 1, 0] * dy + poses[i, 2, 0] * dz
+                    down = poses[i, 0, 1] * dx + poses[i, 1, 1] * dy + poses[i, 2, 1] * dz
+                    across, along = right / away * fx + cx + 0.5, down / away * fy + cy + 0.5
+                    if not (0.0 <= across < width and 0.0 <= along < height):
+                        known += 1
+                        continue
+                    measured = float(depths[i, int(along), int(across)])
+                    if measured > 0.0:
+                        known += 1
+                        seen += abs(measured - away) <= AGREE * away
+            result[i, j] = seen / known if known > 0 else 0.0
 
 
 def seen_shares(sequence: Sequence) -> NDArray[np.float32]:
@@ -98,11 +79,9 @@ def seen_shares(sequence: Sequence) -> NDArray[np.float32]:
 
     About 10 us a pair: some seconds for a thousand frames.
     """
-    camera = sequence.camera
     depths = np.stack([sequence.depth(k) for k in range(len(sequence))])
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    seen = np.eye(len(sequence), dtype=np.float32)
-    _all_shares(depths, np.ascontiguousarray(sequence.poses), lens, max(1, camera.width // POINTS_ACROSS), seen)
+    seen, stride = np.eye(len(sequence), dtype=np.float32), max(1, sequence.camera.width // POINTS_ACROSS)
+    _all_shares(depths, np.ascontiguousarray(sequence.poses), sequence.camera.lens, stride, seen)
     return seen
 
 
@@ -160,14 +139,7 @@ class Coverage:
 
 def _cells(sequence: Sequence, k: int, cell_m: float) -> NDArray[np.int64]:
     """Cell of each point that frame k measured, 20 bits for each of x, y and z, int64[points]."""
-    x, y, z = np.floor(world_points(sequence, k) / cell_m).astype(np.int64).T + 2**19
+    pose = sequence.poses[k]
+    world = points_of(sequence.depth(k), sequence.camera, near_m=0.0, far_m=np.inf) @ pose[:3, :3].T + pose[:3, 3]
+    x, y, z = np.floor(world / cell_m).astype(np.int64).T + 2**19
     return np.asarray((x << 40) + (y << 20) + z, np.int64)
-
-
-def world_points(sequence: Sequence, k: int) -> Float64Array:
-    """World coordinates of the points that frame k measured, float64[points, 3], m."""
-    depth, camera, pose = sequence.depth(k), sequence.camera, sequence.poses[k]
-    v, u = np.nonzero(depth > 0)
-    z = depth[v, u].astype(np.float64)
-    local = np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], axis=1)
-    return np.asarray(local @ pose[:3, :3].T + pose[:3, 3], np.float64)

@@ -16,16 +16,17 @@ counting it.
 from __future__ import annotations
 
 import functools
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import reward_term
-from bufgym.papers.perception import room, streams, tracking, views
+from bufgym.papers.perception import streams, views
 from bufgym.papers.perception.frames import Sequence
-from bufgym.papers.perception.mapping import Grid, grid_of
+from bufgym.papers.perception.room import made_up_room
+from bufgym.papers.perception.stage import Stage
 from bufgym.policies.registry import Memory
 from bufgym.scenario import Uplink
 from bufgym.scenario.draws import shipped
@@ -42,35 +43,20 @@ SIZES: Final = (
 )
 """Bytes of every tenth frame and the last, measured once and checked by a test. So episodes begin at once and do not
 depend on the JPEG library installed."""
-WIDTH, VIEW_WIDTH = 160, 80
-"""Image widths: frames are tracked at 160 x 120, and views are compared at 80 x 60."""
 SCALE: Final = 0.25
 """Scale of the shipped links, which then carry about half of the frames."""
-
-
-class Scene(NamedTuple):
-    """The recording and the data that the terms need."""
-
-    whole: Sequence
-    film: Sequence
-    grid: Grid
-    seen: NDArray[np.float32]
-    coverage: views.Coverage
 
 
 @functools.cache
 def recording() -> Sequence:
     """Make the recording of the room, not yet rendered."""
-    return room.room(SEED, frames=FRAMES)
+    return made_up_room(SEED, frames=FRAMES)
 
 
 @functools.cache
-def scene() -> Scene:
+def scene() -> Stage:
     """Render the room once per process, in some seconds."""
-    whole = recording()
-    film = whole.reduced(whole.camera.width // WIDTH).loaded()
-    small = film.reduced(WIDTH // VIEW_WIDTH)
-    return Scene(whole, film, grid_of(film), views.seen_shares(small), views.Coverage(small))
+    return Stage(recording())
 
 
 @functools.cache
@@ -99,8 +85,7 @@ def tracked_part(frames: NDArray[np.int64]) -> float:
     """Part of the recording up to which tracking along these frames gets."""
     if not len(frames):
         return 0.0
-    track = tracking.track(scene().film, frames, scene().grid)
-    reached = frames[~np.isnan(track.poses[:, 0, 0])]
+    reached = frames[~np.isnan(scene().track_of(frames.tolist()).poses[:, 0, 0])]
     return float(reached[-1] - frames[0]) / (FRAMES - 1)
 
 

@@ -31,6 +31,9 @@ class Held(Sequence):
     def image(self, k: int) -> Image:
         return np.zeros(self._depths[k].shape, np.uint8)
 
+    def size_bytes(self, k: int) -> int:
+        return 1000 * (k + 1)
+
 
 def png(value: int, dtype: type = np.uint16, shape: tuple[int, ...] = (HEIGHT, WIDTH)) -> bytes:
     return cv2.imencode(".png", np.full(shape, value, dtype))[1].tobytes()

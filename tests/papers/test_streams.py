@@ -1,12 +1,13 @@
 """Frames sent over a link, what arrives, how much of it is new, and which frames images call similar."""
 
+import frame_cases
 import numpy as np
 import pytest
 
 from bufgym import scenario, sim
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import streams
-from bufgym.papers.perception.frames import Camera, Depth, Image, Sequence
+from bufgym.papers.perception.frames import Camera
 from bufgym.papers.perception.orb import OrbSimilarity, decision_ms, orbbuf_by
 from bufgym.papers.perception.views import Coverage, overlap_information, seen_shares
 from bufgym.policies import get
@@ -16,32 +17,20 @@ from bufgym.traces import Trace
 TRACE = Trace.steps([(1, 100.0), (1, 50.0), (2, 10.0)], name="falling")
 
 
-class Wall(Sequence):
+def wall(*right_m: float) -> frame_cases.Held:
     """A wall 2 m ahead of a camera that looks along z and moves to the right; a pixel is 10 cm wide there."""
-
-    def __init__(self, right_m: list[float]) -> None:
-        self.name, self.camera = "wall", Camera(40, 30, 20.0, 20.0, 19.5, 14.5)
-        self.time_us = np.arange(len(right_m)) * 33_333
-        self.poses = np.tile(np.eye(4), (len(right_m), 1, 1))
-        self.poses[:, 0, 3] = right_m
-        self.depths = np.full((len(right_m), 30, 40), 2.0, np.float32)
-
-    def depth(self, k: int) -> Depth:
-        return self.depths[k]
-
-    def image(self, k: int) -> Image:
-        return np.zeros((30, 40), np.uint8)
-
-    def size_bytes(self, k: int) -> int:
-        return 1000 * (k + 1)
+    poses = np.tile(np.eye(4), (len(right_m), 1, 1))
+    poses[:, 0, 3] = right_m
+    depths = [np.full((30, 40), 2.0, np.float32) for _ in right_m]
+    return frame_cases.Held(Camera(40, 30, 20.0, 20.0, 19.5, 14.5), depths, list(poses))
 
 
 def test_sizes_first_frames_and_fades() -> None:
-    assert streams.sizes(Wall([0.0] * 4), every=2).tolist() == [1000, 2000, 3000, 4000]
-    part = streams.first(Wall([0, 1, 2]), 2)
+    assert streams.sizes(wall(*[0.0] * 14)).tolist() == [1000 * k for k in range(1, 15)]
+    part = wall(0, 1, 2).first(2)
     assert (len(part), part.poses[1, 0, 3], part.depth(1)[0, 0], part.size_bytes(1)) == (2, 1, 2, 2000)
-    whole = Wall([0, 1])
-    assert streams.first(whole, 5) is whole
+    whole = wall(0, 1)
+    assert whole.first(5) is whole
     # Two seconds carry 150 bytes wherever they begin; what comes after them is the two seconds again.
     for offset_us, first in ((0, 100), (1_000_000, 50), (2_000_000, 100)):
         link = streams.fading(2_000_000, TRACE, offset_us)
@@ -50,51 +39,35 @@ def test_sizes_first_frames_and_fades() -> None:
     assert longer.carried_at(4_000_000) == 170 and longer.carried_at(8_000_000) == 340
 
 
-def test_what_arrives_over_a_slow_link() -> None:
-    """Frames of 10 bytes each 1/30 s; the link carries one while three come, the queue holds one."""
-    wall, size = Wall([0.1 * k for k in range(60)]), np.full(60, 10, np.int64)
-
-    def received(policy: str, frames: int, bytes_per_s: float, L: int, seed: int = 0) -> tuple[int, ...]:
-        link = streams.fading(10_000_000, Trace.constant(bytes_per_s, 10.0, name="link"))
-        return streams.received(policy, streams.episode(streams.first(wall, frames), size[:frames], link, seed), L)
-
-    assert received("drop-oldest", 9, 1e6, 1) == tuple(range(9))
-    # In transmission: 0 until 0.1 s, as 3 comes; 3 replaces 2 before the next is taken, and so on.
-    some = received("drop-oldest", 9, 100.0, 1)
-    assert some[0] == 0 and some[-1] == 8 and len(some) < 6
-    kept = [received("random", 60, 60.0, 5, seed) for seed in (0, 0, 1)]
-    assert kept[0] == kept[1] != kept[2]
-
-
 def test_shares_of_a_view_that_were_seen_before() -> None:
     """1 m to the right is 10 of 40 pixels, a quarter of the view; 5 m leave nothing in common."""
-    seen = seen_shares(Wall([0, 1, 5]))
+    seen = seen_shares(wall(0, 1, 5))
     assert (seen[0, 1], seen[0, 2], seen[1, 0]) == (0.75, 0, 0)  # only what came after
     assert seen.diagonal().tolist() == [1, 1, 1]
-    wall = Wall([0, 0])
-    wall.depths[0, :, :20] = 0  # frame 0 measured nothing on its left half: a hole tells nothing
-    assert seen_shares(wall)[0, 1] == 1
-    wall.depths[0, :, :20] = 1.5  # something stood before the wall there
-    assert seen_shares(wall)[0, 1] == 0.5
-    wall.depths[0] = 0
-    assert seen_shares(wall)[0, 1] == 0
-    turned = Wall([0, 0])
+    holed = wall(0, 0)
+    holed.depth(0)[:, :20] = 0  # frame 0 measured nothing on its left half: a hole tells nothing
+    assert seen_shares(holed)[0, 1] == 1
+    holed.depth(0)[:, :20] = 1.5  # something stood before the wall there
+    assert seen_shares(holed)[0, 1] == 0.5
+    holed.depth(0)[:] = 0
+    assert seen_shares(holed)[0, 1] == 0
+    turned = wall(0, 0)
     turned.poses[1, :3, :3] = np.diag([-1, 1, -1])
     assert seen_shares(turned)[0, 1] == 0
 
 
 def test_information_and_coverage_count_what_is_new() -> None:
-    seen = seen_shares(Wall([0, 1, 0]))
+    seen = seen_shares(wall(0, 1, 0))
     # A quarter there, and another back.
     assert [overlap_information(seen, kept) for kept in ([], [1], [0, 1, 2], [0, 2])] == [0, 1, 1.5, 1]
     # Frame 0 and its return see 40 columns of the wall, frame 1 the 10 beyond them, and 30 of the 40.
-    coverage = Coverage(Wall([0, 1, 0]), least_views=1)
+    coverage = Coverage(wall(0, 1, 0), least_views=1)
     assert coverage.cells == 50 * 30
     assert coverage.share([0]) == coverage.share([1]) == coverage.share([0, 2]) == 0.8
     assert (coverage.share([0, 1]), coverage.share([2, 1, 0]), coverage.share([])) == (1, 1, 0)
-    assert Coverage(Wall([0, 1, 0]), least_views=2).cells == 40 * 30
-    with pytest.raises(BufgymError, match=r"wall: no cell of 0\.1 m was seen by 3 of its frames"):
-        Coverage(Wall([0, 0]))
+    assert Coverage(wall(0, 1, 0), least_views=2).cells == 40 * 30
+    with pytest.raises(BufgymError, match=r"held: no cell of 0\.1 m was seen by 3 of its frames"):
+        Coverage(wall(0, 0))
 
 
 @pytest.mark.kernels
@@ -111,7 +84,7 @@ def test_with_motion_for_images_it_decides_as_orbbuf() -> None:
 
 def test_images_are_like_themselves_less_like_what_moved_and_hardly_like_others() -> None:
     pytest.importorskip("cv2")
-    from bufgym.papers.perception.room import room
+    from bufgym.papers.perception.room import made_up_room
 
     # Squares of noise, which have corners.
     noise = np.random.default_rng(0).integers(0, 255, (2, 30, 40), np.uint8).repeat(8, 1).repeat(8, 2)
@@ -123,4 +96,4 @@ def test_images_are_like_themselves_less_like_what_moved_and_hardly_like_others(
     assert similar(0, 2) < 0.3
     assert similar(0, 3) == similar(3, 0) == 0  # no features, no likeness
     assert similar(1, 0) == similar(0, 1)
-    assert (decision_ms(room(0, frames=5).reduced(4), 2) > 0).all()
+    assert (decision_ms(made_up_room(0, frames=5).reduced(4), 2) > 0).all()

@@ -8,42 +8,28 @@ import pytest
 
 from bufgym.papers import afr_fig7, afr_fig8, afr_overlap, frame_tasks
 from bufgym.papers.correlation import spearman, spearman_over
-from bufgym.papers.frame_tasks import Store, Task, carry_out
+from bufgym.papers.frame_tasks import FrameTask, carry_out
 from bufgym.papers.rows import Rows
 from bufgym.traces import Trace
 
 LINK = Trace.constant(1e6, 10.0, name="link")
 
 
-def task(kept: tuple[int, ...], kind: Any = "map") -> Task:
-    return Task(kind, "room", None, 40, kept, "afr", LINK)
-
-
-def test_a_task_is_known_by_what_is_asked() -> None:
-    assert task((0, 3)).key == task((0, 3))._replace(data="elsewhere", policy="random").key
-    others = [task((0, 4)), task((0, 3), "track"), task((0, 3))._replace(frames=41), task((0, 3), "kept")]
-    assert len({task((0, 3)).key, *(other.key for other in others)}) == 5
-    assert task((0, 3), "kept").key != task((0, 3), "kept")._replace(policy="random").key
-
-
 def test_what_is_finished_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
+    """Equal tasks are done once, wherever the data lie; a map or track is of its frames, whatever the policy was."""
+    asked: list[tuple[int, ...]] = []
 
-    def carried_out(one: Task) -> tuple[str, dict[str, Any]]:
-        asked.append(one.key)
-        return one.key, {"rmse_mm": float(len(one.about))}
+    class Counted:
+        def mapped(self, about: tuple[int, ...]) -> dict[str, float]:
+            asked.append(about)
+            return {"rmse_mm": float(len(about))}
 
-    monkeypatch.setattr(frame_tasks, "carried_out", carried_out)
-    path = tmp_path / "new" / "runs.jsonl"
-    carry_out([task((0, 1)), task((0, 1)), task((0, 1, 2))], Store(path), 1)
-    assert len(asked) == 2  # equal tasks once
-    with path.open("a") as file:
-        file.write('["cut short by a ki')
-    again = Store(path)
-    carry_out([task((0, 1)), task((0, 5, 6))], again, 1)
-    assert asked[2:] == [task((0, 5, 6)).key]
-    assert again[task((0, 1))] == {"rmse_mm": 2.0}
-    assert Store(path)[task((0, 5, 6))] == {"rmse_mm": 3.0}  # also behind the line that was cut short
+    monkeypatch.setattr(frame_tasks, "stage", lambda *place: Counted())
+    one, two, three = (FrameTask("map", "room", 40, kept) for kept in ((0, 1), (0, 1, 2), (0, 5, 6)))
+    found = carry_out([one, one, two], None, LINK, tmp_path, 1)
+    assert found == {one: {"rmse_mm": 2.0}, two: {"rmse_mm": 3.0}} and len(asked) == 2
+    assert carry_out([one, three], "elsewhere", LINK, tmp_path, 1)[one] == {"rmse_mm": 2.0}
+    assert asked[2:] == [(0, 5, 6)]
 
 
 def test_spearman() -> None:
