@@ -18,7 +18,7 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.score import paired_difference, scores
 from bufgym.benchmark.tasks import bound
-from bufgym.oracle.measure import BASELINE, normalised_score, regret
+from bufgym.oracle import BASELINE, normalised_score, regret
 from bufgym.policies import registry
 from bufgym.scenario import Scenario, Uplink
 from bufgym.sim import run

@@ -31,7 +31,7 @@ import bufgym  # noqa: F401  (registers the environments)
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
 from bufgym.envs import expert
-from bufgym.oracle.measure import normalised_score
+from bufgym.oracle import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]

@@ -18,7 +18,7 @@ from bufgym import policies, scenario
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.table import aligned
 from bufgym.benchmark.tasks import bound
-from bufgym.oracle.measure import BASELINE, normalised_score
+from bufgym.oracle import BASELINE, normalised_score
 from bufgym.sim.metrics import outcome
 from bufgym.sim.state import NEVER
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import bundle, direct, kernel, local, prefetch, stretch, table
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
@@ -92,15 +91,6 @@ def decision_of(action: int, capacity: int) -> int:
     if action < capacity:
         return action
     return REJECT if action == capacity else ACCEPT
-
-
-def action_of(decision: int, capacity: int) -> int:
-    """The inverse of ``decision_of``; a BufgymError for a number that is no decision."""
-    if 0 <= decision < capacity:
-        return decision
-    if decision in (REJECT, ACCEPT):
-        return capacity if decision == REJECT else capacity + 1
-    raise BufgymError(f"decision {decision}: must be a slot 0..{capacity - 1}, REJECT or ACCEPT")
 
 
 # --- what a row hands out --------------------------------------------------------------------------------------------
