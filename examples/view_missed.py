@@ -19,8 +19,7 @@ from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.table import aligned
 from bufgym.benchmark.tasks import bound
 from bufgym.oracle import BASELINE, normalised_score
-from bufgym.sim.metrics import outcome
-from bufgym.sim.state import NEVER
+from bufgym.sim import NEVER, outcome
 
 
 def missed(x: NDArray[np.float64], arrived: NDArray[np.bool_], overlap: float) -> float:

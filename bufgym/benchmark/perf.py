@@ -28,7 +28,8 @@ from bufgym.benchmark.run import draw
 from bufgym.envs.step import StepOutput, write_mask, write_observation
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT, compile_here, kernel
-from bufgym.sim import NOTHING_WAITS, Batch, Senders
+from bufgym.sim import Senders
+from bufgym.sim.state import NOTHING_WAITS, Batch
 
 ENVIRONMENTS = {"bufgym/Uplink-v0": 10e6, "bufgym/Interruption-v0": 8e6}
 """Decisions a second that their native batches aim at."""

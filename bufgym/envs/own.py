@@ -22,8 +22,9 @@ from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.model.observe import OwnField, OwnTerm
 from bufgym.policies.registry import view_type
-from bufgym.sim import ARRIVAL_WAITS, NOTHING_WAITS, Batch, python_arrival, python_view, view
-from bufgym.sim.state import LOG_ENTRY, batch_type
+from bufgym.sim.rollout import python_arrival, python_view
+from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch, batch_type
+from bufgym.sim.view import view
 
 # Columns of ``marks``: counts of a sender at the step before, and that step's end.
 TRANSMITTED, CREDITED, DROPS, UNTIL = range(4)

@@ -28,29 +28,13 @@ from bufgym.model.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.sim import (
-    ARRIVAL_WAITS,
-    DECISION,
-    DEPARTURE,
-    END,
-    NOTHING_WAITS,
-    SOCKET_WAITS,
-    Batch,
-    age_until,
-    answer_send,
-    arrival_of,
-    can_evict,
-    can_hold,
-    can_reject,
-    can_send,
-    credit,
-    decide,
-    has_room,
-    next_event,
-    offer,
-    view,
-)
+from bufgym.sim.decisions import answer_send, can_evict, can_hold, can_reject, can_send, decide, has_room
+from bufgym.sim.rules import age_until
 from bufgym.sim.shared_link import Shares, next_in_cell
+from bufgym.sim.socket import credit
+from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, END, NOTHING_WAITS, SOCKET_WAITS, Batch
+from bufgym.sim.transition import next_event, offer
+from bufgym.sim.view import arrival_of, view
 
 DELIVERED, RETAINED, AGE, LATE = range(len(REWARD_TERMS) + len(TOPIC_REWARD_TERMS))
 """Columns of ``StepOutput.reward_terms``."""

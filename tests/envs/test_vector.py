@@ -16,7 +16,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, Uplink
 from bufgym.scenario.suites.mixture import SuiteScenario
-from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS
+from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 
 kernels = pytest.mark.kernels
 CASES: dict[str, tuple[Scenario, dict[str, Any]]] = {

@@ -11,7 +11,8 @@ from bufgym.oracle.clairvoyant import privileged
 from bufgym.oracle.measure import regret
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Scenario
-from bufgym.sim import Senders, padded, run
+from bufgym.sim import Senders, run
+from bufgym.sim.senders import padded
 
 
 def best(

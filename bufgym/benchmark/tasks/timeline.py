@@ -13,8 +13,8 @@ from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.scenario.numbered import draw
-from bufgym.sim import NEVER
 from bufgym.sim.metrics import outcome
+from bufgym.sim.state import NEVER
 
 _STEP_S = 0.25
 """The capacity curve is drawn in steps of so many seconds."""

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.step import delivered_qoi
-from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders
+from bufgym.sim import Senders
+from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 
 DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
 """States of a message."""
