@@ -24,8 +24,7 @@ from bufgym.benchmark.run import run as run_policies
 from bufgym.benchmark.score import DISCRIMINATIVE, regret
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.ground.errors import BufgymError
-from bufgym.oracle import measure
-from bufgym.oracle.measure import BASELINE, normalised_score
+from bufgym.oracle import BASELINE, measure, normalised_score
 from bufgym.policies import Policy
 from bufgym.sb3 import takes_masks
 from bufgym.scenario import Episode

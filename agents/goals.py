@@ -26,9 +26,7 @@ from bufgym.benchmark.score import regret, scores
 from bufgym.benchmark.sweep import Sweep
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
-from bufgym.oracle import law, online_optimum
-from bufgym.oracle.lengths import EveryLength
-from bufgym.oracle.measure import BASELINE
+from bufgym.oracle import BASELINE, EveryLength, law, online_optimum
 from bufgym.policies import Policy, registry
 from bufgym.scenario import Interruption
 from bufgym.scenario.suites import get as suite_of

@@ -27,7 +27,7 @@ from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import aligned, same, told_once, unranked
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
-from bufgym.oracle.measure import BASELINE
+from bufgym.oracle import BASELINE
 from bufgym.policies import Policy, registry, weights
 
 COLUMNS = (

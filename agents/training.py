@@ -34,7 +34,7 @@ from agents.objectives.objective import policy_of as slot_policy_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
 from agents.settings import Settings
 from bufgym.benchmark.rows import Row
-from bufgym.envs.fleet_vec import FleetVecEnv
+from bufgym.envs import FleetVecEnv
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import load as load_policy
 from bufgym.policies import weights

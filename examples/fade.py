@@ -17,8 +17,7 @@ from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
-from bufgym.sim import run
-from bufgym.sim.metrics import outcome
+from bufgym.sim import outcome, run
 from bufgym.traces import Trace
 
 RATE_HZ, SIZE_BYTES, QUEUE_SIZE = 30.0, 230_000, 15

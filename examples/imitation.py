@@ -30,7 +30,7 @@ import torch
 import bufgym
 from bufgym import policies, scenario
 from bufgym.envs import expert
-from bufgym.oracle.measure import normalised_score
+from bufgym.oracle import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]

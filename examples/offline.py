@@ -35,7 +35,7 @@ from bufgym import policies, scenario
 from bufgym.envs.expert import dataset
 from bufgym.envs.observation import ObservationForm
 from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
-from bufgym.oracle.measure import normalised_score
+from bufgym.oracle import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]

@@ -14,12 +14,12 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies, scenario, sim
-from bufgym.oracle import clairvoyant
-from bufgym.oracle.measure import BASELINE, normalised_score
-from bufgym.scenario.numbered import by_trace, draw
-from bufgym.sim.metrics import outcome
-from bufgym.sim.state import NEVER
+from bufgym import policies, scenario
+from bufgym.benchmark.run import by_trace, draw
+from bufgym.benchmark.table import aligned
+from bufgym.benchmark.tasks import bound
+from bufgym.oracle import BASELINE, normalised_score
+from bufgym.sim import NEVER, outcome
 
 
 def missed(x: NDArray[np.float64], arrived: NDArray[np.bool_], overlap: float) -> float:

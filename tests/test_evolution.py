@@ -22,8 +22,7 @@ from agents.settings import LINK, MOTION, SEES, Settings
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import exponential
-from bufgym.oracle import integer, law
-from bufgym.oracle.lengths import EveryLength
+from bufgym.oracle import EveryLength, integer, law
 from bufgym.policies import learned, weights
 from bufgym.scenario import Interruption, Streams, Uplink
 from bufgym.sim import run

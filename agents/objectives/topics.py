@@ -26,7 +26,8 @@ from bufgym.policies import Policy
 from bufgym.policies.learned import Network
 from bufgym.policies.learned_topics import TopicWeights
 from bufgym.scenario import Client, suites
-from bufgym.sim import Senders, age_until
+from bufgym.sim import Senders
+from bufgym.sim.rules import age_until
 
 RIVAL = "robofleet"
 

@@ -18,7 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.policies import Policy
 from bufgym.scenario import Uplink
-from bufgym.sim import NEVER
+from bufgym.sim.state import NEVER
 
 # Most topics for a readable table; the CSV file has all.
 _SHOWN_TOPICS = 6

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bufgym import oracle  # noqa: F401  (registers the clairvoyant as a policy that can play here)
-from bufgym.envs.fleet_vec import FleetVecEnv
+from bufgym.envs.fleet_rows import FleetVecEnv
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym.envs.fleet import FleetEnv, parallel_env
@@ -19,13 +19,4 @@ if TYPE_CHECKING:
 __all__ = ["FleetEnv", "FleetVecEnv", "SenderEnv", "SenderVectorEnv", "parallel_env"]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in ("FleetEnv", "parallel_env"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        from bufgym.envs import fleet
-    except ModuleNotFoundError as error:
-        if error.name != "pettingzoo":
-            raise
-        raise BufgymError(f"{name} needs pettingzoo: {install('fleet')}") from None
-    return getattr(fleet, name)
+__getattr__ = on_demand(__name__, FleetEnv="fleet", parallel_env="fleet")

@@ -11,13 +11,19 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
-from pettingzoo import ParallelEnv
 
 from bufgym.envs.fleet_rows import FleetRows
 from bufgym.envs.observation import Observation
 from bufgym.envs.rows import check_render_mode
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, install
 from bufgym.scenario import FleetScenario, Uplink
+
+try:
+    from pettingzoo import ParallelEnv
+except ModuleNotFoundError as error:
+    if error.name != "pettingzoo":
+        raise
+    raise BufgymError(f"FleetEnv needs pettingzoo: {install('fleet')}") from None
 
 Infos = dict[str, dict[str, Any]]
 Spaces = dict[str, spaces.Space[Any]]

@@ -1,4 +1,4 @@
-"""Rows whose senders are the robots of cells; the robots of a cell share one link."""
+"""Rows whose senders are the robots of cells, and the batch of them from which one shared policy learns."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.rows import NO_ACTIONS, Rows
+from bufgym.envs.rows import Rows, Threads
 from bufgym.envs.step import step_cells
-from bufgym.envs.threads import Threads
+from bufgym.envs.vector import SenderVectorEnv
 from bufgym.ground.errors import BufgymError
-from bufgym.scenario import FleetScenario
+from bufgym.model.checks import whole
+from bufgym.scenario import FleetScenario, Uplink
 from bufgym.sim.cell import Fleet
 
 
@@ -50,8 +51,8 @@ class FleetRows(Rows):
         if i % self.robots == 0:
             super().seed(i, rng)
 
-    def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
-        """Begin a new episode in each cell of ``rows``: ``episodes[c]``, or the next one drawn where that is None."""
+    def _load(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None) -> NDArray[np.int64]:
+        """Load ``episodes[c]``, or the next one drawn where that is None, into each cell of ``rows``."""
         cells = np.unique(rows // self.robots)
         if len(cells) * self.robots != len(rows):
             raise BufgymError("reset_mask: the robots of one cell begin together; give all of them or none")
@@ -65,16 +66,10 @@ class FleetRows(Rows):
             if not episode.ticks_together:
                 raise BufgymError("episode: in an environment the messages of all robots arrive at the same times")
             self.fleet.load(c, episode)
-        step_cells(self.senders.batch, self.fleet.shares, cells, NO_ACTIONS, self.rewarded, self.output)
-        if self._has_own:
-            self._begin_own(rows)
+        return cells
 
-    def step(self, actions: NDArray[np.int64]) -> None:
-        """Apply one decision of every robot; the result is in ``self.output``."""
-        batch, shares, rewarded, output = self.senders.batch, self.fleet.shares, self.rewarded, self.output
-        self._threads.each(lambda cells: step_cells(batch, shares, cells, actions, rewarded, output))
-        if self._has_own:
-            self._step_own()
+    def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
+        step_cells(self.senders.batch, self.fleet.shares, rows, actions, self.rewarded, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[rows]: each robot's own weighted sum, or for a "team" the mean within its cell."""
@@ -82,3 +77,40 @@ class FleetRows(Rows):
         if self.reward == "own":
             return own
         return np.repeat(own.reshape(len(self.fleet), self.robots).mean(axis=1), self.robots)
+
+
+class FleetVecEnv(SenderVectorEnv):
+    """``cells`` cells with N ``robots`` each, as a batch of cells x N environments. Robot r of cell c is row c N + r.
+
+    Any learner for one robot thus trains weights that all robots of a fleet share, each deciding from its own
+    observation:
+
+        from sb3_contrib import MaskablePPO
+        from bufgym.sb3 import GymVecEnv
+
+        envs = GymVecEnv(FleetVecEnv(cells=16, robots=4, autoreset_mode="SameStep"))
+        MaskablePPO("MultiInputPolicy", envs).learn(1_000_000)
+
+    **Action, observation, episode end** of each row and the other arguments are as in ``SenderVectorEnv``, with these
+    differences. The robots of a cell begin and end together. ``reset(seed=s)`` seeds cell c with s + c N.
+    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell. ``parameters`` replace the uplink's parameters.
+
+    **Reward** "team" gives each robot the mean over its cell of ``term``, the reward of the other environments; "own"
+    gives each robot its own. ``info["reward_terms"]`` has each robot's own terms in any case.
+    """
+
+    def __init__(
+        self,
+        cells: int = 1,
+        robots: int = 4,
+        scenario: str | Uplink | FleetScenario = "lte",
+        capacity: int = 8,
+        *,
+        parameters: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        fleet: Any = FleetScenario.of(robots, scenario, **(parameters or {}))
+        super().__init__(whole("cells", cells, 1), fleet, capacity, **options)
+
+    def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
+        return FleetRows(n, scenario, capacity, **options)

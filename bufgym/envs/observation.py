@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections import OrderedDict
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -146,47 +146,53 @@ class ObservationForm:
         return spaces.Dict(parts)
 
 
-class _Made:
-    """An observation of one row, with the arrays behind it."""
+Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
-    def __init__(self, form: ObservationForm, row: NDArray[np.float32]) -> None:
-        self.numbers = row.copy()
-        self.observation = form.of(self.numbers)
-        self.views = list(self.observation.values())
 
-    def references(self) -> tuple[int, int]:
-        """Count references to the numbers, including views, and the most to one of the views."""
-        return sys.getrefcount(self.numbers), max(map(sys.getrefcount, self.views))
+class Reused(Generic[Arrays]):
+    """Makes tuples of arrays. One is taken again once nobody outside holds an array of it or a view of one.
+
+    So what a caller still holds is never written again.
+    """
+
+    def __init__(self, make: Callable[[], Arrays]) -> None:
+        self._make = make
+        self._made: list[tuple[Arrays, list[int]]] = []
+
+    def take(self) -> Arrays:
+        """A tuple of arrays that nobody holds, with any content."""
+        for arrays, free in self._made:
+            if list(map(sys.getrefcount, arrays)) == free:
+                return arrays
+        arrays = self._make()
+        # A caller that collects them holds them all.
+        self._made = [*self._made[1 - _KEPT :], (arrays, list(map(sys.getrefcount, arrays)))]
+        return arrays
+
+
+_KEPT = 4
+"""Most tuples to keep."""
 
 
 class Handed:
-    """Hands out observations of one row; an observation that anyone still holds is never written again.
-
-    Making a dict of twenty views costs more than a step, so observations that nobody holds are filled again.
-    """
+    """Hands out observations of one row. Making a dict of twenty views costs more than a step, so they are reused."""
 
     def __init__(self, form: ObservationForm) -> None:
         self._form = form
-        self._made: list[_Made] = []
-        self._free = (0, 0)
+        self._reused = Reused(self._new)
 
     def of(self, row: NDArray[np.float32]) -> Observation:
         """The observation of this row of numbers, which is copied."""
         if self._form.form != "dict":
             return self._form.of(row.copy())
-        for made in self._made:
-            if made.references() == self._free:
-                made.numbers[:] = row
-                return dict(made.observation)
-        made = _Made(self._form, row)
-        if len(self._made) < _MADE:
-            self._made.append(made)
-            self._free = made.references()
-        return dict(made.observation)
+        numbers, *views = self._reused.take()
+        numbers[:] = row
+        return dict(zip(self._form.space, views, strict=True))
 
-
-_MADE = 4
-"""Most observations to keep: a caller that collects them holds them all."""
+    def _new(self) -> tuple[NDArray[np.float32], ...]:
+        """A row of numbers and the views of it."""
+        numbers = np.empty(self._form.numbers, np.float32)
+        return numbers, *self._form.of(numbers).values()
 
 
 def _box(fields: Sequence[Field], entries: int) -> spaces.Box:

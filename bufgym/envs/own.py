@@ -22,8 +22,9 @@ from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.model.observe import OwnField, OwnTerm
 from bufgym.policies.registry import view_type
-from bufgym.sim import ARRIVAL_WAITS, NOTHING_WAITS, Batch, python_arrival, python_view, view
-from bufgym.sim.state import LOG_ENTRY, batch_type
+from bufgym.sim.rollout import python_arrival, python_view
+from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch, batch_type
+from bufgym.sim.view import view
 
 # Columns of ``marks``: counts of a sender at the step before, and that step's end.
 TRANSMITTED, CREDITED, DROPS, UNTIL = range(4)
@@ -222,7 +223,7 @@ class OwnTerms:
                 compiled(batch, self._marks, ended, self._memory[k], parameters, column, output.reward_terms)
             else:
                 for i in range(len(ended)):
-                    step = _read_only_step(_step_of(records, i, self._marks, bool(ended[i]), parameters))
+                    step = _read_only_step(records, i, self._marks, bool(ended[i]), parameters)
                     output.reward_terms[i, column] = term.function(step, self._memory[k][i])
             if not np.isfinite(output.reward_terms[:, column]).all():
                 raise BufgymError(f"reward term {term.name!r}: is no finite number")
@@ -234,14 +235,12 @@ class OwnTerms:
 
 # --- compiled once for all functions ---------------------------------------------------------------------------------
 
-_python_step_of = getattr(step_of, "py_func", step_of)
+_python_step_of: Any = getattr(step_of, "py_func", step_of)
 
 
-def _step_of(*arguments: Any) -> Step:
-    return cast(Step, _python_step_of(*arguments))
-
-
-def _read_only_step(step: Step) -> Step:
+def _read_only_step(*arguments: Any) -> Step:
+    """``step_of`` for terms in Python."""
+    step: Step = _python_step_of(*arguments)
     for array in step:
         if isinstance(array, np.ndarray):
             array.flags.writeable = False

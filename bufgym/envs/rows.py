@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import operator
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 import numpy as np
@@ -16,13 +18,11 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
-from bufgym.envs.bound import BOUND, check_one_queue, measured
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_rows
-from bufgym.envs.threads import Threads
 from bufgym.ground.errors import BufgymError
-from bufgym.model.checks import is_number
+from bufgym.model.checks import is_number, whole
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
     OWN_TERMS,
@@ -33,6 +33,7 @@ from bufgym.model.observe import (
     own_term,
     terms_for,
 )
+from bufgym.oracle.measure import MEASURED, measured
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import numbered
 from bufgym.scenario.pool import Pool
@@ -92,6 +93,32 @@ def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
     return names
 
 
+class Threads:
+    """Does the same work on each part of a batch at once, the first part here and the others in threads.
+
+    Kernels hold no lock of Python's, and rows share no memory that a step writes.
+    """
+
+    def __init__(self, numbers: NDArray[np.int64], num_threads: int) -> None:
+        """``numbers``, int64[n], are rows or cells. They are split into at most ``num_threads`` parts."""
+        parts = np.array_split(numbers, min(whole("num_threads", num_threads, 1), len(numbers)))
+        self.parts = [np.ascontiguousarray(part) for part in parts]
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0
+
+    def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
+        """Call ``work`` on every part; return when all are done."""
+        if len(self.parts) == 1:
+            work(self.parts[0])
+            return
+        if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
+            self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
+        running = [self._pool.submit(work, part) for part in self.parts[1:]]
+        work(self.parts[0])
+        for part in running:
+            part.result()
+
+
 class Rows:
     """n senders, each with its own random streams, stepped together.
 
@@ -134,15 +161,14 @@ class Rows:
         if not isinstance(bound, bool | np.bool_):
             raise BufgymError(f"bound = {bound!r}: must be True or False")
         self.bound = bool(bound)
-        if bound:
-            check_one_queue(self.senders)
-        weights, own_terms = reward_weights(reward, bool(topics))
+        if bound and topics:
+            raise BufgymError("bound = True: the clairvoyant is known for one queue, not for several topics")
+        self.weights, own_terms = reward_weights(reward, bool(topics))
         self.terms = terms_for(bool(topics)) + own_terms
         self._term_names = [term.name for term in self.terms]
-        self.weights = weights
-        self.slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
-        self.context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
-        self.form = ObservationForm(observation, self.slot_fields, self.context_fields, self.capacity, fields)
+        slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
+        context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
+        self.form = ObservationForm(observation, slot_fields, context_fields, self.capacity, fields)
         self._handed = Handed(self.form)
         self.observation_space = self.form.space
         self.action_space = spaces.Discrete(self.capacity + 2)
@@ -179,7 +205,21 @@ class Rows:
         self.streams[i] = Streams.seeded(int(rng.integers(2**63)))
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
-        """Begin a new episode in each of ``rows``: ``episodes[i]``, or the next of its streams where that is None.
+        """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
+        self._run(self._load(rows, episodes), NO_ACTIONS)
+        if self._has_own:
+            self._own_terms.begin(self.senders.batch, rows)
+            self._own_fields.write(self.senders.batch, self.output)
+
+    def step(self, actions: NDArray[np.int64]) -> None:
+        """Take one decision in every row; the result is in ``self.output``."""
+        self._threads.each(lambda numbers: self._run(numbers, actions))
+        if self._has_own:
+            self._own_terms.write(self.senders.batch, self.output)
+            self._own_fields.write(self.senders.batch, self.output)
+
+    def _load(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None) -> NDArray[np.int64]:
+        """Load ``episodes[i]`` into each of ``rows``; return what ``_run`` is to step.
 
         An episode may be a dict of arguments for ``numbered``.
         """
@@ -198,16 +238,10 @@ class Rows:
         self.senders.load_all(begun)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
-        step_rows(self.senders.batch, rows, NO_ACTIONS, self.rewarded, self.output)
-        if self._has_own:
-            self._begin_own(rows)
+        return rows
 
-    def step(self, actions: NDArray[np.int64]) -> None:
-        """Take one decision in every row; the result is in ``self.output``."""
-        batch, rewarded, output = self.senders.batch, self.rewarded, self.output
-        self._threads.each(lambda rows: step_rows(batch, rows, actions, rewarded, output))
-        if self._has_own:
-            self._step_own()
+    def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
+        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step."""
@@ -247,7 +281,7 @@ class Rows:
         if self.bound and ended:
             info |= measured(self.senders, i, info["qoi"])
         elif self.bound and self.is_steady:
-            info |= dict.fromkeys(BOUND, math.nan)
+            info |= dict.fromkeys(MEASURED, math.nan)
         return info
 
     def observation(self, i: int | None = None) -> Observation:
@@ -285,7 +319,7 @@ class Rows:
 
     def bounds(self, ended: NDArray[np.bool_], qoi: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Name -> float64[n]: ``measured`` for the rows that have ``ended`` with this H; 0 elsewhere."""
-        columns = {name: np.zeros(len(self)) for name in BOUND}
+        columns = {name: np.zeros(len(self)) for name in MEASURED}
         for i in np.flatnonzero(ended).tolist():
             for name, number in measured(self.senders, i, float(qoi[i])).items():
                 columns[name][i] = number
@@ -294,19 +328,6 @@ class Rows:
     def bad_action(self, name: str, action: Any) -> BufgymError:
         """Make the error for an action outside 0..L+1."""
         return BufgymError(f"{name} = {action}: must lie in 0..{self.capacity + 1} (L = {self.capacity})")
-
-    def _begin_own(self, rows: NDArray[np.int64]) -> None:
-        """Compute your own fields and terms for rows that begin an episode."""
-        self._own_terms.begin(self.senders.batch, rows)
-        if self._own_fields:
-            self._own_fields.write(self.senders.batch, self.output)
-
-    def _step_own(self) -> None:
-        """Compute your own fields and terms after a step of all rows."""
-        if self._own_terms:
-            self._own_terms.write(self.senders.batch, self.output)
-        if self._own_fields:
-            self._own_fields.write(self.senders.batch, self.output)
 
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
         """The next episode of row ``i``'s streams, and the generator of its uniform draws."""

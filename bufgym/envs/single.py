@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -86,32 +85,11 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         scenario: str | Scenario = "lte",
         capacity: int = 8,
         *,
-        max_bytes: int | None = None,
-        decide_at: str = "arrival",
-        reward: str | Mapping[str, float] = "retained",
-        fields: Sequence[str] | None = None,
-        observation: str = "dict",
-        info: str = "full",
-        bound: bool = False,
-        pool: int | None = None,
         render_mode: str | None = None,
-        **parameters: Any,
+        **options: Any,
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        self.rows = Rows(
-            1,
-            scenario,
-            capacity,
-            max_bytes=max_bytes,
-            decide_at=decide_at,
-            reward=reward,
-            fields=fields,
-            observation=observation,
-            info=info,
-            bound=bound,
-            pool=pool,
-            **parameters,
-        )
+        self.rows = Rows(1, scenario, capacity, **options)
         self.observation_space = self.rows.observation_space
         self.action_space = self.rows.action_space
         self._action = np.zeros(1, np.int64)

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import bundle, direct, kernel, local, prefetch, stretch, table
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
@@ -29,29 +28,13 @@ from bufgym.model.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
-from bufgym.sim import (
-    ARRIVAL_WAITS,
-    DECISION,
-    DEPARTURE,
-    END,
-    NOTHING_WAITS,
-    SOCKET_WAITS,
-    Batch,
-    age_until,
-    answer_send,
-    arrival_of,
-    can_evict,
-    can_hold,
-    can_reject,
-    can_send,
-    credit,
-    decide,
-    has_room,
-    next_event,
-    offer,
-    view,
-)
+from bufgym.sim.decisions import answer_send, can_evict, can_hold, can_reject, can_send, decide, has_room
+from bufgym.sim.rules import age_until
 from bufgym.sim.shared_link import Shares, next_in_cell
+from bufgym.sim.socket import credit
+from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, END, NOTHING_WAITS, SOCKET_WAITS, Batch
+from bufgym.sim.transition import next_event, offer
+from bufgym.sim.view import arrival_of, view
 
 DELIVERED, RETAINED, AGE, LATE = range(len(REWARD_TERMS) + len(TOPIC_REWARD_TERMS))
 """Columns of ``StepOutput.reward_terms``."""
@@ -92,15 +75,6 @@ def decision_of(action: int, capacity: int) -> int:
     if action < capacity:
         return action
     return REJECT if action == capacity else ACCEPT
-
-
-def action_of(decision: int, capacity: int) -> int:
-    """The inverse of ``decision_of``; a BufgymError for a number that is no decision."""
-    if 0 <= decision < capacity:
-        return decision
-    if decision in (REJECT, ACCEPT):
-        return capacity if decision == REJECT else capacity + 1
-    raise BufgymError(f"decision {decision}: must be a slot 0..{capacity - 1}, REJECT or ACCEPT")
 
 
 # --- what a row hands out --------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -13,9 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.observation import Observation
+from bufgym.envs.observation import Observation, Reused
 from bufgym.envs.rows import Rows, check_render_mode
-from bufgym.envs.step import StepOutput
 from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
@@ -80,7 +78,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.zeros(self.num_envs, np.bool_)
         self._every_row = np.ones(self.num_envs, np.bool_)
-        self._pool: list[StepOutput] = []
+        self._outputs = Reused(rows.new_output)
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
 
@@ -224,16 +222,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _renew_output(self, keep: bool = False) -> None:
         """Let the next step write into arrays that nobody outside holds; ``keep`` copies the last step's results."""
         rows, before = self.rows, self.rows.output
-        if not any(before is output for output in self._pool):
-            self._pool.append(before)
-        for output in self._pool:
-            # Only its own tuple and this loop's call hold it: no view is left outside.
-            if all(sys.getrefcount(array) <= _OWN_REFERENCES for array in output):
-                rows.output = output
-                break
-        else:
-            rows.output = rows.new_output()
-            self._pool = [*self._pool[1 - _POOLED :], rows.output]  # a caller that collects outputs holds them all
+        rows.output = self._outputs.take()
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old
@@ -250,14 +239,3 @@ def _only(rows: NDArray[np.bool_], info: dict[str, Any]) -> dict[str, Any]:
         else:
             own[name] = np.where(rows if column.ndim == 1 else rows[:, None], column, 0)
     return own
-
-
-def _count_own() -> int:
-    """References to an array that only a StepOutput holds, as seen from the loop in ``_renew_output``."""
-    output = StepOutput(*(np.zeros(1) for _ in StepOutput._fields))  # type: ignore[arg-type]
-    return max(sys.getrefcount(array) for array in output)
-
-
-_OWN_REFERENCES = _count_own()
-_POOLED = 4
-"""Most outputs to keep for reuse."""

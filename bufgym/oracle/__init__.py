@@ -1,10 +1,13 @@
 """Bounds for policies: the best possible in one interruption, on any link, and without knowing T."""
 
 from bufgym.oracle.clairvoyant import Plan, clairvoyant
-from bufgym.oracle.interruption import by_length, ideal, integer
-from bufgym.oracle.online import OnlineOptimum, law, online_optimum
+from bufgym.oracle.interruption import EveryLength, by_length, ideal, integer, law
+from bufgym.oracle.measure import BASELINE, measured, normalised_score, regret
+from bufgym.oracle.online import OnlineOptimum, online_optimum
 
 __all__ = [
+    "BASELINE",
+    "EveryLength",
     "OnlineOptimum",
     "Plan",
     "by_length",
@@ -12,5 +15,8 @@ __all__ = [
     "ideal",
     "integer",
     "law",
+    "measured",
+    "normalised_score",
     "online_optimum",
+    "regret",
 ]

@@ -4,11 +4,14 @@ Message 0 was sent before and message T + 1 is sent after; L of the T messages b
 gaps that add up to T + 1. V is concave, so equal gaps are best. ``ideal`` and ``integer`` count the information gained
 after message 0, as the paper does: compare them with H - 1 of a run.
 
-``by_length`` scores a policy for every T at once. Until an arrival, nothing that a policy sees depends on T. So the
-longest interruption holds all shorter ones, and one run gives the exact mean over any law of T.
+``EveryLength`` scores a policy for every T at once. Until an arrival, nothing that a policy sees depends on T. So the
+longest interruption holds all shorter ones, and some 400 decisions give the mean over T without sampling noise.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +19,9 @@ from numpy.typing import NDArray
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel
 from bufgym.model.qoi import Value, value
+from bufgym.policies import Policy
+from bufgym.scenario import Interruption, Scenario
+from bufgym.sim import Senders
 
 
 def _check(capacity: int, T: int) -> None:
@@ -43,6 +49,29 @@ def evenly_kept(capacity: int, T: int) -> NDArray[np.int64]:
     gaps = min(capacity, T) + 1
     kept: NDArray[np.int64] = np.arange(1, gaps) * (T + 1) // gaps
     return kept
+
+
+def law(scenario: Interruption) -> NDArray[np.float64]:
+    """P(T = t) for t = 0..t_max, float64[t_max + 1], exactly as ``scenario.draw_length`` draws T."""
+    if not isinstance(scenario, Interruption):
+        raise BufgymError(f"law: {scenario!r} is not an Interruption")
+    t_min, t_max = scenario.t_min, scenario.t_max
+    p = np.zeros(t_max + 1)
+    t = np.arange(t_min, t_max + 1)
+    if scenario.law == "fixed":
+        p[t_max] = 1.0
+    elif scenario.law == "uniform":
+        p[t] = 1 / len(t)
+    elif scenario.law == "log-uniform":
+        p[t] = np.log1p(1 / t) / math.log((t_max + 1) / t_min)
+    else:
+        stays = 1 - 1 / (scenario.t_mean - t_min + 1)
+        p[t] = (1 - stays) * stays ** (t - t_min)
+        p[t_max] = stays ** (t_max - t_min)  # every longer T is cut off to t_max
+    if scenario.lengths:
+        p[[T for T in range(t_max + 1) if T not in scenario.lengths]] = 0.0
+        p /= p.sum()
+    return p
 
 
 def by_length(dropped: NDArray[np.int64], v: Value) -> NDArray[np.float64]:
@@ -77,3 +106,47 @@ def _by_length(
             h[T] += value(v, float(kept[k] - before))
             before = kept[k]
         h[T] += value(v, float(T + 1 - before))
+
+
+class EveryLength:
+    """One law of T and one V at several capacities, which run side by side as rows of one batch.
+
+    Args:
+        scenario: the interruption; its ``lengths`` or ``t_max`` give the law of T.
+        capacities: L, messages, one row each.
+    """
+
+    def __init__(self, scenario: Scenario, capacities: Sequence[int]) -> None:
+        if not isinstance(scenario, Interruption):
+            raise BufgymError(f"{type(scenario).__name__}: must be an Interruption, whose law of T is known")
+        self.scenario, self._law = scenario, law(scenario)
+        self._senders = Senders(len(capacities), max(capacities), scenario.value, max_messages=scenario.max_messages)
+        longest = scenario.episode(scenario.t_max)
+        self._senders.load_all([(row, longest, None) for row in range(len(capacities))])
+        batch = self._senders.batch
+        batch.senders["capacity"] = capacities
+        self._loaded = batch.senders.copy(), batch.log.copy()
+        lengths = range(scenario.t_max + 1)
+        self._best = [
+            float(self._law @ [1 + integer(capacity, T, scenario.value) for T in lengths]) for capacity in capacities
+        ]
+
+    @property
+    def decisions(self) -> int:
+        """Arrivals that a policy decides about, over all rows."""
+        return int(self._senders.batch.senders["arrivals"].sum())
+
+    def qoi(self, policy: Policy) -> NDArray[np.float64]:
+        """H for each row and T, float64[capacities, t_max + 1]."""
+        batch = self._senders.batch
+        batch.senders[:], batch.log[:] = self._loaded
+        self._senders.run(policy)
+        dropped_us = batch.log["dropped_us"]
+        arrival_number = np.rint(dropped_us / self.scenario.period_us).astype(np.int64)
+        dropped = np.where(dropped_us < 0, self.scenario.max_messages, arrival_number)
+        return np.array([by_length(row, self.scenario.value) for row in dropped])
+
+    def regrets(self, policy: Policy) -> list[float]:
+        """1 - mean H / mean H of the best that knows T, for each capacity."""
+        pairs = zip(self.qoi(policy), self._best, strict=True)
+        return [1 - float(self._law @ h) / best for h, best in pairs]

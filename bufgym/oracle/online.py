@@ -31,35 +31,11 @@ from bufgym.model.qoi import Value
 from bufgym.oracle.interruption import integer
 from bufgym.policies.gaps import min_gap
 from bufgym.policies.registry import Policy
-from bufgym.scenario import Interruption
 
 OBJECTIVES = ("ratio", "qoi")
 
 _MOST = 2**61
 """Cut-off for binomial coefficients: larger ones belong to no state that fits into memory."""
-
-
-def law(scenario: Interruption) -> NDArray[np.float64]:
-    """P(T = t) for t = 0..t_max, float64[t_max + 1], exactly as ``scenario.draw_length`` draws T."""
-    if not isinstance(scenario, Interruption):
-        raise BufgymError(f"law: {scenario!r} is not an Interruption")
-    t_min, t_max = scenario.t_min, scenario.t_max
-    p = np.zeros(t_max + 1)
-    t = np.arange(t_min, t_max + 1)
-    if scenario.law == "fixed":
-        p[t_max] = 1.0
-    elif scenario.law == "uniform":
-        p[t] = 1 / len(t)
-    elif scenario.law == "log-uniform":
-        p[t] = np.log1p(1 / t) / math.log((t_max + 1) / t_min)
-    else:
-        stays = 1 - 1 / (scenario.t_mean - t_min + 1)
-        p[t] = (1 - stays) * stays ** (t - t_min)
-        p[t_max] = stays ** (t_max - t_min)  # every longer T is cut off to t_max
-    if scenario.lengths:
-        p[[T for T in range(t_max + 1) if T not in scenario.lengths]] = 0.0
-        p /= p.sum()
-    return p
 
 
 @dataclass(frozen=True, eq=False)

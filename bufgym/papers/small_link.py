@@ -1,6 +1,6 @@
 """Every policy beside the exact optimum without knowledge of the future, over a link small enough to solve.
 
-``bufgym.oracle.small_link`` defines the link, the programme and the optimum's knowledge. All policies meet the same
+``link_optimum`` defines the link, the programme and the optimum's knowledge. All policies meet the same
 episodes, so differences in regret do not come from the draw of episodes.
 """
 
@@ -18,8 +18,8 @@ from bufgym import policies, sim
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import clairvoyant
-from bufgym.oracle.small_link import MESSAGE, QUARTERS, Chain, cut_off, small_link
 from bufgym.papers.figure import COLOURS, Figure, finish, several, whole
+from bufgym.papers.link_optimum import MESSAGE, QUARTERS, Chain, cut_off, small_link
 from bufgym.papers.rows import Row, Rows, listed
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, messages

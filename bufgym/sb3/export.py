@@ -14,7 +14,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
 from bufgym.ground.errors import BufgymError
-from bufgym.oracle.lengths import EveryLength
+from bufgym.oracle import EveryLength
 from bufgym.policies import Policy, learned, learned_topics
 from bufgym.policies import weights as files
 from bufgym.policies.learned import Network, Weights

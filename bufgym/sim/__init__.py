@@ -17,64 +17,20 @@ after a message's last byte has crossed the link. With n_T = 1 and no ack delay 
 Robots that share the link of a cell are senders like all others: only the link differs (``bufgym.sim.shared_link``).
 """
 
-from bufgym.sim.decisions import (
-    answer_dequeue,
-    answer_send,
-    can_evict,
-    can_hold,
-    can_reject,
-    can_send,
-    decide,
-    has_room,
-)
-from bufgym.sim.rollout import answer_of, python_arrival, python_view
-from bufgym.sim.rules import age_until
-from bufgym.sim.senders import Senders, padded, run
-from bufgym.sim.socket import credit
-from bufgym.sim.state import (
-    ARRIVAL_WAITS,
-    DECISION,
-    DEPARTURE,
-    DEQUEUE,
-    END,
-    NEVER,
-    NOTHING_WAITS,
-    SEND,
-    SOCKET_WAITS,
-    Batch,
-)
-from bufgym.sim.transition import next_event, offer
-from bufgym.sim.view import arrival_of, view
+from bufgym.sim.cell import Fleet, run_fleet
+from bufgym.sim.metrics import Outcome, TopicOutcome, outcome, received, topic_outcomes
+from bufgym.sim.senders import Senders, run
+from bufgym.sim.state import NEVER
 
 __all__ = [
-    "ARRIVAL_WAITS",
-    "DECISION",
-    "DEPARTURE",
-    "DEQUEUE",
-    "END",
     "NEVER",
-    "NOTHING_WAITS",
-    "SEND",
-    "SOCKET_WAITS",
-    "Batch",
+    "Fleet",
+    "Outcome",
     "Senders",
-    "age_until",
-    "answer_dequeue",
-    "answer_of",
-    "answer_send",
-    "arrival_of",
-    "can_evict",
-    "can_hold",
-    "can_reject",
-    "can_send",
-    "credit",
-    "decide",
-    "has_room",
-    "next_event",
-    "offer",
-    "padded",
-    "python_arrival",
-    "python_view",
+    "TopicOutcome",
+    "outcome",
+    "received",
     "run",
-    "view",
+    "run_fleet",
+    "topic_outcomes",
 ]

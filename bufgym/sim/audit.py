@@ -6,113 +6,69 @@ So every benchmark run is checked at its end: a policy that changed a message or
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import at, item, kernel
-from bufgym.model.qoi import value
+from bufgym.model.qoi import information
 from bufgym.sim.state import NEVER, Batch
 
-_ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC, _QOI = range(1, 7)
+if TYPE_CHECKING:
+    from bufgym.sim.senders import Senders
+
+ARRIVAL = "a message that arrived is not as the episode has it"
+QUEUED = "a queued message is not as it arrived"
+BYTES = "the queue's bytes are not those of its messages"
+LOG = "not every message was sent, dropped or queued exactly once"
+TOPIC = "a topic's rules are not as they were"
+QOI = "H is not that of the messages that were received"
+
+_MESSAGE = ("seq", "arrival_us", "size_bytes", "topic", "x", "uniform")
+_RULES = ("priority", "weight", "period_us", "limit", "no_drop", "deadline_us", "v_start")
 _ROUNDING = 1e-9
 """Tolerance: H is added up in another order here."""
-_FOUND = {
-    _ARRIVAL: "a message that arrived is not as the episode has it",
-    _QUEUED: "a queued message is not as it arrived",
-    _BYTES: "the queue's bytes are not those of its messages",
-    _LOG: "not every message was sent, dropped or queued exactly once",
-    _TOPIC: "a topic's rules are not as they were",
-    _QOI: "H is not that of the messages that were received",
-}
 
 
-def check_untouched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any], policy: str) -> None:
-    """Raise if sender ``i``'s finished run does not agree with its episode, MESSAGE[n] and TOPIC[topics]."""
-    found = _touched(batch, i, arrivals, topics)
-    if found:
-        raise BufgymError(
-            f"policy {policy}: wrote to what it may only read: {_FOUND[found]} (run {i + 1} of the batch)"
-        )
-
-
-@kernel
-def _same(a: Any, b: Any) -> bool:
-    """Whether two MESSAGE records are the same message."""
-    return bool(
-        a.seq == b.seq
-        and a.arrival_us == b.arrival_us
-        and a.size_bytes == b.size_bytes
-        and a.topic == b.topic
-        and a.x == b.x
-        and a.uniform == b.uniform
-    )
-
-
-@kernel
-def _touched(batch: Batch, i: int, arrivals: NDArray[Any], topics: NDArray[Any]) -> int:
-    """A code for the record that does not agree, or 0."""
-    sender = batch.senders[i]
-    dequeued, dropped, backlog_bytes, last = 0, 0, 0, -1
-    for k in range(len(arrivals)):
-        if not _same(at(batch.arrivals, i, k), item(arrivals, k)):
-            return _ARRIVAL
-        entry = at(batch.log, i, k)
-        dequeued += entry.dequeued_us != NEVER
-        dropped += entry.dropped_us != NEVER
-        if entry.dequeued_us != NEVER and (
-            entry.dropped_us != NEVER or entry.dequeued_us < item(arrivals, k).arrival_us
-        ):
-            return _LOG
-    for k in range(sender.occupancy):
-        slot = at(batch.slots, i, sender.first + k)
-        if not (last < slot.seq < len(arrivals) and _same(slot, item(arrivals, slot.seq))):
-            return _QUEUED
-        entry = at(batch.log, i, slot.seq)
-        if entry.dequeued_us != NEVER or entry.dropped_us != NEVER:
-            return _QUEUED
-        backlog_bytes += slot.size_bytes
-        last = slot.seq
-    if backlog_bytes != sender.backlog_bytes:
-        return _BYTES
+def touched(senders: Senders, i: int) -> str:
+    """What does not agree with the episode in sender ``i``'s finished run; empty if all does."""
+    batch, episode = senders.batch, senders.episodes[i]
+    assert episode is not None
+    sender, arrivals = np.asarray(batch.senders)[i], np.asarray(episode.arrivals)
+    log = np.asarray(batch.log[i])[: len(arrivals)]
+    if not _same(batch.arrivals[i, : len(arrivals)], arrivals, _MESSAGE):
+        return ARRIVAL
+    dequeued, dropped = log["dequeued_us"] != NEVER, log["dropped_us"] != NEVER
+    if (dequeued & (dropped | (log["dequeued_us"] < arrivals["arrival_us"]))).any():
+        return LOG
+    queued = np.asarray(batch.slots[i])[sender["first"] : sender["first"] + sender["occupancy"]]
+    seq = queued["seq"]
+    if not ((np.diff(seq, prepend=-1) > 0) & (seq < len(arrivals))).all():
+        return QUEUED
+    if not _same(queued, arrivals[seq], _MESSAGE) or (dequeued | dropped)[seq].any():
+        return QUEUED
+    if queued["size_bytes"].sum() != sender["backlog_bytes"]:
+        return BYTES
     # Each event writes one entry: as many entries as events means that no two were about one message.
-    counted = dequeued == sender.dequeued and dropped == sender.evicted + sender.rejected
-    if not counted or dequeued + dropped + sender.occupancy != sender.next:
-        return _LOG
-    for k in range(len(topics)):
-        now, then = at(batch.topics, i, k), item(topics, k)
-        if (
-            now.priority != then.priority
-            or now.weight != then.weight
-            or now.period_us != then.period_us
-            or now.limit != then.limit
-            or now.no_drop != then.no_drop
-            or now.deadline_us != then.deadline_us
-            or now.v_start != then.v_start
-        ):
-            return _TOPIC
-    gained = 0.0
-    for topic in range(sender.topics):
-        gained += _gained(batch, i, arrivals, topic)
-    if abs(gained - sender.delivered_gain) > _ROUNDING * max(1.0, gained):
-        return _QOI
-    return 0
+    sent, gone = dequeued.sum(), dropped.sum()
+    counted = sent == sender["dequeued"] and gone == sender["evicted"] + sender["rejected"]
+    if not counted or sent + gone + len(queued) != sender["next"]:
+        return LOG
+    if not _same(batch.topics[i], senders.topic_table, _RULES):
+        return TOPIC
+    gained = _gained(batch, i, arrivals[batch.order[i, : sender["credited"]]])
+    return QOI if abs(gained - sender["delivered_gain"]) > _ROUNDING * max(1.0, gained) else ""
 
 
-@kernel
-def _gained(batch: Batch, i: int, arrivals: NDArray[Any], topic: int) -> float:
-    """Gain of sender ``i`` from the received messages of one topic, or of its one queue, without the 1."""
-    sender, gained, before = batch.senders[i], 0.0, -1
-    several = sender.topics > 1
-    weight, v_start = 1.0, sender.v_start
-    if several:
-        weight, v_start = at(batch.topics, i, topic).weight, at(batch.topics, i, topic).v_start
-    for k in range(sender.credited):
-        seq = at(batch.order, i, k)
-        if several and item(arrivals, seq).topic != topic:
-            continue
-        if before >= 0:
-            gained += weight * value(batch.v[v_start:], item(arrivals, seq).x - item(arrivals, before).x)
-        before = seq
-    return gained
+def _gained(batch: Batch, i: int, messages: NDArray[Any]) -> float:
+    """Gain of sender ``i`` from the received ``messages``, without the 1 of each topic."""
+    sender, topics, x = np.asarray(batch.senders)[i], np.asarray(batch.topics[i]), messages["x"]
+    parts = [(1.0, sender["v_start"], x)]
+    if len(topics) > 1:
+        parts = [(row["weight"], row["v_start"], x[messages["topic"] == k]) for k, row in enumerate(topics)]
+    return sum(w * max(0.0, information(batch.v[start:], np.ascontiguousarray(x)) - 1) for w, start, x in parts)
+
+
+def _same(a: NDArray[Any], b: NDArray[Any], fields: tuple[str, ...]) -> bool:
+    """Whether the records are equal in these fields."""
+    return all(np.array_equal(a[field], b[field]) for field in fields)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.sim import NEVER, Senders
+from bufgym.sim.senders import Senders
+from bufgym.sim.state import NEVER
 
 NAN = float("nan")
 

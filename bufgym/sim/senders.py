@@ -16,7 +16,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
-from bufgym.sim.audit import check_untouched
+from bufgym.sim.audit import touched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
 from bufgym.sim.state import FRESH, SENDER, beginning, new_batch
@@ -62,14 +62,14 @@ class Senders:
         self.decide_at = decide_at
         self.value = v
         self.topics = check_topics(topics)
-        self._topic_table, values = topic_table(self.topics, self.capacity, v)
+        self.topic_table, values = topic_table(self.topics, self.capacity, v)
         self._v_starts = {v.array.tobytes(): 0}
         self.episodes: list[Episode | None] = [None] * n
         self.begun = np.zeros(n, np.int64)
         self._uniforms: list[np.random.Generator | None] = [None] * n
         self._knots = Knots()
-        self.batch = new_batch(n, self.capacity, max_messages, len(self._topic_table), values)
-        self._rules = self._topic_table.view(np.int64)
+        self.batch = new_batch(n, self.capacity, max_messages, len(self.topic_table), values)
+        self._rules = self.topic_table.view(np.int64)
         self._unlogged = np.tile(FRESH, max_messages)
         when_full = int(decide_at == "overflow")
         self._beginning = beginning(
@@ -77,7 +77,7 @@ class Senders:
             max_bytes=self.max_bytes,
             ask_when_full=when_full,
             screens=int(when_full or self.max_bytes < UNLIMITED_BYTES),
-            topics=len(self._topic_table),
+            topics=len(self.topic_table),
         )
 
     def __len__(self) -> int:
@@ -189,8 +189,10 @@ class Senders:
     def check_untouched(self, policy: Policy) -> None:
         """Raise if ``policy`` has written to its view while it ran every sender to its end."""
         for i, episode in enumerate(self.episodes):
-            if episode is not None:
-                check_untouched(self.batch, i, episode.arrivals, self._topic_table, policy.name)
+            if episode is not None and (found := touched(self, i)):
+                raise BufgymError(
+                    f"policy {policy.name}: wrote to what it may only read: {found} (run {i + 1} of the batch)"
+                )
 
 
 def padded(rows: Sequence[NDArray[Any]]) -> NDArray[np.float64]:

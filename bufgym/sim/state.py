@@ -45,10 +45,7 @@ SENDER = np.dtype(
         ("window", np.int64),  # n_T: most messages sent and not yet acked
         ("ack_delay_us", np.int64),  # from the end of a message's transmission to its ack
         ("limit_at_send", np.int64),  # 1: rate limits hold back at the socket, 0: they drop at arrival
-        (
-            "limit_since_sent",
-            np.int64,
-        ),  # 1: at arrival they count from the message sent last, 0: from the one kept last
+        ("limit_since_sent", np.int64),  # 1: at arrival they count from the message sent last, 0: kept last
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
         ("v_start", np.int64),  # for one queue: where its V begins in the array of all V
         # episode
@@ -131,9 +128,6 @@ LOG_ENTRY = np.dtype(
 NEVER = -1
 """A time in LOG_ENTRY for an event that has not happened."""
 
-_FRESH = {"dequeued_us": NEVER, "transmitted_us": NEVER, "dropped_us": NEVER}
-_BEGINNING = {"first": 1, "finish_us": FOREVER, "measures": 1}
-
 NOT_YET = FOREVER - 1
 """Arrival time of a message that a live row still waits for: the row stops there."""
 
@@ -208,8 +202,8 @@ def words(dtype: np.dtype[Any], **values: float) -> NDArray[np.int64]:
 
 def beginning(**settings: int) -> NDArray[np.int64]:
     """int64[fields]: SENDER at the beginning of an episode: empty buffer, idle socket, nothing arrived."""
-    return words(SENDER, **_BEGINNING, **settings)
+    return words(SENDER, first=1, finish_us=FOREVER, measures=1, **settings)
 
 
-FRESH = words(LOG_ENTRY, **_FRESH)
+FRESH = words(LOG_ENTRY, dequeued_us=NEVER, transmitted_us=NEVER, dropped_us=NEVER)
 """int64[fields]: LOG_ENTRY of a message that has not arrived yet."""

@@ -14,7 +14,8 @@ from bufgym.model.buffer import ACCEPT, MESSAGE, NO_PARAMETERS, REJECT, TOPIC, U
 from bufgym.model.link import Link
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, messages
-from bufgym.sim import NEVER, Senders
+from bufgym.sim import Senders
+from bufgym.sim.state import NEVER
 from bufgym.traces import Trace
 
 

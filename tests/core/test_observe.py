@@ -12,7 +12,11 @@ from bufgym.model.observe import FIELDS, TOPIC_FIELDS
 from bufgym.model.qoi import saturating
 from bufgym.model.topics import Topic
 from bufgym.scenario import Episode, messages
-from bufgym.sim import DECISION, END, Senders, decide, next_event, python_view
+from bufgym.sim import Senders
+from bufgym.sim.decisions import decide
+from bufgym.sim.rollout import python_view
+from bufgym.sim.state import DECISION, END
+from bufgym.sim.transition import next_event
 from bufgym.traces import Trace
 
 

@@ -15,8 +15,7 @@ from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.oracle import integer
-from bufgym.oracle.online import OnlineOptimum, law, online_optimum
+from bufgym.oracle import OnlineOptimum, integer, law, online_optimum
 from bufgym.policies import ACCEPT, REJECT, Policy
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.sim import run

@@ -15,7 +15,7 @@ from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.oracle import by_length, clairvoyant, ideal, integer, law
-from bufgym.oracle.small_link import ASKED, QUARTERS, Chain, cut_off, small_link
+from bufgym.papers.link_optimum import ASKED, QUARTERS, Chain, cut_off, small_link
 from bufgym.papers.small_link import episode
 from bufgym.scenario import Interruption, Streams, registry
 from bufgym.sim import run

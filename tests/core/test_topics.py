@@ -13,7 +13,8 @@ from bufgym.model.link import FOREVER, Link
 from bufgym.model.topics import Topic, check_topics
 from bufgym.policies.registry import ClientSettings
 from bufgym.scenario import Episode, messages
-from bufgym.sim import Senders, age_until, run
+from bufgym.sim import Senders, run
+from bufgym.sim.rules import age_until
 
 pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.5)

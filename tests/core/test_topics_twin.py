@@ -18,6 +18,21 @@ from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
+from bufgym.sim.decisions import (
+    answer_dequeue,
+    answer_send,
+    can_evict,
+    can_hold,
+    can_reject,
+    can_send,
+    decide,
+    has_room,
+)
+from bufgym.sim.rollout import python_view
+from bufgym.sim.rules import age_until
+from bufgym.sim.socket import credit
+from bufgym.sim.state import DECISION, DEQUEUE, END, NEVER, SEND
+from bufgym.sim.transition import next_event
 
 kernels = pytest.mark.kernels
 
@@ -29,24 +44,24 @@ def test_agrees_with_twin_event_by_event(case):
 
     def check(event, senders, twin):
         batch = senders.batch
-        sim.credit(batch, 0, int(batch.senders[0]["now_us"]))
+        credit(batch, 0, int(batch.senders[0]["now_us"]))
         agree(senders, twin)
-        view = sim.python_view(kernel.named(batch), 0)
+        view = python_view(kernel.named(batch), 0)
         assert (view.window, view.in_flight) == (case.case.episode.window, len(twin.in_flight))
         assert (view.busy, view.left_bytes) == (int(bool(twin.socket)), twin.left_bytes())
         if event == "decision":
             agree_on_gaps(senders, twin)
         if event == "send":
             can = [twin.sendable(m) for m in twin.slots()]
-            assert [sim.can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can] + [False] * (L + 1 - len(can))
-            assert sim.can_hold(batch, 0) == twin.may_hold()
+            assert [can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can] + [False] * (L + 1 - len(can))
+            assert can_hold(batch, 0) == twin.may_hold()
 
     senders, twin = case.beside_its_twin(check)
     agree_on_log(senders, twin)
     until = int(senders.batch.senders[0]["now_us"]) + 5_000
-    sim.credit(senders.batch, 0, until)
+    credit(senders.batch, 0, until)
     for k in range(len(case.topics)):
-        sim.age_until(senders.batch, 0, k, until)
+        age_until(senders.batch, 0, k, until)
     agree(senders, twin, until, to_the_end=True)
 
 
@@ -91,14 +106,14 @@ def agree(senders, twin, until=None, to_the_end=False):
 def agree_on_gaps(senders, twin):
     """What a policy reads about the newcomer and every slot."""
     seen = kernel.named(senders.batch)
-    buffer, arrival = sim.python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
+    buffer, arrival = python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
     newcomer, slots = twin.newcomer, twin.slots()
     reference, last = twin.reference(), twin.kept_before(newcomer)
     assert (buffer.dequeued_arrival_us, buffer.dequeued_x) == (reference["us"], reference["x"])
     gain = twin.gain(twin.lane(newcomer), [last, newcomer]) if last else 0.0
     assert arrival_gain(buffer, arrival) == pytest.approx(gain, abs=1e-12)
-    assert sim.has_room(senders.batch, 0) == twin.fits(newcomer)
-    assert sim.can_reject(senders.batch, 0) == (not twin.must_keep(newcomer))
+    assert has_room(senders.batch, 0) == twin.fits(newcomer)
+    assert can_reject(senders.batch, 0) == (not twin.must_keep(newcomer))
     evictable = twin.evictable(newcomer)
     for k, message in enumerate([*slots, newcomer]):
         lane = twin.lane(message)
@@ -112,7 +127,7 @@ def agree_on_gaps(senders, twin):
         if k < len(slots):
             assert slot_after(buffer, k, lane) == min([j for j in own if j > k], default=len(slots))
             assert is_first(buffer, k) == (k == own[0])
-            assert sim.can_evict(senders.batch, 0, k) == (message in evictable)
+            assert can_evict(senders.batch, 0, k) == (message in evictable)
 
 
 def agree_on_log(senders, twin):
@@ -146,23 +161,23 @@ def test_what_the_masks_allow_is_carried_out_and_invariants_hold(case, chance):
     L, event, now_us = case.case.capacity, None, 0
     # Arrivals that ask nobody may find no room; where all ask, and are given what is possible, nothing is impossible.
     everyone = case.case.episode.first_decision == 0 and case.case.episode.last_decision > len(case.case.twin_messages)
-    while event != sim.END:
-        event = sim.next_event(batch, None, 0)
+    while event != END:
+        event = next_event(batch, None, 0)
         assert sender["now_us"] >= now_us
         now_us = int(sender["now_us"])
         hold(case, senders)
-        if event == sim.DECISION:
-            possible = [k for k in range(L) if sim.can_evict(batch, 0, k)]
-            possible += [REJECT] * sim.can_reject(batch, 0) + [ACCEPT] * sim.has_room(batch, 0)
-            assert sim.decide(batch, 0, chance.choice(possible))
-        elif event == sim.SEND:
-            possible = [k for k in range(L) if sim.can_send(batch, 0, k)] + [HOLD] * sim.can_hold(batch, 0)
-            assert sim.answer_send(batch, 0, chance.choice(possible))
-        elif event == sim.DEQUEUE:
-            sim.answer_dequeue(batch, 0, chance.random() < 0.5)
+        if event == DECISION:
+            possible = [k for k in range(L) if can_evict(batch, 0, k)]
+            possible += [REJECT] * can_reject(batch, 0) + [ACCEPT] * has_room(batch, 0)
+            assert decide(batch, 0, chance.choice(possible))
+        elif event == SEND:
+            possible = [k for k in range(L) if can_send(batch, 0, k)] + [HOLD] * can_hold(batch, 0)
+            assert answer_send(batch, 0, chance.choice(possible))
+        elif event == DEQUEUE:
+            answer_dequeue(batch, 0, chance.random() < 0.5)
     assert sender["invalid"] == 0 or not everyone
     assert sender["next"] == len(case.case.twin_messages)
-    assert sim.next_event(batch, None, 0) == sim.END  # and stays there
+    assert next_event(batch, None, 0) == END  # and stays there
 
 
 def hold(case, senders):
@@ -176,7 +191,7 @@ def hold(case, senders):
     x = np.asarray(case.case.episode.arrivals)["x"]
     slots = np.asarray(batch.slots[0])[first : first + queued]
     times = ("dropped_us", "transmitted_us", "dequeued_us")
-    dropped, transmitted, dequeued = (rows[name] != sim.NEVER for name in times)
+    dropped, transmitted, dequeued = (rows[name] != NEVER for name in times)
     assert (transmitted <= dequeued).all() and not (dropped & dequeued).any()
     assert not (dropped | dequeued)[slots["seq"]].any()
     assert (dequeued & ~transmitted).sum() == sender["busy"]
@@ -276,8 +291,8 @@ def test_every_policy_runs_on_topics_and_nothing_is_lost(name, case):
     # No no_drop message goes while another that could go is queued.
     rows, arrivals = np.asarray(senders.batch.log[0]), case.case.episode.arrivals
     free = np.array([not topic.no_drop for topic in case.topics])[arrivals["topic"]]
-    for lost in np.flatnonzero(~free & (rows["dropped_us"] != sim.NEVER) & (rows["limited"] == 0)):
+    for lost in np.flatnonzero(~free & (rows["dropped_us"] != NEVER) & (rows["limited"] == 0)):
         at_us = arrivals["arrival_us"][lost]
         assert rows["dropped_us"][lost] == at_us  # rejected when it came: no_drop is never evicted
-        later = [(rows[field] == sim.NEVER) | (rows[field] > at_us) for field in ("dequeued_us", "dropped_us")]
+        later = [(rows[field] == NEVER) | (rows[field] > at_us) for field in ("dequeued_us", "dropped_us")]
         assert not (free & later[0] & later[1])[:lost].any()

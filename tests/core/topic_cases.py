@@ -12,7 +12,7 @@ import numpy as np
 from cases import Case, cases
 from hypothesis import strategies as st
 
-from bufgym import policies, sim
+from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
@@ -27,6 +27,9 @@ from bufgym.model.observe import (
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
 from bufgym.sim import Senders
+from bufgym.sim.decisions import answer_dequeue, answer_send, decide
+from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, SEND
+from bufgym.sim.transition import next_event
 
 TWIN_V = {
     **{qoi.exponential(base): naive.exponential(base) for base in (0.3, 0.618, 0.95)},
@@ -37,7 +40,7 @@ V = st.sampled_from(list(TWIN_V))
 
 EVENTS = dict(zip(range(5), ("end", "departure", "decision", "dequeue", "send"), strict=True))
 """The twin's names of ``sim.END``, ``sim.DEPARTURE`` and so on."""
-assert (sim.END, sim.DEPARTURE, sim.DECISION, sim.DEQUEUE, sim.SEND) == tuple(range(5))
+assert (END, DEPARTURE, DECISION, DEQUEUE, SEND) == tuple(range(5))
 
 CLIENT_RULES = ("limit_at_send", "limit_since_sent", "flush_no_drop")
 """Settings of the client that change what a sender does."""
@@ -121,11 +124,11 @@ class TopicCase:
         senders = self.senders()
         batch, to_kernel = (
             senders.batch,
-            {"decision": sim.decide, "send": sim.answer_send, "dequeue": sim.answer_dequeue},
+            {"decision": decide, "send": answer_send, "dequeue": answer_dequeue},
         )
 
         def ask(twin: Any, event: str) -> Any:
-            assert EVENTS[sim.next_event(batch, None, 0)] == event
+            assert EVENTS[next_event(batch, None, 0)] == event
             check(event, senders, twin)
             answer = self.answer(twin, event)
             if event in to_kernel:

@@ -15,7 +15,7 @@ from bufgym.envs import SenderEnv, SenderVectorEnv, expert
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.oracle.online import law, online_optimum
+from bufgym.oracle import law, online_optimum
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Interruption, Uplink, messages
 from bufgym.scenario.numbered import draw

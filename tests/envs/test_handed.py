@@ -43,6 +43,6 @@ def test_a_collector_gets_an_observation_of_its_own_each_time() -> None:
     handed = Handed(FORM)
     collected = [handed.of(row(number)) for number in range(20)]
     assert [observation["busy"][0] for observation in collected] == list(range(20))
-    assert len(handed._made) < 20
+    assert len(handed._reused._made) < 20
     collected[0].clear()  # a dict that its owner changes changes no other
     assert list(handed.of(row(2))) == list(FORM.space)

@@ -22,7 +22,7 @@ from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
 from bufgym.model.observe import FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
-from bufgym.sim import python_view
+from bufgym.sim.rollout import python_view
 from bufgym.traces import Trace, drive_motion
 from tests.conftest import COMPILED
 

@@ -16,8 +16,9 @@ from bufgym.model.link import Link
 from bufgym.model.observe import REWARD_TERMS, TOPIC_REWARD_TERMS
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Episode, Stream, messages
-from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, answer_send
+from bufgym.sim.decisions import answer_send
 from bufgym.sim.metrics import topic_outcomes
+from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 from bufgym.traces import Trace
 
 TERMS = [term.name for term in REWARD_TERMS + TOPIC_REWARD_TERMS]

@@ -16,7 +16,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, Uplink
 from bufgym.scenario.suites.mixture import SuiteScenario
-from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS
+from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 
 kernels = pytest.mark.kernels
 CASES: dict[str, tuple[Scenario, dict[str, Any]]] = {
@@ -286,7 +286,7 @@ def test_arrays_that_nobody_holds_are_used_again() -> None:
     envs.reset(seed=0)
     for _ in range(60):
         step = envs.step(np.full(N, L))
-    assert len(envs._pool) <= 4
+    assert len(envs._outputs._made) <= 4
     assert step[1].shape == (N,)
 
 

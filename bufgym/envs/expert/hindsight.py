@@ -13,7 +13,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps
 from bufgym.oracle.from_queue import find_values, new_work
 from bufgym.oracle.programme import find_idle
-from bufgym.sim import ARRIVAL_WAITS
+from bufgym.sim.state import ARRIVAL_WAITS
 
 _TIE = 1e-9
 """Values closer than this are equal: they sum the same gaps in another order."""

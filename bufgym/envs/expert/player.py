@@ -9,25 +9,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.step import action_of
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import compile_for, entry, local, located, named
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT
+from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.policies import Policy
 from bufgym.policies.registry import runs_compiled, signatures
-from bufgym.sim import (
-    ARRIVAL_WAITS,
-    NOTHING_WAITS,
-    SOCKET_WAITS,
-    Batch,
-    Senders,
-    answer_of,
-    arrival_of,
-    python_arrival,
-    python_view,
-    view,
-)
-from bufgym.sim.state import batch_type
+from bufgym.sim import Senders
+from bufgym.sim.rollout import answer_of, python_arrival, python_view
+from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch, batch_type
+from bufgym.sim.view import arrival_of, view
 
 
 class Player:
@@ -65,10 +55,13 @@ class Player:
             for _ in range(int(sender.dequeued - self._heard[i])):
                 self.policy.on_departure(buffer, memory)
         self._heard[i] = sender.dequeued
-        if sender.waiting == SOCKET_WAITS:
-            return self._sends(answer_of(self.policy, "on_send", self.policy.on_send(buffer, memory)), senders.capacity)
-        answer = self.policy.on_arrival(buffer, python_arrival(batch, i), memory)
-        return self._drops(answer_of(self.policy, "on_arrival", answer), senders.capacity)
+        sends = bool(sender.waiting == SOCKET_WAITS)
+        if sends:
+            answer = answer_of(self.policy, "on_send", self.policy.on_send(buffer, memory))
+        else:
+            answer = self.policy.on_arrival(buffer, python_arrival(batch, i), memory)
+            answer = answer_of(self.policy, "on_arrival", answer)
+        return int(self._checked(np.array([answer]), senders.capacity, sends=sends)[0])
 
     def actions(self, senders: Senders, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """int64[n]: ``action`` of every sender in ``rows`` (by default all) whose decision is due, L elsewhere.
@@ -90,10 +83,9 @@ class Player:
         compiled_ask(bool(batch.several))(
             batch, self._memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers
         )
-        dropped = rows[waiting[rows] == ARRIVAL_WAITS]
-        actions[dropped] = self._all_drops(answers[dropped], senders.capacity)
-        for i in rows[waiting[rows] == SOCKET_WAITS].tolist():
-            actions[i] = self._sends(int(answers[i]), senders.capacity)
+        for sends in (False, True):
+            asked = rows[waiting[rows] == (SOCKET_WAITS if sends else ARRIVAL_WAITS)]
+            actions[asked] = self._checked(answers[asked], senders.capacity, sends=sends)
         return actions
 
     def _begin(self, senders: Senders, rows: NDArray[np.int64]) -> None:
@@ -110,22 +102,14 @@ class Player:
             self._heard[i] = 0
             self._begun[i] = senders.begun[i]
 
-    def _sends(self, choice: int, capacity: int) -> int:
-        if not HOLD <= choice < capacity:
-            raise BufgymError(f"policy {self.policy.name}: sends slot {choice}: must be 0..{capacity - 1}, or HOLD")
-        return capacity if choice == HOLD else choice
-
-    def _drops(self, decision: int, capacity: int) -> int:
-        try:
-            return action_of(decision, capacity)
-        except BufgymError as error:
-            raise BufgymError(f"policy {self.policy.name}: {error}") from None
-
-    def _all_drops(self, decisions: NDArray[np.int64], capacity: int) -> NDArray[np.int64]:
-        wrong = decisions[(decisions < ACCEPT) | (decisions >= capacity)]
+    def _checked(self, answers: NDArray[np.int64], capacity: int, *, sends: bool) -> NDArray[np.int64]:
+        """The actions for the policy's answers at arrivals, or where the socket asks what it ``sends``."""
+        wrong = answers[(answers < (HOLD if sends else ACCEPT)) | (answers >= capacity)]
         if len(wrong):
-            self._drops(int(wrong[0]), capacity)
-        return np.where(decisions >= 0, decisions, np.where(decisions == REJECT, capacity, capacity + 1))
+            told, last = ("sends slot", "or HOLD") if sends else ("decision", "REJECT or ACCEPT")
+            slots = f"0..{capacity - 1}," if sends else f"a slot 0..{capacity - 1},"
+            raise BufgymError(f"policy {self.policy.name}: {told} {wrong[0]}: must be {slots} {last}")
+        return np.where(answers >= 0, answers, np.where(answers == ACCEPT, capacity + 1, capacity))
 
 
 def ask(

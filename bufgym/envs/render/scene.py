@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.step import delivered_qoi
-from bufgym.model.link import position_at
-from bufgym.sim import ARRIVAL_WAITS, SOCKET_WAITS, Senders
+from bufgym.sim import Senders
+from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 
 DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
 """States of a message."""
@@ -104,11 +104,6 @@ def scene_of(senders: Senders, i: int) -> Scene:
 
 def link_rates(senders: Senders, i: int, edges_us: NDArray[np.int64]) -> NDArray[np.float64]:
     """Mean link capacity of sender ``i`` between neighbouring ``edges_us``, bytes per second."""
-    batch, sender = senders.batch, senders.batch.senders[i]
-    first, last, after = int(sender["first_knot"]), int(sender["last_knot"]), int(sender["after"])
-    offset_us = int(sender["offset_us"])
-    carried = [
-        position_at(batch.knot_us, batch.knot_bytes, first, last, after, first, int(t_us) + offset_us)[0]
-        for t_us in edges_us
-    ]
-    return 1e6 * np.diff(np.array(carried, np.float64)) / np.maximum(1, np.diff(edges_us))
+    episode = senders.episodes[i]
+    assert episode is not None
+    return 1e6 * np.diff(episode.link.carried_by(edges_us).astype(np.float64)) / np.maximum(1, np.diff(edges_us))

@@ -16,8 +16,11 @@ from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy, signatures
 from bufgym.scenario import Episode, messages
-from bufgym.sim import DECISION, DEPARTURE, END, Senders, arrival_of, decide, next_event, view
-from bufgym.sim.state import Batch, batch_type
+from bufgym.sim import Senders
+from bufgym.sim.decisions import decide
+from bufgym.sim.state import DECISION, DEPARTURE, END, Batch, batch_type
+from bufgym.sim.transition import next_event
+from bufgym.sim.view import arrival_of, view
 from bufgym.traces import Trace
 
 INIT, ARRIVAL, DEQUEUE, SENT = range(4)
