@@ -116,7 +116,8 @@ def test_archives_unpack(tmp_path: Path) -> None:
     packed = [tarred(tmp_path / name, *contents, mode=mode) for name, mode in modes.items()]
     for archive in (zipped(tmp_path / "a.zip", {**dict(contents), "__MACOSX/top/._log.txt": b"junk"}), *packed):
         out = tmp_path / f"{archive.name}.out"
-        assert [(str(path.relative_to(out)), path.read_bytes()) for path in unpack(archive, out)] == contents
+        unpack(archive, out)
+        assert {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*.*")} == dict(contents)
 
 
 @pytest.mark.parametrize("name", ["../out.txt", "/tmp/out.txt", "a/../../out.txt", "C:out.txt", "a\\..\\out.txt"])
@@ -154,12 +155,12 @@ def test_what_is_no_file_comes_twice_or_is_too_much_is_refused(tmp_path: Path, m
     path.write_bytes(raw.replace(struct.pack("<I", 1_000_001), struct.pack("<I", 10)))
     refused(path, r"unpacks to more|damaged")
     halves = tarred(tgz, ("first", bytes(600_000)), ("second", bytes(600_000)))
-    refused(halves, r"unpacks to more than 1000000 bytes \(at second\)")
+    refused(halves, r"member = second: unpacks to more than 1000000 bytes")
     # tarfile would read an extended header of any announced length into memory.
     info = tarfile.TarInfo("x")
     info.type, info.size = tarfile.XHDTYPE, 2**31
     (tmp_path / "a.tar").write_bytes(info.tobuf(tarfile.USTAR_FORMAT) + bytes(10_240))
     refused(tmp_path / "a.tar", "a header of 2147483648 bytes: must be at most")
     monkeypatch.setattr(unpacking, "MAX_MEMBERS", 3)
-    refused(zipped(path, {f"{k}": b"" for k in range(4)}), "3 files: must be less")
-    refused(tarred(tgz, *((f"{k}", b"") for k in range(4))), "more than 3 members")
+    refused(zipped(path, {f"{k}": b"" for k in range(4)}), "or 3 files: must be less")
+    refused(tarred(tgz, *((f"{k}", b"") for k in range(4))), "or 3 files: must be less")
