@@ -12,7 +12,6 @@ files, `generate` makes links, motions and frame sizes, `fit` fits links to reco
 fetches public recordings.
 """
 
-from bufgym.traces.formats.archives import members
 from bufgym.traces.formats.bags import read_bag
 from bufgym.traces.formats.links import FORMATS, detect_format, read_trace
 from bufgym.traces.formats.motions import read_motion, write_motion_csv
@@ -65,7 +64,6 @@ __all__ = [
     "load",
     "load_motion",
     "markov_link",
-    "members",
     "motion_from_poses",
     "outage",
     "ramp",
