@@ -9,7 +9,7 @@ import argparse
 import inspect
 from collections.abc import Callable
 
-from bufgym.cli.options import Commands, Parser, command, count, least_0, natural, number, positive
+from bufgym.cli.options import Commands, Parser, command, least_0, natural, number, positive
 from bufgym.ground.errors import BufgymError
 
 
@@ -32,16 +32,6 @@ def _add_links(kinds: Commands) -> None:
     help = "scale to this mean (default: as recorded)"
     link.add_argument("--mean", dest="mean_bytes_per_s", type=positive, metavar="BYTES/S", help=help)
     link.add_argument("--links", metavar="FILE", help="parameters made by 'bufgym trace fit' (default: bufgym's own)")
-    states = _kind(kinds, "gilbert-elliott", _generate, "a link of two states, good and bad", "gilbert_elliott")
-    _option(states, "--good", "good_bytes_per_s", least_0, 10e6, "BYTES/S")
-    _option(states, "--bad", "bad_bytes_per_s", least_0, 0.0, "BYTES/S")
-    _option(states, "--mean-good", "mean_good_s", positive, 20.0, "S", "mean stay")
-    _option(states, "--mean-bad", "mean_bad_s", positive, 2.0, "S", "mean stay")
-    path = _kind(kinds, "roaming", _roaming, "WiFi past access points, with hand-overs", "roaming")
-    _option(path, "--access-points", "access_points", count, 4, "N", "in a row")
-    _option(path, "--spacing", "spacing_m", positive, 50.0, "M", "between them")
-    _option(path, "--speed", "speed_m_per_s", positive, 1.0, "M/S", "of the robot")
-    _option(path, "--gap", "gap_s", least_0, 1.0, "S", "without a link at a hand-over")
 
 
 def _add_rules(kinds: Commands) -> None:
@@ -125,14 +115,6 @@ def _link(options: argparse.Namespace) -> None:
     from bufgym.traces import read_links
 
     options.links = None if options.links is None else read_links(options.links)
-    _generate(options)
-
-
-def _roaming(options: argparse.Namespace) -> None:
-    from bufgym.traces import Corridor
-
-    names = ("access_points", "spacing_m", "speed_m_per_s", "gap_s")
-    options.corridor = Corridor(**{name: getattr(options, name) for name in names})
     _generate(options)
 
 

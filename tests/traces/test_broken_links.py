@@ -4,7 +4,6 @@ import gzip
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 from link_files import HEADER, UCC_HEADER, written
 

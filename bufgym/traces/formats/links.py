@@ -15,8 +15,8 @@
 | `runs` | `Run 1`, then a line of Mbit/s each 0.1 s, or of times and one of Mbit/s | 5G mmWave uplinks |
 
 Any of them may be gzip'd. The format is recognised by the first line that is not blank, and stated in the trace's
-`source`; a line that fits two formats is an error. Blank lines are skipped. Every other line must follow its format exactly, because a wrong capacity is worse than
-none.
+`source`; a line that fits two formats is an error. Blank lines are skipped. Every other line must follow its format
+exactly, because a wrong capacity is worse than none.
 
 Limits beyond which a number counts as a mistake: 10**7 s in all, 86,400 s from one rate to the next, 10**12 bytes in an
 interval, 10**6 Mbit/s. `text.py` has the limits of text files.
