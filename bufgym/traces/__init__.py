@@ -10,6 +10,9 @@ workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
 This room holds `Trace`, `Motion` and `Workload`, and `shipped`, which loads them by name. `formats` reads and writes
 files, `generate` makes links, motions and frame sizes, `fit` fits links to recordings and compares both, and `datasets`
 fetches public recordings.
+
+An argument out of its range raises a BufgymError. A file that cannot be read or written, or that breaks a rule of its
+format, raises its subclass TraceError, whose message names the file, the line, the value and the rule.
 """
 
 from bufgym.traces.formats.bags import read_bag

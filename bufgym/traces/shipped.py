@@ -32,11 +32,7 @@ def load(
 
 
 def load_motion(name_or_path: StrPath) -> Motion:
-    """A motion recording by its shipped name or from a file; trajectories are read with the default settings.
-
-    Raises:
-        TraceError: as `load`.
-    """
+    """A motion recording by its shipped name or from a file; trajectories are read with the default settings."""
     return read_motion(_resolve(name_or_path))
 
 

@@ -130,12 +130,7 @@ def _read(path: StrPath, format: str, column: str | None) -> Knots:
 
 
 def detect_format(path: StrPath) -> str:
-    """The one format that the file's first line fits.
-
-    Raises:
-        TraceError: it fits none, or several (then `read_trace` needs its `format` argument), or cannot be
-            read.
-    """
+    """The one format that the file's first line fits."""
     with open_text(path) as file:
         line = file.first()
     if line is None:

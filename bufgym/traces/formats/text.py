@@ -110,11 +110,7 @@ class Line(NamedTuple):
 
 @contextmanager
 def open_text(path: StrPath) -> Iterator[TextFile]:
-    """Open a text file for one pass: plain or gzip, recognised by its first bytes whatever its name.
-
-    Raises:
-        TraceError: missing, not a regular file, unreadable, a zip archive.
-    """
+    """Open a text file for one pass: plain or gzip, recognised by its first bytes whatever its name."""
     with os_errors(path, "opened"):
         raw = _open(path)
     with raw:
@@ -125,11 +121,7 @@ def open_text(path: StrPath) -> Iterator[TextFile]:
 
 
 class TextFile:
-    """An open text file. Use one of `lines`, `first`, `text` and `read`; all of them respect the module's limits.
-
-    Raises:
-        TraceError: unreadable, damaged or truncated gzip data, more than MAX_TEXT_BYTES.
-    """
+    """An open text file. Use one of `lines`, `first`, `text` and `read`; all of them respect the module's limits."""
 
     def __init__(self, path: StrPath, stream: IO[bytes]) -> None:
         """Take the file's name, for error messages, and its bytes after decompression."""
@@ -170,11 +162,7 @@ class TextFile:
         return None
 
     def text(self, most: int = MAX_JSON_BYTES) -> str:
-        """All of it, at most `most` bytes.
-
-        Raises:
-            TraceError: also if it is longer than `most`, or not UTF-8.
-        """
+        """All of it, at most `most` bytes."""
         content = bytearray()
         while piece := self._take(_PIECE_BYTES, content.count(b"\n") + 1, whole_line=False):
             content += piece
@@ -217,11 +205,7 @@ class TextFile:
 
 
 def parsed_line(path: StrPath, number: int, raw: bytes) -> Line:
-    """A line of bytes as text.
-
-    Raises:
-        TraceError: it is not UTF-8, or longer than MAX_LINE_CHARACTERS.
-    """
+    """A line of bytes as text."""
     try:
         line = Line(path, number, raw.decode("utf-8").strip())
     except UnicodeDecodeError as error:
@@ -233,11 +217,7 @@ def parsed_line(path: StrPath, number: int, raw: bytes) -> Line:
 
 
 def write_text(path: StrPath, *parts: Iterable[str]) -> None:
-    """Write all parts, one after the other, as UTF-8; or no file at all.
-
-    Raises:
-        TraceError: it cannot be written.
-    """
+    """Write all parts, one after the other, as UTF-8; or no file at all."""
     with (
         os_errors(path, "written"),
         replaced(Path(path)) as temporary,

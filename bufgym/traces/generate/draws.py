@@ -19,11 +19,7 @@ NORMAL_UNIFORMS: Final = 12
 
 
 def stream(seed: int) -> np.random.Generator:
-    """The random numbers of a seed.
-
-    Raises:
-        BufgymError: a seed below 0.
-    """
+    """The random numbers of a seed."""
     if seed < 0:
         raise BufgymError(f"seed = {seed}: must be >= 0")
     return np.random.Generator(np.random.PCG64(seed))

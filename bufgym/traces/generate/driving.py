@@ -69,9 +69,6 @@ def drive_motion(seed: int, duration_s: float = 300.0, driving: Driving | None =
         seed: >= 0.
         duration_s: rounded to whole tenths; 0.1 to 10**6.
         driving: by default `Driving()`.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     driving = Driving() if driving is None else driving
     if not 0.1 <= duration_s <= 1e6:

@@ -27,11 +27,7 @@ from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 @dataclass(frozen=True)
 class FrameModel:
-    """How large frames are; shares are parts of the base.
-
-    Raises:
-        BufgymError: a value out of its range.
-    """
+    """How large frames are; shares are parts of the base."""
 
     base_bytes: Annotated[float, Between(1, 1e9)] = 230_000.0
     """Size of a frame at rest, of ordinary detail."""
@@ -62,9 +58,6 @@ def frame_sizes(arrival_us: Int64Array, motion: Motion, seed: int, model: FrameM
         motion: how the camera moves; past its end it begins again.
         seed: >= 0.
         model: by default `FrameModel()`.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     m = FrameModel() if model is None else model
     times = np.asarray(arrival_us)

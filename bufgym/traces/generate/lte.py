@@ -82,9 +82,6 @@ def synthetic_lte(
         duration_s: whole seconds, 1 to 10**7.
         mean_bytes_per_s: mean of this very trace, breakdowns included (to half a byte), 1 to 10**10.
         mode: one of `LTE_MODES`; the faster, the more variable.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     if mode not in get_args(LteMode):
         raise BufgymError(f"mode = {mode!r}: must be one of {', '.join(get_args(LteMode))}")

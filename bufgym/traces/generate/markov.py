@@ -59,9 +59,6 @@ def markov_link(
         mean_bytes_per_s: scale this very trace to that mean, 1 to 10**10; by default rates are the recordings', and the
             mean differs from seed to seed as it does between recordings.
         links: by default `fitted_links()`.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     links = fitted_links() if links is None else links
     if mode not in links:

@@ -39,11 +39,7 @@ _MAX_FILE_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True)
 class OutageParameters:
-    """Outages: runs of seconds below a threshold.
-
-    Raises:
-        BufgymError: a value out of its range.
-    """
+    """Outages: runs of seconds below a threshold."""
 
     spells: Annotated[int, Between(1, 1e9)]
     """Number of outages that the other numbers come from."""
@@ -71,11 +67,7 @@ class OutageParameters:
 
 @dataclass(frozen=True)
 class LinkParameters:
-    """A link in steps of 1 s; `markov.py` says how a trace is drawn from it.
-
-    Raises:
-        BufgymError: a value out of its range.
-    """
+    """A link in steps of 1 s; `markov.py` says how a trace is drawn from it."""
 
     recordings: Annotated[int, Between(1, 1e9)]
     """Number of recordings that it was fitted to."""

@@ -21,22 +21,14 @@ class Between(NamedTuple):
 
 
 def checked(name: str, value: float, least: float, most: float) -> float:
-    """`value` if it is a number from `least` to `most`.
-
-    Raises:
-        BufgymError: it is not, or not finite.
-    """
+    """`value` if it is a number from `least` to `most`."""
     if not (is_finite(value) and least <= value <= most):
         raise BufgymError(f"{name} = {value!r}: must be a number from {least:g} to {most:g}")
     return value
 
 
 def check_ranges(parameters: object) -> None:
-    """Check each field of a dataclass that is annotated with a range.
-
-    Raises:
-        BufgymError: a value is not a number in its range.
-    """
+    """Check each field of a dataclass that is annotated with a range."""
     for name, hint in get_type_hints(type(parameters), include_extras=True).items():
         for limits in getattr(hint, "__metadata__", ()):
             checked(name, getattr(parameters, name), *limits)

@@ -58,9 +58,6 @@ def tunnel(
         bytes_per_s: rate outside the tunnel, 1 to 10**10.
         before_s, fade_s, blackout_s, recover_s, after_s: length of each part, 0 to 10**5 s; the parts with capacity
             must not all be 0.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     checked("bytes_per_s", bytes_per_s, 1, 1e10)
     parts = [
