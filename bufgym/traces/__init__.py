@@ -8,7 +8,7 @@ motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
 workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
 
 This room holds `Trace`, `Motion` and `Workload`, and `shipped`, which loads them by name. `formats` reads and writes
-files, `generate` makes links, motions and frame sizes, `fit` fits links to recordings and compares both, and `datasets`
+files, `generate` makes links and motions, `fit` fits links to recordings and compares both, and `datasets`
 fetches public recordings.
 
 An argument out of its range raises a BufgymError. A file that cannot be read or written, or that breaks a rule of its
@@ -23,11 +23,8 @@ from bufgym.traces.formats.trajectories import read_poses
 from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
 from bufgym.traces.formats.writers import WRITERS, Difference, difference, write_csv, write_mahimahi
 from bufgym.traces.generate import (
-    Driving,
-    FrameModel,
     drive_motion,
     fitted_links,
-    frame_sizes,
     markov_link,
     ramp,
     read_links,
@@ -45,8 +42,6 @@ __all__ = [
     "FORMATS",
     "WRITERS",
     "Difference",
-    "Driving",
-    "FrameModel",
     "Motion",
     "MotionSettings",
     "Poses",
@@ -57,7 +52,6 @@ __all__ = [
     "difference",
     "drive_motion",
     "fitted_links",
-    "frame_sizes",
     "load",
     "load_motion",
     "markov_link",

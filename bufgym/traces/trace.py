@@ -160,11 +160,6 @@ class Trace:
         window_bytes = np.diff(np.interp(edges_us, self.time_us, self.cumulative_bytes))
         return np.diff(edges_us), window_bytes * (US_PER_S / window_us)
 
-    def seconds_below(self, bytes_per_s: float, window_us: int | None = None) -> float:
-        """Total length, in seconds, of the `samples` whose rate is strictly below `bytes_per_s`."""
-        lengths_us, rates = self.samples(window_us)
-        return float(lengths_us[rates < bytes_per_s].sum()) / US_PER_S
-
     def scaled(self, factor: float) -> Trace:
         """The same trace with every rate times `factor`; each cumulative count is rounded to a whole byte."""
         if not (math.isfinite(factor) and factor >= 0):

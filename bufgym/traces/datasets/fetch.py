@@ -267,37 +267,30 @@ def _placed(remote: Remote, source: Path, target: Path, origin: Origin) -> Fetch
             checksum = _sha256(copy)
             if remote.sha256 not in (None, checksum):
                 raise BufgymError(f"{name}: wrong checksum: sha256 is {checksum}, must be {remote.sha256}; not kept")
+            target.unlink(missing_ok=True)  # first, so that a half removed folder is never taken for a complete one
+            if (folder := _unpacked(target)) is not None:
+                shutil.rmtree(folder, ignore_errors=True)
     return _settled(remote, target, checksum, origin)
 
 
 def _settled(remote: Remote, target: Path, checksum: str, origin: Origin) -> Fetched:
     """The file in its place, unpacked if it is an archive."""
-    try:
-        unpacked = _unpacked(target, renew=origin != "there already")
-    except BufgymError:
-        if remote.sha256 is None:
-            # There is no checksum to verify this file with, so the next attempt must fetch it again.
-            target.unlink()
-        raise
-    return Fetched(target, checksum, remote.sha256 is not None, origin, unpacked)
+    folder = _unpacked(target)
+    if folder is not None and not folder.exists():
+        try:
+            unpack(target, folder)
+        except BufgymError:
+            if remote.sha256 is None:
+                # There is no checksum to verify this file with, so the next attempt must fetch it again.
+                target.unlink()
+            raise
+    return Fetched(target, checksum, remote.sha256 is not None, origin, folder)
 
 
-def _unpacked(archive: Path, renew: bool) -> Path | None:
-    """The folder beside the archive with its content; None if it is no archive."""
+def _unpacked(archive: Path) -> Path | None:
+    """The folder beside the archive for its content; None if it is no archive."""
     suffix = ending(archive.name)
-    if suffix is None:
-        return None
-    folder = archive.with_name(archive.name[: -len(suffix)])
-    if renew and folder.exists():
-        # Renamed first, in one step, so that a half removed folder is never taken for a complete one.
-        stale = folder.with_name(f".{folder.name}.stale")
-        shutil.rmtree(stale, ignore_errors=True)
-        with os_errors(folder, "written"):
-            folder.rename(stale)
-        shutil.rmtree(stale, ignore_errors=True)
-    if not folder.exists():
-        unpack(archive, folder)
-    return folder
+    return None if suffix is None else archive.with_name(archive.name[: -len(suffix)])
 
 
 def _sha256(path: Path) -> str:

@@ -31,7 +31,6 @@ MAX_JSON_BYTES: Final = 16 * 2**20
 _GZIP_MAGIC = b"\x1f\x8b"
 _ZIP_MAGIC = b"PK\x03\x04"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-_PIECE_BYTES = 2**20
 # int() and float() accept more than a data file should hold: "1_000", "infinity", digits of other scripts.
 _WHOLE = re.compile(r"[0-9]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -163,17 +162,14 @@ class TextFile:
 
     def text(self, most: int = MAX_JSON_BYTES) -> str:
         """All of it, at most `most` bytes."""
-        content = bytearray()
-        while piece := self._take(_PIECE_BYTES, content.count(b"\n") + 1, whole_line=False):
-            content += piece
-            if len(content) > most:
-                rule = f"more than {most} bytes of JSON: must be at most"
-                raise fault(self.path, rule, line=content.count(b"\n") + 1)
+        content = self._take(most + 1, 1, whole_line=False)
+        if len(content) > most:
+            raise fault(self.path, f"more than {most} bytes of JSON: must be at most")
         try:
             return content.decode("utf-8")
         except UnicodeDecodeError as error:
             line = content.count(b"\n", 0, error.start) + 1
-            value = bytes(content[error.start : error.start + 20])
+            value = content[error.start : error.start + 20]
             raise fault(self.path, "must be UTF-8 text", line=line, value=value) from error
 
     def _raw_lines(self) -> Iterator[tuple[int, bytes]]:

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.formats.faults import StrPath, fault, os_errors
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.logs import read_json
 from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.ranges import Between, check_ranges, checked, is_finite
 
@@ -34,7 +35,6 @@ LOW_QUANTILES: Final = 5
 SHOULDER_S: Final = 5
 
 _MAX_RATE: Final = 1e10
-_MAX_FILE_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -104,16 +104,9 @@ def read_links(path: StrPath) -> dict[str, LinkParameters]:
     """Mode -> parameters, from a file that `bufgym trace fit` wrote.
 
     Raises:
-        TraceError: the file cannot be read, is over 1 MiB, or a value breaks its rule.
+        TraceError: the file cannot be read, or a value breaks its rule.
     """
-    with os_errors(path, "read"), open(path, "rb") as file:
-        raw = file.read(_MAX_FILE_BYTES + 1)
-    if len(raw) > _MAX_FILE_BYTES:
-        raise fault(path, f"must be at most {_MAX_FILE_BYTES} bytes")
-    try:
-        content = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise fault(path, f"must be JSON: {error}") from error
+    content = read_json(path)
     modes = content.get("modes") if isinstance(content, dict) else None
     if not isinstance(modes, dict) or not modes:
         raise fault(path, 'must be an object with "modes", as `bufgym trace fit` writes it')
