@@ -13,6 +13,7 @@ from bufgym.scenario.configuration import read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams
 from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode, FleetScenario
 from bufgym.scenario.interruption import LAWS, Interruption
+from bufgym.scenario.numbered import draw
 from bufgym.scenario.registry import SCENARIOS, get, register
 from bufgym.scenario.uplink import Uplink
 
@@ -29,6 +30,7 @@ __all__ = [
     "Stream",
     "Streams",
     "Uplink",
+    "draw",
     "get",
     "messages",
     "read_client",

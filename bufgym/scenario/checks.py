@@ -11,35 +11,16 @@ from bufgym import traces
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.checks import above_0, between, whole
+from bufgym.model.checks import above_0 as above_0  # papers check their parameters with it too
+from bufgym.model.checks import between, whole
 from bufgym.model.link import MAX_TIME_US
 from bufgym.model.qoi import Value
 from bufgym.traces import Motion, Trace
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
-__all__ = [
-    "above_0",
-    "as_tuple",
-    "check_stream",
-    "check_value",
-    "delay",
-    "duration",
-    "links",
-    "message_bytes",
-    "positive",
-    "rate",
-    "recordings",
-]
-
 MAX_RATE_HZ = 100_000
 """Highest arrival rate: times are whole microseconds, at least ten to a period."""
-
-
-def positive(scenario: object, *names: str) -> None:
-    """Check that these parameters are finite numbers > 0."""
-    for name in names:
-        above_0(name, getattr(scenario, name))
 
 
 def rate(rate_hz: Any) -> None:

@@ -18,7 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
-from bufgym.model.checks import check_window, whole
+from bufgym.model.checks import above_0, check_window, whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics
@@ -30,10 +30,9 @@ from bufgym.scenario.checks import (
     delay,
     duration,
     message_bytes,
-    positive,
     recordings,
 )
-from bufgym.scenario.draws import place, place_link, scaled, sizes
+from bufgym.scenario.draws import place, place_link, sizes
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace
 
@@ -120,7 +119,7 @@ class Client:
                 raise BufgymError(f"{name}: a client needs at least one")
         check_topics(self.topics)
         duration(self.duration_s)
-        positive(self, "scale")
+        above_0("scale", self.scale)
         check_window(self.window)
         delay("propagation_us", self.propagation_us)
         delay("round_trip_us", self.ack_delay_us)
@@ -151,7 +150,7 @@ class Client:
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:
-        return tuple(scaled(trace, self.scale) for trace in self.traces)
+        return tuple(trace.scaled(self.scale) for trace in self.traces)
 
     def draw(self, streams: Streams) -> Episode:
         """Draw one episode."""

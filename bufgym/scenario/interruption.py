@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.checks import whole
+from bufgym.model.checks import above_0, whole
 from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages, read_only
-from bufgym.scenario.checks import check_value, message_bytes, positive, rate
+from bufgym.scenario.checks import check_value, message_bytes, rate
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
 
@@ -63,7 +63,7 @@ class Interruption:
         if self.law != "fixed" and not 1 <= self.t_min <= self.t_max:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
         message_bytes("size_bytes", self.size_bytes)
-        positive(self, "t_mean")
+        above_0("t_mean", self.t_mean)
         rate(self.rate_hz)
         if self.period_us * self.max_messages > MAX_TIME_US:
             raise BufgymError(

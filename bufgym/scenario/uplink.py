@@ -17,7 +17,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import read_only, unchecked_messages
 from bufgym.scenario.checks import as_tuple, check_stream, check_value, delay, duration, recordings
-from bufgym.scenario.draws import beside, place, place_link, scaled, shipped, sizes, skip
+from bufgym.scenario.draws import beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.trace import MAX_DURATION_S
@@ -111,7 +111,7 @@ class Uplink:
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:
-        return tuple(scaled(trace, factor) for trace in self.traces for factor in self.scale)
+        return tuple(trace.scaled(factor) for trace in self.traces for factor in self.scale)
 
     def draw(self, streams: Streams) -> Episode:
         """Draw one episode."""

@@ -164,6 +164,8 @@ class Trace:
         """The same trace with every rate times `factor`; each cumulative count is rounded to a whole byte."""
         if not (math.isfinite(factor) and factor >= 0):
             raise self._broken(f"factor = {factor}: must be a finite number >= 0")
+        if factor == 1:
+            return self
         if self.total_bytes * factor >= PRODUCT_LIMIT:
             raise self._broken(f"factor = {factor}: the total of {self.total_bytes} bytes would pass 2**62")
         # Multiplying and rounding both preserve order, so the counts cannot start to decrease.

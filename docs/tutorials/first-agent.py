@@ -64,7 +64,7 @@ print(table.plain(rows))
 
 # %%
 from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+from bufgym.scenario import draw
 
 one = Interruption(law="fixed", t_max=60)
 episode = draw(one, seed=0)

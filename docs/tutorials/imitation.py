@@ -99,7 +99,7 @@ print(table.plain(run.run(chosen, held_out, capacities=[8], seeds=10)))
 
 # %%
 from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+from bufgym.scenario import draw
 
 episode = draw(held_out, seed=0)
 picture.save(

@@ -46,7 +46,7 @@ print(table.plain(rows))
 
 # %%
 from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+from bufgym.scenario import draw
 
 fading = picture.fading()
 episode = draw(fading, seed=0)

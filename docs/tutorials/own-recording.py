@@ -57,7 +57,7 @@ print(Path("dropped.csv").read_text().splitlines()[:3])
 
 # %%
 from bufgym.benchmark import picture
-from bufgym.scenario.numbered import draw
+from bufgym.scenario import draw
 
 episode = draw(scenario, seed=0)
 picture.save(picture.play(names, episode, 8, scenario), episode, "own-recording.png", "My drive over my link, L = 8")

@@ -31,9 +31,8 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.draws import NORMAL_UNIFORMS, nearly_normal, second_stream, stream
+from bufgym.traces.generate.draws import NORMAL_UNIFORMS, checked, nearly_normal, second_stream, stream
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
-from bufgym.traces.generate.ranges import checked
 from bufgym.traces.trace import US_PER_S, Float64Array, Trace
 
 MAX_LINK_S: Final = 10**6

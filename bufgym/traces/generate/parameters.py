@@ -12,13 +12,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple, get_type_hints
 
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.logs import read_json
 from bufgym.traces.formats.text import write_text
-from bufgym.traces.generate.ranges import Between, check_ranges, checked, is_finite
+from bufgym.traces.generate.draws import checked, is_finite
 
 LINKS: Final = Path(__file__).with_name("links.json")
 UPLINKS: Final = Path(__file__).with_name("uplinks.json")
@@ -35,6 +35,20 @@ LOW_QUANTILES: Final = 5
 SHOULDER_S: Final = 5
 
 _MAX_RATE: Final = 1e10
+
+
+class Between(NamedTuple):
+    """The range of a parameter, stated with it: `share: Annotated[float, Between(0, 1)]`."""
+
+    least: float
+    most: float
+
+
+def _check_ranges(parameters: object) -> None:
+    """Check each field of a dataclass that is annotated with a range."""
+    for name, hint in get_type_hints(type(parameters), include_extras=True).items():
+        for limits in getattr(hint, "__metadata__", ()):
+            checked(name, getattr(parameters, name), *limits)
 
 
 @dataclass(frozen=True)
@@ -61,7 +75,7 @@ class OutageParameters:
     """Whether lengths and rates come from all modes of the fit, because there are too few outages."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
+        _check_ranges(self)
         _check_quantiles(self, "low_quantiles_bytes_per_s", LOW_QUANTILES)
 
 
@@ -87,7 +101,7 @@ class LinkParameters:
     """None if there were none."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
+        _check_ranges(self)
         checked("level_share", self.level_share, 0, 1 - self.place_share + 1e-9)
         _check_quantiles(self, "quantiles_bytes_per_s", len(PROBABILITIES))
         if not self.quantiles_bytes_per_s[0] > 0:

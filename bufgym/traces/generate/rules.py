@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.ranges import checked
+from bufgym.traces.generate.draws import checked
 from bufgym.traces.trace import US_PER_S, After, Trace
 
 # A linear change is cut into steps of this length; each carries the bytes of the line.
