@@ -116,7 +116,7 @@ def open_text(path: StrPath) -> Iterator[TextFile]:
         magic = raw.peek(4)[:4]
         if magic == _ZIP_MAGIC:
             raise fault(path, "is a zip archive: must be unpacked first")
-        stream: IO[bytes] = gzip.open(raw) if magic.startswith(_GZIP_MAGIC) else raw  # type: ignore[assignment]
+        stream: IO[bytes] = gzip.GzipFile(fileobj=raw) if magic.startswith(_GZIP_MAGIC) else raw  # type: ignore[assignment]
         yield TextFile(path, stream)
 
 
