@@ -8,8 +8,7 @@ two policy seeds) meet the same episode: common random numbers.
 from __future__ import annotations
 
 from bufgym.scenario.arrivals import messages
-from bufgym.scenario.client import Client, Stream
-from bufgym.scenario.configuration import read_client, robofleet_example
+from bufgym.scenario.client import Client, Stream, read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams
 from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode, FleetScenario
 from bufgym.scenario.interruption import LAWS, Interruption

@@ -12,7 +12,7 @@ import numpy as np
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
-from bufgym.scenario.configuration import client_over_lte, read_client
+from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
 from bufgym.scenario.uplink import uplink_over_lte

@@ -110,23 +110,18 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         format, origin = detect_format(path), "detected"
     elif format not in FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(FORMATS)}")
-    time_us, cumulative_bytes, note = _read(path, format, column)
+    columns = FORMATS[format].columns
+    if column is not None and not columns:
+        raise BufgymError(f"column = {column!r}: format {format} has no columns to choose from")
+    if column is not None and column not in columns:
+        raise BufgymError(f"column = {column!r}: must be one of {', '.join(columns)}")
+    chosen = () if column is None else (column,)
+    time_us, cumulative_bytes, note = FORMATS[format].read(path, *chosen)
     source = f"{path} (format {format}, {origin}{', ' if note else ''}{note})"
     try:
         return Trace(trace_name(path), time_us, cumulative_bytes, after, source)
     except BufgymError as error:
         raise TraceError(f"{path}: {error}") from error
-
-
-def _read(path: StrPath, format: str, column: str | None) -> Knots:
-    reader = FORMATS[format]
-    if column is None:
-        return reader.read(path)
-    if not reader.columns:
-        raise BufgymError(f"column = {column!r}: format {format} has no columns to choose from")
-    if column not in reader.columns:
-        raise BufgymError(f"column = {column!r}: must be one of {', '.join(reader.columns)}")
-    return reader.read(path, column)
 
 
 def detect_format(path: StrPath) -> str:
