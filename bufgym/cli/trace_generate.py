@@ -1,4 +1,4 @@
-"""``bufgym trace generate``: links, motions and frame sizes from a seed.
+"""``bufgym trace generate``: links and motions from a seed.
 
 A link's options have its generator's parameter names as `dest` and are passed on to the generator.
 """
@@ -9,16 +9,15 @@ import argparse
 import inspect
 from collections.abc import Callable
 
-from bufgym.cli.options import Commands, Parser, command, count, least_0, natural, number, positive
-from bufgym.ground.errors import BufgymError
+from bufgym.cli.options import Commands, Parser, command, least_0, natural, positive
 
 
 def add(commands: Commands) -> None:
     """Declare ``generate`` among the commands of ``bufgym trace``."""
     generate = commands.add_parser(
         "generate",
-        help="make a link, a motion or frame sizes from a seed",
-        description="Make a link, a motion or frame sizes from a seed, as CSV.",
+        help="make a link or a motion from a seed",
+        description="Make a link or a motion from a seed, as CSV.",
     )
     kinds = generate.add_subparsers(title="kinds", metavar="KIND", required=True)
     _add_links(kinds)
@@ -32,16 +31,6 @@ def _add_links(kinds: Commands) -> None:
     help = "scale to this mean (default: as recorded)"
     link.add_argument("--mean", dest="mean_bytes_per_s", type=positive, metavar="BYTES/S", help=help)
     link.add_argument("--links", metavar="FILE", help="parameters made by 'bufgym trace fit' (default: bufgym's own)")
-    states = _kind(kinds, "gilbert-elliott", _generate, "a link of two states, good and bad", "gilbert_elliott")
-    _option(states, "--good", "good_bytes_per_s", least_0, 10e6, "BYTES/S")
-    _option(states, "--bad", "bad_bytes_per_s", least_0, 0.0, "BYTES/S")
-    _option(states, "--mean-good", "mean_good_s", positive, 20.0, "S", "mean stay")
-    _option(states, "--mean-bad", "mean_bad_s", positive, 2.0, "S", "mean stay")
-    path = _kind(kinds, "roaming", _roaming, "WiFi past access points, with hand-overs", "roaming")
-    _option(path, "--access-points", "access_points", count, 4, "N", "in a row")
-    _option(path, "--spacing", "spacing_m", positive, 50.0, "M", "between them")
-    _option(path, "--speed", "speed_m_per_s", positive, 1.0, "M/S", "of the robot")
-    _option(path, "--gap", "gap_s", least_0, 1.0, "S", "without a link at a hand-over")
 
 
 def _add_rules(kinds: Commands) -> None:
@@ -61,13 +50,7 @@ def _add_rules(kinds: Commands) -> None:
 
 
 def _add_motion(kinds: Commands) -> None:
-    drive = _kind(kinds, "drive", _drive, "the motion of a robot that cruises, turns in place and stops")
-    drive.add_argument("--cruise", type=_range, metavar="LOW,HIGH", help="speeds, m/s (0.5,1.5)")
-    drive.add_argument("--turn", type=_range, metavar="LOW,HIGH", help="turn rates in place, degrees/s (30,60)")
-    frames = _kind(kinds, "frames", _frames, "RGB-D frames whose sizes follow motion and detail (time_s,bytes,x)")
-    frames.add_argument("--motion", metavar="FILE", help="a motion or trajectory, or a shipped name (default: drive)")
-    _option(frames, "--rate-hz", "rate_hz", positive, 30.0, "HZ", "frames a second")
-    _option(frames, "--base", "base_bytes", positive, 230_000.0, "BYTES", "at rest")
+    _kind(kinds, "drive", _drive, "the motion of a robot that cruises, turns in place and stops")
 
 
 def _kind(
@@ -96,17 +79,6 @@ def _option(
     parser.add_argument(flag, dest=dest, type=type, default=default, metavar=unit, help=help)
 
 
-def _range(text: str) -> tuple[float, float]:
-    """Two numbers, the first not above the second."""
-    parts = text.split(",")
-    if len(parts) != 2:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be two numbers, LOW,HIGH")
-    low, high = number(parts[0]), number(parts[1])
-    if low > high:
-        raise argparse.ArgumentTypeError(f"{text}: the first must not be above the second")
-    return low, high
-
-
 # --- links -----------------------------------------------------------------------------------------------------------
 
 
@@ -128,38 +100,12 @@ def _link(options: argparse.Namespace) -> None:
     _generate(options)
 
 
-def _roaming(options: argparse.Namespace) -> None:
-    from bufgym.traces import Corridor
-
-    names = ("access_points", "spacing_m", "speed_m_per_s", "gap_s")
-    options.corridor = Corridor(**{name: getattr(options, name) for name in names})
-    _generate(options)
-
-
-# --- motion and frames -----------------------------------------------------------------------------------------------
+# --- motion ----------------------------------------------------------------------------------------------------------
 
 
 def _drive(options: argparse.Namespace) -> None:
-    from bufgym.traces import Driving, drive_motion, write_motion_csv
+    from bufgym.traces import drive_motion, write_motion_csv
 
-    ranges = {"cruise_m_per_s": options.cruise, "turn_deg_per_s": options.turn}
-    driving = Driving(**{name: limits for name, limits in ranges.items() if limits is not None})
-    motion = drive_motion(options.seed, options.duration_s, driving)
+    motion = drive_motion(options.seed, options.duration_s)
     write_motion_csv(motion, options.out)
     print(f"wrote {options.out}: {motion.source}, {motion.total:.3f} views")
-
-
-def _frames(options: argparse.Namespace) -> None:
-    import numpy as np
-
-    from bufgym.traces import FrameModel, Workload, drive_motion, frame_sizes, load_motion, write_workload_csv
-
-    frames = options.duration_s * options.rate_hz
-    if not 1 <= frames <= 1e7:
-        raise BufgymError(f"--duration x --rate-hz = {frames:g} frames: must be from 1 to 1e7")
-    motion = load_motion(options.motion) if options.motion else drive_motion(options.seed, options.duration_s)
-    arrival_us = np.rint(np.arange(int(frames)) * (1e6 / options.rate_hz)).astype(np.int64)
-    sizes = frame_sizes(arrival_us, motion, options.seed, FrameModel(base_bytes=options.base_bytes))
-    x = motion.at(arrival_us)
-    write_workload_csv(Workload("frames", arrival_us, sizes, x=x - x[0]), options.out)
-    print(f"wrote {options.out}: {len(sizes)} frames, mean {sizes.mean() / 1e3:.1f} kB")

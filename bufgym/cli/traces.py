@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
     )
     convert = command(verbs, "convert", _convert, "write bandwidth traces in another format and say what was lost")
     for parser in (info, plot, validate, convert):
-        parser.add_argument("files", nargs="+", metavar="FILE", help="a file, archive.zip:member, or a shipped name")
+        parser.add_argument("files", nargs="+", metavar="FILE", help="a file, or a shipped name")
         parser.add_argument("--format", metavar="NAME", help="the files' format, where it is not to be detected")
         parser.add_argument(
             "--column", metavar="NAME", help="of UCC files (DL_bitrate, UL_bitrate), or which run of a list"
@@ -78,7 +78,7 @@ def _info(options: argparse.Namespace) -> None:
 def _validate(options: argparse.Namespace) -> None:
     from bufgym import traces
 
-    failed, names = 0, _with_members(options.files)
+    failed, names = 0, options.files
     for name in names:
         try:
             trace = _load(name, options)
@@ -94,20 +94,6 @@ def _validate(options: argparse.Namespace) -> None:
         print(f"{len(names) - failed} of {len(names)} files are sound")
     if failed:
         raise SystemExit(1)
-
-
-def _with_members(names: list[str]) -> list[str]:
-    """The names, with each zip archive of several members replaced by its members."""
-    from bufgym import traces
-
-    expanded: list[str] = []
-    for name in names:
-        try:
-            members = traces.members(name) if Path(name).is_file() else []
-        except TraceError:
-            members = []  # reading it reports the error
-        expanded += [f"{name}:{member}" for member in members] if len(members) > 1 else [name]
-    return expanded
 
 
 # --- convert ---------------------------------------------------------------------------------------------------------

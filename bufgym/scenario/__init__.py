@@ -8,11 +8,11 @@ two policy seeds) meet the same episode: common random numbers.
 from __future__ import annotations
 
 from bufgym.scenario.arrivals import messages
-from bufgym.scenario.client import Client, Stream
-from bufgym.scenario.configuration import read_client, robofleet_example
+from bufgym.scenario.client import Client, Stream, read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams
 from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode, FleetScenario
 from bufgym.scenario.interruption import LAWS, Interruption
+from bufgym.scenario.numbered import draw
 from bufgym.scenario.registry import SCENARIOS, get, register
 from bufgym.scenario.uplink import Uplink
 
@@ -29,6 +29,7 @@ __all__ = [
     "Stream",
     "Streams",
     "Uplink",
+    "draw",
     "get",
     "messages",
     "read_client",

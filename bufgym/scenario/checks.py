@@ -11,35 +11,15 @@ from bufgym import traces
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.checks import above_0, between, whole
-from bufgym.model.link import MAX_TIME_US
+from bufgym.model.checks import above_0 as above_0  # papers check their parameters with it too
+from bufgym.model.checks import between
 from bufgym.model.qoi import Value
 from bufgym.traces import Motion, Trace
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
-__all__ = [
-    "above_0",
-    "as_tuple",
-    "check_stream",
-    "check_value",
-    "delay",
-    "duration",
-    "links",
-    "message_bytes",
-    "positive",
-    "rate",
-    "recordings",
-]
-
 MAX_RATE_HZ = 100_000
 """Highest arrival rate: times are whole microseconds, at least ten to a period."""
-
-
-def positive(scenario: object, *names: str) -> None:
-    """Check that these parameters are finite numbers > 0."""
-    for name in names:
-        above_0(name, getattr(scenario, name))
 
 
 def rate(rate_hz: Any) -> None:
@@ -49,29 +29,17 @@ def rate(rate_hz: Any) -> None:
         raise BufgymError(f"rate_hz = {rate_hz}: must be at most {MAX_RATE_HZ}, and at least {1 / MAX_DURATION_S:g}")
 
 
-def duration(duration_s: Any) -> None:
-    """Check that ``duration_s`` is > 0 and at most the longest duration of a trace."""
-    above_0("duration_s", duration_s)
-    if duration_s > MAX_DURATION_S:
-        raise BufgymError(f"duration_s = {duration_s}: must be at most {MAX_DURATION_S}")
-
-
-def delay(name: str, us: Any) -> None:
-    """Check a delay in whole microseconds, up to the longest possible time."""
-    whole(name, us, 0, MAX_TIME_US)
-
-
-def message_bytes(name: str, size: Any) -> None:
-    """Check the (mean) size of messages: a number > 0, at most ``MAX_MESSAGE_BYTES``."""
-    above_0(name, size)
-    if size > MAX_MESSAGE_BYTES:
-        raise BufgymError(f"{name} = {size}: must be at most {MAX_MESSAGE_BYTES}")
+def up_to(name: str, value: Any, most: float) -> None:
+    """Check that a parameter is > 0 and at most ``most``."""
+    above_0(name, value)
+    if value > most:
+        raise BufgymError(f"{name} = {value}: must be at most {most}")
 
 
 def check_stream(stream: Any) -> None:
     """Check the parameters of every stream of messages: rate_hz, size_bytes, jitter and size_cv."""
     rate(stream.rate_hz)
-    message_bytes("size_bytes", stream.size_bytes)
+    up_to("size_bytes", stream.size_bytes, MAX_MESSAGE_BYTES)
     between("jitter", stream.jitter, 0, 1, "of a period")
     between("size_cv", stream.size_cv, 0, 10)
 

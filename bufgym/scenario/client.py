@@ -1,41 +1,37 @@
 """A robot's client: many topics over one uplink, like a Robofleet client.
 
 Each ``Stream`` publishes one topic. The ``Client`` sends them all over one link, with at most n_T messages in flight.
-``bufgym.scenario.configuration`` has Robofleet's example client and reads configurations from files.
+There are Robofleet's example client, and clients from TOML files.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import check_keys, read_toml
 from bufgym.ground.kernel import records
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
-from bufgym.model.checks import check_window, whole
-from bufgym.model.link import Link
+from bufgym.model.checks import above_0, check_window, whole
+from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics
 from bufgym.scenario.arrivals import read_only
-from bufgym.scenario.checks import (
-    as_tuple,
-    check_stream,
-    check_value,
-    delay,
-    duration,
-    message_bytes,
-    positive,
-    recordings,
-)
-from bufgym.scenario.draws import place, place_link, scaled, sizes
+from bufgym.scenario.checks import as_tuple, check_stream, check_value, recordings, up_to
+from bufgym.scenario.draws import place, place_link, shipped, sizes
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace
+from bufgym.traces.trace import MAX_DURATION_S
+from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
 ENCODINGS = ("ros", "json")
 """Encodings of rivals, in place of Robofleet's flatbuffers (``Policy.client.encoding``)."""
@@ -71,7 +67,7 @@ class Stream:
             for name, size in self.encodings.items():
                 if name not in ENCODINGS:
                     raise BufgymError(f"unknown encoding {name!r}; known: {', '.join(ENCODINGS)}")
-                message_bytes(f"bytes in {name}", size)
+                up_to(f"bytes in {name}", size, MAX_MESSAGE_BYTES)
         except BufgymError as error:
             raise BufgymError(f"topic {self.topic.name!r}: {error}") from None
 
@@ -119,11 +115,11 @@ class Client:
             if not getattr(self, name):
                 raise BufgymError(f"{name}: a client needs at least one")
         check_topics(self.topics)
-        duration(self.duration_s)
-        positive(self, "scale")
+        up_to("duration_s", self.duration_s, MAX_DURATION_S)
+        above_0("scale", self.scale)
         check_window(self.window)
-        delay("propagation_us", self.propagation_us)
-        delay("round_trip_us", self.ack_delay_us)
+        whole("propagation_us", self.propagation_us, 0, MAX_TIME_US)
+        whole("round_trip_us", self.ack_delay_us, 0, MAX_TIME_US)
         whole("consumers", self.consumers, 1)
         check_value(self)
         for stream in self.streams:
@@ -151,7 +147,7 @@ class Client:
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:
-        return tuple(scaled(trace, self.scale) for trace in self.traces)
+        return tuple(trace.scaled(self.scale) for trace in self.traces)
 
     def draw(self, streams: Streams) -> Episode:
         """Draw one episode."""
@@ -197,3 +193,85 @@ class Client:
         )
         size: NDArray[np.int64] = np.rint(arrivals["size_bytes"] * ratios[arrivals["topic"]]).astype(np.int64)
         return np.maximum(1, size)
+
+
+# --- configurations --------------------------------------------------------------------------------------------------
+
+
+def robofleet_example() -> tuple[Stream, ...]:
+    """The topics of Robofleet's example client configuration.
+
+    Priorities and rate limits are the example's: localization 10 Hz, priority 20; odometry 15 Hz, 20; laser scans 15
+    Hz, 2; point cloud and images 10 Hz, 1; visualization 10 Hz, 2; status 1 Hz; subscriptions no_drop. The rest is
+    assumed. Publish rates are common drivers' rates. Sizes come from the paper's Table I or from encoding such
+    messages. Deadlines and the meaning of x are our choice.
+    """
+    fast = qoi.exponential(0.618)
+    view = qoi.exponential(math.exp(-1))
+
+    def stream(
+        name: str, hz: float, size: int, ros: int, json: int, *, moves: bool = False, cv: float = 0.0, **topic: Any
+    ) -> Stream:
+        rules = Topic(name, value=view if moves else fast, **topic)
+        return Stream(rules, hz, size, size_cv=cv, moves=moves, encodings={"ros": ros, "json": json})
+
+    return (
+        stream("localization", 20, 240, 75, 318, priority=20, rate_limit_hz=10, deadline_s=0.25),
+        stream("odometry", 40, 960, 713, 1_084, priority=20, rate_limit_hz=15, deadline_s=0.25),
+        stream("scan", 15, 7_328, 7_260, 28_000, priority=2, rate_limit_hz=15, deadline_s=0.5),
+        stream("visualization", 10, 15_000, 14_800, 53_000, priority=2, rate_limit_hz=10, cv=0.5, deadline_s=1.0),
+        stream("pointcloud", 10, 160_344, 160_111, 562_376, moves=True, rate_limit_hz=10, deadline_s=1.0),
+        stream("image", 30, 75_224, 75_188, 267_650, moves=True, rate_limit_hz=10, cv=0.2, deadline_s=1.0),
+        stream("status", 1, 156, 42, 162),
+        stream("subscriptions", 1, 600, 500, 1_200, no_drop=True),
+    )
+
+
+def client_over_lte() -> Client:
+    """The example client over the shipped synthetic LTE links at a quarter of their capacity."""
+    return Client(robofleet_example(), **shipped(), scale=0.25)
+
+
+_TOPIC_KEYS = {f.name for f in fields(Topic)} - {"value"}
+_STREAM_KEYS = {"rate_hz", "size_bytes", "jitter", "size_cv", "moves"}
+_CLIENT_KEYS = {"window", "propagation_us", "round_trip_us", "consumers", "duration_s"}
+
+
+def read_client(path: str | Path, **parameters: Any) -> Client:
+    """Read a client from a TOML file with ``[[topic]]`` tables for ``Topic`` and ``Stream``, ``window`` and the like.
+
+    A topic's ``value`` has the form of the command line (``"exponential:0.618"``). Its sizes in other encodings look
+    like ``encodings = {json = 28000}``. ``parameters`` add settings that the file lacks, such as ``traces`` and
+    ``motion``. Without ``traces`` the client gets the shipped LTE links and motions, as in ``bufgym topics --config``.
+
+    Raises BufgymError, one line that names the file, for a file that can't be read or breaks a rule.
+    """
+    try:
+        settings = read_toml(path)
+        tables = settings.pop("topic", [])
+        check_keys(settings, _CLIENT_KEYS, "topic, ")
+        if not isinstance(tables, list) or not tables:
+            raise BufgymError("needs at least one [[topic]]")
+        recordings = {} if "traces" in parameters else shipped()
+        return Client(tuple(map(_stream, tables)), **{**settings, **recordings, **parameters})
+    except BufgymError as error:
+        raise error if str(error).startswith(f"{path}") else BufgymError(f"{path}: {error}") from None
+
+
+def _stream(table: Any) -> Stream:
+    if not isinstance(table, Mapping):
+        raise BufgymError(f"topic = {table!r}: must be a [[topic]] table")
+    topic = {key: table[key] for key in table if key in _TOPIC_KEYS}
+    encodings = table.get("encodings", {})
+    try:
+        check_keys(table, _TOPIC_KEYS | _STREAM_KEYS | {"value", "encodings"})
+        for key in ("name", "rate_hz", "size_bytes"):
+            if key not in table:
+                raise BufgymError(f"{key} is missing")
+        if "value" in table:
+            topic["value"] = qoi.parse(str(table["value"]))
+        if not isinstance(encodings, Mapping):
+            raise BufgymError(f"encodings = {encodings!r}: must be a table of bytes by encoding")
+    except BufgymError as error:
+        raise BufgymError(f"topic {table.get('name', 'without a name')!r}: {error}") from None
+    return Stream(Topic(**topic), encodings=encodings, **{key: table[key] for key in table if key in _STREAM_KEYS})

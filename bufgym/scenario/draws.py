@@ -63,8 +63,3 @@ def shipped() -> dict[str, Any]:
         "traces": tuple(traces.load(name) for name in names if name.startswith("lte-")),
         "motion": tuple(traces.load_motion(name) for name in names if name.startswith("drive-")),
     }
-
-
-def scaled(trace: Trace, factor: float) -> Trace:
-    """The trace with ``factor`` times its capacity."""
-    return trace if factor == 1 else trace.scaled(factor)

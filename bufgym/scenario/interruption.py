@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.checks import whole
+from bufgym.model.checks import above_0, whole
 from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages, read_only
-from bufgym.scenario.checks import check_value, message_bytes, positive, rate
+from bufgym.scenario.checks import check_value, rate, up_to
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
+from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
 LAWS = ("fixed", "uniform", "log-uniform", "geometric")
 
@@ -62,8 +63,8 @@ class Interruption:
             raise BufgymError(f"t_max = {self.t_max}: must lie between 1 and 1000000")
         if self.law != "fixed" and not 1 <= self.t_min <= self.t_max:
             raise BufgymError(f"t_min = {self.t_min}, t_max = {self.t_max}: need 1 <= t_min <= t_max <= 1000000")
-        message_bytes("size_bytes", self.size_bytes)
-        positive(self, "t_mean")
+        up_to("size_bytes", self.size_bytes, MAX_MESSAGE_BYTES)
+        above_0("t_mean", self.t_mean)
         rate(self.rate_hz)
         if self.period_us * self.max_messages > MAX_TIME_US:
             raise BufgymError(

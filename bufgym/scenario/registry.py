@@ -12,7 +12,7 @@ import numpy as np
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
-from bufgym.scenario.configuration import client_over_lte, read_client
+from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
 from bufgym.scenario.uplink import uplink_over_lte
@@ -68,20 +68,16 @@ def _named(name: str) -> Scenario:
 
 def checked(scenario: Any, name: str) -> Scenario:
     """Check that this has all that a scenario needs, and return it."""
-    if not isinstance(getattr(scenario, "value", None), Value):
-        raise BufgymError(f"scenario {name}: {scenario!r} has no `value`, a bufgym.model.qoi Value")
+    count = getattr(scenario, "max_messages", None)
     for what, holds in (
+        ("`value`, a bufgym.model.qoi Value", isinstance(getattr(scenario, "value", None), Value)),
         ("method `draw(streams)` that returns an Episode", callable(getattr(scenario, "draw", None))),
-        ("`max_messages`, a whole number >= 1", _is_count(getattr(scenario, "max_messages", None))),
+        ("`max_messages`, a whole number >= 1", isinstance(count, int | np.integer) and count >= 1),
         ("`topics`, a tuple; () for one queue", isinstance(getattr(scenario, "topics", None), tuple)),
     ):
         if not holds:
             raise BufgymError(f"scenario {name}: {scenario!r} has no {what}")
     return cast(Scenario, scenario)
-
-
-def _is_count(number: Any) -> bool:
-    return isinstance(number, int | np.integer) and not isinstance(number, bool) and bool(number >= 1)
 
 
 def get(spec: str | Scenario, **overrides: Any) -> Scenario:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.link import Link
+from bufgym.model.checks import whole
+from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import read_only, unchecked_messages
-from bufgym.scenario.checks import as_tuple, check_stream, check_value, delay, duration, recordings
-from bufgym.scenario.draws import beside, place, place_link, scaled, shipped, sizes, skip
+from bufgym.scenario.checks import as_tuple, check_stream, check_value, recordings, up_to
+from bufgym.scenario.draws import beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.trace import MAX_DURATION_S
@@ -84,8 +85,8 @@ class Uplink:
         if not self.scale or not all(math.isfinite(s) and s > 0 for s in self.scale):
             raise BufgymError(f"scale = {self.scale}: every factor must be a number > 0")
         check_stream(self)
-        duration(self.duration_s)
-        delay("propagation_us", self.propagation_us)
+        up_to("duration_s", self.duration_s, MAX_DURATION_S)
+        whole("propagation_us", self.propagation_us, 0, MAX_TIME_US)
         if self.size_bytes < 1:
             raise BufgymError(f"size_bytes = {self.size_bytes}: must be at least 1")
         if self.link_offset_s is not None and not (
@@ -111,7 +112,7 @@ class Uplink:
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:
-        return tuple(scaled(trace, factor) for trace in self.traces for factor in self.scale)
+        return tuple(trace.scaled(factor) for trace in self.traces for factor in self.scale)
 
     def draw(self, streams: Streams) -> Episode:
         """Draw one episode."""

@@ -8,11 +8,13 @@ motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
 workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
 
 This room holds `Trace`, `Motion` and `Workload`, and `shipped`, which loads them by name. `formats` reads and writes
-files, `generate` makes links, motions and frame sizes, `fit` fits links to recordings and compares both, and `datasets`
+files, `generate` makes links and motions, `fit` fits links to recordings and compares both, and `datasets`
 fetches public recordings.
+
+An argument out of its range raises a BufgymError. A file that cannot be read or written, or that breaks a rule of its
+format, raises its subclass TraceError, whose message names the file, the line, the value and the rule.
 """
 
-from bufgym.traces.formats.archives import members
 from bufgym.traces.formats.bags import read_bag
 from bufgym.traces.formats.links import FORMATS, detect_format, read_trace
 from bufgym.traces.formats.motions import read_motion, write_motion_csv
@@ -21,18 +23,11 @@ from bufgym.traces.formats.trajectories import read_poses
 from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
 from bufgym.traces.formats.writers import WRITERS, Difference, difference, write_csv, write_mahimahi
 from bufgym.traces.generate import (
-    Corridor,
-    Driving,
-    FrameModel,
     drive_motion,
     fitted_links,
-    frame_sizes,
-    gilbert_elliott,
     markov_link,
-    outage,
     ramp,
     read_links,
-    roaming,
     steady,
     synthetic_lte,
     tunnel,
@@ -46,10 +41,7 @@ from bufgym.traces.workload import Workload
 __all__ = [
     "FORMATS",
     "WRITERS",
-    "Corridor",
     "Difference",
-    "Driving",
-    "FrameModel",
     "Motion",
     "MotionSettings",
     "Poses",
@@ -60,14 +52,10 @@ __all__ = [
     "difference",
     "drive_motion",
     "fitted_links",
-    "frame_sizes",
-    "gilbert_elliott",
     "load",
     "load_motion",
     "markov_link",
-    "members",
     "motion_from_poses",
-    "outage",
     "ramp",
     "read_bag",
     "read_links",
@@ -76,7 +64,6 @@ __all__ = [
     "read_trace",
     "read_workload",
     "read_workload_csv",
-    "roaming",
     "shipped",
     "steady",
     "synthetic_lte",

@@ -20,11 +20,7 @@ from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array, first_true, 
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """How motion is measured.
-
-    Raises:
-        BufgymError: a value that is not a finite number above 0.
-    """
+    """How motion is measured."""
 
     fov_deg: float = 60.0
     """Horizontal field of view of the camera, degrees: Kinect of the TUM sequences 57, RealSense D435 69."""
@@ -46,11 +42,7 @@ class MotionSettings:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion recording, checked when it is made; its arrays are read-only.
-
-    Raises:
-        BufgymError: an array breaks the rule stated with it.
-    """
+    """A motion recording, checked when it is made; its arrays are read-only."""
 
     name: str
     """What to call it in tables."""
@@ -100,9 +92,6 @@ class Motion:
         """Coordinate at each time (int64 microseconds, any shape), linear between samples.
 
         Past the end the recording begins again and its total is carried on, so the coordinate never decreases.
-
-        Raises:
-            BufgymError: a time before 0.
         """
         times = np.asarray(time_us, dtype=np.int64)
         first_us, last_us = times.min(initial=0), times.max(initial=0)

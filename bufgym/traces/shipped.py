@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from bufgym.ground import files
-from bufgym.traces.formats.archives import split_member
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import read_trace
 from bufgym.traces.formats.motions import read_motion
@@ -33,11 +32,7 @@ def load(
 
 
 def load_motion(name_or_path: StrPath) -> Motion:
-    """A motion recording by its shipped name or from a file; trajectories are read with the default settings.
-
-    Raises:
-        TraceError: as `load`.
-    """
+    """A motion recording by its shipped name or from a file; trajectories are read with the default settings."""
     return read_motion(_resolve(name_or_path))
 
 
@@ -45,7 +40,7 @@ def _resolve(name_or_path: StrPath) -> StrPath:
     paths = shipped()
     if isinstance(name_or_path, str) and name_or_path in paths:
         return paths[name_or_path]
-    if not split_member(name_or_path)[0].exists():
+    if not Path(name_or_path).exists():
         names = ", ".join(paths) or "none found"
         raise fault(name_or_path, f"no such file, and no shipped trace (known: {names})")
     return name_or_path

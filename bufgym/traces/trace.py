@@ -129,9 +129,6 @@ class Trace:
         """Rate in bytes/s at each time (microseconds, any shape); at a knot, that of the segment that begins there.
 
         Beyond the last knot `after` decides: loop, hold, or 0.
-
-        Raises:
-            BufgymError: a time before 0.
         """
         times = np.asarray(time_us, dtype=np.int64)
         if (times < 0).any():
@@ -150,9 +147,6 @@ class Trace:
             window_us: take means over consecutive windows of this length; an incomplete last one is left out unless it
                 is the only one. By default the samples are the segments themselves, except for traces of single packets
                 (median segment under 100 ms, as in mahimahi files), where they are windows of 1 s.
-
-        Raises:
-            BufgymError: `window_us` below 1.
         """
         if window_us is None:
             lengths_us = np.diff(self.time_us)
@@ -166,19 +160,12 @@ class Trace:
         window_bytes = np.diff(np.interp(edges_us, self.time_us, self.cumulative_bytes))
         return np.diff(edges_us), window_bytes * (US_PER_S / window_us)
 
-    def seconds_below(self, bytes_per_s: float, window_us: int | None = None) -> float:
-        """Total length, in seconds, of the `samples` whose rate is strictly below `bytes_per_s`."""
-        lengths_us, rates = self.samples(window_us)
-        return float(lengths_us[rates < bytes_per_s].sum()) / US_PER_S
-
     def scaled(self, factor: float) -> Trace:
-        """The same trace with every rate times `factor`; each cumulative count is rounded to a whole byte.
-
-        Raises:
-            BufgymError: a factor that is not a finite number >= 0, or a result that breaks a rule of `Trace`.
-        """
+        """The same trace with every rate times `factor`; each cumulative count is rounded to a whole byte."""
         if not (math.isfinite(factor) and factor >= 0):
             raise self._broken(f"factor = {factor}: must be a finite number >= 0")
+        if factor == 1:
+            return self
         if self.total_bytes * factor >= PRODUCT_LIMIT:
             raise self._broken(f"factor = {factor}: the total of {self.total_bytes} bytes would pass 2**62")
         # Multiplying and rounding both preserve order, so the counts cannot start to decrease.
@@ -216,11 +203,7 @@ class Trace:
 
     @classmethod
     def constant(cls, bytes_per_s: float, duration_s: float, *, name: str = "constant", after: After = "loop") -> Trace:
-        """One rate throughout, with a knot every second.
-
-        Raises:
-            BufgymError: a rate below 0, a duration not above 0 or over 10**7 s, or either not finite.
-        """
+        """One rate throughout, with a knot every second."""
         return cls.steps([(duration_s, bytes_per_s)], name=name, after=after)
 
     @classmethod

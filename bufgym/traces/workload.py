@@ -36,11 +36,7 @@ class TopicSummary(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """Recorded messages, checked when it is made; its arrays are read-only.
-
-    Raises:
-        BufgymError: an array breaks the rule stated with it.
-    """
+    """Recorded messages, checked when it is made; its arrays are read-only."""
 
     name: str
     """What to call it in tables."""

@@ -96,7 +96,8 @@ print(compared)
 # ## The picture
 
 # %%
-import matplotlib
+from bufgym.benchmark import picture
+from bufgym.scenario import draw
 
 matplotlib.use("agg")
 compared.plot().figure.savefig("imitation.png")

@@ -57,7 +57,8 @@ print(Path("dropped.csv").read_text().splitlines()[:3])
 # ## The picture
 
 # %%
-import matplotlib
+from bufgym.benchmark import picture
+from bufgym.scenario import draw
 
 import bufgym
 

@@ -17,7 +17,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import SCENARIOS, Episode, Interruption, Uplink, messages, registry
-from bufgym.scenario.configuration import read_client
+from bufgym.scenario.client import read_client
 from bufgym.traces import Trace
 
 MODULE = """

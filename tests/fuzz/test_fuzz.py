@@ -139,7 +139,7 @@ def links(folder: Path) -> Kind:
 
     def read(path: Path, uniform: random.Random) -> object:
         if uniform.random() < 0.2:
-            raw = packed(uniform, path.read_bytes())
+            raw = gzip.compress(path.read_bytes(), 1)
             path.write_bytes(mutated(uniform, raw, others) if uniform.random() < 0.5 else raw)
         column = uniform.choice([None, None, None, "UL_bitrate"])
         try:
@@ -151,16 +151,6 @@ def links(folder: Path) -> Kind:
         return trace
 
     return files, read
-
-
-def packed(uniform: random.Random, data: bytes) -> bytes:
-    if uniform.random() < 0.5:
-        return gzip.compress(data, 1)
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w", uniform.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])) as archive:
-        for k in range(uniform.choice([1, 1, 1, 2])):
-            archive.writestr(f"{k}.csv", data)
-    return target.getvalue()
 
 
 @pytest.mark.parametrize("kind", [weights, poses, bags, toml, results, archives, links])

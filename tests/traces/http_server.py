@@ -1,4 +1,4 @@
-"""An HTTP server for tests that cuts connections, lies, stalls and changes its mind; and a data set that it serves."""
+"""An HTTP server for tests that cuts connections, lies and stalls; and a data set that it serves."""
 
 import hashlib
 import http.server
@@ -10,30 +10,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bufgym.traces.datasets.download import Patience
-from bufgym.traces.datasets.fetch import Fetched, fetch_dataset
-from bufgym.traces.datasets.table import Dataset, Remote
+from bufgym.traces.datasets import Dataset, Fetched, Remote, fetch_dataset
 
 DATA = random.Random(1).randbytes(300_000)
 SHA256 = hashlib.sha256(DATA).hexdigest()
-HASTY = Patience(attempts=3, first_wait_s=0.01)
 ELSEWHERE = {"/moved": "/data.bin", "/file": "file:///etc/hostname", "/nowhere": "http://a..b/"}
 
 
 @dataclass
 class Site:
-    """How the server answers requests of `/data.bin`, and which it got."""
+    """How the server answers requests of `/data.bin`, and how many it got."""
 
     data: bytes = DATA
-    etag: str | None = '"v1"'
-    ranges: bool = True
     cuts: list[int] = field(default_factory=list)  # bytes after which each of the next connections is cut
     codes: list[int] = field(default_factory=list)  # answers to the next requests, instead of the file
     stall: int | None = None  # silent after so many bytes
     length: int | None = None  # Content-Length instead of the true one; -1: none
-    chunked: bool = False
-    headers: dict[str, str] = field(default_factory=dict)
-    asked: list[str | None] = field(default_factory=list)  # the Range of each request
+    asked: int = 0
     address: str = ""
     closing: threading.Event = field(default_factory=threading.Event)
 
@@ -51,36 +44,14 @@ class Handler(http.server.BaseHTTPRequestHandler):
             return self.answer(302, {"Location": ELSEWHERE[self.path], "Content-Length": "0"})
         if self.path != "/data.bin":
             return self.answer(404, {"Content-Length": "0"})
-        asked = self.headers["Range"]
-        site.asked.append(asked)
+        site.asked += 1
         if site.codes:
-            return self.answer(site.codes.pop(0), {"Retry-After": "0", "Content-Length": "0"})
-        start = 0
-        if asked and site.ranges and self.headers["If-Range"] in (site.etag, site.headers.get("Last-Modified")):
-            start = int(asked.removeprefix("bytes=").removesuffix("-"))
-            if start >= len(site.data):
-                return self.answer(416, {"Content-Range": f"bytes */{len(site.data)}"})
-        body = site.data[start:]
-        headers = {"Content-Range": f"bytes {start}-{len(site.data) - 1}/{len(site.data)}"} if start else {}
-        if site.chunked:
-            headers["Transfer-Encoding"] = "chunked"
-        elif site.length != -1:
-            headers["Content-Length"] = str(len(body) if site.length is None else site.length)
-        if site.etag is not None:
-            headers["ETag"] = site.etag
-        self.answer(206 if start else 200, headers | site.headers)
-        self.body(body[: site.cuts.pop(0)] if site.cuts else body)
-
-    def body(self, body: bytes) -> None:
-        site = self.site
-        if site.chunked:
-            whole = len(body) == len(site.data)
-            self.wfile.write(b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body) if whole else b"fffff\r\n" + body)
-        elif site.stall is not None:
-            self.wfile.write(body[: site.stall])
+            return self.answer(site.codes.pop(0), {"Content-Length": "0"})
+        length = len(site.data) if site.length is None else site.length
+        self.answer(200, {} if length < 0 else {"Content-Length": str(length)})
+        self.wfile.write(site.data[: site.cuts.pop(0) if site.cuts else site.stall])
+        if site.stall is not None:
             site.closing.wait(60)
-        else:
-            self.wfile.write(body)
 
     def answer(self, code: int, headers: dict[str, str]) -> None:
         self.send_response(code)
@@ -110,8 +81,8 @@ def of(*remotes: Remote) -> Dataset:
 
 
 def get(site: Site, to: Path, sha256: str | None = SHA256, path: str = "data.bin", **options: Any) -> Fetched:
-    remote = Remote(path, f"{site.address}/data.bin", sha256)
-    return fetch_dataset(of(remote), to, patience=options.pop("patience", HASTY), **options)[0]
+    address = options.pop("address", f"{site.address}/data.bin")
+    return fetch_dataset(of(Remote(path, address, sha256)), to, **options)[0]
 
 
 def left(to: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Links, motions and frame sizes from a seed: rules by hand, chance by its laws, shipped files, `trace generate`."""
+"""Links and motions from a seed: rules by hand, chance by its laws, shipped files, `trace generate`."""
 
 import json
 from collections.abc import Callable
@@ -14,23 +14,17 @@ from hypothesis import strategies as st
 
 from bufgym import traces
 from bufgym.ground.errors import BufgymError, TraceError
-from bufgym.traces import describe, load, load_motion, outage, read_motion, read_trace, synthetic_lte
-from bufgym.traces.generate.driving import Driving, drive_motion
-from bufgym.traces.generate.frames import FrameModel, frame_sizes
-from bufgym.traces.generate.gilbert_elliott import gilbert_elliott
+from bufgym.traces import describe, load, load_motion, read_motion, read_trace, synthetic_lte
+from bufgym.traces.generate.driving import drive_motion
 from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates, markov_link
 from bufgym.traces.generate.parameters import LINKS, LinkParameters, OutageParameters, fitted_links, read_links
-from bufgym.traces.generate.roaming import Corridor, roaming
 from bufgym.traces.generate.rules import ramp, steady, tunnel
 from bufgym.traces.generate.shipped import SHIPPED_LTE, shipped_calls, write_shipped
-from bufgym.traces.motion import Motion
 from bufgym.traces.trace import Trace
 
 MODES = ("bicycle", "bus", "car", "foot", "train", "tram")
 SEEDED: tuple[Callable[[int], Trace], ...] = (
     lambda seed: markov_link("tram", seed, 120),
-    lambda seed: gilbert_elliott(seed, 120),
-    lambda seed: roaming(seed, 120),
     lambda seed: synthetic_lte(seed, 120),
 )
 
@@ -51,9 +45,6 @@ def test_a_seed_is_a_trace_whose_bytes_never_change() -> None:
     lowered = [6621400, 6654152, 3027288, 2683391, 1422412, 1261835, 1853449, 0]
     assert np.diff(link.cumulative_bytes).tolist()[4:] == lowered
     assert synthetic_lte(1, duration_s=1).duration_us == 1_000_000
-    assert gilbert_elliott(1, 40, mean_good_s=2, mean_bad_s=1).total_bytes == 283_000_000
-    assert roaming(1, 60).total_bytes == 227_808_750
-    assert frame_sizes(np.array([0, 10**6, 2 * 10**6]), drive_motion(0, 10), 3).tolist() == [240183, 273977, 274993]
 
 
 @given(seed=st.integers(0, 2**32), seconds=st.integers(1, 400), mode=st.sampled_from(MODES))
@@ -114,15 +105,11 @@ def test_links_by_rule() -> None:
     trace = steady(7e6, 2.5)
     assert (trace.duration_us, trace.total_bytes) == (2_500_000, 17_500_000)
     assert set(trace.segments()[1].tolist()) == {7e6}
-    trace = outage(3, 1, 8e6, repeats=2)
-    assert trace.rate_bytes_per_s(np.arange(7) * 1_000_000).tolist() == [8e6, 8e6, 0, 8e6, 8e6, 0, 8e6]
-    assert outage(3, 1, 8e6, outage_bytes_per_s=1e5).total_bytes == 16_100_000
     trace = tunnel(1e6, before_s=1, fade_s=0, blackout_s=2, recover_s=0, after_s=0)
     assert (trace.duration_us, trace.total_bytes) == (3_000_000, 1_000_000)
     # 20 s + 20 s at 10 MB/s, 3 s and 2 s at half of it in the mean, 10 s of nothing.
     trace = tunnel(10e6)
     assert (trace.duration_us, trace.total_bytes) == (55_000_000, 400_000_000 + 25_000_000)
-    assert trace.seconds_below(1.0) == 10.0
     # The last tenth of 3 s: a sixtieth of the rate, in whole bytes.
     rates = trace.rate_bytes_per_s([22_950_000, 23_000_000, 32_999_999, 33_000_000])
     assert rates == pytest.approx([10e6 / 60, 0.0, 0.0, 10e6 / 40], abs=5)
@@ -135,31 +122,8 @@ def test_a_ramp_carries_its_area(start: float, end: float, seconds: float, after
     assert abs(trace.total_bytes - area) <= 0.5 + 1e-9 * area
 
 
-def test_two_states_and_hand_overs() -> None:
-    """2 s bad in 22 s is 1/11. In 20,000 s there are some 900 cycles: a standard deviation of about 0.004."""
-    trace = gilbert_elliott(7, 20_000, good_bytes_per_s=1e7, bad_bytes_per_s=1e6)
-    rates = trace.segments()[1]
-    assert set(rates.tolist()) == {1e7, 1e6}
-    assert abs((rates == 1e6).mean() - 1 / 11) < 0.016
-    assert abs(np.count_nonzero(np.diff(rates)) / 2 - 20_000 / 22) < 150
-    # Without shadows, from the first of two access points to the second: one gap of 2 s a crossing.
-    corridor = Corridor(access_points=2, spacing_m=80.0, shadow_db=0.0, gap_s=2.0)
-    rates = roaming(0, 80, corridor).segments()[1]
-    assert (rates == 0).sum() == 20
-    assert np.flatnonzero(rates == 0).min() > 400  # past the middle: the other one must be 8 dB better
-    assert (roaming(0, 80, replace(corridor, gap_s=0.0)).segments()[1] > 0).all()
-
-
-TURNING = Motion("m", np.array([0, 10_000_000, 20_000_000]), np.array([0.0, 0.0, 7.5]))
-"""10 s at rest, 10 s at 0.75 views a second (45 degrees/s)."""
-
-
-def test_driving_as_told_and_by_default() -> None:
-    """Told to go 1 m/s without turning it has 0.5 views a second; by default it cruises, turns and stops."""
-    ahead = Driving(cruise_m_per_s=(1, 1), cruise_turn_deg_per_s=(0, 0), turn_chance=0.0, stop_chance=0.0)
-    assert drive_motion(3, 60, ahead).total == 30.0
+def test_driving() -> None:
     motion = drive_motion(3, 300)
-    assert drive_motion(3, 300, Driving()).coordinate.tolist() == motion.coordinate.tolist()
     assert drive_motion(4, 300).coordinate.tolist() != motion.coordinate.tolist()
     assert motion.duration_us == 300_000_000
     per_s = np.diff(motion.coordinate) * 10
@@ -168,29 +132,13 @@ def test_driving_as_told_and_by_default() -> None:
     assert 0.02 < (per_s < 1e-6).mean() < 0.4
 
 
-def test_frames_without_chance_follow_motion_alone() -> None:
-    model = FrameModel(base_bytes=100_000, motion_share=0.5, detail_share=0.0, noise_share=0.0)
-    sizes = frame_sizes(np.arange(20) * 1_000_000, TURNING, 0, model)
-    assert sizes.tolist() == [100_000] * 11 + [150_000] * 9
-    assert frame_sizes(np.zeros(0, np.int64), TURNING, 0).tolist() == []
-    # Detail stays while the camera stands still.
-    model = FrameModel(motion_share=0.0, noise_share=0.0)
-    sizes = frame_sizes(np.arange(600) * 33_333, TURNING, 1, model)
-    assert len(set(sizes[:300].tolist())) == 1 and len(set(sizes[301:].tolist())) > 250
-    spread = [frame_sizes(np.array([0, 10_000_000, 20_000_000]), TURNING, s, model)[2] for s in range(400)]
-    assert abs(np.std(spread) / 230_000 - 0.12) < 0.015
-
-
 def test_broken_arguments() -> None:
     for make, says in (
         (lambda: markov_link("boat", 0), "mode = 'boat': must be one of bicycle, bus"),
         (lambda: synthetic_lte(-1), "seed = -1: must be >= 0"),
-        (lambda: outage(1, 1, 5), "length_s = 1: must be above 0 and below period_s = 1"),
         (lambda: markov_link("bus", 0, 2.5), "duration_s = 2.5: must be a whole number"),  # type: ignore[arg-type]
         (lambda: markov_link("bus", 0, mean_bytes_per_s=float("nan")), "mean_bytes_per_s = nan"),
-        (lambda: gilbert_elliott(0, bad_bytes_per_s=2e7), "bad_bytes_per_s = 20000000.0: must be at most good"),
         (lambda: steady(0), "bytes_per_s = 0: must be a number from 1"),
-        (lambda: frame_sizes(np.array([1, 1]), TURNING, 0), "arrival_us must be a row of whole"),
         (lambda: replace(FLAT, place_share=0.7, level_share=0.7), "level_share = 0.7: must be a number from 0 to 0.3"),
     ):
         with pytest.raises(BufgymError, match=says):
@@ -208,11 +156,10 @@ def test_broken_parameter_files(tmp_path: Path) -> None:
         ("[]", 'must be an object with "modes"'),
         ('{"modes": {"bus": {"seconds": 5}}}', "mode 'bus': must be an object with fast_memory"),
         ("[" * 100_000, "must be JSON"),
-        (" " * (2**20 + 1), "must be at most 1048576 bytes"),
-        *((text, "mode '.*': level_stay_s = ") for text in stays),
+        *((text, "mode '.*': level_stay_s = |is not a finite number") for text in stays),
     ):
         file.write_text(text, encoding="utf-8")
-        with pytest.raises(TraceError, match=f"links.json.*{says}"):
+        with pytest.raises(TraceError, match=f"links.json.*({says})"):
             read_links(file)
 
 
@@ -222,8 +169,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_calls_that_are_stated_make_the_shipped_files_byte_for_byte(tmp_path: Path) -> None:
-    write_shipped(tmp_path / "new")
-    made = {path.name: path.read_bytes() for path in (tmp_path / "new").iterdir()}
+    write_shipped(tmp_path)
+    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert made == {path.name: path.read_bytes() for path in (ROOT / "traces").glob("*.csv")}
     assert len(made) == len(SHIPPED_LTE) + 2 and set(shipped_calls()) == set(traces.shipped())
     for name, call in shipped_calls().items():
@@ -235,10 +182,7 @@ def test_the_calls_that_are_stated_make_the_shipped_files_byte_for_byte(tmp_path
             trace = load(name)
             assert trace.cumulative_bytes.tolist() == generated.cumulative_bytes.tolist()
             # They trouble a robot, but not always: 30 frames of 230 kB a second.
-            assert 3 <= describe(trace)["seconds_below_500KBps"] <= 45 and 30 <= trace.seconds_below(6.9e6) <= 150
-    (tmp_path / "file").write_text("")
-    with pytest.raises(TraceError, match="cannot be created"):
-        write_shipped(tmp_path / "file" / "below")
+            assert 3 <= describe(trace)["seconds_below_500KBps"] <= 45
 
 
 def test_shipped_names_and_loading(tmp_path: Path) -> None:
@@ -246,7 +190,7 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
     assert {f"lte-synthetic-{k}" for k in range(8)} | {"drive-0", "drive-1"} <= set(names)
     assert load_motion("drive-0").name == "drive-0"
     own = tmp_path / "own.csv"
-    traces.write_csv(outage(2, 1, 1e6), own)
+    traces.write_csv(tunnel(), own)
     assert load(own) == load(str(own)) == read_trace(own) and load(own, after="stop").after == "stop"
     with pytest.raises(TraceError, match=r"lte-nowhere: no such file, .*known: .*drive-0.*lte-synthetic-7"):
         load("lte-nowhere")
@@ -259,28 +203,17 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
 GENERATE = ["trace", "generate"]
 
 
-def test_the_command_writes_traces_motion_and_frames(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_command_writes_traces_and_motion(tmp_path: Path, capsys: Capsys) -> None:
     for arguments in (
         "link --mode train --seed 4 --duration 50 --mean 8e6",
-        "gilbert-elliott --seed 4 --duration 50 --mean-bad 1",
-        "roaming --seed 4 --duration 50 --gap 0.5",
         "steady --duration 50 --rate 1e6",
         "ramp --duration 50",
         "tunnel --before 15 --after 20",
     ):
         assert "mean" in shown([*GENERATE, *arguments.split(), "-o", tmp_path / "a.csv"], capsys)
         assert read_trace(tmp_path / "a.csv").duration_us == 50_000_000
-    drive = ["drive", "--seed", "1", "--duration", "20", "--cruise", "1,1", "-o", tmp_path / "m.csv"]
+    drive = ["drive", "--seed", "1", "--duration", "20", "-o", tmp_path / "m.csv"]
     shown([*GENERATE, *drive], capsys)
     assert read_motion(tmp_path / "m.csv").duration_us == 20_000_000
-    frames = ["frames", "--motion", tmp_path / "m.csv", "--duration", "2", "-o", tmp_path / "f.csv"]
-    assert "60 frames" in shown([*GENERATE, *frames], capsys)
-    header, *lines = (tmp_path / "f.csv").read_text().splitlines()
-    assert header == "time_s,bytes,x" and len(lines) == 60
-    assert float(lines[-1].split(",")[2]) == pytest.approx(load_motion(tmp_path / "m.csv").at(1_966_667))
-    for arguments, says in (
-        ("drive --cruise 2,1 -o x.csv", "must not be above the second"),
-        ("drive --cruise 2 -o x.csv", "must be two numbers"),
-        ("link --mode bus --links no.json -o x.csv", "no.json: cannot be read"),
-    ):
+    for arguments, says in (("link --mode bus --links no.json -o x.csv", "no.json: no such file"),):
         fails([*GENERATE, *arguments.split()], says, capsys)

@@ -1,7 +1,6 @@
 """Bandwidth traces from files: numbers worked by hand in every format; and `trace info|plot|validate|convert`."""
 
 import gzip
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -131,14 +130,6 @@ def test_runs_of_a_list_with_and_without_times(tmp_path: Path) -> None:
         read_trace(path, column="run 4")
 
 
-@pytest.fixture
-def archive(tmp_path: Path) -> str:
-    with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
-        for name in ("ucc", "nyu"):
-            archive.writestr(f"a/{name}.csv", SAMPLES[name])
-    return str(tmp_path / "two.zip")
-
-
 def test_what_convert_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = str(written(tmp_path, "1\n", "a.up")), str(written(tmp_path, "2\n", "b.up"))
     out = tmp_path / "out"
@@ -155,27 +146,26 @@ def test_what_convert_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         fails(["trace", "convert", first, "--out", *words], says, capsys)
 
 
-def test_info_of_every_format(tmp_path: Path, archive: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [written(tmp_path, text, format) for format, text in SAMPLES.items()]
     for format, block in zip(SAMPLES, shown(["trace", "info", *files], capsys).split("\n\n"), strict=True):
         assert block.startswith(f"{format}\n") and f"(format {format}, detected" in block
-    # By format and column, out of a zip.
-    out = shown(["trace", "info", f"{archive}:ucc.csv", "--format", "ucc", "--column", "UL_bitrate"], capsys)
+    out = shown(["trace", "info", tmp_path / "ucc", "--format", "ucc", "--column", "UL_bitrate"], capsys)
     assert "(format ucc, requested, column UL_bitrate," in out
     # 20 and 8 kbit/s are 2.5 and 1 KB/s.
     assert ["mean_KBps", "1.75"] in [line.split() for line in out.splitlines()]
 
 
-def test_validate_tells_sound_files(tmp_path: Path, archive: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_validate_tells_sound_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sound, broken = written(tmp_path, "1\n2\n", "sound.up"), written(tmp_path, "1\nx\n", "broken.up")
     out = shown(["trace", "validate", sound, "lte-synthetic-0"], capsys)
     assert [line.split()[0] for line in out.splitlines()] == ["OK", "OK", "2"]
     with pytest.raises(SystemExit) as ended:
-        main(["trace", "validate", str(sound), str(broken), str(tmp_path / "missing"), archive])
+        main(["trace", "validate", str(sound), str(broken), str(tmp_path / "missing")])
     assert ended.value.code == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[:-1]] == ["OK", "error", "error", "OK", "OK"]  # a zip's members, too
-    assert lines[-1] == "3 of 5 files are sound" and "a/nyu.csv (format nyu, detected): 3.0 s" in lines[4]
+    assert [line.split()[0] for line in lines[:-1]] == ["OK", "error", "error"]
+    assert lines[-1] == "1 of 3 files are sound"
     assert "broken.up, line 2: time in ms = x: must be a whole number" in lines[1]
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bufgym.traces import Trace, describe, members, read_trace
+from bufgym.traces import Trace, describe, read_trace
+from bufgym.traces.datasets.unpack import unpack
 
 SETS = {
     "belgium_4g": ("belgium_4g/csv/*.csv", "csv", 30),
@@ -62,9 +63,9 @@ def test_recorded_links_agree_with_the_table(shared_data: Path, name: str) -> No
 
 
 @pytest.mark.nightly
-def test_every_member_of_the_ucc_archive(shared_data: Path) -> None:
-    archive = shared_data / "ucc_5g" / "5G-production-dataset.zip"
-    traces = {member: read_trace(f"{archive}:{member}") for member in members(archive)}
+def test_every_file_of_the_ucc_archive(shared_data: Path, tmp_path: Path) -> None:
+    unpack(shared_data / "ucc_5g" / "5G-production-dataset.zip", tmp_path / "ucc")
+    traces = {str(path): read_trace(path) for path in (tmp_path / "ucc").rglob("*.csv")}
     downloads = {"/".join(m.split("/")[-2:]): trace for m, trace in traces.items() if "/Download/" in m}
     assert len(traces) == 83 and len(downloads) == 21
     compare(shared_data, "ucc_5g_download", downloads)

@@ -50,7 +50,7 @@ _MOST_TRACES = 12
 """Most recordings in a split; a larger folder gives evenly spaced ones, in the order of their names."""
 
 
-def _recorded(pattern: str, size_bytes: int) -> Build:
+def _every_fifth(pattern: str, size_bytes: int) -> Build:
     """All files of a pattern, by name: of every five, three are for training, one validates and one tests."""
 
     def build(split: str, data: Path | None) -> dict[str, Setting]:
@@ -66,30 +66,30 @@ def _recorded(pattern: str, size_bytes: int) -> Build:
     return build
 
 
+def _by_name(pattern: str, belongs: Callable[[str, str], bool]) -> Build:
+    """The files of a pattern that belong to (name, split), at most as many as other suites have traces."""
+
+    def build(split: str, data: Path | None) -> dict[str, Setting]:
+        assert data is not None
+        paths = sorted(path for path in data.glob(pattern) if belongs(path.name, split))
+        if not paths:
+            raise BufgymError(f"{data / pattern}: holds no recording of the split {split}; this suite needs some")
+        return both_sizes([read_trace(path) for path in _at_most(paths, TRACES[split])], _tum(split, data))
+
+    return build
+
+
 _DAYS = {"train": ("20241101", "20241102", "20241103"), "validation": ("20241104",), "test": ("20241105",)}
 """Days of the drive from Los Angeles to Boston, by split: no two splits share a day, or a place."""
 
 _FAILED = ("20241101_170456963", "20241102_104344891", "20241103_110904624", "20241104_132730722")
 """Runs that their server ended with an error."""
 
-
-def _uplink_5g(split: str, data: Path | None) -> dict[str, Setting]:
-    assert data is not None
-    paths = _evenly(
-        data, "uplink_5g/*.out.gz", split, lambda name: name[:8] in _DAYS[split] and name[:18] not in _FAILED
-    )
-    return both_sizes([read_trace(path) for path in paths], _tum(split, data))
-
-
 _PLACES = {"train": "loc2", "validation": "loc1", "test": "loc3"}
 """Places in the shipyard, by split. loc3, with the slowest links, tests; runs that name no place are left out."""
 
-
-def _uplink_wifi(split: str, data: Path | None) -> dict[str, Setting]:
-    assert data is not None
-    paths = _evenly(data, "uplink_wifi/*_server.json.gz", split, lambda name: f"_{_PLACES[split]}_" in name)
-    return both_sizes([read_trace(path) for path in paths], _tum(split, data))
-
+_uplink_5g = _by_name("uplink_5g/*.out.gz", lambda name, split: name[:8] in _DAYS[split] and name[:18] not in _FAILED)
+_uplink_wifi = _by_name("uplink_wifi/*_server.json.gz", lambda name, split: f"_{_PLACES[split]}_" in name)
 
 _MMWAVE = {
     "train": ("static_5g_away_p1", "static_5g_toward_p1", "walking_5g_away"),
@@ -111,14 +111,6 @@ def _uplink_mmwave(split: str, data: Path | None) -> dict[str, Setting]:
 Item = TypeVar("Item")
 
 
-def _evenly(data: Path, pattern: str, split: str, belongs: Callable[[str], bool]) -> list[Path]:
-    """The files of a pattern whose names belong to the split, at most as many as other suites have traces."""
-    names = sorted(path for path in data.glob(pattern) if belongs(path.name))
-    if not names:
-        raise BufgymError(f"{data / pattern}: holds no recording of the split {split}; this suite needs some")
-    return _at_most(names, TRACES[split])
-
-
 def _at_most(items: Sequence[Item], most: int) -> list[Item]:
     """All items, or ``most`` evenly spaced ones if there are more."""
     if len(items) <= most:
@@ -128,37 +120,25 @@ def _at_most(items: Sequence[Item], most: int) -> list[Item]:
 
 _WITH_TUM = "and tum_rgbd/*.groundtruth.txt.gz"
 
-SUITES = (
-    Suite(
-        "lte-belgium-v1",
-        "30 Hz camera over the Belgium 4G logs with TUM RGB-D motion",
-        _belgium,
-        needs=f"belgium_4g/csv/*.csv {_WITH_TUM}",
-    ),
-    *(
-        Suite(name, f"30 Hz camera {over} with TUM RGB-D motion", build, needs=f"{pattern} {_WITH_TUM}")
-        for name, over, build, pattern in (
-            ("uplink-5g-v1", "over 5G uplinks of a drive, split by day", _uplink_5g, "uplink_5g/*.out.gz"),
-            (
-                "uplink-wifi-v1",
-                "over WiFi uplinks in a shipyard, split by place",
-                _uplink_wifi,
-                "uplink_wifi/*.json.gz",
-            ),
-            ("uplink-mmwave-v1", "over 5G mmWave uplinks, split by place", _uplink_mmwave, "uplink_mmwave/*.list.gz"),
-        )
-    ),
-    *(
-        Suite(
-            name,
-            f"30 Hz camera {over} with TUM RGB-D motion",
-            _recorded(pattern, size_bytes),
-            needs=f"{pattern} {_WITH_TUM}",
-        )
-        for name, over, pattern, size_bytes in (
-            ("lumos5g-v1", "over Lumos5G's 4G traces", "lumos5g/4G/*", SIZE_BYTES),
-            ("norway-hsdpa-v1", "of 8 kB frames over the Norway HSDPA logs", "norway_hsdpa/cooked/*", 8_000),
-            ("mahimahi-v1", "of 30 kB frames over Mahimahi's cellular traces", "mahimahi/*.gz", 30_000),
-        )
-    ),
+SUITES = tuple(
+    Suite(name, f"30 Hz camera {over} with TUM RGB-D motion", build, needs=f"{pattern} {_WITH_TUM}")
+    for name, over, build, pattern in (
+        ("lte-belgium-v1", "over the Belgium 4G logs", _belgium, "belgium_4g/csv/*.csv"),
+        ("uplink-5g-v1", "over 5G uplinks of a drive, split by day", _uplink_5g, "uplink_5g/*.out.gz"),
+        ("uplink-wifi-v1", "over WiFi uplinks in a shipyard, split by place", _uplink_wifi, "uplink_wifi/*.json.gz"),
+        ("uplink-mmwave-v1", "over 5G mmWave uplinks, split by place", _uplink_mmwave, "uplink_mmwave/*.list.gz"),
+        ("lumos5g-v1", "over Lumos5G's 4G traces", _every_fifth("lumos5g/4G/*", SIZE_BYTES), "lumos5g/4G/*"),
+        (
+            "norway-hsdpa-v1",
+            "of 8 kB frames over the Norway HSDPA logs",
+            _every_fifth("norway_hsdpa/cooked/*", 8_000),
+            "norway_hsdpa/cooked/*",
+        ),
+        (
+            "mahimahi-v1",
+            "of 30 kB frames over Mahimahi's cellular traces",
+            _every_fifth("mahimahi/*.gz", 30_000),
+            "mahimahi/*.gz",
+        ),
+    )
 )

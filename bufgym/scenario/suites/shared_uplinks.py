@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bufgym.scenario.client import Client
-from bufgym.scenario.configuration import robofleet_example
+from bufgym.scenario.client import Client, robofleet_example
 from bufgym.scenario.fleet import FleetScenario
 from bufgym.scenario.suites import synthetic
 from bufgym.scenario.suites.suite import Setting, Suite

@@ -1,8 +1,8 @@
 """Public data sets in a cache folder: downloaded or copied from files, verified, unpacked.
 
-Every file in the cache is complete and has the checksum that is known for it. A download in progress has a name of its
-own (`.NAME.part`) and takes its place by one renaming. Each data set has a lock, so that one process fetches at a time;
-the others wait and then find the files.
+Every file in the cache is complete and has the checksum that is known for it: pooch downloads and verifies it in a
+folder of its own (`.NAME.part`), from which it takes its place by one renaming. Each data set has a lock, so that one
+process fetches at a time; the others wait and then find the files.
 
     <cache>/ucc-5g/5G-production-dataset.zip     as published
     <cache>/ucc-5g/5G-production-dataset/...     unpacked
@@ -13,23 +13,32 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
+from urllib.parse import urljoin
 
+from bufgym import __version__
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError, where
-from bufgym.traces.datasets.download import Patience, Progress, discard, disk, download, refuse_page
 from bufgym.traces.datasets.table import Dataset, Remote, datasets
 from bufgym.traces.datasets.unpack import ending, unpack
-from bufgym.traces.formats.faults import StrPath
+from bufgym.traces.formats.faults import StrPath, os_errors
+
+MAX_BYTES: Final = 64 * 2**30
+"""No file may be longer."""
+SILENCE_S: Final = 30.0
+"""An attempt fails when the server sends nothing for so long, s."""
+RETRIES: Final = 2
+"""Further attempts after the first has failed."""
 
 Origin = Literal["downloaded", "there already", "copied"]
 Note: TypeAlias = Callable[[str], None]
 """Called with a sentence about what is being done."""
+Progress: TypeAlias = Callable[[int, int | None], None]
+"""Called with about the bytes on disk, and the file's length (None if the server does not say)."""
 Watch: TypeAlias = Callable[[str], Progress]
 """Called with a file's name; returns what is called with the progress of its download."""
 
@@ -52,16 +61,9 @@ class Fetched:
 
 def cache_folder() -> Path:
     """Where data sets are kept: `bufgym/datasets` in XDG_CACHE_HOME, or else in the platform's cache folder."""
-    named = os.environ.get("XDG_CACHE_HOME", "")
-    if os.path.isabs(named):  # the XDG specification says to ignore other values
-        base = Path(named)
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path.home() / ".cache"
-    return base / "bufgym" / "datasets"
+    import pooch
+
+    return Path(pooch.os_cache("bufgym")) / "datasets"
 
 
 def fetch_dataset(
@@ -71,7 +73,6 @@ def fetch_dataset(
     *,
     note: Note | None = None,
     watch: Watch | None = None,
-    patience: Patience | None = None,
 ) -> list[Fetched]:
     """Put a data set into `to`/NAME.
 
@@ -81,14 +82,16 @@ def fetch_dataset(
         local_files: files fetched by hand, recognised by name or checksum; if there are any, nothing is downloaded.
         note: called with what happens, in sentences.
         watch: called with the name of each file before its download, for a callback that reports the progress.
-        patience: when to give up on a server.
 
     Returns:
         The files, in the order of the data set or of `local_files`.
 
     Raises:
-        BufgymError: no such data set, a wrong checksum, an unknown address, or an error of `download` or `unpack`.
+        BufgymError: no such data set, an unknown address, no network, no such file, a server that fails again and
+            again, a wrong checksum, an HTML page, no room on the disk, an archive that `unpack` refuses.
     """
+    from filelock import FileLock, Timeout
+
     if isinstance(dataset, str):
         if dataset not in datasets():
             raise BufgymError(f"{dataset}: no such data set: must be one of {', '.join(datasets())}")
@@ -101,62 +104,135 @@ def fetch_dataset(
     note = note or (lambda sentence: None)
     root = cache_folder() if to is None else Path(to)
     folder = root / dataset.name
-    with disk(folder):
+    with os_errors(folder, "written"):
         folder.mkdir(parents=True, exist_ok=True)
-    waiting = f"waiting for another bufgym that fetches {dataset.name}"
-    with _locked(root / f".{dataset.name}.lock", lambda: note(waiting)):
+        lock = FileLock(root / f".{dataset.name}.lock")
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            note(f"waiting for another bufgym that fetches {dataset.name}")
+            lock.acquire()
+    try:
         if local_files:
             return [_copied(dataset, folder, Path(file)) for file in local_files]
-        return [_downloaded(remote, folder, note, watch, patience) for remote in dataset.files]
+        return [_downloaded(remote, folder, note, watch) for remote in dataset.files]
+    finally:
+        lock.release()
 
 
 # --- one file ---------------------------------------------------------------------------------------------------------
 
 
-def _downloaded(remote: Remote, folder: Path, note: Note, watch: Watch | None, patience: Patience | None) -> Fetched:
+def _downloaded(remote: Remote, folder: Path, note: Note, watch: Watch | None) -> Fetched:
     target = folder / remote.path
     if target.is_file():
         checksum = _sha256(target)
         if remote.sha256 in (None, checksum):
             return _settled(remote, target, checksum, "there already")
         note(f"{target}: changed since it was fetched: fetching it again")
-    with disk(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-    part = target.with_name(f".{target.name}.part")
-    for may_retry in (True, False):
-        resumed = part.exists()
-        download(remote.address, part, watch(remote.path) if watch is not None else None, patience)
-        checksum = _sha256(part)
-        if remote.sha256 in (None, checksum):
-            break
-        discard(part)
-        if not (resumed and may_retry):
-            raise _wrong(remote.address, checksum, remote.sha256)
-        note(f"{remote.path}: the parts do not fit together: fetching it again")
-    with disk(target):
-        os.replace(part, target)
-        discard(part)
-    return _settled(remote, target, checksum, "downloaded")
+    scratch = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(scratch, ignore_errors=True)  # of a process that was killed
+    try:
+        _download(remote, scratch / "file", watch(remote.path) if watch is not None else lambda count, total: None)
+        return _placed(remote, scratch / "file", target, "downloaded")
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _download(remote: Remote, part: Path, progress: Progress) -> None:
+    import pooch
+
+    pooch.get_logger().setLevel("WARNING")
+    meter = _Meter(remote.address, progress)
+    downloader = pooch.HTTPDownloader(
+        progressbar=meter,
+        timeout=SILENCE_S,
+        headers={"User-Agent": f"bufgym/{__version__}", "Accept-Encoding": "identity"},
+        hooks={"response": _refuse_plain},
+    )
+    cache = pooch.create(
+        part.parent,
+        base_url="",
+        registry={part.name: remote.sha256},
+        urls={part.name: remote.address},
+        retry_if_failed=RETRIES,
+    )
+    with _failures(remote.address):
+        cache.fetch(part.name, downloader=downloader)
+    count = part.stat().st_size
+    if meter.total and count != meter.total:
+        raise BufgymError(f"{remote.address}: the connection was cut after {count} of {meter.total} bytes")
+
+
+class _Meter:
+    """What pooch calls a progress bar."""
+
+    def __init__(self, address: str, progress: Progress) -> None:
+        self.total = self._count = 0
+        self._address, self._progress = address, progress
+
+    def update(self, count: int) -> None:
+        self._count += count
+        if self._count > MAX_BYTES:
+            raise BufgymError(f"{self._address}: sends more than {MAX_BYTES} bytes: must be less")
+        self._progress(min(self._count, self.total or self._count), self.total or None)
+
+    def reset(self) -> None:
+        self._count = 0
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def _refuse_plain(response: Any, **options: Any) -> None:
+    """Refuse a redirection from https back to http; requests follows none to anything else."""
+    to = urljoin(response.url, response.headers.get("Location", ""))
+    if response.is_redirect and response.url.startswith("https:") and not to.startswith("https:"):
+        raise BufgymError(f"{response.url}: redirects to {to}, which is not allowed")
+
+
+@contextmanager
+def _failures(address: str) -> Iterator[None]:
+    """Turn what goes wrong on the way into one sentence."""
+    from requests import exceptions
+
+    try:
+        yield
+    except BufgymError:
+        raise
+    except exceptions.HTTPError as error:
+        said = str(error).partition(" for url")[0]
+        rule = f"the server says {said}"
+        if said.startswith("404"):
+            rule = "no such file on the server (404); it may have moved: fetch it by hand, then use --from"
+        raise BufgymError(f"{address}: {rule}") from None
+    except exceptions.SSLError as error:
+        raise BufgymError(f"{address}: no safe connection to the server ({_reason(error)})") from None
+    except exceptions.Timeout:
+        raise BufgymError(f"{address}: the server does not respond") from None
+    except (exceptions.ConnectionError, exceptions.ChunkedEncodingError) as error:
+        raise BufgymError(f"{address}: no network, no such server, or it broke off ({_reason(error)})") from None
+    except exceptions.RequestException as error:
+        raise BufgymError(f"{address}: cannot be downloaded ({_reason(error)})") from None
+    except OSError as error:
+        raise BufgymError(f"{address}: cannot be written to the disk: {error.strerror or error}") from None
+    except ValueError as error:  # pooch's: the checksum; or an address that is none
+        raise BufgymError(f"{address}: {str(error).partition('. ')[0]}; not kept") from None
+
+
+def _reason(error: BaseException) -> str:
+    """What the innermost of these errors says, as one line of limited length."""
+    while nested := [e for e in (getattr(error, "reason", None), *error.args) if isinstance(e, BaseException)]:
+        error = nested[0]
+    return " ".join(str(error).rpartition(": ")[2].split())[:200]
 
 
 def _copied(dataset: Dataset, folder: Path, file: Path) -> Fetched:
     """A file fetched by hand, copied into the cache under its published name."""
     if not file.is_file():
         raise BufgymError(f"{file}: no such file (--from)")
-    with file.open("rb") as opened:
-        refuse_page(file, opened.read(1024))
-    checksum = _sha256(file)
-    remote = _recognised(dataset, file, checksum)
-    if remote.sha256 not in (None, checksum):
-        raise _wrong(file, checksum, remote.sha256)
-    target = folder / remote.path
-    with disk(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with files.replaced(target) as copy:
-            shutil.copyfile(file, copy)
-            if _sha256(copy) != checksum:
-                raise BufgymError(f"{file}: changed while it was copied")
-    return _settled(remote, target, checksum, "copied")
+    remote = _recognised(dataset, file, _sha256(file))
+    return _placed(remote, file, folder / remote.path, "copied")
 
 
 def _recognised(dataset: Dataset, file: Path, checksum: str) -> Remote:
@@ -174,71 +250,49 @@ def _recognised(dataset: Dataset, file: Path, checksum: str) -> Remote:
     raise BufgymError(where(file, None, None, rule))
 
 
+def _placed(remote: Remote, source: Path, target: Path, origin: Origin) -> Fetched:
+    """Put a file into its place in the cache, unless it is an error page."""
+    with source.open("rb") as opened:
+        start = opened.read(1024).lstrip(b"\xef\xbb\xbf \t\r\n")[:14].lower()
+    name = remote.address if origin == "downloaded" else source
+    if start.startswith((b"<!doctype html", b"<html")):
+        raise BufgymError(f"{name}: is an HTML page, not data (a log-in or error page?)")
+    with os_errors(target, "written"):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with files.replaced(target) as copy:
+            if origin == "copied":
+                shutil.copyfile(source, copy)
+            else:
+                os.replace(source, copy)
+            checksum = _sha256(copy)
+            if remote.sha256 not in (None, checksum):
+                raise BufgymError(f"{name}: wrong checksum: sha256 is {checksum}, must be {remote.sha256}; not kept")
+            target.unlink(missing_ok=True)  # first, so that a half removed folder is never taken for a complete one
+            if (folder := _unpacked(target)) is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+    return _settled(remote, target, checksum, origin)
+
+
 def _settled(remote: Remote, target: Path, checksum: str, origin: Origin) -> Fetched:
     """The file in its place, unpacked if it is an archive."""
-    try:
-        unpacked = _unpacked(target, renew=origin != "there already")
-    except BufgymError:
-        if remote.sha256 is None:
-            # There is no checksum to verify this file with, so the next attempt must fetch it again.
-            target.unlink()
-        raise
-    return Fetched(target, checksum, remote.sha256 is not None, origin, unpacked)
+    folder = _unpacked(target)
+    if folder is not None and not folder.exists():
+        try:
+            unpack(target, folder)
+        except BufgymError:
+            if remote.sha256 is None:
+                # There is no checksum to verify this file with, so the next attempt must fetch it again.
+                target.unlink()
+            raise
+    return Fetched(target, checksum, remote.sha256 is not None, origin, folder)
 
 
-def _unpacked(archive: Path, renew: bool) -> Path | None:
-    """The folder beside the archive with its content; None if it is no archive."""
+def _unpacked(archive: Path) -> Path | None:
+    """The folder beside the archive for its content; None if it is no archive."""
     suffix = ending(archive.name)
-    if suffix is None:
-        return None
-    folder = archive.with_name(archive.name[: -len(suffix)])
-    if renew and folder.exists():
-        # Renamed first, in one step, so that a half removed folder is never taken for a complete one.
-        stale = folder.with_name(f".{folder.name}.stale")
-        shutil.rmtree(stale, ignore_errors=True)
-        with disk(folder):
-            folder.rename(stale)
-        shutil.rmtree(stale, ignore_errors=True)
-    if not folder.exists():
-        unpack(archive, folder)
-    return folder
-
-
-def _wrong(source: object, checksum: str, expected: str | None) -> BufgymError:
-    return BufgymError(f"{source}: wrong checksum: sha256 is {checksum}, must be {expected}; not kept")
+    return None if suffix is None else archive.with_name(archive.name[: -len(suffix)])
 
 
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@contextmanager
-def _locked(lock: Path, waiting: Callable[[], None]) -> Iterator[None]:
-    """Let one process in at a time; the system frees the lock of a process that dies."""
-    with disk(lock):
-        handle = lock.open("ab")
-    with handle:
-        if sys.platform == "win32":
-            import msvcrt
-            import time
-
-            announced = False
-            while True:
-                try:
-                    msvcrt.locking(handle.fileno(), msvcrt.LK_NBLCK, 1)
-                    break
-                except OSError:
-                    if not announced:
-                        waiting()
-                    announced = True
-                    time.sleep(0.2)
-        else:
-            import fcntl
-
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                waiting()
-                fcntl.flock(handle, fcntl.LOCK_EX)
-        yield

@@ -23,7 +23,7 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -62,18 +62,6 @@ _EM_STEPS: Final = 300
 _ROUNDS: Final = 3
 # Seconds generated to measure the correlation that a fit has.
 _TRIAL_S: Final = 40_000
-
-
-@dataclass(frozen=True)
-class Gaps:
-    """Times between outages, s."""
-
-    whole: Float64Array
-    """float64[n], from the end of one to the start of the next."""
-    cut: Float64Array
-    """float64[m], from the last of a recording to the recording's end."""
-    first: list[int]
-    """From a recording's start to its first outage, at least 1."""
 
 
 def rates_of(path: StrPath) -> Float64Array:
@@ -209,8 +197,7 @@ def _fit_outages(rows: Rows, low: float) -> OutageParameters | None:
     first = [max(1, int(starts[0])) for starts, _ in pairs if len(starts)]
     pooled = np.concatenate(rows)
     tail, scale_s = _fit_lengths(lengths_s)
-    gaps = Gaps(outage_gaps(rows, low), np.array(cut, np.float64), first)
-    share, short_s, long_s = _fit_gaps(gaps, clusters=len(lengths_s) >= FEW_OUTAGES)
+    share, short_s, long_s = _fit_gaps(outage_gaps(rows, low), np.array(cut, np.float64), first, len(lengths_s))
     quantiles = _rounded_quantiles(pooled[pooled < low], [k / (LOW_QUANTILES - 1) for k in range(LOW_QUANTILES)])
     return OutageParameters(len(lengths_s), share, short_s, long_s, shoulder_of(rows, low), tail, scale_s, quantiles)
 
@@ -226,11 +213,18 @@ def _fit_lengths(lengths_s: Float64Array) -> tuple[float, float]:
     return chosen
 
 
-def _fit_gaps(gaps: Gaps, clusters: bool) -> tuple[float, float, float]:
-    """Share of short gaps, mean short and mean long gap in s."""
-    whole, cut, first_s = gaps.whole, gaps.cut, float(sum(gaps.first))
-    exposure_s, events = first_s + whole.sum() + cut.sum(), len(gaps.first) + len(whole)
-    if not clusters or not len(whole):
+def _fit_gaps(whole: Float64Array, cut: Float64Array, first: list[int], outages: int) -> tuple[float, float, float]:
+    """Share of short gaps, mean short and mean long gap in s.
+
+    Args:
+        whole: float64[n], from the end of an outage to the start of the next, s.
+        cut: float64[m], from the last of a recording to the recording's end, s.
+        first: from a recording's start to its first outage, at least 1 s.
+        outages: number of outages.
+    """
+    first_s = float(sum(first))
+    exposure_s, events = first_s + whole.sum() + cut.sum(), len(first) + len(whole)
+    if outages < FEW_OUTAGES or not len(whole):
         return 0.0, 1.0, _three_digits(max(1.0, exposure_s / events))
     share, short_s = 0.5, max(1.5, float(np.median(whole)) / 2)
     long_s = max(2 * short_s, exposure_s / events)
@@ -241,7 +235,7 @@ def _fit_gaps(gaps: Gaps, clusters: bool) -> tuple[float, float, float]:
         share = float((is_short.sum() + cut_short.sum()) / (len(whole) + len(cut)))
         short_s = float((is_short @ whole + cut_short @ cut) / max(1e-9, is_short.sum()))
         long_time = (1 - is_short) @ whole + (1 - cut_short) @ cut + first_s
-        long_s = float(long_time / max(1e-9, (1 - is_short).sum() + len(gaps.first)))
+        long_s = float(long_time / max(1e-9, (1 - is_short).sum() + len(first)))
         short_s, long_s = max(1.0001, short_s), max(1.0001, long_s)
     return round(share, 2), _three_digits(short_s), _three_digits(long_s)
 

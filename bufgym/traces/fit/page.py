@@ -76,9 +76,6 @@ def write_page(
         command: what the page names as its origin.
         sets: generated sets for each comparison.
         most_held_out: recordings of a mode that are held out at most, a fit each; by default all.
-
-    Raises:
-        TraceError: a file cannot be written.
     """
     compared = {mode: compare(links[mode], rows, sets) for mode, rows in recordings.items()}
     plain = {mode: compare(_without_memory(links[mode]), rows, sets) for mode, rows in recordings.items()}

@@ -8,6 +8,6 @@
 | `workloads` | messages as CSV |
 | `bags`, `bag_poses`, `recordings` | robots' recordings, and the workloads that they make |
 
-`text` opens every text file safely, `archives` the members of zip archives, `faults` makes the error messages, and
-`intervals` collects measurements that follow each other.
+`text` opens every text file safely, `faults` makes the error messages, and `intervals` collects
+measurements that follow each other.
 """

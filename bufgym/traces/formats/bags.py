@@ -62,11 +62,7 @@ class Bag:
 
 
 def matching(source: str, names: Sequence[str], patterns: Sequence[str] | None) -> list[str]:
-    """The topics among ``names`` that fit a name or a pattern such as ``/camera/*``; all of them for None.
-
-    Raises:
-        BufgymError: a name or pattern that fits no topic; the message lists the topics.
-    """
+    """The topics among ``names`` that fit a name or a pattern such as ``/camera/*``; all of them for None."""
     if patterns is None:
         return list(names)
     for pattern in patterns:

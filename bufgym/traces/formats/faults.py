@@ -19,9 +19,9 @@ def fault(
 
 
 @contextmanager
-def os_errors(path: StrPath, action: str, line: int | None = None) -> Iterator[None]:
+def os_errors(path: StrPath, action: str) -> Iterator[None]:
     """Turn an OSError into a TraceError: the file "cannot be read" (or whatever the action is), and why."""
     try:
         yield
     except OSError as error:
-        raise fault(path, f"cannot be {action}: {error.strerror or error}", line=line) from error
+        raise fault(path, f"cannot be {action}: {error.strerror or error}") from error

@@ -76,11 +76,7 @@ class Intervals:
         return len(self._us)
 
     def knots(self, path: StrPath, note: str = "") -> Knots:
-        """The capacity of all intervals together.
-
-        Raises:
-            TraceError: there is none, or they last beyond MAX_DURATION_S.
-        """
+        """The capacity of all intervals together."""
         if not self._us:
             raise fault(path, "holds no measurement: must hold at least one")
         columns = (np.asarray(column, np.int64) for column in (self._us, self._bytes))

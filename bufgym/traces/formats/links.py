@@ -14,10 +14,9 @@
 | `iperf3` | JSON: an object with `intervals` | `iperf3 --json` |
 | `runs` | `Run 1`, then a line of Mbit/s each 0.1 s, or of times and one of Mbit/s | 5G mmWave uplinks |
 
-Any of them may be gzip'd, or a zip's member (`archive.zip:member`; `archive.zip` if it has just one). The format is
-recognised by the first line that is not blank, and stated in the trace's `source`; a line that fits two formats is an
-error. Blank lines are skipped. Every other line must follow its format exactly, because a wrong capacity is worse than
-none.
+Any of them may be gzip'd. The format is recognised by the first line that is not blank, and stated in the trace's
+`source`; a line that fits two formats is an error. Blank lines are skipped. Every other line must follow its format
+exactly, because a wrong capacity is worse than none.
 
 Limits beyond which a number counts as a mistake: 10**7 s in all, 86,400 s from one rate to the next, 10**12 bytes in an
 interval, 10**6 Mbit/s. `text.py` has the limits of text files.
@@ -92,7 +91,7 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
     """Read a bandwidth trace.
 
     Args:
-        path: the file, plain, gzip'd or zipped; `archive.zip:member` is a member of a zip.
+        path: the file, plain or gzip'd.
         format: one of `FORMATS`; by default it is detected from the content.
         after: what follows the end of the trace (see `Trace`).
         column: the one to read, where a format has several (`ucc`: DL_bitrate, the default, or UL_bitrate; `runs`:
@@ -111,7 +110,13 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         format, origin = detect_format(path), "detected"
     elif format not in FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(FORMATS)}")
-    time_us, cumulative_bytes, note = _read(path, format, column)
+    columns = FORMATS[format].columns
+    if column is not None and not columns:
+        raise BufgymError(f"column = {column!r}: format {format} has no columns to choose from")
+    if column is not None and column not in columns:
+        raise BufgymError(f"column = {column!r}: must be one of {', '.join(columns)}")
+    chosen = () if column is None else (column,)
+    time_us, cumulative_bytes, note = FORMATS[format].read(path, *chosen)
     source = f"{path} (format {format}, {origin}{', ' if note else ''}{note})"
     try:
         return Trace(trace_name(path), time_us, cumulative_bytes, after, source)
@@ -119,24 +124,8 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         raise TraceError(f"{path}: {error}") from error
 
 
-def _read(path: StrPath, format: str, column: str | None) -> Knots:
-    reader = FORMATS[format]
-    if column is None:
-        return reader.read(path)
-    if not reader.columns:
-        raise BufgymError(f"column = {column!r}: format {format} has no columns to choose from")
-    if column not in reader.columns:
-        raise BufgymError(f"column = {column!r}: must be one of {', '.join(reader.columns)}")
-    return reader.read(path, column)
-
-
 def detect_format(path: StrPath) -> str:
-    """The one format that the file's first line fits.
-
-    Raises:
-        TraceError: it fits none, or several (then `read_trace` needs its `format` argument), or cannot be
-            read.
-    """
+    """The one format that the file's first line fits."""
     with open_text(path) as file:
         line = file.first()
     if line is None:
@@ -152,8 +141,8 @@ def detect_format(path: StrPath) -> str:
 
 
 def trace_name(path: StrPath) -> str:
-    """The file's name without `.gz`, `.zip` and the usual endings: "TMobile-LTE-short.down", "report_car_0002"."""
-    name = Path(path).name.rpartition(".zip:")[2].removesuffix(".gz").removesuffix(".zip")
+    """The file's name without `.gz` and the usual endings: "TMobile-LTE-short.down", "report_car_0002"."""
+    name = Path(path).name.removesuffix(".gz")
     for suffix in _SUFFIXES:
         name = name.removesuffix(suffix)
     return name

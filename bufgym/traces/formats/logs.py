@@ -8,12 +8,10 @@ Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
-from bufgym.ground.errors import TraceError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
@@ -30,9 +28,7 @@ _MAX_KBIT_PER_S: Final = MAX_MBIT_PER_S * 1000
 _UCC_TIME: Final = "Timestamp"
 _UCC_TIME_FORMAT: Final = "%Y.%m.%d_%H.%M.%S"
 _NYU_BITS: Final = {"bits/sec": 1, "Kbits/sec": 10**3, "Mbits/sec": 10**6, "Gbits/sec": 10**9}
-_SABRE_FIELDS: Final = {"duration_ms": MAX_DURATION_S * 1000, "bandwidth_kbps": _MAX_KBIT_PER_S}
 _SHOWN_CHARACTERS: Final = 40
-_MARK: Final = re.compile(r"[ \t\n\r]*([\[\],]?)[ \t\n\r]*")
 
 
 def fits_ucc(text: str) -> bool:
@@ -109,80 +105,53 @@ def fits_sabre(text: str) -> bool:
 
 
 def read_sabre(path: StrPath) -> Knots:
-    """A JSON list of objects with `duration_ms` and `bandwidth_kbps` (1000 bit/s); their other members are ignored.
-
-    Samples are parsed one by one, so that an error names the line of its sample and only one is held as objects.
-    """
-    with open_text(path) as file:
-        text = file.text()
+    """A JSON list of objects with `duration_ms` and `bandwidth_kbps` (1000 bit/s); their other members are ignored."""
+    samples = read_json(path)
+    if not isinstance(samples, list):
+        raise fault(path, "must be a list of objects")
     intervals = Intervals()
-    for line, sample in json_items(path, text):
-        _add_sample(intervals, line, sample)
+    for line, sample in json_items(path, samples):
+        length_us = round(json_number(line, sample, "duration_ms", MAX_DURATION_S * 1000) * 1000)
+        kbit_per_s = json_number(line, sample, "bandwidth_kbps", _MAX_KBIT_PER_S)
+        if length_us == 0:
+            raise line.error(0, "must be above 0", "duration_ms")
+        # kbit/s times microseconds is thousandths of a bit.
+        intervals.add(line, length_us, round(kbit_per_s * length_us / 8000))
     return intervals.knots(path)
 
 
-def json_items(path: StrPath, text: str, start: int = 0) -> Iterator[tuple[Line, object]]:
-    """The items of the list that begins at `start`, each with its line; a list from 0 on must be all of the text."""
-    decoder = json.JSONDecoder(parse_constant=_no_constant)
-    number, counted = 1, 0  # the line number of the place `counted`
-    mark = _mark(path, text, start, "[")
-    if text.startswith("]", mark.end()):
-        mark = _mark(path, text, mark.end(), "]")
-    while mark[1] != "]":
-        place = mark.end()
-        number, counted = number + text.count("\n", counted, place), place
-        try:
-            item, end = decoder.raw_decode(text, place)
-        except (ValueError, RecursionError) as error:
-            raise json_error(path, text, number, error) from error
-        yield Line(path, number, text[place : min(end, place + _SHOWN_CHARACTERS)]), item
-        mark = _mark(path, text, end, ",]")
-    if start == 0 and mark.end() < len(text):
-        raise _error_at(path, text, mark.end(), "must be nothing after the list")
+# --- JSON ------------------------------------------------------------------------------------------------------------
 
 
-def _mark(path: StrPath, text: str, place: int, marks: str) -> re.Match[str]:
-    """The mark that comes next, with the white space around it; it must be one of `marks`."""
-    match = _MARK.match(text, place)
-    assert match is not None  # it may match nothing at all
-    if not match[1] or match[1] not in marks:
-        raise _error_at(path, text, match.start(1), f"must be {marks[0]!r}, for a list of objects")
-    return match
+def read_json(path: StrPath) -> Any:
+    """The file's JSON, whose numbers are finite."""
+    with open_text(path) as file:
+        text = file.text()
+    try:
+        return json.loads(text, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        value = text[error.pos : error.pos + _SHOWN_CHARACTERS] or None
+        raise fault(path, f"must be JSON ({error.msg})", line=error.lineno, value=value) from error
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deep" if isinstance(error, RecursionError) else str(error).partition(";")[0]
+        raise fault(path, f"must be JSON ({reason})") from error
 
 
-def _add_sample(intervals: Intervals, line: Line, sample: object) -> None:
-    if not isinstance(sample, dict):
-        raise line.error(line.text, "must be an object with duration_ms and bandwidth_kbps")
-    values: list[float] = []
-    for field, most in _SABRE_FIELDS.items():
-        if field not in sample:
-            raise line.error(line.text, f"must hold {field}")
-        value = sample[field]
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise line.error(line.text, f"{field} must be a number")
-        if not 0 <= value <= most:
-            raise line.error(value, f"must be from 0 to {most:g}", field)
-        values.append(value)
-    length_us = round(values[0] * 1000)
-    if length_us == 0:
-        raise line.error(values[0], "must be above 0", "duration_ms")
-    # kbit/s times microseconds is thousandths of a bit.
-    intervals.add(line, length_us, round(values[1] * length_us / 8000))
+def json_items(path: StrPath, items: list[Any]) -> Iterator[tuple[Line, Any]]:
+    """Each item of a list with a `Line` that names it in error messages, counted from 1."""
+    for number, item in enumerate(items, 1):
+        yield Line(f"{path}, item {number}", 0, json.dumps(item)), item
 
 
-def _error_at(path: StrPath, text: str, place: int, rule: str) -> TraceError:
-    value = text[place : place + _SHOWN_CHARACTERS] or None
-    return fault(path, rule, line=1 + text.count("\n", 0, place), value=value)
+def json_number(line: Line, item: Any, name: str, most: float) -> float:
+    """The member of that name, a number from 0 to `most`."""
+    value = item.get(name) if isinstance(item, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise line.error(line.text if value is None else value, f"must hold {name}, a number")
+    if not 0 <= value <= most:
+        raise line.error(value, f"must be from 0 to {most:g}", name)
+    return value
 
 
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a finite number")
-
-
-def json_error(path: StrPath, text: str, number: int, error: Exception) -> TraceError:
-    """What to raise about text that is no JSON; `number`: the line, where the error does not know it."""
-    if isinstance(error, json.JSONDecodeError):
-        value = text[error.pos : error.pos + _SHOWN_CHARACTERS]
-        return fault(path, f"must be JSON ({error.msg})", line=error.lineno, value=value)
-    reason = "nested too deep" if isinstance(error, RecursionError) else str(error).partition(";")[0]
-    return fault(path, f"must be JSON ({reason})", line=number)

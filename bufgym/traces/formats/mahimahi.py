@@ -7,16 +7,12 @@ The packets of ms m are through *at* m, so their bytes accrue at an even rate du
 Ms 0 has no ms before it, so its packets accrue together with those in ms 1. The total is then exactly 1500 bytes a
 line, and no packet is through before its time. The trace lasts as long as its last line says. A file with the single
 line "1" is a steady 12 Mbit/s, as in mahimahi.
-
-A gigabyte of lines can hold a hundred million distinct ms, more than should be held in memory. A trace of more than
-MAX_KNOTS knots is therefore read in bins of 2 ms, 4 ms, ... by the same rule. The packets of a bin accrue evenly in it,
-and the total and the duration stay exact. The trace's `source` states the bin.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -29,22 +25,20 @@ PACKET_BYTES: Final = 1500
 MAX_STAMP_MS: Final = MAX_DURATION_S * 1000
 
 # 384 MB as arrays; seven hours of a link with packets in every ms.
-MAX_KNOTS: Final = 24_000_000
+MAX_TIMES: Final = 24_000_000
 
 _CHUNK_BYTES: Final = 4 * 2**20
 
 
 def read_mahimahi(path: StrPath) -> Knots:
-    """Knots of the capacity, at most MAX_KNOTS.
-
-    The result takes at most 32 bytes a distinct ms, reading about twice as much.
+    """Knots of the capacity.
 
     Raises:
         TraceError: a line that is not a whole number from 0 to 10**10, a time before that of the line above,
-            no line at all, or none after ms 0 (such a trace would have no duration).
+            no line at all, none after ms 0 (such a trace would have no duration), or over MAX_TIMES different times.
     """
-    knots = _KnotBuilder()
-    last_ms = lines_before = odd_lines = 0
+    pieces: list[tuple[Int64Array, Int64Array]] = []
+    last_ms = lines_before = odd_lines = times = 0
     for block in _blocks(path):
         stamps_ms, lines = _parsed_at_once(block, last_ms), block.count(b"\n")
         if stamps_ms is None:
@@ -54,14 +48,35 @@ def read_mahimahi(path: StrPath) -> Knots:
                 raise fault(path, rule, line=lines_before + 1)
             stamps_ms = _parsed_by_line(path, block, lines_before, last_ms)
         if stamps_ms.size:
-            knots.add(stamps_ms)
-            last_ms = int(stamps_ms[-1])
+            pieces.append(np.unique(np.maximum(stamps_ms, 1), return_counts=True))
+            last_ms, times = int(stamps_ms[-1]), times + len(pieces[-1][0])
         lines_before += lines
-    if not knots.packets:
+        if times > MAX_TIMES:
+            raise fault(path, f"more than {MAX_TIMES} different times: must be fewer", line=lines_before)
+    if not pieces:
         raise fault(path, "is empty: must hold a line for each packet")
     if last_ms == 0:
         raise fault(path, "the last time must be after ms 0", line=lines_before, value=0, field="time in ms")
-    return knots.finish()
+    ends_ms, packets = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    packets = np.cumsum(packets)
+    is_last = np.append(ends_ms[1:] != ends_ms[:-1], True)  # a ms may continue in the next block
+    return _knots(ends_ms[is_last], packets[is_last])
+
+
+def _knots(ends_ms: Int64Array, packets: Int64Array) -> Knots:
+    """The capacity, from the ms in which packets were delivered and all packets up to the end of each."""
+    # A ms after a stretch without packets needs a knot of its own where it begins.
+    after_gap = np.diff(ends_ms, prepend=0) > 1
+    count = 1 + after_gap.size + int(np.count_nonzero(after_gap))
+    time_us, cumulative = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    at_end = 1 + np.arange(after_gap.size) + np.cumsum(after_gap)
+    time_us[at_end], cumulative[at_end] = ends_ms * 1000, packets * PACKET_BYTES
+    at_start = at_end[after_gap] - 1
+    time_us[at_start] = (ends_ms[after_gap] - 1) * 1000
+    cumulative[at_start] = np.append(0, packets[:-1])[after_gap] * PACKET_BYTES
+    for array in (time_us, cumulative):
+        array.flags.writeable = False  # so that `Trace` takes them without a copy
+    return Knots(time_us, cumulative)
 
 
 def _blocks(path: StrPath) -> Iterator[bytes]:
@@ -83,68 +98,6 @@ def _blocks(path: StrPath) -> Iterator[bytes]:
                 raise fault(path, rule, line=lines_before + 1, value=value)
     if carried:
         yield carried + b"\n"
-
-
-class _Bins(NamedTuple):
-    """The bins of time in which packets were delivered: their ends, and all packets up to each end, int64[n] each."""
-
-    ends_ms: Int64Array
-    packets: Int64Array
-
-    def of(self, bin_ms: int) -> _Bins:
-        """The same in bins of that length; of entries with the same end the last counts the packets of all."""
-        ends_ms = -(-self.ends_ms // bin_ms) * bin_ms
-        is_last = np.append(ends_ms[1:] != ends_ms[:-1], True)
-        return _Bins(ends_ms[is_last], self.packets[is_last])
-
-
-class _KnotBuilder:
-    """Turns packet times, given in pieces, into at most MAX_KNOTS knots of the capacity."""
-
-    def __init__(self) -> None:
-        self.packets = 0
-        self._bin_ms = 1
-        self._pieces: list[_Bins] = []
-        self._last_ms = 0
-
-    def add(self, stamps_ms: Int64Array) -> None:
-        """Add packets at `stamps_ms` (int64[n], n >= 1, in order, and not before earlier packets)."""
-        counts = np.arange(self.packets + 1, self.packets + stamps_ms.size + 1)
-        self._pieces.append(_Bins(np.maximum(stamps_ms, 1), counts).of(self._bin_ms))
-        self.packets += stamps_ms.size
-        self._last_ms = int(stamps_ms[-1])
-        # Neighbouring pieces share at most one bin, so there are at least so many bins, each with a knot.
-        while sum(piece.ends_ms.size - 1 for piece in self._pieces) > MAX_KNOTS:
-            self._bin_ms *= 2
-            self._pieces = [self._joined()]
-
-    def _joined(self) -> _Bins:
-        """All pieces as one, in the present bins."""
-        return _Bins(*(np.concatenate(column) for column in zip(*self._pieces, strict=True))).of(self._bin_ms)
-
-    def finish(self) -> Knots:
-        """All knots; read-only, so that `Trace` takes them without a copy."""
-        bins = self._joined()
-        self._pieces = []
-        while True:
-            # A bin after a stretch without packets needs a knot of its own where it begins.
-            after_gap = np.diff(bins.ends_ms, prepend=0) > self._bin_ms
-            count = 1 + after_gap.size + int(np.count_nonzero(after_gap))
-            if count <= MAX_KNOTS:
-                break
-            self._bin_ms *= 2
-            bins = bins.of(self._bin_ms)
-        time_us, cumulative = np.zeros(count, np.int64), np.zeros(count, np.int64)
-        at_end = 1 + np.arange(after_gap.size) + np.cumsum(after_gap)
-        time_us[at_end], cumulative[at_end] = bins.ends_ms * 1000, bins.packets * PACKET_BYTES
-        at_start = at_end[after_gap] - 1
-        time_us[at_start] = (bins.ends_ms[after_gap] - self._bin_ms) * 1000
-        cumulative[at_start] = np.append(0, bins.packets[:-1])[after_gap] * PACKET_BYTES
-        # The last bin may reach beyond the last packet, but the trace must not.
-        time_us[-1] = max(self._last_ms, 1) * 1000
-        for array in (time_us, cumulative):
-            array.flags.writeable = False
-        return Knots(time_us, cumulative, f"a knot every {self._bin_ms} ms" if self._bin_ms > 1 else "")
 
 
 def _parsed_at_once(block: bytes, last_ms: int) -> Int64Array | None:

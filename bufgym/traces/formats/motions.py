@@ -29,11 +29,6 @@ def read_motion(
         settings: how the motion of a trajectory is measured, by default `MotionSettings()`.
         format: of a trajectory, see `trajectories.read_poses`.
         times: of a trajectory, likewise.
-
-    Raises:
-        TraceError: the file cannot be read, or a line breaks a rule of its format. The message names the file, the
-            line, the value and the rule.
-        BufgymError: a format that does not exist.
     """
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
@@ -48,11 +43,7 @@ def read_motion(
 
 
 def write_motion_csv(motion: Motion, path: StrPath) -> None:
-    """Write `t_s,motion`; `read_motion` gives back the same times and coordinates, bit for bit.
-
-    Raises:
-        TraceError: the file cannot be written.
-    """
+    """Write `t_s,motion`; `read_motion` gives back the same times and coordinates, bit for bit."""
     rows = (
         f"{t // US_PER_S}.{t % US_PER_S:06d}".rstrip("0").rstrip(".") + f",{x!r}\n"
         for t, x in zip(motion.time_us.tolist(), motion.coordinate.tolist(), strict=True)

@@ -8,14 +8,13 @@ of 5G mmWave Networks", 5G-MeMU 2022 (lists).
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.logs import json_error, json_items
+from bufgym.traces.formats.logs import json_items, json_number, read_json
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
 from bufgym.traces.formats.text import Line, open_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
@@ -66,7 +65,6 @@ def read_nuttcp(path: StrPath) -> Knots:
 
 # --- iperf3 ----------------------------------------------------------------------------------------------------------
 
-_INTERVALS: Final = re.compile(r'(?<!\\)"intervals"\s*:\s*(?=\[)')
 # Of one interval to the next; both are the same clock, written with six decimals.
 _MAX_STEP_S: Final = 1e-3
 
@@ -81,54 +79,31 @@ def read_iperf3(path: StrPath) -> Knots:
     its own result are left out. The note says on which side it was measured: the sender counts what went into its
     socket, the receiver what came out.
     """
-    with open_text(path) as file:
-        text = file.text()
-    try:
-        report = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise json_error(path, text, 1, error) from error
+    report = read_json(path)
     if not isinstance(report, dict) or not isinstance(report.get("intervals"), list):
         raise fault(path, "must be an object with a list of intervals, as iperf3 --json writes it")
     if report.get("error"):
         raise fault(path, "must be a run that succeeded", value=str(report["error"])[:60], field="error")
-    place = _INTERVALS.search(text)
-    assert place is not None  # a key of the object
     intervals, sides, previous_s = Intervals(), set[str](), None
-    for line, item in json_items(path, text, place.end()):
-        measured = _member(line, item, "sum", dict)
+    for line, item in json_items(path, report["intervals"]):
+        measured = item.get("sum") if isinstance(item, dict) else None
+        if not isinstance(measured, dict):
+            raise line.error(line.text, "must hold sum, an object")
         if measured.get("omitted"):
             continue
-        start_s, end_s = (_seconds(line, measured, name) for name in ("start", "end"))
-        count = _member(line, measured, "bytes", int)
+        start_s, end_s = (float(json_number(line, measured, name, MAX_DURATION_S)) for name in ("start", "end"))
+        count = json_number(line, measured, "bytes", MAX_INTERVAL_BYTES)
+        if not isinstance(count, int):
+            raise line.error(count, "must be a whole number", "bytes")
         if previous_s is not None and abs(start_s - previous_s) > _MAX_STEP_S:
             raise line.error(start_s, f"must begin where the interval above ended ({previous_s:g} s)", "start")
         length_us = round(end_s * US_PER_S) - round((start_s if previous_s is None else previous_s) * US_PER_S)
         if length_us <= 0:
             raise line.error(end_s, f"must be after its start ({start_s:g} s)", "end")
-        if count < 0:
-            raise line.error(count, "must be at least 0", "bytes")
         intervals.add(line, length_us, count)
         sides.add("sender" if measured.get("sender") else "receiver")
         previous_s = end_s
     return intervals.knots(path, f"measured by the {' and the '.join(sorted(sides)) or 'nobody'}")
-
-
-def _member(line: Line, item: Any, name: str, kind: type) -> Any:
-    """The member of an object; an error if there is none, or none of that kind."""
-    value = item.get(name) if isinstance(item, dict) else None
-    if not isinstance(value, kind) or isinstance(value, bool):
-        what = {dict: "an object", int: "a whole number", float: "a number"}[kind]
-        raise line.error(line.text if value is None else value, f"must hold {name}, {what}")
-    return value
-
-
-def _seconds(line: Line, measured: dict[str, Any], name: str) -> float:
-    value = measured.get(name)
-    seconds = float(value) if type(value) is int and abs(value) < 2**53 else value
-    value = _member(line, {name: seconds}, name, float)
-    if not 0 <= value <= MAX_DURATION_S:
-        raise line.error(value, f"must be from 0 to {MAX_DURATION_S}", name)
-    return float(value)
 
 
 # --- lists of runs ---------------------------------------------------------------------------------------------------

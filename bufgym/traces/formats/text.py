@@ -1,4 +1,4 @@
-"""Text files, written completely or not at all, and read with bounds: plain, gzip'd, or a zip archive's member.
+"""Text files, written completely or not at all, and read with bounds: plain or gzip'd.
 
 Every reader gets its lines from here, so that a directory, a truncated download, a binary file or a compression bomb
 ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of text after decompression, 10**7 lines
@@ -12,14 +12,14 @@ import gzip
 import io
 import itertools
 import re
+import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
 from bufgym.ground.errors import TraceError
 from bufgym.ground.files import replaced
-from bufgym.traces.formats.archives import ZIP_MAGIC, damage_errors, open_member, split_member
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
 
 # Text after decompression; reading stops as soon as there is more.
@@ -29,8 +29,8 @@ MAX_LINES: Final = 10**7
 MAX_JSON_BYTES: Final = 16 * 2**20
 
 _GZIP_MAGIC = b"\x1f\x8b"
+_ZIP_MAGIC = b"PK\x03\x04"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-_PIECE_BYTES = 2**20
 # int() and float() accept more than a data file should hold: "1_000", "infinity", digits of other scripts.
 _WHOLE = re.compile(r"[0-9]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -59,7 +59,7 @@ class Line(NamedTuple):
 
     Attributes:
         path: the file.
-        number: of the line, counted from 1.
+        number: of the line, counted from 1; 0 if `path` names the place.
         text: of the line, without surrounding white space.
     """
 
@@ -69,7 +69,7 @@ class Line(NamedTuple):
 
     def error(self, value: object | None, rule: str, field: str | None = None) -> TraceError:
         """The error to raise about this line."""
-        return fault(self.path, rule, line=self.number, value=value, field=field)
+        return fault(self.path, rule, line=self.number or None, value=value, field=field)
 
     def columns(self, count: int, separator: str | None = None) -> list[str]:
         """The line's cells, of which there must be `count`; separated by white space unless a separator is given."""
@@ -109,47 +109,24 @@ class Line(NamedTuple):
 
 @contextmanager
 def open_text(path: StrPath) -> Iterator[TextFile]:
-    """Open a text file for one pass: plain, gzip or zip, recognised by its first bytes whatever its name.
-
-    Raises:
-        TraceError: missing, not a regular file, unreadable; a zip of several members of which none is named (as in
-            `archive.zip:member`).
-    """
-    with ExitStack() as stack:
-        with os_errors(path, "opened"):
-            file, member = split_member(path)
-            raw = stack.enter_context(_open(path, file))
-            stream: IO[bytes] = raw
-            magic = raw.peek(4)[:4]
-            packing = "plain"
-            if magic.startswith(ZIP_MAGIC):
-                packing = "zip"
-                stream = stack.enter_context(io.BufferedReader(open_member(path, raw, member)))
-            elif member is not None:
-                raise fault(path, f"{file} is no zip archive: cannot have members")
-            elif magic.startswith(_GZIP_MAGIC):
-                packing = "gzip"
-                stream = stack.enter_context(io.BufferedReader(gzip.GzipFile(fileobj=raw)))
-        yield TextFile(path, stream, packing)
+    """Open a text file for one pass: plain or gzip, recognised by its first bytes whatever its name."""
+    with os_errors(path, "opened"):
+        raw = _open(path)
+    with raw:
+        magic = raw.peek(4)[:4]
+        if magic == _ZIP_MAGIC:
+            raise fault(path, "is a zip archive: must be unpacked first")
+        stream: IO[bytes] = gzip.GzipFile(fileobj=raw) if magic.startswith(_GZIP_MAGIC) else raw  # type: ignore[assignment]
+        yield TextFile(path, stream)
 
 
 class TextFile:
-    """An open text file. Use one of `lines`, `first`, `text` and `read`; all of them respect the module's limits.
+    """An open text file. Use one of `lines`, `first`, `text` and `read`; all of them respect the module's limits."""
 
-    Raises:
-        TraceError: unreadable, damaged or truncated gzip or zip data, more than MAX_TEXT_BYTES.
-    """
-
-    def __init__(self, path: StrPath, stream: IO[bytes], packing: str) -> None:
-        """
-        Args:
-            path: the file's name, for error messages.
-            stream: its bytes after decompression.
-            packing: "plain", "gzip" or "zip", for error messages.
-        """
+    def __init__(self, path: StrPath, stream: IO[bytes]) -> None:
+        """Take the file's name, for error messages, and its bytes after decompression."""
         self.path = path
         self._stream = stream
-        self._packing = packing
         self._read_bytes = 0
 
     def read(self, count: int, line: int) -> bytes:
@@ -185,22 +162,15 @@ class TextFile:
         return None
 
     def text(self, most: int = MAX_JSON_BYTES) -> str:
-        """All of it, at most `most` bytes.
-
-        Raises:
-            TraceError: also if it is longer than `most`, or not UTF-8.
-        """
-        content = bytearray()
-        while piece := self._take(_PIECE_BYTES, content.count(b"\n") + 1, whole_line=False):
-            content += piece
-            if len(content) > most:
-                rule = f"more than {most} bytes of JSON: must be at most"
-                raise fault(self.path, rule, line=content.count(b"\n") + 1)
+        """All of it, at most `most` bytes."""
+        content = self._take(most + 1, 1, whole_line=False)
+        if len(content) > most:
+            raise fault(self.path, f"more than {most} bytes of JSON: must be at most")
         try:
             return content.decode("utf-8")
         except UnicodeDecodeError as error:
             line = content.count(b"\n", 0, error.start) + 1
-            value = bytes(content[error.start : error.start + 20])
+            value = content[error.start : error.start + 20]
             raise fault(self.path, "must be UTF-8 text", line=line, value=value) from error
 
     def _raw_lines(self) -> Iterator[tuple[int, bytes]]:
@@ -215,8 +185,12 @@ class TextFile:
             yield number, raw
 
     def _take(self, count: int, line: int, whole_line: bool) -> bytes:
-        with os_errors(self.path, "read", line), damage_errors(self.path, self._packing, line):
+        try:
             data = self._stream.readline(count) if whole_line else self._stream.read(count)
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise fault(self.path, f"gzip data damaged or cut off ({error})", line=line) from error
+        except OSError as error:
+            raise fault(self.path, f"cannot be read: {error.strerror or error}", line=line) from error
         is_start = self._read_bytes == 0
         self._read_bytes += len(data)
         if self._read_bytes > MAX_TEXT_BYTES:
@@ -228,11 +202,7 @@ class TextFile:
 
 
 def parsed_line(path: StrPath, number: int, raw: bytes) -> Line:
-    """A line of bytes as text.
-
-    Raises:
-        TraceError: it is not UTF-8, or longer than MAX_LINE_CHARACTERS.
-    """
+    """A line of bytes as text."""
     try:
         line = Line(path, number, raw.decode("utf-8").strip())
     except UnicodeDecodeError as error:
@@ -244,11 +214,7 @@ def parsed_line(path: StrPath, number: int, raw: bytes) -> Line:
 
 
 def write_text(path: StrPath, *parts: Iterable[str]) -> None:
-    """Write all parts, one after the other, as UTF-8; or no file at all.
-
-    Raises:
-        TraceError: it cannot be written.
-    """
+    """Write all parts, one after the other, as UTF-8; or no file at all."""
     with (
         os_errors(path, "written"),
         replaced(Path(path)) as temporary,
@@ -262,7 +228,8 @@ def _too_long(line: Line) -> TraceError:
     return line.error(line.text, f"must be at most {MAX_LINE_CHARACTERS} characters")
 
 
-def _open(path: StrPath, file: Path) -> io.BufferedReader:
+def _open(path: StrPath) -> io.BufferedReader:
+    file = Path(path)
     if file.is_dir():
         raise fault(path, "is a directory: must be a file")
     if not file.exists():

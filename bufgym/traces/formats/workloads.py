@@ -88,10 +88,6 @@ def write_workload_csv(workload: Workload, path: StrPath) -> None:
 
     The column topic is left out if the only topic has no name, and x if it is unknown. A name with a comma, or with
     blanks at its ends, is refused.
-
-    Raises:
-        BufgymError: such a name.
-        TraceError: the file cannot be written.
     """
     for name in workload.topics:
         if workload.topics != ("",) and (not name or name != name.strip() or "," in name or not name.isprintable()):

@@ -1,4 +1,4 @@
-"""What every generator draws from: uniform doubles of PCG64, and sums of twelve of them for a normal distribution.
+"""What generators share: draws (uniform doubles of PCG64, sums of twelve of them for a normal distribution), checks.
 
 A seed gives the same bytes on every machine: sums are taken in a fixed order, products and square roots are exact to
 the last bit by IEEE 754, and results are rounded to whole bytes. Where a logarithm or a power is needed, its last bit
@@ -7,6 +7,7 @@ may differ between C libraries; the rounding removes the difference.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -19,11 +20,7 @@ NORMAL_UNIFORMS: Final = 12
 
 
 def stream(seed: int) -> np.random.Generator:
-    """The random numbers of a seed.
-
-    Raises:
-        BufgymError: a seed below 0.
-    """
+    """The random numbers of a seed."""
     if seed < 0:
         raise BufgymError(f"seed = {seed}: must be >= 0")
     return np.random.Generator(np.random.PCG64(seed))
@@ -42,3 +39,15 @@ def nearly_normal(uniforms: Float64Array) -> Float64Array:
     for k in range(1, NORMAL_UNIFORMS):
         total += uniforms[:, k]
     return total - 6.0
+
+
+def checked(name: str, value: float, least: float, most: float) -> float:
+    """`value` if it is a number from `least` to `most`."""
+    if not (is_finite(value) and least <= value <= most):
+        raise BufgymError(f"{name} = {value!r}: must be a number from {least:g} to {most:g}")
+    return value
+
+
+def is_finite(value: object) -> bool:
+    """Whether `value` is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

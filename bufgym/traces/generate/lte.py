@@ -1,12 +1,9 @@
 """LTE-like links from a seed, for users without recordings.
 
-Everything is drawn from a seed (numpy's PCG64, uniform doubles only) and rounded to whole bytes, so a seed gives the
-same integers on every machine.
-
-Shape and numbers come from the 30 Belgium 4G logs [vanderhooft2016http2], whose
-rates over 1 s have a coefficient of variation of 0.26-0.82 (median 0.42) and a lag-1 autocorrelation of 0.33-0.91
-(0.61) that is still 0.16-0.73 (0.46) at 10 s. They fall under a quarter of their median in 0.4 % (bus) to 14 % (tram)
-of all samples, mostly for 1-3 s, at worst for 12 s.
+Shape and numbers come from the 30 Belgium 4G logs [vanderhooft2016http2], whose rates over 1 s have a coefficient of
+variation of 0.26-0.82 (median 0.42) and a lag-1 autocorrelation of 0.33-0.91 (0.61) that is still 0.16-0.73 (0.46) at
+10 s. They fall under a quarter of their median in 0.4 % (bus) to 14 % (tram) of all samples, mostly for 1-3 s, at worst
+for 12 s.
 
 Two deviations are deliberate. Rates are higher, because a robot that offers 6.9 MB/s (30 frames of 230 kB a second)
 needs a link that suits it most of the time. Outages are more frequent and longer, because they are what a full send
@@ -82,9 +79,6 @@ def synthetic_lte(
         duration_s: whole seconds, 1 to 10**7.
         mean_bytes_per_s: mean of this very trace, breakdowns included (to half a byte), 1 to 10**10.
         mode: one of `LTE_MODES`; the faster, the more variable.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     if mode not in get_args(LteMode):
         raise BufgymError(f"mode = {mode!r}: must be one of {', '.join(get_args(LteMode))}")

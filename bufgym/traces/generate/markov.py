@@ -31,9 +31,8 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.draws import NORMAL_UNIFORMS, nearly_normal, second_stream, stream
+from bufgym.traces.generate.draws import NORMAL_UNIFORMS, checked, nearly_normal, second_stream, stream
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
-from bufgym.traces.generate.ranges import checked
 from bufgym.traces.trace import US_PER_S, Float64Array, Trace
 
 MAX_LINK_S: Final = 10**6
@@ -59,9 +58,6 @@ def markov_link(
         mean_bytes_per_s: scale this very trace to that mean, 1 to 10**10; by default rates are the recordings', and the
             mean differs from seed to seed as it does between recordings.
         links: by default `fitted_links()`.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     links = fitted_links() if links is None else links
     if mode not in links:

@@ -12,12 +12,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple, get_type_hints
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.formats.faults import StrPath, fault, os_errors
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.logs import read_json
 from bufgym.traces.formats.text import write_text
-from bufgym.traces.generate.ranges import Between, check_ranges, checked, is_finite
+from bufgym.traces.generate.draws import checked, is_finite
 
 LINKS: Final = Path(__file__).with_name("links.json")
 UPLINKS: Final = Path(__file__).with_name("uplinks.json")
@@ -34,16 +35,25 @@ LOW_QUANTILES: Final = 5
 SHOULDER_S: Final = 5
 
 _MAX_RATE: Final = 1e10
-_MAX_FILE_BYTES: Final = 1 << 20
+
+
+class Between(NamedTuple):
+    """The range of a parameter, stated with it: `share: Annotated[float, Between(0, 1)]`."""
+
+    least: float
+    most: float
+
+
+def _check_ranges(parameters: object) -> None:
+    """Check each field of a dataclass that is annotated with a range."""
+    for name, hint in get_type_hints(type(parameters), include_extras=True).items():
+        for limits in getattr(hint, "__metadata__", ()):
+            checked(name, getattr(parameters, name), *limits)
 
 
 @dataclass(frozen=True)
 class OutageParameters:
-    """Outages: runs of seconds below a threshold.
-
-    Raises:
-        BufgymError: a value out of its range.
-    """
+    """Outages: runs of seconds below a threshold."""
 
     spells: Annotated[int, Between(1, 1e9)]
     """Number of outages that the other numbers come from."""
@@ -65,17 +75,13 @@ class OutageParameters:
     """Whether lengths and rates come from all modes of the fit, because there are too few outages."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
+        _check_ranges(self)
         _check_quantiles(self, "low_quantiles_bytes_per_s", LOW_QUANTILES)
 
 
 @dataclass(frozen=True)
 class LinkParameters:
-    """A link in steps of 1 s; `markov.py` says how a trace is drawn from it.
-
-    Raises:
-        BufgymError: a value out of its range.
-    """
+    """A link in steps of 1 s; `markov.py` says how a trace is drawn from it."""
 
     recordings: Annotated[int, Between(1, 1e9)]
     """Number of recordings that it was fitted to."""
@@ -95,7 +101,7 @@ class LinkParameters:
     """None if there were none."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
+        _check_ranges(self)
         checked("level_share", self.level_share, 0, 1 - self.place_share + 1e-9)
         _check_quantiles(self, "quantiles_bytes_per_s", len(PROBABILITIES))
         if not self.quantiles_bytes_per_s[0] > 0:
@@ -112,16 +118,9 @@ def read_links(path: StrPath) -> dict[str, LinkParameters]:
     """Mode -> parameters, from a file that `bufgym trace fit` wrote.
 
     Raises:
-        TraceError: the file cannot be read, is over 1 MiB, or a value breaks its rule.
+        TraceError: the file cannot be read, or a value breaks its rule.
     """
-    with os_errors(path, "read"), open(path, "rb") as file:
-        raw = file.read(_MAX_FILE_BYTES + 1)
-    if len(raw) > _MAX_FILE_BYTES:
-        raise fault(path, f"must be at most {_MAX_FILE_BYTES} bytes")
-    try:
-        content = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise fault(path, f"must be JSON: {error}") from error
+    content = read_json(path)
     modes = content.get("modes") if isinstance(content, dict) else None
     if not isinstance(modes, dict) or not modes:
         raise fault(path, 'must be an object with "modes", as `bufgym trace fit` writes it')

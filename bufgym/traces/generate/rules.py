@@ -1,4 +1,4 @@
-"""Links by rule, without randomness: steady, a linear ramp, a tunnel, regular outages.
+"""Links by rule, without randomness: steady, a linear ramp, a tunnel.
 
 The ramp of Robofleet's Fig. 5 is `ramp(100e6 / 8, 4e6 / 8, 15)`: 100 to 4 Mbit/s in 15 s [sikand2021robofleet].
 """
@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.ranges import checked
+from bufgym.traces.generate.draws import checked
 from bufgym.traces.trace import US_PER_S, After, Trace
 
 # A linear change is cut into steps of this length; each carries the bytes of the line.
@@ -58,9 +58,6 @@ def tunnel(
         bytes_per_s: rate outside the tunnel, 1 to 10**10.
         before_s, fade_s, blackout_s, recover_s, after_s: length of each part, 0 to 10**5 s; the parts with capacity
             must not all be 0.
-
-    Raises:
-        BufgymError: an argument out of its range.
     """
     checked("bytes_per_s", bytes_per_s, 1, 1e10)
     parts = [
@@ -71,36 +68,6 @@ def tunnel(
         (checked("after_s", after_s, 0, _MAX_S), bytes_per_s, bytes_per_s),
     ]
     return _lines(parts, "tunnel", "loop")
-
-
-def outage(
-    period_s: float,
-    length_s: float,
-    bytes_per_s: float,
-    *,
-    repeats: int = 1,
-    outage_bytes_per_s: float = 0.0,
-) -> Trace:
-    """A steady link that breaks down at the end of each period.
-
-    `outage(10, 2, 8e6)` is 8 s at 8 MB/s, then 2 s of nothing, and so on.
-
-    Args:
-        period_s: from the end of one breakdown to the end of the next, s.
-        length_s: length of the breakdown, s, above 0 and below the period.
-        bytes_per_s: rate of the link otherwise.
-        repeats: periods in the trace, >= 1; the trace loops in any case.
-        outage_bytes_per_s: rate during the breakdown.
-
-    Raises:
-        BufgymError: an argument out of its range.
-    """
-    if not 0 < length_s < period_s:
-        raise BufgymError(f"length_s = {length_s}: must be above 0 and below period_s = {period_s}")
-    if repeats < 1:
-        raise BufgymError(f"repeats = {repeats}: must be >= 1")
-    period = [(period_s - length_s, bytes_per_s), (length_s, outage_bytes_per_s)]
-    return Trace.steps(period * repeats, name=f"outage-{length_s:g}s-every-{period_s:g}s")
 
 
 def _lines(parts: Sequence[tuple[float, float, float]], name: str, after: After) -> Trace:

@@ -9,8 +9,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from bufgym.ground.errors import BufgymError
-from bufgym.traces.formats.faults import StrPath, os_errors
+from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.motions import write_motion_csv
 from bufgym.traces.formats.writers import write_csv
 from bufgym.traces.generate.driving import drive_motion
@@ -42,38 +41,14 @@ def shipped_calls() -> dict[str, str]:
     return motions | links
 
 
-def write_shipped(folder: StrPath) -> list[Path]:
-    """Write the shipped traces and motion recordings into `folder`, which is created if need be; their paths.
-
-    Raises:
-        TraceError: the folder or a file cannot be written.
-    """
-    folder = Path(folder)
-    with os_errors(folder, "created"):
-        folder.mkdir(parents=True, exist_ok=True)
-    paths = []
+def write_shipped(folder: StrPath) -> None:
+    """Write the shipped traces and motion recordings into `folder`."""
     for seed, (mode, mean_bytes_per_s) in enumerate(SHIPPED_LTE):
-        paths.append(folder / f"lte-synthetic-{seed}.csv")
-        write_csv(synthetic_lte(seed, SHIPPED_DURATION_S, mean_bytes_per_s, mode), paths[-1])
+        trace = synthetic_lte(seed, SHIPPED_DURATION_S, mean_bytes_per_s, mode)
+        write_csv(trace, Path(folder) / f"lte-synthetic-{seed}.csv")
     for seed in SHIPPED_SEEDS_OF_MOTION:
-        paths.append(folder / f"drive-{seed}.csv")
-        write_motion_csv(drive_motion(seed, SHIPPED_DURATION_S), paths[-1])
-    return paths
-
-
-def main(arguments: list[str]) -> int:
-    """Write the shipped files into the folder that is the one argument; the process's exit status."""
-    if len(arguments) != 1 or arguments[0].startswith("-"):
-        print("usage: python -m bufgym.traces.generate.shipped FOLDER", file=sys.stderr)
-        return 2
-    try:
-        for path in write_shipped(arguments[0]):
-            print(path)
-    except BufgymError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+        write_motion_csv(drive_motion(seed, SHIPPED_DURATION_S), Path(folder) / f"drive-{seed}.csv")
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    write_shipped(*sys.argv[1:])
