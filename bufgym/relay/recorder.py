@@ -8,7 +8,6 @@ from typing import Any, BinaryIO, Final
 
 from bufgym.relay import wire
 from bufgym.relay.config import Config, Rotation
-from bufgym.relay.extra import needs
 from bufgym.relay.rules import RECORDER, Permissions
 
 FOLDER: Final = "recordings"
@@ -63,8 +62,8 @@ class Recorder:
 
     def _begin(self) -> None:
         """Begin the next file and delete the oldest."""
-        with needs("mcap"):
-            from mcap.writer import Writer
+        from mcap.writer import Writer
+
         files = sorted(self.folder.glob("*.mcap"))
         for path in files[: max(0, len(files) + 1 - self._rotation.files)]:
             path.unlink()

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay.extra import needs
 
 MOST_BYTES: Final = 4 * 2**20
 """Limit on the payloads of a piece."""
@@ -120,9 +119,9 @@ class _Recording:
                     yield channel, seq, logged_ns // 1000, content[_MESSAGE.size :]
 
     def _declare(self, kind: int, content: bytes) -> None:
-        with needs("mcap"):
-            from mcap import records
-            from mcap.data_stream import ReadDataStream
+        from mcap import records
+        from mcap.data_stream import ReadDataStream
+
         stream = ReadDataStream(io.BytesIO(content))
         if kind == _SCHEMA:
             schema = records.Schema.read(stream)

@@ -21,9 +21,8 @@ from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies, wire
-from bufgym.relay.config import DEFAULT_CAPACITY
+from bufgym.relay.config import DEFAULT_CAPACITY, SKIP_PENDING
 from bufgym.relay.connection import Connection
-from bufgym.relay.extra import needs
 from bufgym.relay.hub import ROBOFLEET, Frame
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import Permissions
@@ -50,9 +49,8 @@ def read(data: bytes) -> Flat:
 
     Raises WireError: it is not one of Robofleet's messages.
     """
-    with needs("flatbuffers"):
-        from flatbuffers.number_types import Uint8Flags, UOffsetTFlags
-        from flatbuffers.table import Table
+    from flatbuffers.number_types import Uint8Flags, UOffsetTFlags
+    from flatbuffers.table import Table
 
     def text(table: Any, field: int) -> str:
         offset = table.Offset(_FIRST + 2 * field)
@@ -132,7 +130,7 @@ class RobofleetConnection(Connection):
             return
         try:
             chosen = pattern(flat.pattern)
-            warmed = await asyncio.to_thread(policies.warm, policies.SKIP_PENDING)
+            warmed = await asyncio.to_thread(policies.warm, SKIP_PENDING)
             if flat.pattern not in self.subscriptions:
                 self._quota.subscribe()
         except BufgymError as error:

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import config
-from bufgym.relay.quota import RefusedError
+from bufgym.relay.config import StoreLimits
 from bufgym.relay.rules import Identity
+from bufgym.relay.wire import RefusedError
 
 FILE: Final = "held.sqlite"
 _SCHEMA: Final = """
@@ -36,8 +36,8 @@ CREATE TABLE IF NOT EXISTS delivery (
 
 
 @dataclass(eq=False)
-class Session:
-    """One client over all its connections."""
+class Mailbox:
+    """A client's session as the relay keeps it, over all its connections."""
 
     name: str
     identity: Identity
@@ -65,7 +65,7 @@ class Session:
 class Settled(NamedTuple):
     """A message that no receiver waits for any more."""
 
-    sender: Session
+    sender: Mailbox
     seq: int
     receivers: int
     lost: int
@@ -75,7 +75,7 @@ class Settled(NamedTuple):
 class Store:
     """Sessions and the messages held for them; without a folder they are in memory only."""
 
-    def __init__(self, folder: Path | None, limits: config.Store, sessions: int = 64) -> None:
+    def __init__(self, folder: Path | None, limits: StoreLimits, sessions: int = 64) -> None:
         self.limits = limits
         self._most_sessions = sessions
         path = ":memory:" if folder is None else str(folder / FILE)
@@ -87,8 +87,8 @@ class Store:
             self._db.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
-        self.sessions: dict[tuple[str, str], Session] = {}
-        self._by_id: dict[int, Session] = {}
+        self.sessions: dict[tuple[str, str], Mailbox] = {}
+        self._by_id: dict[int, Mailbox] = {}
         self._load()
 
     def _load(self) -> None:
@@ -96,7 +96,7 @@ class Store:
         for id, name, address, email, temporary, received, numbered, seen_s in self._db.execute(
             f"SELECT {columns} FROM session"
         ).fetchall():
-            session = Session(name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s)
+            session = Mailbox(name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s)
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
             (session.held,) = self._db.execute("SELECT count(*) FROM delivery WHERE session = ?", (id,)).fetchone()
             self.sessions[session.key] = self._by_id[id] = session
@@ -107,7 +107,7 @@ class Store:
 
     # --- sessions -----------------------------------------------------------------------------------------------------
 
-    def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Session:
+    def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Mailbox:
         """Open the session of this name; a new session begins at the client's numbers.
 
         Raises RefusedError: the identity has too many sessions.
@@ -116,7 +116,7 @@ class Store:
         if session is None:
             if sum(key == identity.key for key, _ in self.sessions) >= self._most_sessions:
                 raise RefusedError("too_many", f"must be at most {self._most_sessions} sessions")
-            session = Session(name, identity, temporary, acked, received)
+            session = Mailbox(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
         session.identity, session.seen_s = identity, time.time()
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
@@ -125,7 +125,7 @@ class Store:
                 self._save(session)
         return session
 
-    def left(self, session: Session) -> list[Settled]:
+    def left(self, session: Mailbox) -> list[Settled]:
         """Note the end of a session's connection; forget messages that nobody will ask for."""
         session.seen_s = time.time()
         if session.temporary or session.id is None:
@@ -134,7 +134,7 @@ class Store:
             self._save(session)
         return []
 
-    def forget(self, session: Session) -> list[Settled]:
+    def forget(self, session: Mailbox) -> list[Settled]:
         """Forget a session; messages held for it are lost."""
         self.sessions.pop(session.key, None)
         if session.id is None:
@@ -146,7 +146,7 @@ class Store:
         self._by_id.pop(session.id, None)
         return settled
 
-    def want(self, session: Session, id: str, pattern: str | None) -> None:
+    def want(self, session: Mailbox, id: str, pattern: str | None) -> None:
         """Hold matching messages while the session is away; the pattern None ends that."""
         if pattern is None and session.durable.pop(id, None) is None:
             return
@@ -160,7 +160,7 @@ class Store:
 
     # --- messages -----------------------------------------------------------------------------------------------------
 
-    def hold(self, sender: Session, seq: int, topic: str, frame: bytes, receivers: Sequence[Session]) -> None:
+    def hold(self, sender: Mailbox, seq: int, topic: str, frame: bytes, receivers: Sequence[Mailbox]) -> None:
         """Store the sender's message number ``seq`` on disk for these receivers.
 
         Without receivers, whom other relays have, the number alone is taken.
@@ -197,7 +197,7 @@ class Store:
             receiver.numbered += 1
             receiver.held += 1
 
-    def waiting(self, session: Session, after: int, most: int) -> list[tuple[int, str, bytes]]:
+    def waiting(self, session: Mailbox, after: int, most: int) -> list[tuple[int, str, bytes]]:
         """List number, topic and frame of the session's next messages."""
         if session.id is None:
             return []
@@ -207,19 +207,19 @@ class Store:
         )
         return self._db.execute(query, (session.id, after, most)).fetchall()
 
-    def acked(self, session: Session, number: int) -> list[Settled]:
+    def acked(self, session: Mailbox, number: int) -> list[Settled]:
         """Note that the session has processed all messages up to this number; return the settled ones."""
         if session.id is None or session.held == 0:
             return []
         with self._transaction():
             return self._settle(session, 0, number, lost=0)
 
-    def denied(self, session: Session, number: int) -> list[Settled]:
+    def denied(self, session: Mailbox, number: int) -> list[Settled]:
         """Drop a message that no rule lets the session have any more; return the settled ones."""
         with self._transaction():
             return self._settle(session, number, number, lost=1)
 
-    def expired(self, connected: Sequence[Session]) -> list[Session]:
+    def expired(self, connected: Sequence[Mailbox]) -> list[Mailbox]:
         """List the sessions that have been away for too long."""
         before_s = time.time() - self.limits.keep_s
         here = set(map(id, connected))
@@ -241,7 +241,7 @@ class Store:
             raise
         self._db.execute("COMMIT")
 
-    def _settle(self, session: Session, first: int, last: int, lost: int) -> list[Settled]:
+    def _settle(self, session: Mailbox, first: int, last: int, lost: int) -> list[Settled]:
         settled = []
         chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
         rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
@@ -260,7 +260,7 @@ class Store:
                     settled.append(Settled(self._by_id[sender], seq, receivers, gone))
         return settled
 
-    def _remember(self, session: Session) -> None:
+    def _remember(self, session: Mailbox) -> None:
         """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
             cursor = self._db.execute(
@@ -280,7 +280,7 @@ class Store:
             session.id = cursor.lastrowid
             self._by_id[session.id] = session
 
-    def _save(self, session: Session) -> None:
+    def _save(self, session: Mailbox) -> None:
         self._db.execute(
             "UPDATE session SET address = ?, email = ?, received = ?, numbered = ?, seen_s = ? WHERE id = ?",
             (

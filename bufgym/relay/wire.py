@@ -39,6 +39,14 @@ class WireError(BufgymError):
     """What came is no frame of this protocol."""
 
 
+class RefusedError(BufgymError):
+    """A request that the relay refuses; ``code`` gives the reason in a word."""
+
+    def __init__(self, code: str, why: str) -> None:
+        super().__init__(why)
+        self.code = code
+
+
 class Message(NamedTuple):
     """One message of a topic."""
 
