@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 PORT = 7410
 """Default port of a receiver."""
-TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt", "dds")
+TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt")
 VALIDATED = (*TRANSPORTS[:3], "ros1", "ros2")
 """Transports that can go through a shaped link."""
 DEFAULT_POLICIES = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")

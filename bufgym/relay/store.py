@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay.config import StoreLimits
@@ -33,6 +33,7 @@ CREATE TABLE IF NOT EXISTS message (
 CREATE TABLE IF NOT EXISTS delivery (
     session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
 """
+_COLUMNS: Final = "name, address, email, temporary, received, numbered, seen_s"
 
 
 @dataclass(eq=False)
@@ -55,6 +56,12 @@ class Mailbox:
     """Time of its last connection, s since 1970."""
     id: int | None = None
     """Id in the store; None while there is nothing to remember."""
+
+    @property
+    def columns(self) -> tuple[Any, ...]:
+        """The session as a row of the store."""
+        who = self.identity
+        return self.name, who.address, who.email, self.temporary, self.received, self.numbered, self.seen_s
 
     @property
     def key(self) -> tuple[str, str]:
@@ -92,10 +99,8 @@ class Store:
         self._load()
 
     def _load(self) -> None:
-        columns = "id, name, address, email, temporary, received, numbered, seen_s"
-        for id, name, address, email, temporary, received, numbered, seen_s in self._db.execute(
-            f"SELECT {columns} FROM session"
-        ).fetchall():
+        for row in self._db.execute(f"SELECT id, {_COLUMNS} FROM session").fetchall():
+            id, name, address, email, temporary, received, numbered, seen_s = row
             session = Mailbox(name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s)
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
             (session.held,) = self._db.execute("SELECT count(*) FROM delivery WHERE session = ?", (id,)).fetchone()
@@ -141,8 +146,8 @@ class Store:
             return []
         with self._transaction():
             settled = self._settle(session, 0, 2**62, lost=1)
-            for table, column in (("session", "id"), ("durable", "session")):
-                self._db.execute(f"DELETE FROM {table} WHERE {column} = ?", (session.id,))
+            self._db.execute("DELETE FROM session WHERE id = ?", (session.id,))
+            self._db.execute("DELETE FROM durable WHERE session = ?", (session.id,))
         self._by_id.pop(session.id, None)
         return settled
 
@@ -176,14 +181,10 @@ class Store:
             for session in (sender, *receivers):
                 self._remember(session)
             with self._transaction():
-                message = (
-                    receivers
-                    and self._db.execute(
-                        "INSERT INTO message (sender, seq, topic, frame, receivers, waiting, lost) "
-                        "VALUES (?, ?, ?, ?, ?, ?, 0)",
-                        (sender.id, seq, topic, frame, len(receivers), len(receivers)),
-                    ).lastrowid
-                )
+                if receivers:
+                    row = sender.id, seq, topic, frame, len(receivers), len(receivers)
+                    columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
+                    message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
                 for receiver in receivers:
                     number = receiver.numbered + 1
                     self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
@@ -263,32 +264,11 @@ class Store:
     def _remember(self, session: Mailbox) -> None:
         """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
-            cursor = self._db.execute(
-                "INSERT INTO session (name, address, email, temporary, received, numbered, seen_s) "
-                "VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (
-                    session.name,
-                    session.identity.address,
-                    session.identity.email,
-                    session.temporary,
-                    session.received,
-                    session.numbered,
-                    session.seen_s,
-                ),
-            )
-            assert cursor.lastrowid is not None
-            session.id = cursor.lastrowid
+            insert = f"INSERT INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+            session.id = self._db.execute(insert, session.columns).lastrowid
+            assert session.id is not None
             self._by_id[session.id] = session
 
     def _save(self, session: Mailbox) -> None:
-        self._db.execute(
-            "UPDATE session SET address = ?, email = ?, received = ?, numbered = ?, seen_s = ? WHERE id = ?",
-            (
-                session.identity.address,
-                session.identity.email,
-                session.received,
-                session.numbered,
-                session.seen_s,
-                session.id,
-            ),
-        )
+        places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
+        self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser_cases import embedded
-from live_cases import OVER_TCP, in_order, meeting_port
+from live_cases import in_order, meeting_port
 from loop_cases import compiled
 
 from bufgym import policies
@@ -18,6 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.robot import PolicyQueue, replay, shaped
+from bufgym.robot.channels import TRANSPORTS
 from bufgym.robot.log import Record
 from bufgym.robot.runs import Run, orders, save, table
 from bufgym.robot.shaped import ShapedLink
@@ -40,7 +41,7 @@ async def live(episode: Episode, policy: str = "afr", capacity: int = 8, **setti
     return await play(policies.get(policy), episode, capacity, V, **{"speed": 2.0, **settings})
 
 
-@pytest.mark.parametrize("transport", OVER_TCP)
+@pytest.mark.parametrize("transport", TRANSPORTS)
 async def test_the_log_tells_what_came(transport: str, request: pytest.FixtureRequest) -> None:
     """And the simulator makes the same of it. Half a second at four times the speed, three messages on their way."""
     slow, records = fade(15, size_bytes=20_000), list[Record]()
@@ -123,7 +124,7 @@ def test_live_as_in_the_simulator() -> None:
     """Wide margins: on a quiet machine counts agree within 1 and QoI within 0.5 %."""
     scenario = Uplink(traces=(fade().link.trace,), duration_s=5.0, random_offset=False, propagation_us=0, value=V)
     chosen = [policies.get(name) for name in ("drop-oldest", "random")]
-    plays = {transport: over(transport) for transport in OVER_TCP if transport != "mqtt"}  # which wants a broker's port
+    plays = {transport: over(transport) for transport in TRANSPORTS if transport != "mqtt"}  # it wants a broker
     runs = validate(chosen, scenario, 4, speed=2.0, plays=plays)
     assert [one.policy for one in runs] == ["drop-oldest"] * len(plays) + ["random"] * len(plays)
     for one in runs:
