@@ -77,9 +77,9 @@ def _robot(options: argparse.Namespace) -> None:
 
 def _source(options: argparse.Namespace, streams: Any) -> Any:
     if options.bag is not None:
-        from bufgym.relay.bag import Recorded
+        from bufgym.relay.bag import BagSource
 
-        return Recorded(options.bag, streams)
+        return BagSource(options.bag, streams)
     if options.ros is not None:
         if streams is None:
             raise BufgymError("--ros needs --config: which topics, and the rules for each")

@@ -14,7 +14,7 @@ with needs("msgspec", "relay", "bufgym.relay"):  # the other libraries of the ex
     import msgspec  # noqa: F401
 
 if TYPE_CHECKING:
-    from bufgym.relay.bag import Recorded
+    from bufgym.relay.bag import BagSource
     from bufgym.relay.client import Client
     from bufgym.relay.config import Config, Foxglove, Limits, Nats, Rotation, Rule, StoreLimits, Tls, Tokens, load
     from bufgym.relay.policies import compiled
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from bufgym.relay.wire import Message, RefusedError
 
 __all__ = [
+    "BagSource",
     "Client",
     "Config",
     "Foxglove",
     "Limits",
     "Message",
     "Nats",
-    "Recorded",
     "RefusedError",
     "Robot",
     "Rotation",
@@ -56,6 +56,6 @@ __getattr__ = on_demand(
     **dict.fromkeys(("Session", "security", "token"), "session"),
     **dict.fromkeys(("Message", "RefusedError"), "wire"),
     Client="client",
-    Recorded="bag",
+    BagSource="bag",
     compiled="policies",
 )

@@ -18,7 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.relay import policies, replay, wire
 from bufgym.relay.config import DEFAULT_CAPACITY
-from bufgym.relay.hub import MAX_JSON_BYTES, OWN, Frame, Hub
+from bufgym.relay.hub import MAX_JSON_BYTES, OWN, Hub, Outgoing
 from bufgym.relay.identity import Verifier, certificate_email
 from bufgym.relay.outbox import Outbox
 from bufgym.relay.patterns import pattern
@@ -300,7 +300,7 @@ class Connection:
         """Messages that have gone to it."""
         return self._outbox.sent
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """A message that its queues decide on."""
         subscription.offer(frame.message.topic, frame, frame.size_bytes)
         self._outbox.wake()

@@ -32,7 +32,7 @@ MAX_JSON_BYTES: Final = 2**20
 """Size limit of a text frame and of a JSON payload, which take time to read."""
 
 
-class Frame:
+class Outgoing:
     """An outgoing message; each of its forms is made once for all receivers."""
 
     def __init__(self, message: wire.Message) -> None:
@@ -70,7 +70,7 @@ class Member(Protocol):
     def sent(self) -> int:
         """Number of messages sent to it."""
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message to its queues."""
 
     def wake(self) -> None:
@@ -164,7 +164,7 @@ class Hub:
         self.received += 1
         for each in self.own:
             each(message)
-        frame = Frame(message)
+        frame = Outgoing(message)
         for member, subscription in self._route(message.topic):
             if member is not sender:
                 member.offer(subscription, frame)
@@ -205,7 +205,7 @@ class Hub:
                 self.members[session].wake()
         for member, subscription in self._route(message.topic):
             if member is not sender and not member.acks:
-                member.offer(subscription, Frame(message))
+                member.offer(subscription, Outgoing(message))
 
     def _holders(self, sender: Member, topic: str) -> list[Mailbox]:
         """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""

@@ -17,7 +17,7 @@ from typing import Any, Final
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies, wire
 from bufgym.relay.config import DEFAULT_CAPACITY, Nats
-from bufgym.relay.hub import OWN, Frame, Hub
+from bufgym.relay.hub import OWN, Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import NATS, Permissions
 from bufgym.relay.store import Mailbox
@@ -113,7 +113,7 @@ class Peers:
 
     # --- ordinary messages --------------------------------------------------------------------------------------------
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message of this relay."""
         if not frame.message.no_drop and self._goes("receive", frame.message.topic):
             subscription.offer(frame.message.topic, frame, frame.size_bytes)

@@ -23,7 +23,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies, wire
 from bufgym.relay.config import DEFAULT_CAPACITY, SKIP_PENDING
 from bufgym.relay.connection import Connection
-from bufgym.relay.hub import ROBOFLEET, Frame
+from bufgym.relay.hub import ROBOFLEET, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import Permissions
 from bufgym.relay.subscriber import Subscription
@@ -139,7 +139,7 @@ class RobofleetConnection(Connection):
         left_bytes = self._socket.transport.get_write_buffer_size
         self._hub.subscribe(self, Subscription(flat.pattern, chosen, warmed, DEFAULT_CAPACITY, left_bytes=left_bytes))
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message if it is a flatbuffer, the only encoding that the client reads."""
         if frame.message.encoding == ROBOFLEET:
             super().offer(subscription, frame)

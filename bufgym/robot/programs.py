@@ -35,10 +35,10 @@ START_S: Final = 0.3
 _POLL_S: Final = 0.02
 
 
-class Program:
+class Worker:
     """A process that runs ``work`` with one end of a pipe to this process."""
 
-    def __init__(self, name: str, work: Callable[[Connection], None], begun: list[Program]) -> None:
+    def __init__(self, name: str, work: Callable[[Connection], None], begun: list[Worker]) -> None:
         """``begun`` lists all programs of a run."""
         self._name, self._begun = name, begun
         self._words, words = Pipe()
@@ -102,14 +102,14 @@ def _run(work: Callable[[Connection], None], words: Connection, failures: Connec
 
 
 @contextmanager
-def running(**works: Callable[[Connection], None]) -> Iterator[list[Program]]:
+def running(**works: Callable[[Connection], None]) -> Iterator[list[Worker]]:
     """Run programs by name while the block runs."""
     if not hasattr(os, "fork"):
         raise BufgymError("episodes on ROS need a system whose processes fork, such as Linux")
-    begun: list[Program] = []
+    begun: list[Worker] = []
     try:
         for name, work in works.items():
-            begun.append(Program(name, work, begun))
+            begun.append(Worker(name, work, begun))
         yield begun
     finally:
         for one in begun:

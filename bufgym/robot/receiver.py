@@ -46,7 +46,7 @@ class Received(NamedTuple):
     """Time of receipt by this system's clock."""
 
 
-class _Stream:
+class _Talk:
     """State of one sender's stream."""
 
     def __init__(self, expected: int) -> None:
@@ -71,7 +71,7 @@ class Receiver:
         """Why connections ended, the last 100."""
         self._on_message = on_message
         self._max_body_bytes = max_body_bytes
-        self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
+        self._streams: OrderedDict[bytes, _Talk] = OrderedDict()
         self._tasks = Tasks()
         self._listener: socket.socket | None = None
         self._server: Any = None
@@ -134,7 +134,7 @@ class Receiver:
         if greeting.kind != GREETING:
             raise FrameError(f"frame of kind {greeting.kind}: must be a greeting first")
         name = bytes(greeting.body)
-        stream = self._streams.setdefault(name, _Stream(greeting.number))
+        stream = self._streams.setdefault(name, _Talk(greeting.number))
         self._streams.move_to_end(name)
         if stream.task is not None:
             stream.task.cancel()  # the sender has given that connection up

@@ -19,7 +19,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.relay import robot, ros_messages, wire
-from bufgym.relay.bag import Recorded
+from bufgym.relay.bag import BagSource
 from bufgym.relay.monitor import Monitor
 from bufgym.relay.robot import Robot
 from bufgym.relay.session import Session
@@ -176,7 +176,7 @@ async def test_a_recording_is_a_robot(corner: Corner, tmp_path: Path) -> None:
     async def story(viewer: Session, came: Came) -> None:
         await until(lambda: len(came["scan"]) >= 12 and came["status"] and came["notes"])
 
-    source = Recorded(recording(tmp_path / "drive.mcap"))
+    source = BagSource(recording(tmp_path / "drive.mcap"))
     assert [(stream.topic.name, stream.rate_hz) for stream in source.streams] == [("notes", 5.0), ("scan", 10.0)]
     came = await watched(corner, source, story, policy="drop-oldest")
     ranges = [ros_messages.read(bytes(one.payload), one.type).ranges[0] for one in came["scan"]]
@@ -190,9 +190,9 @@ def test_what_a_recording_lacks(tmp_path: Path) -> None:
     path = recording(tmp_path / "drive.mcap")
     camera = [stream for stream in MadeUp().streams if stream.topic.name == "camera"]
     with pytest.raises(BufgymError, match=r"no messages of topic '/camera'; it has: /notes, /scan"):
-        Recorded(path, camera)
+        BagSource(path, camera)
     with pytest.raises(BufgymError, match="no such file"):
-        Recorded(tmp_path / "none.mcap")
+        BagSource(tmp_path / "none.mcap")
     with pytest.raises(BufgymError, match="robot 'a/b': a name must be a text without '/'"):
         Robot("ws://a:1", "a/b", MadeUp())
 

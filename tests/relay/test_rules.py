@@ -14,7 +14,7 @@ from relay_cases import settings
 
 from bufgym.relay import policies
 from bufgym.relay.config import Rule
-from bufgym.relay.hub import Frame, Hub
+from bufgym.relay.hub import Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
 from bufgym.relay.store import Mailbox
@@ -94,7 +94,7 @@ class Ear:
         self.subscriptions = {"a": Subscription("a", pattern(".*"), policies.policy("drop-oldest"), 1)}
         self.came: set[str] = set()
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         self.came.add(frame.message.topic)
 
 

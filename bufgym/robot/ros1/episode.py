@@ -59,7 +59,7 @@ def play(
         return asyncio.run(_play(begun, episode))
 
 
-async def _play(begun: Sequence[programs.Program], episode: Episode) -> list[Received]:
+async def _play(begun: Sequence[programs.Worker], episode: Episode) -> list[Received]:
     viewer, camera = begun
     camera.tell(await viewer.told())  # where the master is
     link = ShapedLink(episode.link, await viewer.told(), back=True)

@@ -72,7 +72,7 @@ def play(
         return asyncio.run(_play(begun, episode))
 
 
-async def _play(begun: Sequence[programs.Program], episode: Episode) -> list[Received]:
+async def _play(begun: Sequence[programs.Worker], episode: Episode) -> list[Received]:
     receiving, sending, viewer, camera = begun
     link = ShapedLink(episode.link, ("127.0.0.1", await receiving.told()))
     try:
