@@ -18,9 +18,9 @@ from typing import Any
 from tqdm import tqdm
 
 from agents.settings import Settings
-from bufgym.benchmark.cluster import end_with
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked, replaced
+from bufgym.ground.processes import end_with
 
 RUNS = Path("runs")
 MODEL = "model.safetensors"

@@ -211,7 +211,7 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 """What a page says of its program."""
 
 ELSEWHERE = {
-    "docs/guide/on-a-robot.md": "tests/live/test_ros1.py, test_ros2.py",
+    "docs/guide/on-a-robot.md": "tests/robot/test_ros1.py, test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
     "docs/guide/yours-to-change.md": "below",
     "docs/fleet.md": "it trains for minutes; what it imports is looked at above",

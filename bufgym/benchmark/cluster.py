@@ -6,36 +6,15 @@ import functools
 import importlib
 import itertools
 import os
-import threading
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.processes import end_with
 
 BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
-
-
-PATIENCE_S = 1.0
-"""Time between a worker's checks that its parent process is alive."""
-
-
-@functools.cache
-def end_with(parent: int) -> None:
-    """End this process soon after ``parent``, the process number of its parent, has ended.
-
-    A killed parent leaves its workers running, and they would hold its pipes and files for ever. The parent may be gone
-    already when a worker calls this.
-    """
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
-
-
-def _watch(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(PATIENCE_S)
-    os._exit(1)
 
 
 class WorkerDiedError(BufgymError):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 PORT = 7410
 """Default port of a receiver."""
-TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt", "dds")
+TRANSPORTS = ("tcp", "websocket", "zenoh", "mqtt")
 VALIDATED = (*TRANSPORTS[:3], "ros1", "ros2")
 """Transports that can go through a shaped link."""
 DEFAULT_POLICIES = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
@@ -60,7 +60,7 @@ def add(commands: Commands) -> None:
     validate.add_argument("--scale", type=positive, default=1.0, metavar="X", help="the traces' capacity times X")
     validate.add_argument("--transport", choices=VALIDATED, nargs="+", default=["tcp"], help="one or more (tcp)")
     validate.add_argument("--speed", type=positive, default=1.0, metavar="X", help="time runs X times as fast")
-    validate.add_argument("--out", metavar="DIR", help="write there a page with pictures, and every run (JSON)")
+    validate.add_argument("--out", metavar="DIR", help="write every run there (JSON)")
 
     view = command(parts, "view", _view, "what a queue does, from its log: queue, drops, rates, QoI")
     view.add_argument("log", metavar="LOG.mcap", help="log of send --log, even a growing one")
@@ -160,9 +160,7 @@ def _validate(options: argparse.Namespace) -> None:
     )
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if options.out is not None:
-        from bufgym.robot import report as page
-
-        print(f"\nwrote {page.write(save(runs, about, _command(options), Path(options.out)))}")
+        print(f"\nwrote {save(runs, about, _command(options), Path(options.out))}")
 
 
 def _play_over(transport: str) -> Play:

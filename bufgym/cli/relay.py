@@ -1,4 +1,4 @@
-"""``bufgym relay``: a fleet's server, its robots, a demonstration."""
+"""``bufgym relay``: a fleet's server, and its robots."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _add_server(parts: Any) -> None:
 
 def _serve(options: argparse.Namespace) -> None:
     from bufgym.relay import config
-    from bufgym.relay.extra import needs
+    from bufgym.robot.extra import needs
 
     settings = config.load(options.config)
     with needs("websockets"):

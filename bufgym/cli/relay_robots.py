@@ -1,10 +1,9 @@
-"""``bufgym relay robot`` and ``bufgym relay demo``: robots for a relay, real, recorded and made up."""
+"""``bufgym relay robot`` and ``bufgym relay foxglove``: robots and a viewer for a relay."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 from bufgym.cli.live import run_async
@@ -15,7 +14,7 @@ CAPACITY = 32
 
 
 def add(parts: Commands) -> None:
-    robot = command(parts, "robot", _robot, "a robot: recorded, of ROS, or made up; Ctrl-C ends it")
+    robot = command(parts, "robot", _robot, "a robot, recorded or of ROS; Ctrl-C ends it")
     _add_session(robot)
     robot.add_argument("--name", default="robot-1", help="(%(default)s)")
     robot.add_argument("--config", metavar="FILE.toml", help="its topics, as in examples/client.toml")
@@ -26,18 +25,9 @@ def add(parts: Commands) -> None:
     robot.add_argument(
         "--receive", nargs="+", default=[], metavar="TOPIC", help="with --ros: published here if it comes"
     )
-    robot.add_argument("--number", type=natural, default=0, metavar="N", help="which made-up robot (%(default)s)")
     robot.add_argument("--policies", metavar="NAME", help="the policy, as in bench (robofleet)")
     policy_file(robot)
     robot.add_argument("--capacity", type=count, default=CAPACITY, metavar="L", help="L, messages (%(default)s)")
-
-    demo = command(parts, "demo", _demo, "a relay, made-up robots over fading links, and the page; Ctrl-C ends it")
-    demo.add_argument("--robots", type=count, default=3, metavar="N", help="(%(default)s)")
-    demo.add_argument("--port", type=natural, default=7420, help="of the relay (%(default)s)")
-    demo.add_argument("--policies", metavar="NAME", help="of the robots, as in bench (robofleet)")
-    demo.add_argument("--folder", metavar="DIR", help="record there")
-    demo.add_argument("--foxglove", type=natural, metavar="PORT", help="show them in Foxglove and Lichtblick too")
-    demo.add_argument("--no-browser", action="store_true", help="do not open the page")
 
     foxglove = command(parts, "foxglove", _foxglove, "a viewer that Foxglove and Lichtblick connect to; Ctrl-C ends it")
     _add_session(foxglove)
@@ -87,59 +77,16 @@ def _robot(options: argparse.Namespace) -> None:
 
 def _source(options: argparse.Namespace, streams: Any) -> Any:
     if options.bag is not None:
-        from bufgym.relay.bag import Recorded
+        from bufgym.relay.bag import BagSource
 
-        return Recorded(options.bag, streams)
+        return BagSource(options.bag, streams)
     if options.ros is not None:
         if streams is None:
             raise BufgymError("--ros needs --config: which topics, and the rules for each")
         from bufgym.relay import ros
 
         return ros.SOURCES[options.ros](streams, options.odom, options.receive)
-    from bufgym.relay.madeup import MadeUp
-
-    return MadeUp(options.number, streams)
-
-
-def _demo(options: argparse.Namespace) -> None:
-    import asyncio
-    import webbrowser
-
-    from bufgym.policies import registry
-    from bufgym.relay import demo, policies
-
-    (policy,) = loaded([options.policies or "robofleet"])[0]
-
-    async def show() -> None:
-        shown, chosen = options.no_browser, registry.get(policy)
-        if options.port and not await asyncio.to_thread(policies.kept, chosen):
-            # The uncompiled demo shows at once; compiled robots take over later.
-            async with demo.uncompiled(_words(options)):
-                await asyncio.to_thread(policies.compiled, chosen)
-            shown = True
-            _say("compiled: the robots begin anew")
-        folder = None if options.folder is None else Path(options.folder)
-        async with (
-            demo.running(options.robots, options.port, policy=policy, folder=folder, say=_say) as port,
-            asyncio.TaskGroup() as tasks,
-        ):
-            page = f"http://127.0.0.1:{port}/"
-            print(f"{page}: {options.robots} robots; Ctrl-C ends it", flush=True)
-            if options.foxglove is not None:
-                tasks.create_task(_bridge(f"ws://127.0.0.1:{port}", "foxglove", options.foxglove).run())
-            if not shown:
-                webbrowser.open(page)
-            await asyncio.Event().wait()
-
-    run_async(show())
-
-
-def _words(options: argparse.Namespace) -> list[str]:
-    """List the arguments of the interim demonstration, which records nothing and ends when this one begins."""
-    words = ["--robots", str(options.robots), "--port", str(options.port)]
-    words += [] if options.policies is None else ["--policies", options.policies]
-    words += [] if options.foxglove is None else ["--foxglove", str(options.foxglove)]
-    return [*words, "--no-browser"] if options.no_browser else words
+    raise BufgymError("needs --bag or --ros; examples/made_up_robot.py is a robot without either")
 
 
 def _foxglove(options: argparse.Namespace) -> None:

@@ -39,7 +39,7 @@ def _send(options: argparse.Namespace) -> None:
     import contextlib
 
     from bufgym.robot import LogFile
-    from bufgym.robot.ros2.relay import Robot
+    from bufgym.robot.ros2.relay import RosSender
     from bufgym.scenario import read_client
 
     client = read_client(options.config)
@@ -49,7 +49,7 @@ def _send(options: argparse.Namespace) -> None:
     host, port = address(options.to)
     with contextlib.ExitStack() as stack:
         log = None if options.log is None else stack.enter_context(LogFile(options.log))
-        robot = Robot(
+        robot = RosSender(
             client,
             host,
             port,

@@ -1,6 +1,61 @@
 """A relay for fleets: robots and viewers connect to it, and publish and subscribe by topic as its rules allow.
 
 Robofleet [sikand2021robofleet] is a client on each robot, one server and a web page. This package is the server, built
-on bufgym's queues. ``server.Server`` serves what ``config.Config`` allows, and ``wire`` defines the protocol on its
-WebSockets.
+on bufgym's queues. ``Server`` serves what a ``Config`` allows. ``Client``, ``Session`` and ``Robot`` connect to it, and
+``wire`` defines the protocol on its WebSockets.
 """
+
+from typing import TYPE_CHECKING
+
+from bufgym.ground.modules import on_demand
+from bufgym.robot.extra import needs
+
+with needs("msgspec", "relay", "bufgym.relay"):  # the other libraries of the extra come with it
+    import msgspec  # noqa: F401
+
+if TYPE_CHECKING:
+    from bufgym.relay.bag import BagSource
+    from bufgym.relay.client import Client
+    from bufgym.relay.config import Config, Foxglove, Limits, Nats, Rotation, Rule, StoreLimits, Tls, Tokens, load
+    from bufgym.relay.policies import compiled
+    from bufgym.relay.robot import Robot, Source
+    from bufgym.relay.server import Server, serve_forever
+    from bufgym.relay.session import Session, security, token
+    from bufgym.relay.wire import Message, RefusedError
+
+__all__ = [
+    "BagSource",
+    "Client",
+    "Config",
+    "Foxglove",
+    "Limits",
+    "Message",
+    "Nats",
+    "RefusedError",
+    "Robot",
+    "Rotation",
+    "Rule",
+    "Server",
+    "Session",
+    "Source",
+    "StoreLimits",
+    "Tls",
+    "Tokens",
+    "compiled",
+    "load",
+    "security",
+    "serve_forever",
+    "token",
+]
+__getattr__ = on_demand(
+    __name__,
+    **dict.fromkeys(("Config", "Foxglove", "Limits", "Nats", "Rotation", "Rule", "StoreLimits"), "config"),
+    **dict.fromkeys(("Tls", "Tokens", "load"), "config"),
+    **dict.fromkeys(("Robot", "Source"), "robot"),
+    **dict.fromkeys(("Server", "serve_forever"), "server"),
+    **dict.fromkeys(("Session", "security", "token"), "session"),
+    **dict.fromkeys(("Message", "RefusedError"), "wire"),
+    Client="client",
+    BagSource="bag",
+    compiled="policies",
+)

@@ -20,7 +20,7 @@ _LATE_S = 1.0
 """Delay beyond which playback does not catch up but continues from the present."""
 
 
-class Recorded:
+class BagSource:
     """The recording in ``path``, an MCAP file, a ROS 1 bag or a rosbag2; ``loops`` repeats it.
 
     ``streams`` selects topics and gives their rules; None plays all topics without rules.

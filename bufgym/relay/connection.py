@@ -18,16 +18,16 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.relay import policies, replay, wire
 from bufgym.relay.config import DEFAULT_CAPACITY
-from bufgym.relay.hub import MAX_JSON_BYTES, OWN, Frame, Hub
+from bufgym.relay.hub import MAX_JSON_BYTES, OWN, Hub, Outgoing
 from bufgym.relay.identity import Verifier, certificate_email
 from bufgym.relay.outbox import Outbox
 from bufgym.relay.patterns import pattern
-from bufgym.relay.quota import Quota, RefusedError
+from bufgym.relay.quota import Quota
 from bufgym.relay.recorder import FOLDER as RECORDINGS
 from bufgym.relay.rules import Identity, Permissions, plain_address
-from bufgym.relay.store import Session
+from bufgym.relay.store import Mailbox
 from bufgym.relay.subscriber import Subscription
-from bufgym.relay.wire import WireError
+from bufgym.relay.wire import RefusedError, WireError
 
 HELLO_BYTES: Final = 2**16
 """Size limit of a frame from a client that has not yet said hello."""
@@ -42,7 +42,7 @@ _ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "recordings", "r
 class Connection:
     """A ``hub.Member`` on a WebSocket."""
 
-    session: Session
+    session: Mailbox
     permissions: Permissions
     name: str
     """Sender's name as others see it."""
@@ -241,12 +241,12 @@ class Connection:
         if not again:
             if message.seq != self.session.received + 1:
                 raise RefusedError("out_of_order", f"seq = {message.seq}: must be {self.session.received + 1}")
-            elsewhere = 0 if hub.others is None else await hub.others.hold(self.session, message)
-            if elsewhere is None:
-                self.end("another relay does not answer")  # it connects again, and sends this again
+            shared = False if hub.peers is None else await hub.peers.hold(self.session, message)
+            if shared is None:
+                self.end("NATS does not answer")  # the client connects again, and sends this again
                 return
             if message.seq > self.session.received:  # else it was taken meanwhile, over another connection
-                hub.hold(self, message, elsewhere)
+                hub.hold(self, message, shared=shared)
         self.tell("ack", seq=message.seq)
 
     async def _subscribe(self, said: Mapping[str, Any]) -> None:
@@ -300,7 +300,7 @@ class Connection:
         """Messages that have gone to it."""
         return self._outbox.sent
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """A message that its queues decide on."""
         subscription.offer(frame.message.topic, frame, frame.size_bytes)
         self._outbox.wake()

@@ -6,17 +6,21 @@ import functools
 import json
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from bufgym.relay import wire
 from bufgym.relay.audit import Audit
 from bufgym.relay.config import Config
 from bufgym.relay.patterns import pattern
-from bufgym.relay.quota import Quotas, RefusedError
+from bufgym.relay.quota import Quotas
 from bufgym.relay.recorder import Recorder
 from bufgym.relay.rules import Permissions
-from bufgym.relay.store import Session, Settled, Store
+from bufgym.relay.store import Mailbox, Settled, Store
 from bufgym.relay.subscriber import Subscription
+from bufgym.relay.wire import RefusedError
+
+if TYPE_CHECKING:
+    from bufgym.relay.peers import Peers
 
 OWN: Final = "relay"
 """The relay's name as a sender, and the prefix of its topics."""
@@ -28,7 +32,7 @@ MAX_JSON_BYTES: Final = 2**20
 """Size limit of a text frame and of a JSON payload, which take time to read."""
 
 
-class Frame:
+class Outgoing:
     """An outgoing message; each of its forms is made once for all receivers."""
 
     def __init__(self, message: wire.Message) -> None:
@@ -56,7 +60,7 @@ class Frame:
 class Member(Protocol):
     """A connection that has said hello."""
 
-    session: Session
+    session: Mailbox
     permissions: Permissions
     subscriptions: dict[str, Subscription]
     acks: bool
@@ -66,7 +70,7 @@ class Member(Protocol):
     def sent(self) -> int:
         """Number of messages sent to it."""
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message to its queues."""
 
     def wake(self) -> None:
@@ -77,13 +81,6 @@ class Member(Protocol):
 
     def end(self, why: str) -> None:
         """Close it."""
-
-
-class Others(Protocol):
-    """Other relays."""
-
-    async def hold(self, sender: Session, message: wire.Message) -> int | None:
-        """Ask them to hold a message; return the number of receivers, or None if not all have answered."""
 
 
 class Own(Protocol):
@@ -109,13 +106,13 @@ class Hub:
         self.store = Store(config.folder, config.store, config.limits.sessions)
         recorder = Recorder.of(config)
         self.own: list[Own] = [] if recorder is None else [recorder]
-        self.members: dict[Session, Member] = {}
+        self.members: dict[Mailbox, Member] = {}
         self.received = 0
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
-        self.others: Others | None = None
-        """The other relays, if it has any."""
+        self.peers: Peers | None = None
+        """The other relays, if it shares topics with any."""
 
     # --- who is here --------------------------------------------------------------------------------------------------
 
@@ -167,7 +164,7 @@ class Hub:
         self.received += 1
         for each in self.own:
             each(message)
-        frame = Frame(message)
+        frame = Outgoing(message)
         for member, subscription in self._route(message.topic):
             if member is not sender:
                 member.offer(subscription, frame)
@@ -185,24 +182,21 @@ class Hub:
             ]
         return route
 
-    def hold(
-        self, sender: Member, message: wire.Message, elsewhere: int = 0, taken: tuple[Session, int] | None = None
-    ) -> int:
-        """Keep a no_drop message until its receivers have acked it; return their number.
+    def hold(self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None) -> None:
+        """Keep a no_drop message until its receivers have acked it.
 
         Args:
-            elsewhere: number of receivers at other relays, which hold it already.
-            taken: session and number under which it was taken; None means the sender's session and the message's
-                number.
+            shared: whether other relays have it too, and may have receivers.
+            taken: number under which it was taken from the sender; None means the message's own.
 
         Raises RefusedError: it has no receiver, or there is no room.
         """
         receivers = self._holders(sender, message.topic)
-        if not receivers and not elsewhere:
+        if not receivers and not shared:
             raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it")
         frame = wire.encode(message)
-        session, number = taken or (sender.session, message.seq)
-        self.store.hold(session, number, message.topic, frame, receivers)
+        number = message.seq if taken is None else taken
+        self.store.hold(sender.session, number, message.topic, frame, receivers)
         self.received += 1
         for each in self.own:
             each(message)
@@ -211,10 +205,9 @@ class Hub:
                 self.members[session].wake()
         for member, subscription in self._route(message.topic):
             if member is not sender and not member.acks:
-                member.offer(subscription, Frame(message))
-        return len(receivers)
+                member.offer(subscription, Outgoing(message))
 
-    def _holders(self, sender: Member, topic: str) -> list[Session]:
+    def _holders(self, sender: Member, topic: str) -> list[Mailbox]:
         """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
         here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
         away = [

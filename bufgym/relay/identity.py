@@ -15,8 +15,7 @@ from urllib.parse import urlsplit
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
 from bufgym.relay.config import Tls, Tokens
-from bufgym.relay.extra import needs
-from bufgym.relay.quota import RefusedError
+from bufgym.relay.wire import RefusedError
 
 MAX_KEYS_BYTES: Final = 2**20
 MAX_TOKEN_CHARACTERS: Final = 2**14
@@ -35,8 +34,8 @@ class Verifier:
     """Checks tokens of one issuer; its keys may change at any time."""
 
     def __init__(self, tokens: Tokens, clock: Callable[[], float] = time.monotonic) -> None:
-        with needs("jwt"):
-            import jwt
+        import jwt
+
         self._jwt: Any = jwt
         self._tokens = tokens
         self._clock = clock

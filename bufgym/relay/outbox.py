@@ -13,7 +13,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import WebSocketException
 
 from bufgym.relay import wire
-from bufgym.relay.hub import Frame, Hub, Member
+from bufgym.relay.hub import Hub, Member, Outgoing
 from bufgym.relay.subscriber import next_lane
 from bufgym.relay.wire import WireError
 
@@ -104,11 +104,11 @@ class Outbox:
             self._sent_number = number
             if member.permissions.allow("receive", topic):
                 self._in_flight.append(number)
-                await self._send(Frame(wire.decode(frame, len(frame))._replace(seq=number)))
+                await self._send(Outgoing(wire.decode(frame, len(frame))._replace(seq=number)))
             else:
                 self._hub.settled(self._hub.store.denied(member.session, number))
         return bool(waiting)
 
-    async def _send(self, frame: Frame) -> None:
+    async def _send(self, frame: Outgoing) -> None:
         await self._socket.send(frame.form(self._form))
         self.sent += 1

@@ -10,7 +10,6 @@ import functools
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay.extra import needs
 
 MAX_CHARACTERS: Final = 512
 MAX_MEMORY_BYTES: Final = 2**18
@@ -40,8 +39,8 @@ def pattern(text: str) -> Pattern:
     """Compile an expression; raise an error if RE2 does not accept it."""
     if not isinstance(text, str) or len(text) > MAX_CHARACTERS:
         raise BufgymError(f"pattern {str(text)[:60]!r}: must be a text of at most {MAX_CHARACTERS} characters")
-    with needs("re2"):
-        import re2
+    import re2
+
     options = re2.Options()
     options.max_mem = MAX_MEMORY_BYTES
     options.log_errors = False

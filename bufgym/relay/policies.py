@@ -8,19 +8,18 @@ from __future__ import annotations
 import contextlib
 import functools
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.processes import compiling
+from bufgym.relay.config import SKIP_PENDING
 
 if TYPE_CHECKING:
     from bufgym.policies.registry import Policy
     from bufgym.robot import PolicyQueue
 
-SKIP_PENDING: Final = "skip-pending"
 PLACES: Final = 32
 """Topics that share a queue, where the policy knows topics."""
 ROOM: Final = 64
@@ -60,14 +59,12 @@ def warm(name: str) -> Policy:
 def compiled(chosen: Policy) -> Policy:
     """Compile a policy that is given as an object.
 
-    Another process compiles a policy that is not cached yet, because the compiler would hold this process's lock for
-    tens of seconds and no client could connect. That process knows all policies except user-defined ones.
+    Another process compiles a policy that is not cached yet, so that clients can connect meanwhile. That process knows
+    all policies except user-defined ones.
     """
     with _COMPILING:
-        if not kept(chosen):
-            command = [sys.executable, "-m", __name__, chosen.name]
-            if subprocess.run(command, stdin=subprocess.DEVNULL).returncode < 0:
-                raise BufgymError(f"policy {chosen.name}: stopped while it was compiled")
+        if not kept(chosen) and compiling(__name__, "fill_cache", chosen.name) < 0:
+            raise BufgymError(f"policy {chosen.name}: stopped while it was compiled")
         return _used(chosen)
 
 
@@ -83,6 +80,13 @@ def kept(chosen: Policy) -> bool:
     return True
 
 
+def fill_cache(name: str) -> None:
+    """Compile the policy of this name, in a process of its own; leave a user-defined one to its own process."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    with contextlib.suppress(BufgymError):
+        _used(policy(name))
+
+
 def _used(chosen: Policy) -> Policy:
     """Send one message through a queue with this policy."""
     queue = new_queue(chosen, PLACES)
@@ -90,9 +94,3 @@ def _used(chosen: Policy) -> Policy:
     queue.get(0)
     queue.gone()
     return queue.policy
-
-
-if __name__ == "__main__":  # compiles the policy of this name
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    with contextlib.suppress(BufgymError):  # a user-defined policy is compiled by its own process
-        _used(policy(sys.argv[1]))

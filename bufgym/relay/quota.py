@@ -5,16 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from bufgym.ground.errors import BufgymError
 from bufgym.relay.config import Limits
-
-
-class RefusedError(BufgymError):
-    """A request that the relay refuses; ``code`` gives the reason in a word."""
-
-    def __init__(self, code: str, why: str) -> None:
-        super().__init__(why)
-        self.code = code
+from bufgym.relay.wire import RefusedError
 
 
 class Bucket:

@@ -10,22 +10,21 @@ import base64
 import bisect
 import io
 import json
-import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader
+
 from bufgym.ground.errors import BufgymError
-from bufgym.relay.extra import needs
 
 MOST_BYTES: Final = 4 * 2**20
 """Limit on the payloads of a piece."""
 _MAGIC: Final = b"\x89MCAP0\r\n"
-_RECORD: Final = struct.Struct("<BQ")
-_MESSAGE: Final = struct.Struct("<HIQQ")
-"""Channel, sequence number, log time and publish time in ns."""
-_SCHEMA, _CHANNEL, _MESSAGES, _CHUNK = 3, 4, 5, 6
 _STEP_BYTES: Final = 2**18
 """Distance between two indexed places of a file."""
 
@@ -47,40 +46,41 @@ def piece(
     """
     if folder is None or file not in {one["name"] for one in recordings(folder)}:
         raise BufgymError(f"recording {file!r}: there is none of this name")
-    recording = _recording(folder / file)
+    recording = _index(folder / file)
     recording.walk()
     messages: list[dict[str, Any]] = []
     left_bytes, last_us, next_us = min(most_bytes, MOST_BYTES), -1, None
-    for channel, seq, time_us, payload in recording.messages(from_us):
+    for record in recording.messages(from_us):
+        time_us = record.log_time // 1000
         if left_bytes <= 0 and time_us > last_us:
             next_us = time_us
             break
-        topic, type, encoding = recording.channels[channel]
+        topic, type, encoding = recording.channels[record.channel_id]
         if not may_receive(topic):
             continue
         try:
-            data = json.loads(payload) if encoding == "json" else base64.b64encode(payload).decode()
+            data = json.loads(record.data) if encoding == "json" else base64.b64encode(record.data).decode()
         except ValueError:
             continue
-        left_bytes -= len(payload)
+        left_bytes -= len(record.data)
         last_us = time_us
-        messages.append(
-            {
-                "topic": topic,
-                "type": type,
-                "encoding": encoding,
-                "sender": "",
-                "seq": seq,
-                "stamp_us": time_us,
-                "no_drop": False,
-                "data": data,
-            }
-        )
+        about = {"topic": topic, "type": type, "encoding": encoding, "sender": "", "no_drop": False}
+        messages.append({**about, "seq": record.sequence, "stamp_us": time_us, "data": data})
     return {"messages": messages, "next_us": next_us, "first_us": recording.first_us, "last_us": recording.last_us}
 
 
-class _Recording:
-    """Index of one file."""
+class _WholeReads(io.BufferedReader):
+    """A file that gives as many bytes as are asked for, or raises EndOfFile."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            raise EndOfFile
+        return data
+
+
+class _Index:
+    """Index of one recording."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -94,58 +94,42 @@ class _Recording:
 
     def walk(self) -> None:
         """Index the records written since the last call."""
-        for kind, offset, content in self._records(self._end):
-            if kind in (_SCHEMA, _CHANNEL):
-                self._declare(kind, content)
-            elif kind == _CHUNK:
+        for offset, record, end in self._records(self._end):
+            if isinstance(record, Schema):
+                self._schemas[record.id] = "" if record.name == "object" else record.name
+            elif isinstance(record, Channel):
+                self.channels[record.id] = record.topic, self._schemas[record.schema_id], record.message_encoding
+            elif isinstance(record, Chunk):
                 raise BufgymError(f"recording {self.path.name}: has chunks, which no relay writes")
-            elif kind == _MESSAGES:
-                self.last_us = _MESSAGE.unpack_from(content)[2] // 1000
+            elif isinstance(record, Message):
+                self.last_us = record.log_time // 1000
                 if not self._times:
                     self.first_us = self.last_us
                 if not self._offsets or offset - self._offsets[-1] >= _STEP_BYTES:
                     self._times.append(self.last_us)
                     self._offsets.append(offset)
-            self._end = offset + _RECORD.size + len(content)
+            self._end = end
 
-    def messages(self, from_us: int) -> Iterator[tuple[int, int, int, bytes]]:
-        """Yield channel, number, recording time in us and payload of each message from that time on."""
-        if not self._offsets:
-            return
-        place = max(0, bisect.bisect_left(self._times, from_us) - 1)
-        for kind, _, content in self._records(self._offsets[place]):
-            if kind == _MESSAGES:
-                channel, seq, logged_ns, _ = _MESSAGE.unpack_from(content)
-                if logged_ns // 1000 >= from_us:
-                    yield channel, seq, logged_ns // 1000, content[_MESSAGE.size :]
+    def messages(self, from_us: int) -> Iterator[Message]:
+        """Yield the messages recorded from that time on."""
+        if self._offsets:
+            place = max(0, bisect.bisect_left(self._times, from_us) - 1)
+            for _, record, _ in self._records(self._offsets[place]):
+                if isinstance(record, Message) and record.log_time // 1000 >= from_us:
+                    yield record
 
-    def _declare(self, kind: int, content: bytes) -> None:
-        with needs("mcap"):
-            from mcap import records
-            from mcap.data_stream import ReadDataStream
-        stream = ReadDataStream(io.BytesIO(content))
-        if kind == _SCHEMA:
-            schema = records.Schema.read(stream)
-            self._schemas[schema.id] = "" if schema.name == "object" else schema.name
-        else:
-            channel = records.Channel.read(stream)
-            self.channels[channel.id] = channel.topic, self._schemas[channel.schema_id], channel.message_encoding
-
-    def _records(self, offset: int) -> Iterator[tuple[int, int, bytes]]:
-        """Yield kind, offset and content of each whole record from ``offset`` on."""
-        size = self.path.stat().st_size
-        with self.path.open("rb") as file:
+    def _records(self, offset: int) -> Iterator[tuple[int, McapRecord, int]]:
+        """Yield each whole record from ``offset`` on, between its two ends in the file."""
+        # The last record may still be being written, or was cut off.
+        with suppress(EndOfFile), _WholeReads(io.FileIO(self.path)) as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise BufgymError(f"recording {self.path.name}: must be an MCAP file")
             file.seek(offset)
-            while offset + _RECORD.size <= size:
-                kind, length = _RECORD.unpack(file.read(_RECORD.size))
-                if offset + _RECORD.size + length > size:
-                    return  # the record is still being written, or was cut off
-                yield kind, offset, file.read(length)
-                offset += _RECORD.size + length
+            for record in StreamReader(file, skip_magic=True, emit_chunks=True).records:
+                yield offset, record, file.tell()
+                offset = file.tell()
 
 
 @lru_cache(maxsize=16)
-def _recording(path: Path) -> _Recording:
-    return _Recording(path)
+def _index(path: Path) -> _Index:
+    return _Index(path)

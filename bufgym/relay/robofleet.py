@@ -21,10 +21,9 @@ from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies, wire
-from bufgym.relay.config import DEFAULT_CAPACITY
+from bufgym.relay.config import DEFAULT_CAPACITY, SKIP_PENDING
 from bufgym.relay.connection import Connection
-from bufgym.relay.extra import needs
-from bufgym.relay.hub import ROBOFLEET, Frame
+from bufgym.relay.hub import ROBOFLEET, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import Permissions
 from bufgym.relay.subscriber import Subscription
@@ -50,9 +49,8 @@ def read(data: bytes) -> Flat:
 
     Raises WireError: it is not one of Robofleet's messages.
     """
-    with needs("flatbuffers"):
-        from flatbuffers.number_types import Uint8Flags, UOffsetTFlags
-        from flatbuffers.table import Table
+    from flatbuffers.number_types import Uint8Flags, UOffsetTFlags
+    from flatbuffers.table import Table
 
     def text(table: Any, field: int) -> str:
         offset = table.Offset(_FIRST + 2 * field)
@@ -132,7 +130,7 @@ class RobofleetConnection(Connection):
             return
         try:
             chosen = pattern(flat.pattern)
-            warmed = await asyncio.to_thread(policies.warm, policies.SKIP_PENDING)
+            warmed = await asyncio.to_thread(policies.warm, SKIP_PENDING)
             if flat.pattern not in self.subscriptions:
                 self._quota.subscribe()
         except BufgymError as error:
@@ -141,7 +139,7 @@ class RobofleetConnection(Connection):
         left_bytes = self._socket.transport.get_write_buffer_size
         self._hub.subscribe(self, Subscription(flat.pattern, chosen, warmed, DEFAULT_CAPACITY, left_bytes=left_bytes))
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message if it is a flatbuffer, the only encoding that the client reads."""
         if frame.message.encoding == ROBOFLEET:
             super().offer(subscription, frame)

@@ -7,15 +7,14 @@ the robot was told to receive that topic.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
 from bufgym.relay import ros_messages, wire
 from bufgym.relay.robot import Robot
-from bufgym.robot.ros2.names import Published, published
-from bufgym.robot.ros2.relay import LOOK_S, matched, own_node, resolved
+from bufgym.robot.ros1 import needs_rospy
+from bufgym.robot.ros2.names import Published
+from bufgym.robot.ros2.relay import look, matched, own_node, resolved, spinning
 from bufgym.scenario import Stream
 
 NODE: Final = "bufgym_robot"
@@ -23,7 +22,7 @@ Outlet = Callable[[bytes], None]
 """Publishes a message in CDR here."""
 
 
-class _Ros:
+class _RosSource:
     """Code shared by both versions of ROS."""
 
     def __init__(self, streams: Sequence[Stream], odometry: str | None = None, receive: Sequence[str] = ()) -> None:
@@ -72,16 +71,12 @@ class _Ros:
         """Ignore the command, because ROS takes commands on topics."""
 
 
-class Ros2(_Ros):
+class Ros2(_RosSource):
     """Topics of ROS 2 (rclpy)."""
 
     async def run(self, robot: Robot) -> None:
         with own_node(NODE) as here:
-            from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
             from rclpy.serialization import deserialize_message
-
-            executor = SingleThreadedExecutor(context=here.context)
-            executor.add_node(here)
 
             async def advertise(topic: Published) -> Outlet:
                 publisher = here.create_publisher(topic.message_class, topic.name, topic.qos)
@@ -93,50 +88,22 @@ class Ros2(_Ros):
 
                 return publish
 
-            def spin() -> None:
-                with suppress(ExternalShutdownException):
-                    executor.spin()
+            def subscribe(topic: Published) -> None:
+                def take(payload: bytes) -> None:
+                    self._take(robot, topic.name, payload, "cdr", topic.type)
+
+                here.create_subscription(topic.message_class, topic.name, take, topic.qos, raw=True)
 
             self._listen(robot, advertise)
-            spinning = asyncio.create_task(asyncio.to_thread(spin))
-            try:
-                await self._look(here, robot)
-            finally:
-                executor.shutdown(timeout_sec=2.0)
-                await asyncio.gather(spinning, return_exceptions=True)
-
-    async def _look(self, here: Any, robot: Robot) -> None:
-        """Subscribe to each topic once it has a publisher."""
-        wanted = self._wanted
-        while wanted:
-            for name in list(wanted):
-                topic = published(here, name, NODE)
-                if topic is not None:
-                    wanted.discard(name)
-                    self._subscribe(here, robot, topic)
-            await asyncio.sleep(LOOK_S)
-        await asyncio.Event().wait()
-
-    def _subscribe(self, here: Any, robot: Robot, topic: Published) -> None:
-        def take(payload: bytes) -> None:
-            self._take(robot, topic.name, payload, "cdr", topic.type)
-
-        here.create_subscription(topic.message_class, topic.name, take, topic.qos, raw=True)
+            async with spinning(here):
+                await look(here, self._wanted, subscribe, NODE)
 
 
-@contextmanager
-def _needs_rospy() -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise BufgymError(f"bufgym.relay needs {error.name}: source ROS 1's set-up (python3-rospy)") from None
-
-
-class Ros1(_Ros):
+class Ros1(_RosSource):
     """Topics of ROS 1 (rospy)."""
 
     async def run(self, robot: Robot) -> None:
-        with _needs_rospy():
+        with needs_rospy():
             import rospy
         rospy.init_node(NODE, anonymous=True, disable_signals=True)
 

@@ -1,4 +1,4 @@
-"""Messages of ROS 2 in CDR, made and read without ROS (the library ``rosbags``)."""
+"""Messages of ROS in CDR and in ROS 1's encoding, read and converted without ROS (the library ``rosbags``)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,9 @@ import math
 from dataclasses import fields, is_dataclass
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bufgym.ground.errors import BufgymError
-from bufgym.relay.extra import needs
-from bufgym.relay.room import Pose
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
-SCAN: Final = "sensor_msgs/msg/LaserScan"
 POSES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 """Types that contain a robot's pose."""
 
@@ -24,50 +18,17 @@ POSES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Po
 @functools.cache
 def store() -> Any:
     """Load the types of ROS 2."""
-    with needs("rosbags"):
-        from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_typestore
+
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 @functools.cache
 def _store_1() -> Any:
     """Load the types of ROS 1."""
-    with needs("rosbags"):
-        from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_typestore
+
     return get_typestore(Stores.ROS1_NOETIC)
-
-
-def _header(time_us: int, frame: str) -> Any:
-    kinds = store().types
-    stamp = kinds["builtin_interfaces/msg/Time"](time_us // 10**6, time_us % 10**6 * 1000)
-    return kinds["std_msgs/msg/Header"](stamp, frame)
-
-
-def odometry(time_us: int, robot: str, pose: Pose, speed_m_s: float) -> bytes:
-    """Make a ``nav_msgs/msg/Odometry``."""
-    kinds, zeros = store().types, np.zeros(36)
-    vector = kinds["geometry_msgs/msg/Vector3"]
-    turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(pose.yaw / 2), math.cos(pose.yaw / 2))
-    place = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](pose.x, pose.y, 0.0), turn)
-    motion = kinds["geometry_msgs/msg/Twist"](vector(speed_m_s, 0.0, 0.0), vector(0.0, 0.0, 0.0))
-    message = kinds[ODOMETRY](
-        _header(time_us, "map"),
-        f"{robot}/base",
-        kinds["geometry_msgs/msg/PoseWithCovariance"](place, zeros),
-        kinds["geometry_msgs/msg/TwistWithCovariance"](motion, zeros),
-    )
-    return bytes(store().serialize_cdr(message, ODOMETRY))
-
-
-def scan(time_us: int, robot: str, angles: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> bytes:
-    """Make a ``sensor_msgs/msg/LaserScan`` of these equally spaced angles."""
-    step = float(angles[1] - angles[0])
-    ends = float(angles[0]), float(angles[-1])
-    ranges, intensities = ranges_m.astype(np.float32), np.zeros(0, np.float32)
-    message = store().types[SCAN](
-        _header(time_us, f"{robot}/base"), *ends, step, 0.0, 0.1, 0.05, 30.0, ranges, intensities
-    )
-    return bytes(store().serialize_cdr(message, SCAN))
 
 
 def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:

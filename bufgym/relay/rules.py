@@ -44,6 +44,8 @@ class Identity:
 
 
 RECORDER, FOXGLOVE = Identity(own="recorder"), Identity(own="foxglove")
+NATS = Identity(email="\0nats", own="nats")
+"""The other relays. No client can prove an e-mail with a character that does not print."""
 
 
 def plain_address(text: str) -> str:

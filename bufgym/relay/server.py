@@ -24,10 +24,9 @@ from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
 from bufgym.relay.hub import Hub
 from bufgym.relay.identity import Verifier, server_context
-from bufgym.relay.mesh import Others
-from bufgym.relay.quota import RefusedError
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
+from bufgym.relay.wire import RefusedError
 from bufgym.robot.sockets import DEAD_AFTER_S, set_option, small_buffers
 
 if TYPE_CHECKING:
@@ -171,16 +170,17 @@ class Server:
         self._tls = None if config.tls is None else server_context(config.tls)
         self._server: WebSocketServer | None = None
         self._ticking: asyncio.Task[None] | None = None
-        self._others: Others | None = None
         self.window: Window | None = None
         """Foxglove's server, if the configuration has one."""
 
     async def start(self) -> int:
         """Listen and return the port; policies are imported and compiled while robots reconnect."""
         limits = self.config.limits
-        if self.config.mesh is not None:
-            self.hub.others = self._others = Others(self.hub, self.config.mesh)
-            await self._others.start()
+        if self.config.nats is not None:
+            from bufgym.relay.peers import Peers  # not at start-up: few need it
+
+            self.hub.peers = Peers(self.hub, self.config.nats)
+            await self.hub.peers.start()
         if self.config.foxglove is not None:
             from bufgym.relay.foxglove import Window  # not at start-up: few need it
 
@@ -239,8 +239,8 @@ class Server:
             self._server.close()
             await self._server.wait_closed()
             await asyncio.wait([self._warming])
-        if self._others is not None:
-            await self._others.close()
+        if self.hub.peers is not None:
+            await self.hub.peers.close()
         self.hub.close()
 
     async def _serve(self, socket: ServerConnection) -> None:

@@ -22,8 +22,8 @@ from urllib.parse import urlsplit
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
 from bufgym.relay import wire
-from bufgym.relay.extra import needs
 from bufgym.relay.unanswered import Unanswered
+from bufgym.relay.wire import RefusedError
 from bufgym.robot.sockets import connected, unacked_bytes
 from bufgym.robot.tasks import Tasks
 
@@ -37,13 +37,9 @@ _MAX_FRAME_BYTES: Final = 2**26
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
 
 
-class RefusedError(BufgymError):
-    """The relay does not let this client in."""
-
-
 @dataclass(frozen=True)
-class Subscription:
-    """A subscription requested from the relay."""
+class Wish:
+    """A subscription that is asked of the relay."""
 
     pattern: re.Pattern[str]
     on_message: OnMessage
@@ -110,7 +106,7 @@ class Session:
         self._unanswered = Unanswered()
         self._wanted = asyncio.Event()
         self._received = 0
-        self._subscriptions: dict[str, Subscription] = {}
+        self._subscriptions: dict[str, Wish] = {}
         self._confirmed: set[str] = set()
         self._connection: Any = None
         self._tasks = Tasks()
@@ -149,7 +145,7 @@ class Session:
         chosen = {"policy": policy, "capacity": capacity, "durable": durable or None}
         fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
         try:
-            self._subscriptions[id] = Subscription(re.compile(pattern), on_message, fields)
+            self._subscriptions[id] = Wish(re.compile(pattern), on_message, fields)
         except re.error as error:
             raise BufgymError(f"subscription {pattern!r}: no regular expression: {error}") from None
         self.ready.clear()
@@ -164,8 +160,8 @@ class Session:
         Raises:
             RefusedError: the relay does not let this client in.
         """
-        with needs("websockets"):
-            from websockets.exceptions import WebSocketException
+        from websockets.exceptions import WebSocketException
+
         try:
             while True:
                 try:
@@ -224,7 +220,7 @@ class Session:
         await self._say_it("hello", **hello, received=self._received, acked=self._unanswered.acked)
         said = wire.heard(await self._connection.recv())
         if said["op"] == "refused":
-            raise RefusedError(f"{self.address.geturl()}: refused: {said['code']}: {said['why']}")
+            raise RefusedError(said["code"], f"{self.address.geturl()}: refused: {said['code']}: {said['why']}")
         if said["op"] != "welcome":
             raise wire.WireError(f"op {said['op']!r}: must be welcome")
         self.welcome = said

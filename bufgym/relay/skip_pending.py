@@ -6,7 +6,7 @@ from typing import Final
 
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.relay.policies import SKIP_PENDING
+from bufgym.relay.config import SKIP_PENDING
 
 
 def skip_pending(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

@@ -14,12 +14,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import config
-from bufgym.relay.quota import RefusedError
+from bufgym.relay.config import StoreLimits
 from bufgym.relay.rules import Identity
+from bufgym.relay.wire import RefusedError
 
 FILE: Final = "held.sqlite"
 _SCHEMA: Final = """
@@ -33,11 +33,12 @@ CREATE TABLE IF NOT EXISTS message (
 CREATE TABLE IF NOT EXISTS delivery (
     session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
 """
+_COLUMNS: Final = "name, address, email, temporary, received, numbered, seen_s"
 
 
 @dataclass(eq=False)
-class Session:
-    """One client over all its connections."""
+class Mailbox:
+    """A client's session as the relay keeps it, over all its connections."""
 
     name: str
     identity: Identity
@@ -57,6 +58,12 @@ class Session:
     """Id in the store; None while there is nothing to remember."""
 
     @property
+    def columns(self) -> tuple[Any, ...]:
+        """The session as a row of the store."""
+        who = self.identity
+        return self.name, who.address, who.email, self.temporary, self.received, self.numbered, self.seen_s
+
+    @property
     def key(self) -> tuple[str, str]:
         """Identity and name; the same name under another identity is another session."""
         return self.identity.key, self.name
@@ -65,7 +72,7 @@ class Session:
 class Settled(NamedTuple):
     """A message that no receiver waits for any more."""
 
-    sender: Session
+    sender: Mailbox
     seq: int
     receivers: int
     lost: int
@@ -75,7 +82,7 @@ class Settled(NamedTuple):
 class Store:
     """Sessions and the messages held for them; without a folder they are in memory only."""
 
-    def __init__(self, folder: Path | None, limits: config.Store, sessions: int = 64) -> None:
+    def __init__(self, folder: Path | None, limits: StoreLimits, sessions: int = 64) -> None:
         self.limits = limits
         self._most_sessions = sessions
         path = ":memory:" if folder is None else str(folder / FILE)
@@ -87,16 +94,14 @@ class Store:
             self._db.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
-        self.sessions: dict[tuple[str, str], Session] = {}
-        self._by_id: dict[int, Session] = {}
+        self.sessions: dict[tuple[str, str], Mailbox] = {}
+        self._by_id: dict[int, Mailbox] = {}
         self._load()
 
     def _load(self) -> None:
-        columns = "id, name, address, email, temporary, received, numbered, seen_s"
-        for id, name, address, email, temporary, received, numbered, seen_s in self._db.execute(
-            f"SELECT {columns} FROM session"
-        ).fetchall():
-            session = Session(name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s)
+        for row in self._db.execute(f"SELECT id, {_COLUMNS} FROM session").fetchall():
+            id, name, address, email, temporary, received, numbered, seen_s = row
+            session = Mailbox(name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s)
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
             (session.held,) = self._db.execute("SELECT count(*) FROM delivery WHERE session = ?", (id,)).fetchone()
             self.sessions[session.key] = self._by_id[id] = session
@@ -107,7 +112,7 @@ class Store:
 
     # --- sessions -----------------------------------------------------------------------------------------------------
 
-    def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Session:
+    def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Mailbox:
         """Open the session of this name; a new session begins at the client's numbers.
 
         Raises RefusedError: the identity has too many sessions.
@@ -116,7 +121,7 @@ class Store:
         if session is None:
             if sum(key == identity.key for key, _ in self.sessions) >= self._most_sessions:
                 raise RefusedError("too_many", f"must be at most {self._most_sessions} sessions")
-            session = Session(name, identity, temporary, acked, received)
+            session = Mailbox(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
         session.identity, session.seen_s = identity, time.time()
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
@@ -125,7 +130,7 @@ class Store:
                 self._save(session)
         return session
 
-    def left(self, session: Session) -> list[Settled]:
+    def left(self, session: Mailbox) -> list[Settled]:
         """Note the end of a session's connection; forget messages that nobody will ask for."""
         session.seen_s = time.time()
         if session.temporary or session.id is None:
@@ -134,19 +139,19 @@ class Store:
             self._save(session)
         return []
 
-    def forget(self, session: Session) -> list[Settled]:
+    def forget(self, session: Mailbox) -> list[Settled]:
         """Forget a session; messages held for it are lost."""
         self.sessions.pop(session.key, None)
         if session.id is None:
             return []
         with self._transaction():
             settled = self._settle(session, 0, 2**62, lost=1)
-            for table, column in (("session", "id"), ("durable", "session")):
-                self._db.execute(f"DELETE FROM {table} WHERE {column} = ?", (session.id,))
+            self._db.execute("DELETE FROM session WHERE id = ?", (session.id,))
+            self._db.execute("DELETE FROM durable WHERE session = ?", (session.id,))
         self._by_id.pop(session.id, None)
         return settled
 
-    def want(self, session: Session, id: str, pattern: str | None) -> None:
+    def want(self, session: Mailbox, id: str, pattern: str | None) -> None:
         """Hold matching messages while the session is away; the pattern None ends that."""
         if pattern is None and session.durable.pop(id, None) is None:
             return
@@ -160,7 +165,7 @@ class Store:
 
     # --- messages -----------------------------------------------------------------------------------------------------
 
-    def hold(self, sender: Session, seq: int, topic: str, frame: bytes, receivers: Sequence[Session]) -> None:
+    def hold(self, sender: Mailbox, seq: int, topic: str, frame: bytes, receivers: Sequence[Mailbox]) -> None:
         """Store the sender's message number ``seq`` on disk for these receivers.
 
         Without receivers, whom other relays have, the number alone is taken.
@@ -176,14 +181,10 @@ class Store:
             for session in (sender, *receivers):
                 self._remember(session)
             with self._transaction():
-                message = (
-                    receivers
-                    and self._db.execute(
-                        "INSERT INTO message (sender, seq, topic, frame, receivers, waiting, lost) "
-                        "VALUES (?, ?, ?, ?, ?, ?, 0)",
-                        (sender.id, seq, topic, frame, len(receivers), len(receivers)),
-                    ).lastrowid
-                )
+                if receivers:
+                    row = sender.id, seq, topic, frame, len(receivers), len(receivers)
+                    columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
+                    message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
                 for receiver in receivers:
                     number = receiver.numbered + 1
                     self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
@@ -197,7 +198,7 @@ class Store:
             receiver.numbered += 1
             receiver.held += 1
 
-    def waiting(self, session: Session, after: int, most: int) -> list[tuple[int, str, bytes]]:
+    def waiting(self, session: Mailbox, after: int, most: int) -> list[tuple[int, str, bytes]]:
         """List number, topic and frame of the session's next messages."""
         if session.id is None:
             return []
@@ -207,19 +208,19 @@ class Store:
         )
         return self._db.execute(query, (session.id, after, most)).fetchall()
 
-    def acked(self, session: Session, number: int) -> list[Settled]:
+    def acked(self, session: Mailbox, number: int) -> list[Settled]:
         """Note that the session has processed all messages up to this number; return the settled ones."""
         if session.id is None or session.held == 0:
             return []
         with self._transaction():
             return self._settle(session, 0, number, lost=0)
 
-    def denied(self, session: Session, number: int) -> list[Settled]:
+    def denied(self, session: Mailbox, number: int) -> list[Settled]:
         """Drop a message that no rule lets the session have any more; return the settled ones."""
         with self._transaction():
             return self._settle(session, number, number, lost=1)
 
-    def expired(self, connected: Sequence[Session]) -> list[Session]:
+    def expired(self, connected: Sequence[Mailbox]) -> list[Mailbox]:
         """List the sessions that have been away for too long."""
         before_s = time.time() - self.limits.keep_s
         here = set(map(id, connected))
@@ -241,7 +242,7 @@ class Store:
             raise
         self._db.execute("COMMIT")
 
-    def _settle(self, session: Session, first: int, last: int, lost: int) -> list[Settled]:
+    def _settle(self, session: Mailbox, first: int, last: int, lost: int) -> list[Settled]:
         settled = []
         chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
         rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
@@ -260,35 +261,14 @@ class Store:
                     settled.append(Settled(self._by_id[sender], seq, receivers, gone))
         return settled
 
-    def _remember(self, session: Session) -> None:
+    def _remember(self, session: Mailbox) -> None:
         """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
-            cursor = self._db.execute(
-                "INSERT INTO session (name, address, email, temporary, received, numbered, seen_s) "
-                "VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (
-                    session.name,
-                    session.identity.address,
-                    session.identity.email,
-                    session.temporary,
-                    session.received,
-                    session.numbered,
-                    session.seen_s,
-                ),
-            )
-            assert cursor.lastrowid is not None
-            session.id = cursor.lastrowid
+            insert = f"INSERT INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+            session.id = self._db.execute(insert, session.columns).lastrowid
+            assert session.id is not None
             self._by_id[session.id] = session
 
-    def _save(self, session: Session) -> None:
-        self._db.execute(
-            "UPDATE session SET address = ?, email = ?, received = ?, numbered = ?, seen_s = ? WHERE id = ?",
-            (
-                session.identity.address,
-                session.identity.email,
-                session.received,
-                session.numbered,
-                session.seen_s,
-                session.id,
-            ),
-        )
+    def _save(self, session: Mailbox) -> None:
+        places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
+        self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))

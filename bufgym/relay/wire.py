@@ -12,7 +12,10 @@ import binascii
 import json
 import struct
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Annotated, Any, Final, NamedTuple, NoReturn
+
+import msgspec
+from msgspec import Meta
 
 from bufgym.ground.errors import BufgymError
 
@@ -37,6 +40,14 @@ _MAGIC: Final = b"bR"
 
 class WireError(BufgymError):
     """What came is no frame of this protocol."""
+
+
+class RefusedError(BufgymError):
+    """A request that the relay refuses; ``code`` gives the reason in a word."""
+
+    def __init__(self, code: str, why: str) -> None:
+        super().__init__(why)
+        self.code = code
 
 
 class Message(NamedTuple):
@@ -143,47 +154,54 @@ def _utf8_bytes(what: str, name: str) -> int:
 
 # --- JSON ------------------------------------------------------------------------------------------------------------
 
-_ANY: Final = object
+Number = Annotated[int, Meta(ge=0, le=MAX_SEQ)]
 _MESSAGE: Final = {
-    "topic": (str, True),
-    "data": (_ANY, True),
-    "encoding": (str, False),
-    "type": (str, False),
-    "seq": (int, False),
-    "stamp_us": (int, False),
-    "no_drop": (bool, False),
+    "topic": str,
+    "data": Any,
+    "encoding?": str,
+    "type?": str,
+    "seq?": Number,
+    "stamp_us?": Number,
+    "no_drop?": bool,
 }
-FIELDS: Final[Mapping[str, Mapping[str, tuple[Any, bool]]]] = {
+FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
     "hello": {
-        "version": (int, True),
-        "name": (str, False),
-        "session": (str, False),
-        "token": (str, False),
-        "form": (str, False),
-        "received": (int, False),
-        "acked": (int, False),
+        "version": Number,
+        **dict.fromkeys(("name?", "session?", "token?", "form?"), str),
+        **dict.fromkeys(("received?", "acked?"), Number),
     },
-    "welcome": {"version": (int, True), "received": (int, True), "window": (int, True), "rules": (list, True)},
+    "welcome": {"version": Number, "received": Number, "window": Number, "rules": list[Any]},
     "subscribe": {
-        "id": (str, True),
-        "topic": (str, True),
-        "policy": (str, False),
-        "capacity": (int, False),
-        "priority": (float, False),
-        "durable": (bool, False),
+        "id": str,
+        "topic": str,
+        "policy?": str,
+        "capacity?": Number,
+        "priority?": Annotated[float, Meta(ge=-MAX_SEQ, le=MAX_SEQ)],
+        "durable?": bool,
     },
-    "subscribed": {"id": (str, True)},
-    "unsubscribe": {"id": (str, True)},
+    "subscribed": {"id": str},
+    "unsubscribe": {"id": str},
     "publish": _MESSAGE,
-    "message": {**_MESSAGE, "sender": (str, True)},
-    "ack": {"seq": (int, True)},
-    "recordings": {"files": (list, False)},
-    "replay": {"id": (str, True), "file": (str, True), "from_us": (int, True), "most_bytes": (int, True)},
-    "replayed": {"id": (str, True), "messages": (list, True)},
-    "delivered": {"seq": (int, True), "receivers": (int, True), "lost": (int, True)},
-    "refused": {"what": (str, True), "code": (str, True), "why": (str, True)},
+    "message": {**_MESSAGE, "sender": str},
+    "ack": {"seq": Number},
+    "recordings": {"files?": list[Any]},
+    "replay": {"id": str, "file": str, "from_us": Number, "most_bytes": Number},
+    "replayed": {"id": str, "messages": list[Any]},
+    "delivered": {"seq": Number, "receivers": Number, "lost": Number},
+    "refused": {"what": str, "code": str, "why": str},
 }
-"""op -> field -> (its kind, whether it must be there). Other fields are let pass: a later version may have more."""
+"""op -> field -> its type; "?" follows the name of a field that may be left out. A later version may have more."""
+
+
+def _kind(op: str, fields: Mapping[str, Any]) -> Any:
+    """Make the type of an ``op``; fields that may be left out stand behind the others."""
+    needed = [(name, kind) for name, kind in fields.items() if name[-1] != "?"]
+    return msgspec.defstruct(
+        op, [*needed, *((name[:-1], kind, None) for name, kind in fields.items() if name[-1] == "?")]
+    )
+
+
+_KINDS: Final = {op: _kind(op, fields) for op, fields in FIELDS.items()}
 FORMS: Final = ("binary", "json")
 
 
@@ -203,24 +221,11 @@ def heard(text: str) -> dict[str, Any]:
         raise WireError(f"text {text[:60]!r}: must be JSON: {error}") from None
     if not isinstance(said, dict) or not isinstance(said.get("op"), str) or said["op"] not in FIELDS:
         raise WireError(f"text {text[:60]!r}: must be an object whose op is one of {', '.join(FIELDS)}")
-    for field, (kind, needed) in FIELDS[said["op"]].items():
-        if field not in said:
-            if needed:
-                raise WireError(f"{said['op']}: {field} is missing")
-        elif not _is(said[field], kind):
-            raise WireError(f"{said['op']}: {field} = {said[field]!r}: must be a {_KINDS[kind]}")
+    try:
+        msgspec.convert(said, _KINDS[said["op"]])
+    except msgspec.ValidationError as error:
+        raise WireError(f"{said['op']}: {error}") from None
     return said
-
-
-_KINDS: Final = {int: "whole number >= 0", str: "text", bool: "true or false", float: "number", list: "list"}
-
-
-def _is(value: Any, kind: Any) -> bool:
-    if kind is int:
-        return type(value) is int and 0 <= value <= MAX_SEQ
-    if kind is float:
-        return type(value) in (int, float) and abs(value) <= MAX_SEQ
-    return isinstance(value, kind)
 
 
 def no_constant(name: str) -> NoReturn:

@@ -1,27 +1,47 @@
 """The simulator's sender on a real link: the same compiled transition function, driven by a clock.
 
-``PolicyQueue`` is a queue ruled by any registered policy. A transport sends its messages and reports when each has
-left. ``Receiver`` is the other end, and ``ShapedLink`` plays a trace between the two. ``replay`` runs the queue's log
-through the simulator, which makes the same decisions, bit for bit.
+``PolicyQueue`` is a queue ruled by any registered policy. A ``Sender`` sends its messages over one of ``TRANSPORTS``
+and reports when each has left. ``Receiver`` is the other end, and ``ShapedLink`` plays a trace between both. ``replay``
+runs the queue's log through the simulator, which makes the same decisions, bit for bit.
 """
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from typing import TYPE_CHECKING, Any
+from bufgym.ground.modules import on_demand
 
 if TYPE_CHECKING:
+    from bufgym.robot.channels import TRANSPORTS
     from bufgym.robot.log import LogFile, read_log
+    from bufgym.robot.odometry import Odometry
     from bufgym.robot.queue import Item, PolicyQueue
+    from bufgym.robot.receiver import Received, Receiver, Recording
     from bufgym.robot.replaying import Replay, replay
+    from bufgym.robot.sender import Sender
+    from bufgym.robot.shaped import ShapedLink
 
-__all__ = ["Item", "LogFile", "PolicyQueue", "Replay", "read_log", "replay"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import the compiled parts at first use, so that a relay, which needs only the sockets, starts three times
-    faster."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from bufgym.robot import log, queue, replaying
-
-    return next(getattr(home, name) for home in (log, queue, replaying) if hasattr(home, name))
+__all__ = [
+    "TRANSPORTS",
+    "Item",
+    "LogFile",
+    "Odometry",
+    "PolicyQueue",
+    "Received",
+    "Receiver",
+    "Recording",
+    "Replay",
+    "Sender",
+    "ShapedLink",
+    "read_log",
+    "replay",
+]
+__getattr__ = on_demand(
+    __name__,
+    **dict.fromkeys(("LogFile", "read_log"), "log"),
+    **dict.fromkeys(("Item", "PolicyQueue"), "queue"),
+    **dict.fromkeys(("Received", "Receiver", "Recording"), "receiver"),
+    **dict.fromkeys(("Replay", "replay"), "replaying"),
+    Odometry="odometry",
+    Sender="sender",
+    ShapedLink="shaped",
+    TRANSPORTS="channels",
+)

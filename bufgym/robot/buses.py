@@ -1,12 +1,11 @@
-"""Publish-subscribe libraries that frames may go over: Zenoh, MQTT and DDS.
+"""Publish-subscribe libraries that frames may go over: Zenoh and MQTT.
 
 | name | library | the receiver | host and port |
 |---|---|---|---|
 | zenoh | ``eclipse-zenoh`` | listens, a peer of Zenoh over TCP | where the receiver listens |
 | mqtt | ``paho-mqtt`` | connects, as the sender does | the broker's |
-| dds | ``cyclonedds`` | is a participant, over UDP | its host; ports are given from this one on |
 
-All send and receive reliably, drop nothing themselves, and are given the next message when the window of acks allows.
+Both send and receive reliably, drop nothing themselves, and are given the next message when the window of acks allows.
 """
 
 from __future__ import annotations
@@ -152,88 +151,5 @@ def _prompt(connection: Any) -> None:
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-# --- DDS --------------------------------------------------------------------------------------------------------------
-
-_DDS: Final = """<CycloneDDS><Domain Id="any">
-<General><AllowMulticast>false</AllowMulticast></General>
-<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
-<Peers><Peer Address="{host}"/></Peers><LeaseDuration>{lease_s:g}s</LeaseDuration>
-<Ports><Base>{base}</Base><DomainGain>0</DomainGain></Ports></Discovery></Domain></CycloneDDS>"""
-_FIRST_PORT: Final = 10
-"""Offset of the first participant's port from DDS's base port."""
-_domains: Final[dict[int, Any]] = {}
-"""Domains by number; a domain's settings hold for the process."""
-
-
-class DdsBus:
-    """A DDS participant. The port sets the domain's number, so that other domains do not hear it."""
-
-    def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
-        with needs("cyclonedds", "dds"):
-            from cyclonedds.core import DDSException
-            from cyclonedds.domain import Domain, DomainParticipant
-            from cyclonedds.pub import DataWriter
-            from cyclonedds.sub import DataReader
-            from cyclonedds.topic import Topic
-
-        from bufgym.robot.dds_message import QUALITY, Message
-
-        number, ways = port % 230, ("up", "down") if name else ("down", "up")
-        try:
-            if number not in _domains:
-                settings = _DDS.format(host=host, base=port - _FIRST_PORT, lease_s=DEAD_AFTER_S)
-                _domains[number] = Domain(number, settings)
-            participant = DomainParticipant(number)
-            out, back = (Topic(participant, f"{ROOT}_{way}", Message) for way in ways)
-            self._reader = DataReader(participant, back, qos=QUALITY[ways[1]])
-            self._writer = DataWriter(participant, out, qos=QUALITY[ways[0]])
-        except DDSException as error:
-            raise ConnectionError(f"dds, {host}:{port}: {error}") from None
-        self._message, self._error, self._participant = Message, DDSException, participant
-        self._closed = threading.Event()
-        threading.Thread(target=self._listen, args=(name, hear, peer), daemon=True).start()
-
-    def _listen(self, name: str, hear: Hear, peer: Peer) -> None:
-        """Hand on messages and the other end's presence.
-
-        A listener of the library would run in the library's thread. Python's garbage collector may delete a closed end
-        there, and that deletion waits for the same thread.
-        """
-        from cyclonedds.core import DDSStatus, ReadCondition, SampleState, WaitSet
-        from cyclonedds.util import duration
-
-        reader, writer, there = self._reader, self._writer, False
-        arrived = ReadCondition(reader, SampleState.NotRead)
-        waitset = WaitSet(self._participant)
-        reader.set_status_mask(DDSStatus.SubscriptionMatched)
-        writer.set_status_mask(DDSStatus.PublicationMatched)
-        for one in (arrived, reader, writer):
-            waitset.attach(one)
-        while not self._closed.is_set():
-            reader.take_status(DDSStatus.SubscriptionMatched)
-            writer.take_status(DDSStatus.PublicationMatched)
-            matched = bool(reader.get_matched_publications() and writer.get_matched_subscriptions())
-            if matched != there:
-                there = matched
-                peer(there)
-            for sample in reader.take(64, condition=arrived):
-                if isinstance(sample, self._message) and sample.name == (name or sample.name):
-                    hear(sample.name, bytes(sample.data))
-            waitset.wait(duration(milliseconds=50))
-        self._participant = self._reader = self._writer = None
-
-    def publish(self, name: str, data: bytes) -> None:
-        writer = self._writer
-        if writer is None:
-            raise ConnectionError("dds: closed")
-        try:
-            writer.write(self._message(name, data))
-        except self._error as error:
-            raise ConnectionError(f"dds: {error}") from None
-
-    def close(self) -> None:
-        self._closed.set()
-
-
-BUSES: Final[dict[str, Open]] = {"zenoh": ZenohBus, "mqtt": MqttBus, "dds": DdsBus}
+BUSES: Final[dict[str, Open]] = {"zenoh": ZenohBus, "mqtt": MqttBus}
 """Name of a library -> class that opens either end."""

@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 
+from bufgym.benchmark.table import markdown_table
 from bufgym.robot.queue import PolicyQueue
 
 POLICIES = ("drop-oldest", "afr", "learned-motion")
@@ -58,6 +59,5 @@ def report(seconds: float) -> str:
     about = f"PolicyQueue, L = {CAPACITY}: {SIZE_BYTES} bytes at {RATE_HZ:g} Hz, a link of {LINK_HZ:g} Hz"
     head = ["policy", "put, median", "99 % within", "without pauses", "of a core", "messages held"]
     rows = [measure(policy, seconds) for policy in POLICIES]
-    first, *others = (f"| {' | '.join(row)} |" for row in (head, *rows))
     goals = "Goals: 100 us, 1000 us, 5 % of a core."
-    return "\n".join([about, "", first, f"|---|{'---:|' * 5}", *others, "", goals])
+    return "\n".join([about, "", *markdown_table(head, rows), "", goals])

@@ -1,4 +1,4 @@
-"""Libraries of the extras ``live``, ``zenoh`` and ``dds``, imported where they are used."""
+"""Libraries of the extras ``live`` and ``zenoh``, imported where they are used."""
 
 from __future__ import annotations
 

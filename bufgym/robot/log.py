@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 
@@ -27,13 +28,12 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.robot.extra import needs
+from bufgym.robot.mcap_file import McapFile
 
 Record = dict[str, Any]
 
 EVENTS: Final = ("settings", "put", "dequeued", "gone", "dropped")
 MAX_RECORD_BYTES: Final = 2**20
-_FLUSH_US: Final = 500_000
-"""Time between flushes; a killed sender loses its log since the last one."""
 
 
 def settings(
@@ -71,42 +71,23 @@ def value_of(v: Record) -> Value:
     return Value(v["name"], np.array(v["numbers"], np.float64))
 
 
-class LogFile:
-    """A log in an MCAP file; call it with each record, then close it."""
+class LogFile(AbstractContextManager["LogFile"]):
+    """A log in an MCAP file; call it with each record, then close it. A log that was not closed can also be read."""
 
     def __init__(self, path: str | Path) -> None:
-        with needs("mcap"):
-            from mcap.writer import Writer
-        self.path = Path(path)
-        self._file = self.path.open("wb")
-        # Chunks would be lost with the process.
-        self._writer = Writer(self._file, use_chunking=False)
-        self._writer.start(profile="", library="bufgym")
-        schema = self._writer.register_schema("bufgym.live.Record", "jsonschema", b'{"type": "object"}')
-        self._channels = {event: self._writer.register_channel(f"/{event}", "json", schema) for event in EVENTS}
-        self._flushed_us = 0
+        self._file = McapFile(path)
+        self.path = self._file.path
 
     def __call__(self, record: Record) -> None:
         """Write one record."""
-        now_us = record["us"]
-        self._writer.add_message(
-            self._channels[record["event"]],
-            log_time=now_us * 1000,
-            publish_time=now_us * 1000,
-            data=json.dumps(record).encode(),
+        now_ns = record["us"] * 1000
+        self._file.write(
+            f"/{record['event']}", json.dumps(record).encode(), now_ns, now_ns, schema="bufgym.live.Record"
         )
-        if now_us - self._flushed_us >= _FLUSH_US:
-            self._file.flush()
-            self._flushed_us = now_us
 
     def close(self) -> None:
-        """Finish the file; a log that was not closed can also be read."""
-        if not self._file.closed:
-            cast(Any, self._writer).finish()
-            self._file.close()
-
-    def __enter__(self) -> LogFile:
-        return self
+        """Finish the file."""
+        self._file.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -10,7 +10,7 @@ import numpy as np
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, ratio, stream, times_drawn, written
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.table import percent
-from bufgym.robot.runs import Run, by_policy
+from bufgym.robot.runs import LiveRun, by_policy
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def _percent(interval: Interval) -> str:
     return " ".join(written(interval, percent)).strip()
 
 
-def margins(runs: Sequence[Run], reference: str = "afr") -> list[Margin]:
+def margins(runs: Sequence[LiveRun], reference: str = "afr") -> list[Margin]:
     """Of each other policy, the best in the simulator first; none without the reference or with a single episode.
 
     Regret is on sums over the episodes. Intervals are paired percentile bootstraps over them (see ``score``): live and
@@ -58,7 +58,7 @@ def margins(runs: Sequence[Run], reference: str = "afr") -> list[Margin]:
     return found
 
 
-def _sums(ours: Sequence[Run], theirs: Sequence[Run]) -> Numbers:
+def _sums(ours: Sequence[LiveRun], theirs: Sequence[LiveRun]) -> Numbers:
     """[episodes, 3] over the transports of each: H less the other's H, live and simulated, and the clairvoyant's."""
     episodes: dict[tuple[str, int], list[float]] = {}
     others = {(one.transport, one.link, one.seed): one for one in theirs}

@@ -10,7 +10,6 @@ import importlib
 import multiprocessing
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.processes import end_with
 from bufgym.robot.queue import PolicyQueue
 from bufgym.robot.receiver import Received
 from bufgym.scenario import Episode
@@ -35,10 +35,10 @@ START_S: Final = 0.3
 _POLL_S: Final = 0.02
 
 
-class Program:
+class Worker:
     """A process that runs ``work`` with one end of a pipe to this process."""
 
-    def __init__(self, name: str, work: Callable[[Connection], None], begun: list[Program]) -> None:
+    def __init__(self, name: str, work: Callable[[Connection], None], begun: list[Worker]) -> None:
         """``begun`` lists all programs of a run."""
         self._name, self._begun = name, begun
         self._words, words = Pipe()
@@ -92,7 +92,7 @@ class Program:
 def _run(work: Callable[[Connection], None], words: Connection, failures: Connection, parent: int) -> None:
     """Run in the program; ``parent`` comes from the caller, as a killed parent may already have been replaced."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends us
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    end_with(parent)
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
         work(words)
@@ -101,22 +101,15 @@ def _run(work: Callable[[Connection], None], words: Connection, failures: Connec
     os._exit(0)  # skips waiting for ROS's threads
 
 
-def _end_with(parent: int) -> None:
-    """End this program when its parent is killed."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
-
-
 @contextmanager
-def programs(**works: Callable[[Connection], None]) -> Iterator[list[Program]]:
+def running(**works: Callable[[Connection], None]) -> Iterator[list[Worker]]:
     """Run programs by name while the block runs."""
     if not hasattr(os, "fork"):
         raise BufgymError("episodes on ROS need a system whose processes fork, such as Linux")
-    begun: list[Program] = []
+    begun: list[Worker] = []
     try:
         for name, work in works.items():
-            begun.append(Program(name, work, begun))
+            begun.append(Worker(name, work, begun))
         yield begun
     finally:
         for one in begun:

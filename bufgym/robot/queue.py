@@ -35,7 +35,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.robot.log import LogFile, Record, settings
-from bufgym.robot.row import ROOM, Row
+from bufgym.robot.row import ROOM, LiveRow
 
 FIRST_US: Final = 2
 """Earliest time of a call; the two first knots of a link lie before it."""
@@ -99,7 +99,7 @@ class PolicyQueue:
         check_limits(capacity, max_bytes)
         self.policy = get(policy)
         value = qoi.exponential() if value is None else value
-        self._row = Row(
+        self._row = LiveRow(
             self.policy,
             capacity,
             value,

@@ -11,7 +11,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.bus_channel import BusServer
@@ -19,6 +19,7 @@ from bufgym.robot.buses import BUSES, MQTT_PORT
 from bufgym.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
 from bufgym.robot.extra import needs
 from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
+from bufgym.robot.mcap_file import McapFile
 from bufgym.robot.sockets import free_port
 from bufgym.robot.tasks import Tasks
 
@@ -46,7 +47,7 @@ class Received(NamedTuple):
     """Time of receipt by this system's clock."""
 
 
-class _Stream:
+class _Talk:
     """State of one sender's stream."""
 
     def __init__(self, expected: int) -> None:
@@ -71,7 +72,7 @@ class Receiver:
         """Why connections ended, the last 100."""
         self._on_message = on_message
         self._max_body_bytes = max_body_bytes
-        self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
+        self._streams: OrderedDict[bytes, _Talk] = OrderedDict()
         self._tasks = Tasks()
         self._listener: socket.socket | None = None
         self._server: Any = None
@@ -134,7 +135,7 @@ class Receiver:
         if greeting.kind != GREETING:
             raise FrameError(f"frame of kind {greeting.kind}: must be a greeting first")
         name = bytes(greeting.body)
-        stream = self._streams.setdefault(name, _Stream(greeting.number))
+        stream = self._streams.setdefault(name, _Talk(greeting.number))
         self._streams.move_to_end(name)
         if stream.task is not None:
             stream.task.cancel()  # the sender has given that connection up
@@ -196,33 +197,20 @@ class Recording(contextlib.AbstractContextManager["Recording"]):
     ``/received``."""
 
     def __init__(self, path: str | Path) -> None:
-        with needs("mcap"):
-            from mcap.writer import Writer
-        self._file = Path(path).open("wb")  # noqa: SIM115  (open as long as this is)
-        self._writer = Writer(self._file)
-        self._writer.start(profile="", library="bufgym")
-        schema = self._writer.register_schema("bufgym.live.Received", "jsonschema", b'{"type": "object"}')
-        self._channel = self._writer.register_channel("/received", "json", schema)
-        self._bodies: dict[int, int] = {}
+        self._file = McapFile(path)
 
     def __call__(self, message: Received) -> None:
         """Write one message; an ``on_message`` of ``Receiver``."""
-        if message.topic not in self._bodies:
-            topic = f"/topic_{message.topic}"
-            self._bodies[message.topic] = self._writer.register_channel(topic, "application/octet-stream", 0)
-        times = {"log_time": message.received_ns, "publish_time": message.at_us * 1000}
-        self._writer.add_message(
-            self._bodies[message.topic], data=bytes(message.body), sequence=message.seq % 2**32, **times
-        )
-        about = {**message._asdict(), "size_bytes": len(message.body)}
+        times, seq = (message.received_ns, message.at_us * 1000), message.seq
+        body, encoding = bytes(message.body), "application/octet-stream"
+        self._file.write(f"/topic_{message.topic}", body, *times, encoding=encoding, seq=seq)
+        about = {**message._asdict(), "size_bytes": len(body)}
         del about["body"]
-        self._writer.add_message(self._channel, data=json.dumps(about).encode(), sequence=message.seq % 2**32, **times)
+        self._file.write("/received", json.dumps(about).encode(), *times, schema="bufgym.live.Received", seq=seq)
 
     def close(self) -> None:
         """Finish the file."""
-        if not self._file.closed:
-            cast(Any, self._writer).finish()
-            self._file.close()
+        self._file.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -35,7 +35,7 @@ ROOM = 2**16
 """Columns of a new row, 7 MB. After this many messages the settled ones are forgotten."""
 
 
-class Row:
+class LiveRow:
     """One sender under one policy. Times never fall between calls, and rise at a knot."""
 
     def __init__(

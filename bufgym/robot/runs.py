@@ -10,6 +10,7 @@ from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any, Final
 
+from bufgym.benchmark.table import markdown_table
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.oracle.measure import regret
@@ -19,7 +20,7 @@ DIFFER: Final = 0.01
 
 
 @dataclass(frozen=True)
-class Run:
+class LiveRun:
     """One policy on one episode, live and simulated."""
 
     policy: str
@@ -64,24 +65,24 @@ class Run:
         return statistics.median(self.simulated_s) if self.simulated_s else 0.0
 
 
-def by_policy(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def by_policy(runs: Sequence[LiveRun]) -> dict[str, list[LiveRun]]:
     """Group the runs by policy, the best in the simulator first."""
-    found: dict[str, list[Run]] = {}
+    found: dict[str, list[LiveRun]] = {}
     for one in runs:
         found.setdefault(one.policy, []).append(one)
     return dict(sorted(found.items(), key=lambda entry: -mean("simulated_qoi", entry[1])))
 
 
-def mean(name: str, runs: Sequence[Run]) -> float:
+def mean(name: str, runs: Sequence[LiveRun]) -> float:
     """Mean of a field over the runs."""
     return statistics.fmean(getattr(one, name) for one in runs)
 
 
-def orders(runs: Sequence[Run]) -> tuple[int, int]:
+def orders(runs: Sequence[LiveRun]) -> tuple[int, int]:
     """Count pairs of policies whose simulated H on an episode differ by over ``DIFFER``: in the same order live,
     all."""
 
-    def episode(one: Run) -> tuple[str, str, int]:
+    def episode(one: LiveRun) -> tuple[str, str, int]:
         return one.transport, one.link, one.seed
 
     same = pairs = 0
@@ -94,7 +95,7 @@ def orders(runs: Sequence[Run]) -> tuple[int, int]:
     return same, pairs
 
 
-def agreement(runs: Sequence[Run]) -> str:
+def agreement(runs: Sequence[LiveRun]) -> str:
     """Summarize the difference of live and simulated in one line."""
     apart = [abs(one.qoi_difference) for one in runs]
     counts = [abs(one.delivered_difference) for one in runs]
@@ -113,27 +114,21 @@ COLUMNS: Final = (
     ("median delivery, s", "median_s", "{:.3f}"),
 )
 """Title, field of a run and format; each column is shown live and simulated."""
+SIDES: Final = ("live", "simulated")
 
 
-def cells(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """Make the table's cells by policy: means of ``COLUMNS``, live and simulated in turn."""
-    return {
-        name: [
-            write.format(mean(f"{side}_{key}", chosen)) for _, key, write in COLUMNS for side in ("live", "simulated")
-        ]
-        for name, chosen in by_policy(runs).items()
-    }
-
-
-def table(runs: Sequence[Run]) -> str:
+def table(runs: Sequence[LiveRun]) -> str:
     """Write the runs as Markdown: means by policy, then the difference of live and simulated."""
-    head = " | ".join(f"{title}, live | simulated" for title, _, _ in COLUMNS)
-    lines = [f"| policy | {head} |", "|---|" + "---:|" * (2 * len(COLUMNS))]
-    lines += [f"| {name} | {' | '.join(row)} |" for name, row in cells(runs).items()]
-    return "\n".join([*lines, "", agreement(runs)])
+    head = ["policy", *(f"{title}{side}" for title, _, _ in COLUMNS for side in (", live", ""))]
+    head[2::2] = ["simulated"] * len(COLUMNS)
+    lines = [
+        [name, *(form.format(mean(f"{side}_{key}", chosen)) for _, key, form in COLUMNS for side in SIDES)]
+        for name, chosen in by_policy(runs).items()
+    ]
+    return "\n".join([*markdown_table(head, lines), "", agreement(runs)])
 
 
-def save(runs: Sequence[Run], about: str, command: str, folder: Path) -> Path:
+def save(runs: Sequence[LiveRun], about: str, command: str, folder: Path) -> Path:
     """Write ``runs.json`` with all runs, delivery times, settings and the command; return its path."""
     target = folder / "runs.json"
     kept: dict[str, Any] = {"about": about, "command": command, "runs": [asdict(one) for one in runs]}

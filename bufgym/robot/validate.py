@@ -20,7 +20,7 @@ from bufgym.robot.channels import TRANSPORTS
 from bufgym.robot.log import Record
 from bufgym.robot.queue import PolicyQueue
 from bufgym.robot.receiver import Received, Receiver
-from bufgym.robot.runs import Run
+from bufgym.robot.runs import LiveRun
 from bufgym.robot.sender import Leaves, Sender
 from bufgym.robot.shaped import ShapedLink
 from bufgym.scenario import Episode, Streams, Uplink
@@ -142,7 +142,7 @@ def validate(
     seeds: int = 1,
     plays: Mapping[str, Play] | None = None,
     speed: float = 1.0,
-) -> list[Run]:
+) -> list[LiveRun]:
     """Run every policy on ``seeds`` episodes of every trace, simulated and live by each of ``plays``, by default
     TCP."""
     plays = {"tcp": over("tcp")} if plays is None else plays
@@ -160,7 +160,7 @@ def validate(
                 for transport, played in plays.items():
                     came = played(policy, episode, capacity, scenario.value, speed=speed, seed=seed)
                     runs.append(
-                        Run(
+                        LiveRun(
                             policy.name,
                             trace.name,
                             seed,

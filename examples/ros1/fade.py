@@ -1,7 +1,7 @@
 """Frames of a rospy camera that arrive over a fading link, with rospy's own queue and under policies.
 
 ``examples/fade.py`` defines link and stream. The node is the unmodified ``camera.py``. The subscriber is rospy's and
-connects through ``bufgym.robot.shaped``. The same policies also run in the simulator. Run it with a Python that has
+connects through ``bufgym.robot.ShapedLink``. The same policies also run in the simulator. Run it with a Python that has
 rospy, rosmaster and bufgym:
 
     python3 examples/ros1/fade.py --policies rospy,drop-oldest,afr
@@ -38,7 +38,7 @@ from fade import (
 )
 
 from bufgym.model.link import Link
-from bufgym.robot.shaped import ShapedLink
+from bufgym.robot import ShapedLink
 
 PORT = 11399
 """Port of the master in a namespace of its own."""

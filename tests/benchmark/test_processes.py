@@ -77,7 +77,7 @@ def test_workers_end_with_their_parent(how: signal.Signals, tmp_path: Path) -> N
 
 
 def test_a_worker_whose_parent_is_gone_before_it_begins_ends() -> None:
-    late = "import os, time; from bufgym.benchmark.cluster import end_with; end_with(os.getpid()); time.sleep(600)"
+    late = "import os, time; from bufgym.ground.processes import end_with; end_with(os.getpid()); time.sleep(600)"
     assert subprocess.run([sys.executable, "-c", late], check=False).returncode == 1
 
 

@@ -23,7 +23,7 @@ from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.stress import ratios
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.margins import margins
-from bufgym.robot.runs import Run as LiveRun
+from bufgym.robot.runs import LiveRun
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
 

@@ -11,6 +11,7 @@ import pytest
 from loop_cases import pytest_pyfunc_call, runner  # noqa: F401
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "fuzz"))  # mutations lie beside the fuzzing of files
+sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))  # the made-up robots
 _NUMBERS = itertools.count(1)
 
 

@@ -22,14 +22,16 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # this is no test: pytest does it for those
+# This is no test: pytest does it for those.
+sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 from loop_cases import beside
+from made_up_robot import ODOMETRY, SCAN, cast, jpeg, odometry, picture, pose_at, scan
 from relay_cases import client, settings
 
-from bufgym.relay import ros_messages, wire
+from bufgym.relay import wire
 from bufgym.relay.config import Limits
-from bufgym.relay.room import cast, jpeg, picture, pose_at
 from bufgym.relay.server import serve_forever
 from bufgym.relay.wire import Message
 
@@ -154,7 +156,7 @@ async def load(robots: int, viewers: int, seconds: float, slow: bool) -> None:
 
 
 POSES, SETTLES_S = 40, 6.0
-SENSES = {"odom": ("cdr", ros_messages.ODOMETRY), "scan": ("cdr", ros_messages.SCAN), "camera": ("jpeg", "")}
+SENSES = {"odom": ("cdr", ODOMETRY), "scan": ("cdr", SCAN), "camera": ("jpeg", "")}
 CATEGORIES = ["devtools.timeline", "disabled-by-default-devtools.timeline.frame", "cc", "benchmark"]
 ANGLES = np.radians(np.arange(0, 360, 2.0))
 
@@ -162,8 +164,8 @@ ANGLES = np.radians(np.arange(0, 360, 2.0))
 async def robot(port: int, number: int) -> None:
     """One that drives its first four seconds again and again, with its status and a queue that fills and empties."""
     name, drive = f"robot-{number}", [pose_at(number, k / RATE_HZ) for k in range(POSES)]
-    odometry = [ros_messages.odometry(0, name, pose, 1.0) for pose in drive]
-    scans = [ros_messages.scan(0, name, ANGLES, cast(pose, ANGLES)[0]) for pose in drive]
+    odometry = [odometry(0, name, pose, 1.0) for pose in drive]
+    scans = [scan(0, name, ANGLES, cast(pose, ANGLES)[0]) for pose in drive]
     senses = list(zip(odometry, scans, [jpeg(picture(drive[0]))] * POSES, strict=True))
     kinds = {topic: {"encoding": encoding, "type": type} for topic, (encoding, type) in SENSES.items()}
     async with client(port, name=name) as one:

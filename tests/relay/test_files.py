@@ -75,7 +75,7 @@ def test_pieces_are_the_whole(tmp_path: Path) -> None:
 
 def test_a_recording_that_is_being_written_goes_on(tmp_path: Path) -> None:
     record, folder = recorder(tmp_path, [b"1", b"2"]), tmp_path / FOLDER
-    record._file.flush()  # type: ignore[union-attr]
+    record._file.file.flush()  # type: ignore[union-attr]
     name = recordings(folder)[0]["name"]
     first = piece(folder, name, 0, 100, every)
     record(Message("/robots/c", b"3"))

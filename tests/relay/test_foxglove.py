@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from loop_cases import beside, compiled, until
+from made_up_robot import SCAN, MadeUp
 from relay_cases import ALL, Corner, client, relay, settings
 
 pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
@@ -17,7 +18,6 @@ from bufgym.ground.errors import BufgymError
 from bufgym.relay import ros_messages
 from bufgym.relay.config import Foxglove, Rule
 from bufgym.relay.foxglove import Bridge, Screen
-from bufgym.relay.madeup import MadeUp
 from bufgym.relay.robot import Robot
 from bufgym.relay.server import Server
 from bufgym.relay.session import Session
@@ -62,10 +62,10 @@ async def test_a_client_of_foxglove_sees_the_fleet(corner: Corner, monkeypatch: 
     async with beside(bridge.run(), source.run(), viewer.listen(bridge.address)):
         await until(lambda: set(came) >= {*topics, "/tf"})  # and the relay's own
     scan = channels[f"{robot}/scan"]
-    assert (scan["encoding"], scan["schemaName"], scan["schemaEncoding"]) == ("cdr", ros_messages.SCAN, "ros2msg")
+    assert (scan["encoding"], scan["schemaName"], scan["schemaEncoding"]) == ("cdr", SCAN, "ros2msg")
     assert "float32[] ranges" in scan["schema"]
     base = f"{corner.robot}/base"
-    assert ros_messages.read(came[f"{robot}/scan"], ros_messages.SCAN).header.frame_id == base
+    assert ros_messages.read(came[f"{robot}/scan"], SCAN).header.frame_id == base
     assert channels[f"{robot}/camera"]["schemaName"] == "foxglove.CompressedImage"
     assert channels["/tf"]["schemaName"] == "foxglove.FrameTransform" and base.encode() in came["/tf"]
     assert 0 < json.loads(came[f"{robot}/status"])["battery"] <= 1

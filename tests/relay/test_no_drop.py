@@ -17,11 +17,11 @@ from relay_cases import Corner, client, nothing, process, relay, settings
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import session
-from bufgym.relay.config import Rule, Store
+from bufgym.relay.config import Rule, StoreLimits
 from bufgym.relay.session import Session
 from bufgym.robot.sockets import free_port
 
-CONFIG = settings(store=Store(window=2, messages=4))
+CONFIG = settings(store=StoreLimits(window=2, messages=4))
 KILLS = int(os.environ.get("BUFGYM_KILLS", "2"))
 COMMAND = "/robots/a/command"
 

@@ -14,7 +14,7 @@ from loop_cases import compiled
 for library in ("websockets", "re2", "rosbags", "PIL"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
-from bufgym.relay import demo  # noqa: E402
+import fleet_demo as demo  # noqa: E402
 
 pytestmark = compiled
 

@@ -15,9 +15,9 @@ from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.relay import session
 from bufgym.relay.client import Client
-from bufgym.relay.session import RefusedError, Session, security, token
+from bufgym.relay.session import Session, security, token
 from bufgym.relay.unanswered import Unanswered
-from bufgym.relay.wire import Message
+from bufgym.relay.wire import Message, RefusedError
 from bufgym.robot.shaped import ShapedLink
 from bufgym.traces import Trace
 

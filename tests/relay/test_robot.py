@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 from loop_cases import beside, compiled, until
+from made_up_robot import HALF_M, ODOMETRY, PICTURE, SCAN, MadeUp, Pose, cast, jpeg, odometry, picture, pose_at, scan
 from relay_cases import Corner, settings
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.relay import robot, ros_messages, wire
-from bufgym.relay.bag import Recorded
-from bufgym.relay.madeup import MadeUp
+from bufgym.relay.bag import BagSource
 from bufgym.relay.monitor import Monitor
 from bufgym.relay.robot import Robot
-from bufgym.relay.room import HALF_M, PICTURE, Pose, cast, jpeg, picture, pose_at
 from bufgym.relay.session import Session
 
 pytest.importorskip("rosbags", reason="no rosbags here: the extra relay")
@@ -95,19 +94,19 @@ def test_a_queue_told_by_hand() -> None:
 
 
 def test_messages_read_as_they_were_made() -> None:
-    made = ros_messages.odometry(1_500_000, "r", Pose(1.0, -2.0, 0.5), 0.25)
-    read = ros_messages.read(made, ros_messages.ODOMETRY)
+    made = odometry(1_500_000, "r", Pose(1.0, -2.0, 0.5), 0.25)
+    read = ros_messages.read(made, ODOMETRY)
     assert (read.header.stamp.sec, read.header.stamp.nanosec, read.child_frame_id) == (1, 500_000_000, "r/base")
     assert ros_messages.planar(read.pose.pose) == {"x": 1.0, "y": -2.0, "yaw": 0.5}
     angles = np.radians([-90.0, 0.0, 90.0])
-    scan = ros_messages.read(ros_messages.scan(0, "r", angles, np.array([1.0, 2.0, 3.0])), ros_messages.SCAN)
-    assert scan.ranges.tolist() == [1, 2, 3] and scan.angle_increment == pytest.approx(math.pi / 2)
+    laser = ros_messages.read(scan(0, "r", angles, np.array([1.0, 2.0, 3.0])), SCAN)
+    assert laser.ranges.tolist() == [1, 2, 3] and laser.angle_increment == pytest.approx(math.pi / 2)
     with pytest.raises(BufgymError, match="message of 3 bytes: no nav_msgs/msg/Odometry in cdr"):
-        ros_messages.read(b"abc", ros_messages.ODOMETRY)
-    old = ros_messages.as_ros1(made, ros_messages.ODOMETRY)
-    assert ros_messages.modern(old, ros_messages.ODOMETRY, "ros1") == ("cdr", made)
+        ros_messages.read(b"abc", ODOMETRY)
+    old = ros_messages.as_ros1(made, ODOMETRY)
+    assert ros_messages.modern(old, ODOMETRY, "ros1") == ("cdr", made)
     assert ros_messages.modern(b"?", "my_msgs/msg/Own", "ros1") == ("ros1", b"?")
-    assert "float32[] ranges" in (ros_messages.definition(ros_messages.SCAN) or "")
+    assert "float32[] ranges" in (ros_messages.definition(SCAN) or "")
 
 
 # --- at a relay ------------------------------------------------------------------------------------------------------
@@ -143,11 +142,11 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
     status = json.loads(bytes(came["status"][-1].payload))
     assert 0.9 < status["battery"] <= 1 and abs(status["location"]["x"]) < HALF_M[0]
     assert status["policies"] == ["drop-oldest", "drop-newest"]
-    assert status["publishes"]["scan"] == {"type": ros_messages.SCAN, "encoding": "cdr"}
+    assert status["publishes"]["scan"] == {"type": SCAN, "encoding": "cdr"}
     assert set(status["queue"]["topics"]) == {"status", "queue", "odom", "scan", "camera"}
     every = [message for messages in came.values() for message in messages if not message.no_drop]
     assert all(message.sender == corner.robot for message in every)
-    pose = ros_messages.read(bytes(came["odom"][0].payload), ros_messages.ODOMETRY)
+    pose = ros_messages.read(bytes(came["odom"][0].payload), ODOMETRY)
     assert abs(pose.pose.pose.position.y) < HALF_M[1]
     assert bytes(came["camera"][0].payload[:2]) == b"\xff\xd8"
 
@@ -159,10 +158,10 @@ def recording(path: Path) -> Path:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        scans = writer.register_channel("/scan", "cdr", writer.register_schema(ros_messages.SCAN, "ros2msg", b""))
+        scans = writer.register_channel("/scan", "cdr", writer.register_schema(SCAN, "ros2msg", b""))
         notes = writer.register_channel("/notes", "json", writer.register_schema("own", "jsonschema", b"{}"))
         for k in range(10):
-            payload = ros_messages.scan(k, "bag", np.radians([0.0, 1.0]), np.array([float(k), 1.0]))
+            payload = scan(k, "bag", np.radians([0.0, 1.0]), np.array([float(k), 1.0]))
             writer.add_message(scans, log_time=k * 10**7, publish_time=k * 10**7, data=payload)
             if k % 2 == 0:
                 writer.add_message(notes, log_time=k * 10**7 + 1, publish_time=0, data=b'{"k":%d}' % k)
@@ -177,7 +176,7 @@ async def test_a_recording_is_a_robot(corner: Corner, tmp_path: Path) -> None:
     async def story(viewer: Session, came: Came) -> None:
         await until(lambda: len(came["scan"]) >= 12 and came["status"] and came["notes"])
 
-    source = Recorded(recording(tmp_path / "drive.mcap"))
+    source = BagSource(recording(tmp_path / "drive.mcap"))
     assert [(stream.topic.name, stream.rate_hz) for stream in source.streams] == [("notes", 5.0), ("scan", 10.0)]
     came = await watched(corner, source, story, policy="drop-oldest")
     ranges = [ros_messages.read(bytes(one.payload), one.type).ranges[0] for one in came["scan"]]
@@ -191,9 +190,9 @@ def test_what_a_recording_lacks(tmp_path: Path) -> None:
     path = recording(tmp_path / "drive.mcap")
     camera = [stream for stream in MadeUp().streams if stream.topic.name == "camera"]
     with pytest.raises(BufgymError, match=r"no messages of topic '/camera'; it has: /notes, /scan"):
-        Recorded(path, camera)
+        BagSource(path, camera)
     with pytest.raises(BufgymError, match="no such file"):
-        Recorded(tmp_path / "none.mcap")
+        BagSource(tmp_path / "none.mcap")
     with pytest.raises(BufgymError, match="robot 'a/b': a name must be a text without '/'"):
         Robot("ws://a:1", "a/b", MadeUp())
 

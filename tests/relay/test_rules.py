@@ -14,10 +14,10 @@ from relay_cases import settings
 
 from bufgym.relay import policies
 from bufgym.relay.config import Rule
-from bufgym.relay.hub import Frame, Hub
+from bufgym.relay.hub import Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
-from bufgym.relay.store import Session
+from bufgym.relay.store import Mailbox
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import Message
 
@@ -89,12 +89,12 @@ class Ear:
 
     def __init__(self, name: str, configuration: list[Rule], identity: Identity) -> None:
         self.identity = identity
-        self.session = Session(name, identity, temporary=True)
+        self.session = Mailbox(name, identity, temporary=True)
         self.permissions = Permissions(configuration, identity)
         self.subscriptions = {"a": Subscription("a", pattern(".*"), policies.policy("drop-oldest"), 1)}
         self.came: set[str] = set()
 
-    def offer(self, subscription: Subscription, frame: Frame) -> None:
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         self.came.add(frame.message.topic)
 
 

@@ -10,7 +10,6 @@ import contextlib
 import importlib
 import os
 import pickle
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -25,12 +24,10 @@ from numba.core.registry import CPUDispatcher
 
 from bufgym.ground.kernel.announce import say
 from bufgym.ground.kernel.cache import FOLDER
+from bufgym.ground.processes import COMPILES, compiling
 
 FEW = 8
 """Rows of a batch that plain Python is fast enough for."""
-_MARK = "BUFGYM_COMPILES"
-"""Environment variable of the process that compiles: it starts no other, whatever program it turns out to be."""
-_CHILD = "import sys; sys.path[:] = {path!r}; from bufgym.ground.kernel.meanwhile import fill_cache; fill_cache()"
 
 Bundle = TypeVar("Bundle", bound=NamedTuple)
 
@@ -69,17 +66,13 @@ class Meanwhile:
             return self._python(*(named(entry) if hasattr(entry, "_fields") else entry for entry in arguments))
 
     def _compile(self) -> None:
-        path = [place for place in sys.path if isinstance(place, str)]
-        command = [sys.executable, "-c", _CHILD.format(path=path)]
-        quiet = subprocess.DEVNULL
         with contextlib.suppress(OSError):  # where no process can be started, is_over says so
-            marked = {**os.environ, _MARK: "1"}
-            subprocess.run(command, input=self._asked, stdout=quiet, stderr=quiet, env=marked, check=False)
+            compiling(__name__, "fill_cache", given=self._asked, quiet=True)
 
 
 def is_possible() -> bool:
     """Whether another process can compile: not in a program that is one file with its Python, such as PyInstaller's."""
-    return bool(sys.executable) and not getattr(sys, "frozen", False) and _MARK not in os.environ
+    return bool(sys.executable) and not getattr(sys, "frozen", False) and COMPILES not in os.environ
 
 
 def fill_cache() -> None:

@@ -33,6 +33,8 @@ from bufgym.robot.odometry import Odometry
 from bufgym.robot.ros1.connection import PolicyConnection
 from bufgym.traces import MotionSettings
 
+__all__ = ["UNTOUCHED", "install"]
+
 UNTOUCHED: Final = ("/rosout", "/tf", "/tf_static", "/clock")
 """Small topics that every node reads. A policy named for one of them still rules it."""
 _ROOM: Final = 4096

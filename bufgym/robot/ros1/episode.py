@@ -23,20 +23,7 @@ from typing import Any
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
-from bufgym.robot import PolicyQueue, ros1
-from bufgym.robot.programs import (
-    CAMERA,
-    ODOMETRY,
-    START_S,
-    Program,
-    Seen,
-    check_messages,
-    drained,
-    pose_stamp,
-    programs,
-    publish_in_time,
-    received,
-)
+from bufgym.robot import PolicyQueue, programs, ros1
 from bufgym.robot.receiver import Received
 from bufgym.robot.shaped import ShapedLink
 from bufgym.robot.validate import Play, warm
@@ -52,7 +39,7 @@ def player() -> Play:
     with ros1.needs_rospy():
         for module in ("rospy", "rosmaster.master"):
             importlib.import_module(module)
-        check_messages("_md5sum")
+        programs.check_messages("_md5sum")
     return play
 
 
@@ -65,25 +52,25 @@ def play(
     warm(PolicyQueue(policy, capacity, value=value))
     with (
         tempfile.TemporaryDirectory() as logs,
-        programs(
+        programs.running(
             viewer=partial(_view, logs), camera=partial(_publish, logs, policy, episode, capacity, value)
         ) as begun,
     ):
         return asyncio.run(_play(begun, episode))
 
 
-async def _play(begun: Sequence[Program], episode: Episode) -> list[Received]:
+async def _play(begun: Sequence[programs.Worker], episode: Episode) -> list[Received]:
     viewer, camera = begun
     camera.tell(await viewer.told())  # where the master is
     link = ShapedLink(episode.link, await viewer.told(), back=True)
     try:
         viewer.tell(await link.listen())
         await camera.told()
-        began_s = time.monotonic() + START_S
+        began_s = time.monotonic() + programs.START_S
         asyncio.get_running_loop().call_at(began_s, link.begin)
         camera.tell(began_s)
         viewer.tell(await camera.told(patience_s=math.inf))
-        return received(await viewer.told(patience_s=math.inf), episode, began_s)
+        return programs.received(await viewer.told(patience_s=math.inf), episode, began_s)
     finally:
         await link.close()
 
@@ -118,8 +105,8 @@ def _view(logs: str, parent: Connection) -> None:
 
     TCPROSHandler.create_transport = through_the_link
     _in_ros(uri, logs, "viewer")
-    seen = Seen()
-    rospy.Subscriber(CAMERA, CompressedImage, seen.take, tcp_nodelay=True)
+    seen = programs.Seen()
+    rospy.Subscriber(programs.CAMERA, CompressedImage, seen.take, tcp_nodelay=True)
     parent.send(uri)
     connected.wait()
     seen.wait(parent.recv())
@@ -130,19 +117,19 @@ def _view(logs: str, parent: Connection) -> None:
 def _publish(logs: str, policy: Policy, episode: Episode, capacity: int, value: Value, parent: Connection) -> None:
     """Run the node, and report its progress to the other programs."""
     uri = parent.recv()
-    ros1.install(policy, topics={ODOMETRY: None}, odometry=ODOMETRY, value=value)
+    ros1.install(policy, topics={programs.ODOMETRY: None}, odometry=programs.ODOMETRY, value=value)
 
     import rospy
     from geometry_msgs.msg import PoseStamped
     from sensor_msgs.msg import CompressedImage
 
     _in_ros(uri, logs, "camera")
-    camera = rospy.Publisher(CAMERA, CompressedImage, queue_size=capacity)
-    odometry = rospy.Publisher(ODOMETRY, PoseStamped, queue_size=100)
+    camera = rospy.Publisher(programs.CAMERA, CompressedImage, queue_size=capacity)
+    odometry = rospy.Publisher(programs.ODOMETRY, PoseStamped, queue_size=100)
 
     def move(k: int, metres: float) -> None:
         pose = PoseStamped()
-        pose.header.stamp = rospy.Time(*pose_stamp(k))
+        pose.header.stamp = rospy.Time(*programs.pose_stamp(k))
         pose.pose.position.x, pose.pose.orientation.w = metres, 1.0
         odometry.publish(pose)
 
@@ -152,6 +139,6 @@ def _publish(logs: str, policy: Policy, episode: Episode, capacity: int, value: 
     while camera.get_num_connections() == 0 or odometry.get_num_connections() == 0:
         time.sleep(0.01)
     parent.send("both are subscribed to")
-    publish_in_time(episode, parent.recv(), move, show)
-    parent.send(drained(camera.impl.connections[0].queue, len(episode.arrivals)))
+    programs.publish_in_time(episode, parent.recv(), move, show)
+    parent.send(programs.drained(camera.impl.connections[0].queue, len(episode.arrivals)))
     parent.recv()

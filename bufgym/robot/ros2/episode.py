@@ -24,24 +24,11 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
-from bufgym.robot import PolicyQueue
+from bufgym.robot import PolicyQueue, programs
 from bufgym.robot.log import Record
-from bufgym.robot.programs import (
-    CAMERA,
-    ODOMETRY,
-    START_S,
-    Program,
-    Seen,
-    check_messages,
-    drained,
-    pose_stamp,
-    programs,
-    publish_in_time,
-    received,
-)
 from bufgym.robot.receiver import Received
 from bufgym.robot.ros2.names import needs_rclpy
-from bufgym.robot.ros2.relay import Robot, receive
+from bufgym.robot.ros2.relay import RosSender, receive
 from bufgym.robot.shaped import ShapedLink
 from bufgym.robot.validate import Play, warm
 from bufgym.scenario import Client, Episode, Stream
@@ -65,7 +52,7 @@ def player() -> Play:
     """
     with needs_rclpy():
         importlib.import_module("rclpy")
-        check_messages("get_fields_and_field_types")
+        programs.check_messages("get_fields_and_field_types")
     return play
 
 
@@ -76,7 +63,7 @@ def play(
     if speed != 1:
         raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
     warm(PolicyQueue(policy, capacity, value=value))
-    with programs(
+    with programs.running(
         receive=_receive,
         send=partial(_send, policy, capacity, value),
         viewer=_view,
@@ -85,18 +72,18 @@ def play(
         return asyncio.run(_play(begun, episode))
 
 
-async def _play(begun: Sequence[Program], episode: Episode) -> list[Received]:
+async def _play(begun: Sequence[programs.Worker], episode: Episode) -> list[Received]:
     receiving, sending, viewer, camera = begun
     link = ShapedLink(episode.link, ("127.0.0.1", await receiving.told()))
     try:
         sending.tell(await link.listen())
         await viewer.told()  # of a frame before the first
-        began_s = time.monotonic() + START_S
+        began_s = time.monotonic() + programs.START_S
         asyncio.get_running_loop().call_at(began_s, link.begin)
         camera.tell(began_s)
         sending.tell(await camera.told(patience_s=math.inf))
         viewer.tell(await sending.told(patience_s=math.inf))
-        return received(await viewer.told(), episode, began_s)
+        return programs.received(await viewer.told(), episode, began_s)
     finally:
         await link.close()
 
@@ -130,16 +117,17 @@ def _send(policy: Policy, capacity: int, value: Value, parent: Connection) -> No
         if record["event"] == "put":
             puts.append(record)
 
-    stream = Stream(Topic(CAMERA), rate_hz=30.0, size_bytes=1, moves=True)
+    stream = Stream(Topic(programs.CAMERA), rate_hz=30.0, size_bytes=1, moves=True)
     # Where a client is simulated, it needs a link and a motion as well.
     client = Client((stream,), (Trace.steps([(1.0, 1e6)]),), (load_motion("drive-0"),), value=value)
     _on(_DOMAIN)
-    robot = Robot(client, "127.0.0.1", parent.recv(), policy=policy, capacity=capacity, odometry=ODOMETRY, log=count)
+    to, odometry = ("127.0.0.1", parent.recv()), programs.ODOMETRY
+    robot = RosSender(client, *to, policy=policy, capacity=capacity, odometry=odometry, log=count)
 
     def all_sent() -> None:
         parent.recv()
         time.sleep(_SETTLED_S)
-        parent.send(drained(robot.queue, len(puts)))
+        parent.send(programs.drained(robot.queue, len(puts)))
 
     async def relay() -> None:
         await asyncio.gather(robot.run(), asyncio.to_thread(all_sent))
@@ -148,12 +136,12 @@ def _send(policy: Policy, capacity: int, value: Value, parent: Connection) -> No
 
 
 def _view(parent: Connection) -> None:
-    node, seen = _node(_DOMAIN + 1, "viewer"), Seen()
+    node, seen = _node(_DOMAIN + 1, "viewer"), programs.Seen()
 
     import rclpy
     from sensor_msgs.msg import CompressedImage
 
-    node.create_subscription(CompressedImage, CAMERA, seen.take, _DEPTH)
+    node.create_subscription(CompressedImage, programs.CAMERA, seen.take, _DEPTH)
     threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
     seen.wait(1)
     parent.send("a frame")
@@ -168,13 +156,13 @@ def _publish(episode: Episode, parent: Connection) -> None:
     from geometry_msgs.msg import PoseStamped
     from sensor_msgs.msg import CompressedImage
 
-    camera = node.create_publisher(CompressedImage, CAMERA, _DEPTH)
-    odometry = node.create_publisher(PoseStamped, ODOMETRY, _DEPTH)
+    camera = node.create_publisher(CompressedImage, programs.CAMERA, _DEPTH)
+    odometry = node.create_publisher(PoseStamped, programs.ODOMETRY, _DEPTH)
     body = array("B", bytes(int(episode.arrivals["size_bytes"].max())))
 
     def move(k: int, metres: float) -> None:
         pose = PoseStamped()
-        pose.header.stamp.sec, pose.header.stamp.nanosec = pose_stamp(k)
+        pose.header.stamp.sec, pose.header.stamp.nanosec = programs.pose_stamp(k)
         pose.pose.position.x, pose.pose.orientation.w = metres, 1.0
         odometry.publish(pose)
 
@@ -185,6 +173,6 @@ def _publish(episode: Episode, parent: Connection) -> None:
         time.sleep(0.01)
     while not parent.poll(0.5):
         show(_WARM_UP, 1)
-    publish_in_time(episode, parent.recv(), move, show)
+    programs.publish_in_time(episode, parent.recv(), move, show)
     parent.send("all is published")
     parent.recv()

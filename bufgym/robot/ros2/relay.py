@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
+from functools import partial
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
@@ -23,6 +24,7 @@ from bufgym.robot.odometry import Odometry
 from bufgym.robot.receiver import Received, Receiver
 from bufgym.robot.ros2.names import Published, needs_rclpy, parse, published
 from bufgym.robot.sender import Sender
+from bufgym.robot.tasks import until_one_ends
 from bufgym.scenario import Client
 
 SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
@@ -53,7 +55,40 @@ def own_node(name: str) -> Iterator[Any]:
         rclpy.try_shutdown(context=context)
 
 
-class Robot:
+@asynccontextmanager
+async def spinning(node: Any) -> AsyncIterator[None]:
+    """Call the node's callbacks in a thread, as long as the block takes."""
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+
+    def spin() -> None:
+        with suppress(ExternalShutdownException):
+            executor.spin()
+
+    thread = asyncio.create_task(asyncio.to_thread(spin))
+    try:
+        yield
+    finally:
+        executor.shutdown(timeout_sec=2.0)
+        await asyncio.gather(thread, return_exceptions=True)
+
+
+async def look(node: Any, names: Iterable[str], found: Callable[[Published], None], but_not: str) -> None:
+    """Call ``found`` once for each of these topics that has a publisher not named ``but_not``; never return."""
+    wanted = set(names)
+    while wanted:
+        for name in list(wanted):
+            topic = published(node, name, but_not)
+            if topic is not None:
+                wanted.discard(name)
+                found(topic)
+        await asyncio.sleep(LOOK_S)
+    await asyncio.Event().wait()
+
+
+class RosSender:
     """The sending end, which sends the topics of ``client`` over one uplink to ``host`` and ``port``."""
 
     def __init__(
@@ -85,7 +120,8 @@ class Robot:
         )
         self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port))
         self._streams = client.streams
-        self._odometry_topic = odometry
+        self._numbers = {resolved(stream.topic.name): number for number, stream in enumerate(client.streams)}
+        self._odometry_topic = None if odometry is None else resolved(odometry)
         self._odometry = Odometry()
         self._began_s = time.monotonic()
         self._say = say
@@ -93,46 +129,15 @@ class Robot:
     async def run(self) -> None:
         """Relay until cancelled."""
         with own_node(SENDER) as node:
-            from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+            names = [*self._numbers, *([] if self._odometry_topic is None else [self._odometry_topic])]
+            async with spinning(node):
+                found = partial(self._subscribe, node)
+                await until_one_ends(self.sender.run(), look(node, names, found, RECEIVER))
 
-            executor = SingleThreadedExecutor(context=node.context)
-            executor.add_node(node)
-
-            def spin() -> None:
-                with suppress(ExternalShutdownException):
-                    executor.spin()
-
-            tasks = [
-                asyncio.create_task(self.sender.run()),
-                asyncio.create_task(self._look(node)),
-                asyncio.create_task(asyncio.to_thread(spin)),
-            ]
-            try:
-                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-                for task in done:
-                    task.result()
-            finally:
-                executor.shutdown(timeout_sec=2.0)
-                for task in tasks:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _look(self, node: Any) -> None:
-        """Subscribe to each topic once it has a publisher."""
-        wanted = {resolved(stream.topic.name): number for number, stream in enumerate(self._streams)}
-        if self._odometry_topic is not None:
-            wanted[resolved(self._odometry_topic)] = wanted.get(resolved(self._odometry_topic), -1)
-        while wanted:
-            for name in list(wanted):
-                topic = published(node, name, RECEIVER)
-                if topic is not None:
-                    self._subscribe(node, topic, wanted.pop(name))
-                    self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
-            await asyncio.sleep(LOOK_S)
-        await asyncio.Event().wait()
-
-    def _subscribe(self, node: Any, topic: Published, number: int) -> None:
-        if number >= 0:
+    def _subscribe(self, node: Any, topic: Published) -> None:
+        self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
+        number = self._numbers.get(topic.name)
+        if number is not None:
             stream, head = self._streams[number], topic.head()
 
             def put(message: bytes) -> None:
@@ -140,7 +145,7 @@ class Robot:
                 self.queue.put(head + message, len(head) + len(message), x, number)
 
             node.create_subscription(topic.message_class, topic.name, put, topic.qos, raw=True)
-        if self._odometry_topic is not None and topic.name == resolved(self._odometry_topic):
+        if topic.name == self._odometry_topic:
             node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos)
 
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from live_cases import OVER_TCP, in_order, meeting_port, put, receiving, sending
+from live_cases import in_order, meeting_port, put, receiving, sending
 from loop_cases import beside, until
 
 from bufgym.cli import live as command
@@ -38,7 +38,7 @@ def test_the_command_knows_every_transport() -> None:
 
 @pytest.mark.parametrize(
     ("transport", "cut_s"),
-    [*((transport, 0.0) for transport in OVER_TCP), pytest.param("tcp", CUT_S, marks=pytest.mark.nightly)],
+    [*((transport, 0.0) for transport in TRANSPORTS), pytest.param("tcp", CUT_S, marks=pytest.mark.nightly)],
 )
 async def test_a_link_cut_and_back(transport: str, cut_s: float, request: pytest.FixtureRequest) -> None:
     """While the link is cut the policy drops, and memory holds no more than before."""

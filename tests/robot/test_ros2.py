@@ -19,7 +19,7 @@ from bufgym.robot import replay
 from bufgym.robot.frames import FrameError
 from bufgym.robot.log import of, read_log
 from bufgym.robot.ros2.names import Published, parse
-from bufgym.robot.ros2.relay import Robot
+from bufgym.robot.ros2.relay import RosSender
 from bufgym.scenario import read_client
 
 REPO = Path(__file__).resolve().parents[2]
@@ -48,7 +48,7 @@ def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
 @pytest.mark.nightly
 def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None:
     numbers = [str(k) for k in range(100)]
-    seen = json.loads(run(REPO / "tests/live/ros2_session.py", tmp_path).splitlines()[-1])
+    seen = json.loads(run(REPO / "tests/robot/ros2_session.py", tmp_path).splitlines()[-1])
     assert seen["came"] == {"camera": numbers, "status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
     assert seen["told"][1] == "/commands: std_msgs/msg/String, reliable"
     assert seen["best_effort"] and seen["by"] == "bufgym_receive" and seen["faults"] == []
@@ -97,7 +97,7 @@ def test_a_type_that_is_not_installed() -> None:
 
 def test_what_moves_needs_odometry() -> None:
     with pytest.raises(BufgymError, match=r"topic 'pointcloud': moves, which needs a topic with odometry"):
-        Robot(read_client(REPO / "examples" / "client.toml"), "127.0.0.1", 1)
+        RosSender(read_client(REPO / "examples" / "client.toml"), "127.0.0.1", 1)
 
 
 def test_the_command_names_what_is_wrong(

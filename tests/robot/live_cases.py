@@ -15,9 +15,7 @@ from bufgym.robot.log import Record
 from bufgym.robot.receiver import Received, Receiver
 from bufgym.robot.sender import Sender
 
-LIBRARIES = {"websocket": "websockets", "zenoh": "zenoh", "mqtt": "paho.mqtt", "dds": "cyclonedds"}
-OVER_TCP = [transport for transport in TRANSPORTS if transport != "dds"]
-"""What goes through a shaped link."""
+LIBRARIES = {"websocket": "websockets", "zenoh": "zenoh", "mqtt": "paho.mqtt"}
 
 VALIDATE = [
     *("-mbufgym", "live", "validate", "--trace", "lte-synthetic-3", "--scale", "0.4"),

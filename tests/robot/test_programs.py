@@ -18,7 +18,7 @@ from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.robot import programs as live
 from bufgym.robot.odometry import Odometry
-from bufgym.robot.programs import pose_stamp, programs, publish_in_time, received
+from bufgym.robot.programs import pose_stamp, publish_in_time, received, running
 from bufgym.robot.ros1 import episode as ros1
 from bufgym.robot.ros2 import episode as ros2
 from bufgym.scenario import Episode, messages
@@ -45,12 +45,12 @@ def ends(_: Connection) -> None:
 
 @pytest.mark.parametrize(("work", "words"), [(fails, "other: no such thing"), (ends, "other: has ended")])
 def test_who_waits_for_one_program_hears_that_another_has_failed(work: Any, words: str) -> None:
-    with programs(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
+    with running(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
         asyncio.run(echo.told())
 
 
 def test_a_program_is_spoken_to_and_may_be_silent() -> None:
-    with programs(echo=echoes) as (echo,):
+    with running(echo=echoes) as (echo,):
         echo.tell({"port": 3})
         assert asyncio.run(echo.told()) == {"port": 3}
         with pytest.raises(BufgymError, match=r"echo: said nothing for 0\.01 s"):
@@ -59,10 +59,10 @@ def test_a_program_is_spoken_to_and_may_be_silent() -> None:
 
 PARENT = """
 import multiprocessing, os, signal, sys, threading, time
-from bufgym.robot.programs import programs
+from bufgym.robot.programs import running
 ours = signal.signal
 signal.signal = lambda *what: (time.sleep(float(sys.argv[1])), ours(*what))  # the program's first step
-with programs(idle=lambda parent: threading.Event().wait()):
+with running(idle=lambda parent: threading.Event().wait()):
     print(multiprocessing.active_children()[0].pid, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """

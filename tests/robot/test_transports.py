@@ -9,17 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser_cases import embedded
-from live_cases import OVER_TCP, in_order, meeting_port
+from live_cases import in_order, meeting_port
 from loop_cases import compiled
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.robot import PolicyQueue, replay, shaped
+from bufgym.robot.channels import TRANSPORTS
 from bufgym.robot.log import Record
-from bufgym.robot.runs import Run, orders, save, table
+from bufgym.robot.runs import LiveRun, orders, save, table
 from bufgym.robot.shaped import ShapedLink
 from bufgym.robot.validate import over, play, validate
 from bufgym.scenario import Episode, Uplink, messages
@@ -40,7 +39,7 @@ async def live(episode: Episode, policy: str = "afr", capacity: int = 8, **setti
     return await play(policies.get(policy), episode, capacity, V, **{"speed": 2.0, **settings})
 
 
-@pytest.mark.parametrize("transport", OVER_TCP)
+@pytest.mark.parametrize("transport", TRANSPORTS)
 async def test_the_log_tells_what_came(transport: str, request: pytest.FixtureRequest) -> None:
     """And the simulator makes the same of it. Half a second at four times the speed, three messages on their way."""
     slow, records = fade(15, size_bytes=20_000), list[Record]()
@@ -123,7 +122,7 @@ def test_live_as_in_the_simulator() -> None:
     """Wide margins: on a quiet machine counts agree within 1 and QoI within 0.5 %."""
     scenario = Uplink(traces=(fade().link.trace,), duration_s=5.0, random_offset=False, propagation_us=0, value=V)
     chosen = [policies.get(name) for name in ("drop-oldest", "random")]
-    plays = {transport: over(transport) for transport in OVER_TCP if transport != "mqtt"}  # which wants a broker's port
+    plays = {transport: over(transport) for transport in TRANSPORTS if transport != "mqtt"}  # it wants a broker
     runs = validate(chosen, scenario, 4, speed=2.0, plays=plays)
     assert [one.policy for one in runs] == ["drop-oldest"] * len(plays) + ["random"] * len(plays)
     for one in runs:
@@ -134,8 +133,8 @@ def test_live_as_in_the_simulator() -> None:
 
 def test_the_table_by_hand() -> None:
     runs = [
-        Run("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0, "tcp", (0.1, 0.2, 0.6), (0.1, 0.2)),
-        Run("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0, "tcp", (0.2, 0.4), (0.15,)),
+        LiveRun("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0, "tcp", (0.1, 0.2, 0.6), (0.1, 0.2)),
+        LiveRun("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0, "tcp", (0.2, 0.4), (0.15,)),
     ]
     text = table(runs)
     assert "| afr | 9.5 | 10.0 | 4.500 | 5.000 | 10.00% | 0.00% | 0.250 | 0.150 |" in text
@@ -145,59 +144,17 @@ def test_the_table_by_hand() -> None:
 def test_orders_by_hand() -> None:
     """On link a the three differ by more than 1 % but for the last two, of which live one swaps with the first."""
 
-    def one(policy: str, simulated: float, live: float, link: str = "a") -> Run:
-        return Run(policy, link, 0, 1, 1, live, simulated, 9.0)
+    def one(policy: str, simulated: float, live: float, link: str = "a") -> LiveRun:
+        return LiveRun(policy, link, 0, 1, 1, live, simulated, 9.0)
 
     runs = [one("afr", 5.0, 4.9), one("random", 4.0, 3.9), one("drop-oldest", 4.03, 4.95), one("afr", 1.0, 1.0, "b")]
     assert orders(runs) == (1, 2)
 
 
-# --- what ``bufgym live validate --out`` leaves: every run in a file, and a page with pictures ------------------------
-
-
-def report() -> Any:
-    pytest.importorskip("jinja2", reason="the page needs Jinja")
-    pytest.importorskip("plotly", reason="the page needs plotly")
-    from bufgym.robot import report as live
-
-    return live
-
-
-RUNS = [
-    Run("afr", "lte <b>", 0, 99, 100, 4.99, 5.0, 5.0, "tcp", (0.1, 0.2), (0.1, 0.3)),
-    Run("afr", "lte <b>", 0, 100, 100, 5.0, 5.0, 5.0, "websocket", (0.1,), (0.1,)),
-    Run("drop-oldest", "lte <b>", 0, 90, 90, 4.0, 4.0, 5.0, "tcp", (), ()),
-]
-
-
-def test_the_page_tells_all_runs(tmp_path: Path) -> None:
-    live = report()
-    page = live.write(save(RUNS, "10 s of <video>", "bufgym live validate --trace x", tmp_path / "out")).read_text()
-    assert json.loads((tmp_path / "out" / "runs.json").read_text())["runs"][0]["live_s"] == [0.1, 0.2]
-    assert "10 s of &lt;video&gt;." in page and "lte <b>" not in page
-    assert "3 runs: QoI live and simulated 0.00% apart (median), 0.20% at most; delivered 0 and 1." in page
-    assert "Of 1 pairs of policies that differ by more than 1%, 1 stand in the same order." in page
-    figures = embedded(page)
-    qoi, delivered = figures["apart"][""]
-    lanes = {trace["y"][0]: trace["x"] for trace in qoi["data"]}
-    assert lanes == {"afr": [-0.2, 0], "drop-oldest": [0]}
-    assert [trace["x"] for trace in delivered["data"]] == [[0], [-1, 0]]
-    assert set(figures["regret"]) == {"lte <b>\ntcp", "lte <b>\nwebsocket"} == set(figures["delivery"])
-    curves = {trace["name"]: trace["x"] for trace in figures["delivery"]["lte <b>\ntcp"][0]["data"]}
-    assert set(curves) == {"afr, live", "afr, simulated"}  # nothing came of the other
-    assert (curves["afr, simulated"][0], curves["afr, simulated"][-1]) == (0.1, 0.3)
-
-    pairs = [("afr", 4.0), ("random", 4.1)]
-    runs = [Run(policy, "a", seed, 1, 1, qoi, qoi, 5.0) for seed in (0, 1) for policy, qoi in pairs]
-    page = live.write(save(runs, "", "", tmp_path)).read_text()
-    assert "<p>random against afr, 2 episodes: regret lower by 2.00 % [2.00, 2.00] live" in page
-
-
-@pytest.mark.parametrize("text", ["", "[]", '{"runs": [{"policy": 3}]}', '{"runs": 1, "about": "", "command": ""}'])
-def test_a_file_without_runs_is_named(text: str, tmp_path: Path) -> None:
-    (tmp_path / "runs.json").write_text(text)
-    with pytest.raises(BufgymError, match=r"runs\.json: must hold the runs of bufgym live validate"):
-        report().write(tmp_path / "runs.json")
+def test_every_run_is_kept(tmp_path: Path) -> None:
+    runs = [LiveRun("afr", "lte", 0, 99, 100, 4.99, 5.0, 5.0, "tcp", (0.1, 0.2), (0.1, 0.3))]
+    kept = json.loads(save(runs, "10 s of video", "bufgym live validate --trace x", tmp_path / "out").read_text())
+    assert kept["runs"][0]["live_s"] == [0.1, 0.2] and kept["command"] == "bufgym live validate --trace x"
 
 
 # --- when a shaped link counts as idle: it carries 1 MB/s, and pieces have 10 kB -------------------------------------

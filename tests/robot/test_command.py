@@ -1,5 +1,6 @@
 """``bufgym live``, as a user types it."""
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -59,8 +60,9 @@ def test_validate_prints_both_side_by_side(tmp_path: Path, capsys: pytest.Captur
     assert main(["live", "validate", *arguments]) == 0
     out = capsys.readouterr().out
     assert "| afr |" in out and "2 runs" in out
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "bufgym live validate --trace lte-synthetic-0 --policies afr" in page and "--transport tcp websocket" in page
+    command = json.loads((tmp_path / "runs.json").read_text(encoding="utf-8"))["command"]
+    assert "bufgym live validate --trace lte-synthetic-0 --policies afr" in command
+    assert "--transport tcp websocket" in command
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,46 @@
+"""Processes that work for this one: they end with it, and one of them may compile in its place."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+import threading
+import time
+from typing import Final
+
+PATIENCE_S: Final = 1.0
+"""Time between a worker's checks that its parent process is alive."""
+COMPILES: Final = "BUFGYM_COMPILES"
+"""Environment variable of a process that compiles: it starts no other, whatever program it turns out to be."""
+_CALL = "import sys; sys.path[:] = {path!r}; from {module} import {name}; {name}({arguments})"
+
+
+@functools.cache
+def end_with(parent: int) -> None:
+    """End this process soon after ``parent``, the process number of its parent, has ended.
+
+    A killed parent leaves its workers running, and they would hold its pipes and files for ever. The parent may be gone
+    already when a worker calls this.
+    """
+    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(PATIENCE_S)
+    os._exit(1)
+
+
+def compiling(module: str, name: str, *arguments: str, given: bytes = b"", quiet: bool = False) -> int:
+    """Call the function ``name`` of ``module`` in another process, which compiles; return that process's exit code.
+
+    The compiler would hold this process's lock for tens of seconds. ``given`` is the standard input of the process.
+    """
+    path = [place for place in sys.path if isinstance(place, str)]
+    call = _CALL.format(path=path, module=module, name=name, arguments=", ".join(map(repr, arguments)))
+    output = subprocess.DEVNULL if quiet else None
+    marked = {**os.environ, COMPILES: "1"}
+    command = [sys.executable, "-c", call]
+    return subprocess.run(command, input=given, stdout=output, stderr=output, env=marked, check=False).returncode
