@@ -247,7 +247,9 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
     message = arrival if k == s else item(buffer.slots, k)
     at_us, x, topic = message.arrival_us, message.x, message.topic
     from_us, from_x = at_us, x
-    follows = arriving and (len(buffer.topics) == 1 or arrival.topic == topic)  # the arrival is the topic's next message
+    follows = arriving and (
+        len(buffer.topics) == 1 or arrival.topic == topic
+    )  # the arrival is the topic's next message
     j = before(buffer, k, topic)
     if j >= 0:
         from_us, from_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x

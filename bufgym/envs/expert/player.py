@@ -14,7 +14,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import compile_for, entry, local, located, named
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.policies import Policy
-from bufgym.policies.registry import runs_compiled, signatures
+from bufgym.policies.registry import signatures
 from bufgym.sim import (
     ARRIVAL_WAITS,
     NOTHING_WAITS,
@@ -45,7 +45,7 @@ class Player:
             raise BufgymError(f"policy {policy.name} {reason}: it can be benchmarked, but not play in an environment")
         self.policy = policy
         self._parameters = policy.parameter_array
-        self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
+        self._functions = tuple(map(located, signatures(), policy.compiled)) if policy.compile else None
         self._memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)
