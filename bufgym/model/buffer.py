@@ -234,48 +234,57 @@ def is_first(buffer: Buffer, k: int) -> bool:
 
 
 @kernel
-def _gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int, float, float]:
-    """Time gaps (us), then gaps in x, from slot ``k`` to the messages kept before and after it on its topic."""
+def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int, float, float, float]:
+    """Gaps of slot ``k`` to the messages kept before and after it on its topic; the newcomer is ``len(buffer.slots)``.
+
+    The successor of the newcomer, and of a topic's last message, is still to come: the next step is expected to be as
+    long as the last one. Where the socket asks (not ``arriving``), ``arrival`` follows nothing.
+
+    Returns:
+        Time gaps before and after, us; gaps in x before and after; the gap in x left if the message is dropped.
+    """
     s = len(buffer.slots)
     message = arrival if k == s else item(buffer.slots, k)
     at_us, x, topic = message.arrival_us, message.x, message.topic
     from_us, from_x = at_us, x
-    arrives = len(buffer.topics) == 1 or arrival.topic == topic  # the arrival is what follows the topic's last message
+    follows = arriving and (
+        len(buffer.topics) == 1 or arrival.topic == topic
+    )  # the arrival is the topic's next message
     j = before(buffer, k, topic)
     if j >= 0:
         from_us, from_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
-    elif arrives:
+    elif follows:
         from_us, from_x = buffer.dequeued_arrival_us, buffer.dequeued_x
     elif item(buffer.topics, topic).dequeued > 0:
         past = item(buffer.topics, topic)
         from_us, from_x = past.dequeued_arrival_us, past.dequeued_x
+    back_us, back_x = at_us - from_us, x - from_x
     if k == s:
-        return at_us - from_us, at_us - buffer.previous_us, x - from_x, x - buffer.previous_x
-    to_us, to_x = arrival.arrival_us, arrival.x
+        step_us, step_x = at_us - buffer.previous_us, x - buffer.previous_x
+        return back_us, step_us, back_x, step_x, back_x + step_x
     j = after(buffer, k, topic)
+    if j == s and not follows:
+        past = item(buffer.topics, topic)
+        step_us = max(past.previous_us - at_us, 0) + past.step_us
+        step_x = max(past.previous_x - x, 0.0) + past.step_x
+        return back_us, step_us, back_x, step_x, back_x + step_x
+    to_us, to_x = arrival.arrival_us, arrival.x
     if j < s:
         to_us, to_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
-    elif not arrives:
-        past = item(buffer.topics, topic)
-        to_us, to_x = max(at_us, past.previous_us) + past.step_us, max(x, past.previous_x) + past.step_x
-    return at_us - from_us, to_us - at_us, x - from_x, to_x - x
+    return back_us, to_us - at_us, back_x, to_x - x, to_x - from_x
 
 
 @kernel
 def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
-    """Times between slot ``k`` and the messages kept before and after it on its topic, us.
-
-    The newcomer is slot ``len(buffer.slots)``. Its successor is still to come: the next step is expected to be as long
-    as the last one, so its second gap is the time since the previous arrival. The same goes for a topic's last message.
-    """
-    back_us, on_us, _, _ = _gaps(buffer, arrival, k)
+    """Times between slot ``k`` and the messages kept before and after it on its topic, us; see ``gaps``."""
+    back_us, on_us, _, _, _ = gaps(buffer, arrival, True, k)
     return back_us, on_us
 
 
 @kernel
 def motion_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
     """Distances in x between slot ``k`` and the messages kept before and after it, as ``time_gaps``."""
-    _, _, back_x, on_x = _gaps(buffer, arrival, k)
+    _, _, back_x, on_x, _ = gaps(buffer, arrival, True, k)
     return back_x, on_x
 
 

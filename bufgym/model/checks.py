@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 
@@ -70,6 +71,13 @@ def named_settings(what: str, spec: str) -> tuple[str, dict[str, float]]:
         except ValueError:
             raise BufgymError(f"{what} {spec!r}: {setting!r} is not of the form parameter=number") from None
     return name, numbers
+
+
+def constants(numbers: Iterable[float]) -> NDArray[np.float64]:
+    """The numbers as a read-only array for kernels."""
+    array = np.array(list(numbers), np.float64)
+    array.flags.writeable = False
+    return array
 
 
 def changed(what: str, parameters: Mapping[str, float], settings: Mapping[str, float]) -> dict[str, float]:

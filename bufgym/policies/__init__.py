@@ -20,7 +20,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     target_gap,
     webrtc,
 )
-from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later, runs_compiled
+from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later
 from bufgym.policies.schedulers import make_room
 
 __all__ = [
@@ -38,7 +38,6 @@ __all__ = [
     "make_room",
     "names",
     "register",
-    "runs_compiled",
 ]
 
 

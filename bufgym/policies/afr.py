@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 R, C, P = range(3)  # where r, c and p lie in the memory
 MEMORY = {"r": 1.0, "c": 0.0, "p": 0.0}
@@ -52,12 +52,8 @@ def afr_departure(buffer: Buffer, memory: Memory) -> None:
     memory[P] = max(0.0, memory[P] - 1)
 
 
-@register(
-    "afr",
-    memory=MEMORY,
-    on_departure=afr_departure,
-    source="AFR [wang2022afr], released code (Jrdevil-Wang/AFR)",
-    compile=True,
+@built_in(
+    "afr", memory=MEMORY, on_departure=afr_departure, source="AFR [wang2022afr], released code (Jrdevil-Wang/AFR)"
 )
 def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate as released: an even, adaptive frame rate."""
@@ -68,7 +64,7 @@ def afr(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return thin(r, c, p, r, buffer, arrival, memory)
 
 
-@register("afr-paper", memory=MEMORY, source="AFR [wang2022afr], Sec. IV-A, Algorithm 1 (literal text)", compile=True)
+@built_in("afr-paper", memory=MEMORY, source="AFR [wang2022afr], Sec. IV-A, Algorithm 1 (literal text)")
 def afr_paper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Adaptive Frame Rate by the letter of the paper: s/L < 2/3, p not moved at departures."""
     r, c, p = memory[R], memory[C], memory[P]

@@ -11,7 +11,7 @@ import math
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.classic import keep_first
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 TARGET_MS, INTERVAL_MS = range(2)  # indices of CoDel's parameters
 FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(7)  # indices of its memory
@@ -72,7 +72,7 @@ def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
     return ok
 
 
-@register(
+@built_in(
     "codel",
     parameters={"target_ms": 5.0, "interval_ms": 100.0},
     memory=dict.fromkeys(
@@ -80,7 +80,6 @@ def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
     ),
     on_dequeue=codel_dequeue,
     source="CoDel, RFC 8289 [nichols2018codel]",
-    compile=True,
 )
 def codel(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """CoDel: drops heads while sojourn times stay above `target_ms` for `interval_ms`; a full queue drops the tail.
@@ -95,12 +94,11 @@ MIN_TH, MAX_TH, MAX_P, WEIGHT = range(4)  # indices of RED's parameters
 AVERAGE, COUNT = range(2)  # indices of its memory
 
 
-@register(
+@built_in(
     "red",
     parameters={"min_th": 0.25, "max_th": 0.75, "max_p": 0.1, "weight": 0.2},
     memory={"average": 0.0, "count": -1.0},
     source="Random Early Detection, Floyd and Jacobson 1993 [floyd1993red]",
-    compile=True,
 )
 def red(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """RED: rejects at random, the more often the higher the average occupancy; a full queue drops the tail.

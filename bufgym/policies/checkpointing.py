@@ -13,7 +13,7 @@ from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
 from bufgym.policies.afr import MEMORY, C, P, R, afr_departure, thin
 from bufgym.policies.classic import keep_last
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 
 @kernel
@@ -32,13 +32,12 @@ def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
     return float(r**alpha * L ** (1 - alpha) * ((L + p + 1) ** alpha - (L + p) ** alpha))
 
 
-@register(
+@built_in(
     "linear-alpha",
     parameters={"alpha": 1.302},
     memory=MEMORY,
     on_departure=afr_departure,
     source="LINEAR, Bringmann et al. [bringmann2015checkpointing]",
-    compile=True,
 )
 def linear_alpha(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """LINEAR: evicts 1, 3, 5, ... pass after pass as AFR does, but keeps arrivals at times i^alpha."""
@@ -82,11 +81,10 @@ def site(n: int, s: int) -> int:
 FIRST = 0
 
 
-@register(
+@built_in(
     "steady",
     memory={"first": 0.0},
     source="steady algorithm, Moreno et al. [moreno2024downsampling], as in the package downstream (PyPI)",
-    compile=True,
 )
 def steady(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Steady curation: the n-th arrival since the queue was empty has a fixed site, or none; S = 2^s <= L sites."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 
 @kernel
@@ -28,31 +28,31 @@ def uniform_draw(buffer: Buffer, arrival: Arrival) -> float:
     return float(u)
 
 
-@register("drop-oldest", source="ROS 1 roscpp subscriber link; ROS 2 / DDS KEEP_LAST", compile=True)
+@built_in("drop-oldest", source="ROS 1 roscpp subscriber link; ROS 2 / DDS KEEP_LAST")
 def drop_oldest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS: a full queue loses its head."""
     return keep_last(buffer, arrival, buffer.capacity)
 
 
-@register("drop-newest", source="drop tail; DDS KEEP_ALL, best effort", compile=True)
+@built_in("drop-newest", source="drop tail; DDS KEEP_ALL, best effort")
 def drop_newest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Drop tail: a full queue rejects the newcomer."""
     return keep_first(buffer, arrival)
 
 
-@register("replace-newest", source="replace tail", compile=True)
+@built_in("replace-newest", source="replace tail")
 def replace_newest(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Replace tail: the newcomer overwrites the newest queued message."""
     return ACCEPT if has_space(buffer, arrival) else len(buffer.slots) - 1
 
 
-@register("latest-only", source="mailbox of one message, as KEEP_LAST(1), the default depth of DDS", compile=True)
+@built_in("latest-only", source="mailbox of one message, as KEEP_LAST(1), the default depth of DDS")
 def latest_only(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A queue of one: the newest replaces what waits."""
     return keep_last(buffer, arrival, 1)
 
 
-@register("random", source="AFR paper [wang2022afr], Eq. 9", compile=True)
+@built_in("random", source="AFR paper [wang2022afr], Eq. 9")
 def random(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Random Drop: a full queue drops one of its messages or the newcomer, each as likely as the others."""
     if has_space(buffer, arrival):

@@ -19,7 +19,7 @@ import math
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 UNKNOWN = 1e6
 """Rate of a link that has not been measured, bytes/us: 1 TB/s."""
@@ -63,7 +63,7 @@ def account(buffer: Buffer, memory: Memory, ahead_bytes: float, kept_bytes: floa
 BATCH, BATCHES, SOCKET, WAIT, MORE, FORGETS = range(6)  # indices of Zenoh's parameters
 
 
-@register(
+@built_in(
     "zenoh-drop",
     parameters={
         "batch_size": 65_535.0,
@@ -75,7 +75,6 @@ BATCH, BATCHES, SOCKET, WAIT, MORE, FORGETS = range(6)  # indices of Zenoh's par
     },
     memory=PIPE,
     source="Zenoh, congestion control DROP [zenoh], measured against version 1.10.2",
-    compile=True,
 )
 def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Zenoh DROP: put cuts the newcomer into batches and drops it when one of them finds no room in time.
@@ -106,12 +105,11 @@ def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return decision
 
 
-@register(
+@built_in(
     "ros2-best-effort",
     parameters={"queue_kb": 200.0, "rate_memory_s": 1.0},
     memory=PIPE,
     source="ROS 2 over Fast DDS and UDP, RELIABILITY best effort [fastdds]",
-    compile=True,
 )
 def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS 2, best effort over UDP: all packets of the newcomer go at once; lost unless the link's queue takes them all.
@@ -130,12 +128,11 @@ def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return decision
 
 
-@register(
+@built_in(
     "ros2-reliable-udp",
     parameters={"queue_kb": 200.0, "depth": 10.0, "rate_memory_s": 1.0},
     memory=PIPE,
     source="ROS 2 over Fast DDS and UDP, RELIABILITY reliable, HISTORY KEEP_LAST(depth) [fastdds]",
-    compile=True,
 )
 def ros2_reliable_udp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS 2, reliable over UDP: packets lost in the link's queue are sent again until `depth` newer messages come.

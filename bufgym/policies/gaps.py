@@ -11,7 +11,7 @@ import numpy as np
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, has_space, loss, motion_gaps, time_gaps
 from bufgym.model.qoi import value
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 
 @kernel
@@ -49,7 +49,7 @@ def smallest_gap(buffer: Buffer, arrival: Arrival, discount: float) -> int:
     return victim if victim < s else REJECT
 
 
-@register("min-gap", source="online checkpointing, smallest merged gap", compile=True)
+@built_in("min-gap", source="online checkpointing, smallest merged gap")
 def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged time gap (newcomer included, ties to the oldest)."""
     s = len(buffer.slots)
@@ -59,11 +59,10 @@ def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return victim if victim < s else REJECT
 
 
-@register(
+@built_in(
     "even-reject",
     parameters={"beta": 1.3},
     source="online checkpointing, a newcomer too close to the tail is rejected (own rule; beta 1.2 to 1.39)",
-    compile=True,
 )
 def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue rejects a newcomer nearer than beta even gaps T / (s + 1) to the tail, else as min-gap.
@@ -81,7 +80,7 @@ def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return smallest_time_gap(buffer, arrival, s)
 
 
-@register("min-motion-gap", source="as min-gap, on the robot's odometry", compile=True)
+@built_in("min-motion-gap", source="as min-gap, on the robot's odometry")
 def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     if has_space(buffer, arrival):
@@ -89,11 +88,10 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return smallest_gap(buffer, arrival, 0.0)
 
 
-@register(
+@built_in(
     "paced-motion-gap",
     parameters={"pace": 0.7, "discount": 0.35},
     source="own rule: min-motion-gap at the pace of an even spacing, older gaps discounted",
-    compile=True,
 )
 def paced_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue rejects a newcomer nearer than ``pace`` even spacings to the tail, else drops a small old gap.
@@ -119,11 +117,7 @@ def paced_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return victim
 
 
-@register(
-    "orbbuf",
-    source="ORBBuf [wang2021orbbuf], released code (Jrdevil-Wang/ORBBuf), with Sim = 1 - V(motion gap)",
-    compile=True,
-)
+@built_in("orbbuf", source="ORBBuf [wang2021orbbuf], released code (Jrdevil-Wang/ORBBuf), with Sim = 1 - V(motion gap)")
 def orbbuf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops the message whose neighbours are most similar, first of equals; the newcomer is always kept.
 
@@ -144,7 +138,7 @@ def orbbuf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return victim
 
 
-@register("greedy-qoi", source="one-step greedy, as a warning", compile=True)
+@built_in("greedy-qoi", source="one-step greedy, as a warning")
 def greedy_qoi(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue takes the decision that leaves the most information at this moment: a trap.
 

@@ -35,17 +35,7 @@ from bufgym.model.observe import (
     observe_slots,
 )
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.scoring import (
-    DROP,
-    KEEP,
-    Network,
-    ScorerWeights,
-    begin,
-    divide,
-    read_context,
-    score,
-    unpack,
-)
+from bufgym.policies.scoring import DROP, KEEP, Network, ScorerWeights, begin, divide, read_context, score, unpack
 
 __all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
 

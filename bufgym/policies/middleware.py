@@ -7,25 +7,21 @@ here so that their users find them in a table. None knows the worth of a message
 from __future__ import annotations
 
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
-from bufgym.policies.classic import keep_first, keep_last
-from bufgym.policies.registry import Arrival, ClientSettings, Memory, register
+from bufgym.policies.classic import drop_newest, drop_oldest, keep_first, keep_last
+from bufgym.policies.registry import Arrival, ClientSettings, Memory, built_in
 
 
-@register(
-    "ros-keep-last",
-    parameters={"depth": 10.0},
-    source="ROS 2 QoS history KEEP_LAST(depth), default 10",
-    compile=True,
-)
+@built_in("ros-keep-last", parameters={"depth": 10.0}, source="ROS 2 QoS history KEEP_LAST(depth), default 10")
 def ros_keep_last(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ROS 2 KEEP_LAST: the oldest unsent message goes when `depth` wait (at most L)."""
     return keep_last(buffer, arrival, buffer.parameters[0])
 
 
-@register("dds-keep-all", source="DDS QoS HISTORY KEEP_ALL with best-effort RELIABILITY", compile=True)
-def dds_keep_all(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """DDS KEEP_ALL, best effort: a full queue rejects the newcomer; reliable would block the publisher instead."""
-    return keep_first(buffer, arrival)
+built_in(
+    "dds-keep-all",
+    source="DDS QoS HISTORY KEEP_ALL with best-effort RELIABILITY",
+    about="DDS KEEP_ALL, best effort: a full queue rejects the newcomer; reliable would block the publisher instead.",
+)(drop_newest)
 
 
 def expired(buffer: Buffer, memory: Memory) -> bool:
@@ -33,13 +29,7 @@ def expired(buffer: Buffer, memory: Memory) -> bool:
     return bool(buffer.now_us - buffer.slots[0].arrival_us > 1e6 * buffer.parameters[0])
 
 
-@register(
-    "lifespan",
-    parameters={"lifespan_s": 0.5},
-    on_dequeue=expired,
-    source="DDS QoS LIFESPAN",
-    compile=True,
-)
+@built_in("lifespan", parameters={"lifespan_s": 0.5}, on_dequeue=expired, source="DDS QoS LIFESPAN")
 def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS LIFESPAN: nothing older than `lifespan_s` is sent; the head goes when full.
 
@@ -48,12 +38,7 @@ def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return keep_last(buffer, arrival, buffer.capacity)
 
 
-@register(
-    "time-filter",
-    parameters={"separation_s": 0.1},
-    source="DDS QoS TIME_BASED_FILTER, minimum_separation",
-    compile=True,
-)
+@built_in("time-filter", parameters={"separation_s": 0.1}, source="DDS QoS TIME_BASED_FILTER, minimum_separation")
 def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; the head goes when full."""
     s, separation_us = len(buffer.slots), 1e6 * buffer.parameters[0]
@@ -64,28 +49,17 @@ def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return keep_last(buffer, arrival, buffer.capacity)
 
 
-@register("zenoh-ring", source="Zenoh RingChannel(L)", compile=True)
-def zenoh_ring(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Zenoh RingChannel: keeps the newest L."""
-    return keep_last(buffer, arrival, buffer.capacity)
-
-
-@register(
+built_in("zenoh-ring", source="Zenoh RingChannel(L)", about="Zenoh RingChannel: keeps the newest L.")(drop_oldest)
+built_in(
     "foxglove-sdk",
     parameters={"depth": 1024.0},
     source="foxglove-sdk, message backlog of a client, default 1024",
-    compile=True,
-)
-def foxglove_sdk(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Foxglove SDK: a client's oldest message goes when `depth` wait (at most L)."""
-    return keep_last(buffer, arrival, buffer.parameters[0])
+    about="Foxglove SDK: a client's oldest message goes when `depth` wait (at most L).",
+)(ros_keep_last)
 
 
-@register(
-    "foxglove-backlog",
-    parameters={"limit_mb": 10.0},
-    source="ros-foxglove-bridge, send_buffer_limit, default 10 MB",
-    compile=True,
+@built_in(
+    "foxglove-backlog", parameters={"limit_mb": 10.0}, source="ros-foxglove-bridge, send_buffer_limit, default 10 MB"
 )
 def foxglove_backlog(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ros-foxglove-bridge: drops the newcomer when all bytes not yet sent, with it, reach `limit_mb`, or none fits."""
@@ -95,12 +69,11 @@ def foxglove_backlog(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return keep_first(buffer, arrival)
 
 
-@register(
+@built_in(
     "rosbridge",
     unbounded=True,
     source="rosbridge_server, unbounded outgoing queue",
     client=ClientSettings(encoding="json", awaits_acks=False),
-    compile=True,
 )
 def rosbridge(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """rosbridge: accepts everything, however long the queue grows; JSON, first in, first out, without acks."""

@@ -41,7 +41,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import BundleType, compile_for
 from bufgym.ground.modules import first_line
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
-from bufgym.model.checks import changed, check_name, named_settings
+from bufgym.model.checks import changed, check_name, constants, named_settings
 
 Arrival = Any
 """A MESSAGE record."""
@@ -170,9 +170,7 @@ class Policy:
     @property
     def parameter_array(self) -> NDArray[np.float64]:
         """Numbers for ``buffer.parameters``: float64[parameters], read-only."""
-        numbers = np.array(self.weights or list(self.parameters.values()), np.float64)
-        numbers.flags.writeable = False
-        return numbers
+        return constants(self.weights or self.parameters.values())
 
     def new_memory(self, senders: int = 1, capacity: int = 0) -> NDArray[np.float64]:
         """Make fresh memory for ``senders`` senders with L = ``capacity``, float64[senders, entries]."""
@@ -250,19 +248,22 @@ def _registration(
         """Register the decorated function as the policy ``name``; it comes back unchanged.
 
         Keywords are the fields of ``Policy``: ``parameters``, ``memory``, ``on_departure``, ``compile`` and so on.
+        A function may replace itself, as a notebook's cell runs again.
 
         Raises:
             BufgymError: the name is empty, holds one of ``:,=`` or a blank, or another policy has it.
         """
-        if _is_built_in(name):
+        known = _REGISTRY.get(name)
+        if isinstance(known, Later) or (known is not None and known.on_arrival.__module__.startswith("bufgym.")):
             raise BufgymError(f"policy {name!r}: a built-in policy has this name")
         check_name("policy", name)
 
         def add(on_arrival: OnArrival) -> OnArrival:
             if not callable(on_arrival):
                 raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
-            if other := _other(name, on_arrival):
-                raise BufgymError(f"policy {name!r}: the function {other} has this name")
+            known = _REGISTRY.get(name)
+            if isinstance(known, Policy) and _place(known.on_arrival) != _place(on_arrival):
+                raise BufgymError(f"policy {name!r}: the function {_place(known.on_arrival)} has this name")
             policy = make(name, on_arrival, *args, **kwargs)
             for what, entries in (("parameters", policy.parameters), ("memory", policy.memory)):
                 if not isinstance(entries, Mapping):
@@ -275,22 +276,14 @@ def _registration(
     return register
 
 
-def _is_built_in(name: str) -> bool:
-    """Whether the package's own policy has this name."""
-    entry = _REGISTRY.get(name)
-    return isinstance(entry, Later) or (entry is not None and entry.on_arrival.__module__.startswith("bufgym."))
-
-
-def _other(name: str, on_arrival: OnArrival) -> str:
-    """The function that has this name, if it is another. One may replace itself, as a notebook runs again."""
-    entry = _REGISTRY.get(name)
-    if not isinstance(entry, Policy):
-        return ""
-    places = [(function.__module__, function.__qualname__) for function in (entry.on_arrival, on_arrival)]
-    return "" if places[0] == places[1] else ".".join(places[0])
+def _place(function: OnArrival) -> str:
+    """Where a function is defined."""
+    return f"{function.__module__}.{function.__qualname__}"
 
 
 register = _registration(Policy)
+built_in = functools.partial(register, compile=True)
+"""The same for bufgym's own policies, which run compiled."""
 
 
 def register_later(
@@ -306,11 +299,8 @@ def names(*, for_topics: bool | None = None, named_only: bool = False) -> Iterat
     ``for_topics`` selects policies made for topics only (True) or the others (False). ``named_only`` gives instead the
     policies that take part only where they are named.
     """
-    chosen = []
-    for name, entry in _REGISTRY.items():
-        if entry.named_only == named_only and for_topics in (None, entry.for_topics):
-            chosen.append(name)
-    return iter(chosen)
+    entries = tuple(_REGISTRY.items())
+    return (name for name, e in entries if e.named_only == named_only and for_topics in (None, e.for_topics))
 
 
 def get(spec: str | Policy | OnArrival) -> Policy:
@@ -335,11 +325,6 @@ def get(spec: str | Policy | OnArrival) -> Policy:
 
 
 def registered_as(function: OnArrival) -> Policy | None:
-    """The policy that ``register`` made of this function, or None."""
+    """The policy that ``register`` made of this function, the first of several, or None."""
     made = (entry for entry in _REGISTRY.values() if isinstance(entry, Policy))
     return next((policy for policy in made if policy.on_arrival is function), None)
-
-
-def runs_compiled(policy: Policy) -> bool:
-    """Whether this policy's functions run inside compiled rollouts."""
-    return policy.compile

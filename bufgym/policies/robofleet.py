@@ -17,7 +17,7 @@ import math
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.policies.registry import Arrival, ClientSettings, Memory, register
+from bufgym.policies.registry import Arrival, ClientSettings, Memory, built_in
 from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, topic_of
 
 
@@ -64,32 +64,21 @@ def longest_wait(buffer: Buffer, memory: Memory) -> int:
     return best
 
 
-@register(
-    "robofleet",
-    on_send=longest_wait,
-    for_topics=True,
-    source="Robofleet [sikand2021robofleet], as published",
-    compile=True,
-)
+@built_in("robofleet", on_send=longest_wait, for_topics=True, source="Robofleet [sikand2021robofleet], as published")
 def robofleet(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Robofleet as published: one slot a topic, no_drop queued and sent first, then the largest priority x wait."""
     return overwrite(buffer, arrival)
 
 
-@register(
+built_in(
     "robofleet-literal",
     on_send=longest_wait,
     for_topics=True,
     source="Robofleet [sikand2021robofleet], rate limits by the letter: since last transmitted",
     client=ClientSettings(limit_since_sent=True),
-    compile=True,
-)
-def robofleet_literal(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Robofleet by the letter: as `robofleet`, but a topic's rate limit counts from when it was last sent, not kept.
-
-    A waiting message is overwritten until a message of its topic is sent.
-    """
-    return overwrite(buffer, arrival)
+    about="Robofleet by the letter: as `robofleet`, but a topic's rate limit counts from when it was last sent, not"
+    " kept.",
+)(robofleet)  # a waiting message is overwritten until a message of its topic is sent
 
 
 FLUSHING = 0
@@ -120,14 +109,13 @@ def shortest_wait(buffer: Buffer, memory: Memory) -> int:
     return best
 
 
-@register(
+@built_in(
     "robofleet-released",
     memory={"flushing": 0.0},
     on_send=shortest_wait,
     for_topics=True,
     source="Robofleet [sikand2021robofleet], released code (ut-amrl/robofleet_client_lib)",
     client=ClientSettings(limit_at_send=True, flush_no_drop=True),
-    compile=True,
 )
 def robofleet_released(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Robofleet as released: rate limits at the socket, no_drop flushed past n_T, the smallest priority x wait first.
@@ -150,13 +138,12 @@ def longest_ago(buffer: Buffer, memory: Memory) -> int:
     return best
 
 
-@register(
+@built_in(
     "ros-native",
     on_send=longest_ago,
     for_topics=True,
     source="ROS publishers, a queue a topic (queue_size: the topic's limit)",
     client=ClientSettings(encoding="ros", awaits_acks=False, copies=True),
-    compile=True,
 )
 def ros_native(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Native ROS: each topic drops its oldest; topics take turns; one copy for each consumer; no acks.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.policies.classic import keep_last, uniform_draw
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 SEEN = 0
 
@@ -14,12 +14,11 @@ def reservoir_departure(buffer: Buffer, memory: Memory) -> None:
     memory[SEEN] = len(buffer.slots)
 
 
-@register(
+@built_in(
     "reservoir",
     memory={"seen": 0.0},
     on_departure=reservoir_departure,
     source="Vitter, Random sampling with a reservoir, 1985 [vitter1985reservoir] (algorithm R)",
-    compile=True,
 )
 def reservoir(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Reservoir sampling: every arrival of the interruption is kept with the same probability.
@@ -41,12 +40,11 @@ def reservoir(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 COUNT = 0
 
 
-@register(
+@built_in(
     "decimate",
     parameters={"every": 3.0},
     memory={"count": 0.0},
     source="fixed decimation, 30 to 10 frames/s (Golodetz et al. 2018 [golodetz2018collaborative])",
-    compile=True,
 )
 def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Fixed decimation: of the arrivals it is asked about, one in `every` is queued; the head goes when full."""
@@ -58,11 +56,10 @@ def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return keep_last(buffer, arrival, buffer.capacity)
 
 
-@register(
+@built_in(
     "keyframe",
     parameters={"step": 0.05},
     source="motion keyframes of collaborative mapping, a threshold on distance or angle",
-    compile=True,
 )
 def keyframe(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Motion keyframes: accepts messages `step` in x beyond the last keyframe; the head goes when full."""

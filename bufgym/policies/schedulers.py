@@ -11,8 +11,9 @@ import math
 from typing import Any
 
 from bufgym.ground.kernel import kernel
+from bufgym.ground.modules import first_line
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, is_first
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 # --- what a newcomer drives out --------------------------------------------------------------------------------------
 
@@ -100,14 +101,14 @@ def make_room(buffer: Buffer, arrival: Arrival) -> int:
 # --- which message goes next -----------------------------------------------------------------------------------------
 
 
-@register("fifo", for_topics=True, source="first come, first served over all topics", compile=True)
+@built_in("fifo", for_topics=True, source="first come, first served over all topics")
 def fifo(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """First in, first out, whatever the topic; a full queue drops the oldest of the newcomer's topic."""
     return make_room(buffer, arrival)
 
 
 def highest_priority(buffer: Buffer, memory: Memory) -> int:
-    """The message of the highest priority; the oldest if several have it."""
+    """Highest priority first, first in, first out among equals; low priorities starve while high ones fill the link."""
     best, highest = 0, -math.inf
     for k in range(len(buffer.slots)):
         priority = topic_of(buffer, buffer.slots[k]).priority
@@ -116,20 +117,14 @@ def highest_priority(buffer: Buffer, memory: Memory) -> int:
     return best
 
 
-@register(
-    "strict-priority",
-    on_send=highest_priority,
-    for_topics=True,
-    source="strict priority queueing, as IEEE 802.1Q transmission selection",
-    compile=True,
-)
-def strict_priority(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Highest priority first, first in, first out among equals; low priorities starve while high ones fill the link."""
-    return make_room(buffer, arrival)
-
-
 def most_aged(buffer: Buffer, memory: Memory) -> int:
-    """The message with the largest weight x age, among the oldest of each topic; the oldest if equal."""
+    """The topic with the largest weight x age of information goes first.
+
+    The age of a topic is the time since its newest *sent* message arrived at the sender, which is the age at the server
+    once every sent message is there [kaul2012status]. A topic that has sent nothing is as old as its oldest queued
+    message. Candidates are the oldest of each topic; of equals the oldest goes. This is the greedy policy of
+    [kadota2018scheduling], which sends where the age is highest; here ages are weighted.
+    """
     best, most = 0, -math.inf
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
@@ -141,26 +136,8 @@ def most_aged(buffer: Buffer, memory: Memory) -> int:
     return best
 
 
-@register(
-    "age-greedy",
-    on_send=most_aged,
-    for_topics=True,
-    source="age of information [kaul2012status]; greedy by weighted age [kadota2018scheduling]",
-    compile=True,
-)
-def age_greedy(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The topic with the largest weight x age of information goes first.
-
-    The age of a topic is the time since its newest *sent* message arrived at the sender, which is the age at the server
-    once every sent message is there [kaul2012status]. A topic that has sent nothing is as old as its oldest queued
-    message. Candidates are the oldest of each topic. This is the greedy policy of [kadota2018scheduling], which sends
-    where the age is highest; here ages are weighted.
-    """
-    return make_room(buffer, arrival)
-
-
 def earliest_deadline(buffer: Buffer, memory: Memory) -> int:
-    """The earliest absolute deadline; the oldest if equal, or if none has a deadline."""
+    """Earliest deadline first: arrival + its topic's deadline; a message already late is still sent."""
     best, earliest_us = 0, 0
     for k in range(len(buffer.slots)):
         deadline_us = buffer.slots[k].arrival_us + topic_of(buffer, buffer.slots[k]).deadline_us
@@ -169,13 +146,9 @@ def earliest_deadline(buffer: Buffer, memory: Memory) -> int:
     return best
 
 
-@register(
-    "edf",
-    on_send=earliest_deadline,
-    for_topics=True,
-    source="earliest deadline first, Liu and Layland 1973 [liu1973scheduling]",
-    compile=True,
-)
-def edf(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Earliest deadline first: arrival + its topic's deadline; a message already late is still sent."""
-    return make_room(buffer, arrival)
+for name, on_send, source in (
+    ("strict-priority", highest_priority, "strict priority queueing, as IEEE 802.1Q transmission selection"),
+    ("age-greedy", most_aged, "age of information [kaul2012status]; greedy by weighted age [kadota2018scheduling]"),
+    ("edf", earliest_deadline, "earliest deadline first, Liu and Layland 1973 [liu1973scheduling]"),
+):
+    built_in(name, on_send=on_send, for_topics=True, source=source, about=first_line(on_send))(fifo)

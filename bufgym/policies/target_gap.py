@@ -29,7 +29,7 @@ from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, Buffer, has_space, motion_gaps, running_mean
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.policies.gaps import gap_left, smallest_gap
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 from bufgym.policies.thinning import places, spare, steady
 
 HORIZON_US = 5e6
@@ -123,12 +123,11 @@ def approach(buffer: Buffer, arrival: Arrival, g: float) -> int:
     return victim
 
 
-@register(
+@built_in(
     "target-gap",
     memory=REMEMBERED,
     source="own rule: min-motion-gap, towards the gap that link and queue can carry",
     reads_rate=True,
-    compile=True,
 )
 def target_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Sends messages as far apart as the link's rate and the room that is left suggest; drops with room, too."""

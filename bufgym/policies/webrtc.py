@@ -15,7 +15,7 @@ from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first
 from bufgym.policies.fragments import PIPE, RATE, UNKNOWN, account, ahead_of_newcomer
-from bufgym.policies.registry import Arrival, Memory, register
+from bufgym.policies.registry import Arrival, Memory, built_in
 
 BUCKET_S = 0.5
 """Size of the bucket, s of the target rate: above it frames are dropped."""
@@ -93,7 +93,7 @@ def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
     memory[LEVEL] = min(memory[LEVEL] + size_bytes, 1e6 * MOST_S * memory[TARGET])
 
 
-@register(
+@built_in(
     "webrtc-frame-dropper",
     memory={
         **PIPE,
@@ -102,7 +102,6 @@ def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
         ),
     },
     source="WebRTC, modules/video_coding/utility/frame_dropper [webrtc]",
-    compile=True,
 )
 def webrtc_frame_dropper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """WebRTC's frame dropper: a leaky bucket at the socket's own rate; a full queue drops the newcomer."""

@@ -24,7 +24,7 @@ from bufgym.ground.kernel import entry, located
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.policies.registry import Policy, runs_compiled, signatures
+from bufgym.policies.registry import Policy, signatures
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
 from bufgym.sim.rollout import compiled_rollout, python_rollout
@@ -63,7 +63,7 @@ class LiveRow:
         self.senders.follow(policy)
         self.memory = policy.new_memory(1, self.senders.capacity)
         self._use(self.senders.batch, room)
-        self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
+        self._functions = tuple(map(located, signatures(), policy.compiled)) if policy.compile else None
         self._rollout: Any = entry(compiled_rollout(False, bool(self.batch.several))) if self._functions else None
 
     def _use(self, batch: Batch, room: int) -> None:

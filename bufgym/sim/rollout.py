@@ -16,7 +16,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import compile_for, interruptible, local, named
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
-from bufgym.policies.registry import Policy, runs_compiled, signatures
+from bufgym.policies.registry import Policy, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.shared_link import Shares, shares_type
 from bufgym.sim.socket import credit
@@ -137,7 +137,7 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
 
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
     """Run every sender to its end under ``policy``, compiled if the policy is."""
-    if not runs_compiled(policy):
+    if not policy.compile:
         python_rollout(batch, shares, memory, policy)
         return
     compiled = compiled_rollout(shares is not None, bool(batch.several))

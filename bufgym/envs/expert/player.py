@@ -13,11 +13,20 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import compile_for, entry, local, located, named
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.policies import Policy
-from bufgym.policies.registry import runs_compiled, signatures
-from bufgym.sim import Senders
-from bufgym.sim.rollout import answer_of, python_arrival, python_view
-from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch, batch_type
-from bufgym.sim.view import arrival_of, view
+from bufgym.policies.registry import signatures
+from bufgym.sim import (
+    ARRIVAL_WAITS,
+    NOTHING_WAITS,
+    SOCKET_WAITS,
+    Batch,
+    Senders,
+    answer_of,
+    arrival_of,
+    python_arrival,
+    python_view,
+    view,
+)
+from bufgym.sim.state import batch_type
 
 
 class Player:
@@ -35,7 +44,7 @@ class Player:
             raise BufgymError(f"policy {policy.name} {reason}: it can be benchmarked, but not play in an environment")
         self.policy = policy
         self._parameters = policy.parameter_array
-        self._functions = tuple(map(located, signatures(), policy.compiled)) if runs_compiled(policy) else None
+        self._functions = tuple(map(located, signatures(), policy.compiled)) if policy.compile else None
         self._memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)

@@ -33,15 +33,8 @@ from numpy.typing import NDArray
 
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
-from bufgym.model.checks import changed, check_name, is_number, named_settings
-from bufgym.model.observe.fields import (
-    FIELDS,
-    REWARD_TERMS,
-    TOPIC_FIELDS,
-    TOPIC_REWARD_TERMS,
-    Field,
-    RewardTerm,
-)
+from bufgym.model.checks import changed, check_name, constants, is_number, named_settings
+from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS, Field, RewardTerm
 
 Function = Callable[..., float]
 
@@ -76,9 +69,7 @@ class OwnTerm(RewardTerm):
     @property
     def parameter_array(self) -> NDArray[np.float64]:
         """Numbers for ``step.parameters``: float64[parameters], read-only."""
-        numbers = np.array(list(self.parameters.values()), np.float64)
-        numbers.flags.writeable = False
-        return numbers
+        return constants(self.parameters.values())
 
 
 OWN_FIELDS: dict[str, OwnField] = {}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps
 from bufgym.model.observe import fields
 from bufgym.model.qoi import merging_loss, value
 
@@ -68,48 +68,30 @@ def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[A
 def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
     """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1]; empty slots are 0, the newcomer is last.
 
-    Gaps equal ``buffer.time_gaps`` and ``motion_gaps``, and losses equal ``buffer.loss``, here computed in one pass
-    along the queue. Gaps and relative losses are squashed row by row afterwards.
+    Losses equal ``buffer.loss``, from the gains that the messages carry. Lengths are squashed row by row afterwards.
     """
     s, last = len(buffer.slots), buffer.capacity
     per_rank = 1 / (s + 1)
-    before_us, before_x = buffer.dequeued_arrival_us, buffer.dequeued_x
-    newcomer_gain = arrival_gain(buffer, arrival)
-    for k in range(s):
-        slot = buffer.slots[k]
-        slot_us, slot_x, gain = slot.arrival_us, slot.x, slot.gain
-        if k + 1 < s:
-            after = buffer.slots[k + 1]
-            after_us, after_x, after_gain = after.arrival_us, after.x, after.gain
+    rows[:, s:last] = 0.0
+    gain = buffer.slots[0].gain if s > 0 else arrival_gain(buffer, arrival)
+    for k in range(s + 1):
+        message, column = (buffer.slots[k], k) if k < s else (arrival, last)
+        back_us, on_us, back_x, on_x, merged_x = gaps(buffer, arrival, True, k)
+        if k == s:
+            next_gain = value(buffer.v, on_x)
         else:
-            after_us, after_x, after_gain = arrival.arrival_us, arrival.x, newcomer_gain
-        rows[fields.OCCUPIED, k] = 1.0
-        rows[fields.RANK, k] = (k + 1) * per_rank
-        rows[fields.TIME_BEFORE, k] = slot_us - before_us
-        rows[fields.TIME_MERGED, k] = after_us - before_us
-        rows[fields.MOTION_BEFORE, k] = slot_x - before_x
-        rows[fields.MOTION_MERGED, k] = after_x - before_x
-        lost = merging_loss(buffer.v, slot_x - before_x, gain, after_x - slot_x, after_gain)
-        rows[fields.LOSS, k] = max(lost, 0.0)  # rounding may make it negative
-        rows[fields.RELATIVE_LOSS, k] = rows[fields.LOSS, k]
-        rows[fields.SIZE, k] = slot.size_bytes
-        before_us, before_x = slot_us, slot_x
-    for k in range(s, last):
-        for field in range(len(rows)):
-            rows[field, k] = 0.0
-    step_us, step_x = arrival.arrival_us - buffer.previous_us, arrival.x - buffer.previous_x
-    rows[fields.OCCUPIED, last] = 1.0
-    rows[fields.RANK, last] = 1.0
-    rows[fields.TIME_BEFORE, last] = arrival.arrival_us - before_us
-    rows[fields.TIME_MERGED, last] = arrival.arrival_us - before_us + step_us
-    rows[fields.MOTION_BEFORE, last] = arrival.x - before_x
-    rows[fields.MOTION_MERGED, last] = arrival.x - before_x + step_x
-    rows[fields.LOSS, last] = max(
-        0.0,  # a first message has no gap before it to merge, so nothing is lost with it
-        merging_loss(buffer.v, arrival.x - before_x, newcomer_gain, step_x, value(buffer.v, step_x)),
-    )
-    rows[fields.RELATIVE_LOSS, last] = rows[fields.LOSS, last]
-    rows[fields.SIZE, last] = arrival.size_bytes
+            next_gain = buffer.slots[k + 1].gain if k + 1 < s else arrival_gain(buffer, arrival)
+        rows[fields.OCCUPIED, column] = 1.0
+        rows[fields.RANK, column] = (k + 1) * per_rank if k < s else 1.0
+        rows[fields.TIME_BEFORE, column] = back_us
+        rows[fields.TIME_MERGED, column] = back_us + on_us
+        rows[fields.MOTION_BEFORE, column] = back_x
+        rows[fields.MOTION_MERGED, column] = merged_x
+        # Rounding may make a loss negative. A first message has no gap before it to merge, so nothing is lost with it.
+        rows[fields.LOSS, column] = max(merging_loss(buffer.v, back_x, gain, on_x, next_gain), 0.0)
+        rows[fields.RELATIVE_LOSS, column] = rows[fields.LOSS, column]
+        rows[fields.SIZE, column] = message.size_bytes
+        gain = next_gain
     even = 1 / (buffer.capacity + 1)
     even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
     squash_row(rows[fields.TIME_BEFORE], even_us)

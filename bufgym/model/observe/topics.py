@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import Buffer
+from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first
 from bufgym.model.observe import fields
 from bufgym.model.observe.queue import ROUNDING, TINY, observe_link, squash, squash_row
 from bufgym.model.qoi import merging_loss, value
@@ -42,19 +42,19 @@ def fill_gaps(
     arrival: Any,
     arriving: bool,
     number: int,
-    k: int,
+    column: int,
     step_us: int,
     step_x: float,
     weight: float,
     rows: NDArray[np.floating[Any]],
 ) -> None:
-    """Write gaps and losses of the message in column ``k``, of topic ``number``, whose successor is one step after it.
+    """Write gaps and losses of the message in ``column``, of topic ``number``, whose successor is one step after it.
 
     Its row holds the plain gaps to its predecessor. ``weight`` is the largest of all topics.
     """
     topic = buffer.topics[number]
     v = buffer.v[topic.v_start :]
-    before_us, before_x = float(rows[fields.TIME_BEFORE, k]), float(rows[fields.MOTION_BEFORE, k])
+    before_us, before_x = float(rows[fields.TIME_BEFORE, column]), float(rows[fields.MOTION_BEFORE, column])
     last_us, last_x = topic.previous_us, topic.previous_x
     if arriving and number == arrival.topic:
         last_us, last_x = arrival.arrival_us, arrival.x
@@ -62,12 +62,12 @@ def fill_gaps(
     lost = max(merging_loss(v, before_x, value(v, before_x), step_x, value(v, step_x)), 0.0)
     even_gain = value(v, even_x)
     even_loss = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
-    rows[fields.LOSS, k] = lost * topic.weight / weight
-    rows[fields.RELATIVE_LOSS, k] = squash(lost, even_loss)
-    rows[fields.TIME_MERGED, k] = squash(before_us + step_us, 2 * even_us)
-    rows[fields.MOTION_MERGED, k] = squash(before_x + step_x, 2 * even_x)
-    rows[fields.TIME_BEFORE, k] = squash(before_us, even_us)
-    rows[fields.MOTION_BEFORE, k] = squash(before_x, even_x)
+    rows[fields.LOSS, column] = lost * topic.weight / weight
+    rows[fields.RELATIVE_LOSS, column] = squash(lost, even_loss)
+    rows[fields.TIME_MERGED, column] = squash(before_us + step_us, 2 * even_us)
+    rows[fields.MOTION_MERGED, column] = squash(before_x + step_x, 2 * even_x)
+    rows[fields.TIME_BEFORE, column] = squash(before_us, even_us)
+    rows[fields.MOTION_BEFORE, column] = squash(before_x, even_x)
 
 
 @kernel
@@ -78,36 +78,29 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
     """
     s, capacity = len(buffer.slots), buffer.capacity
     priority, weight = largest(buffer)
-    for number in range(len(buffer.topics)):
-        buffer.topics[number].mark = -1  # the column of the topic's previous message
     rows[:, s:] = 0.0
     count = s + 1 if arriving else s
     size_sum, gain_sum = 0.0, 0.0
     for k in range(count):
         message, column = (buffer.slots[k], k) if k < s else (arrival, capacity)
         topic = buffer.topics[message.topic]
-        j = topic.mark
-        before_us, before_x = message.arrival_us, message.x
-        if j >= 0:
-            before_us, before_x = buffer.slots[j].arrival_us, buffer.slots[j].x
-            step_us, step_x = message.arrival_us - before_us, message.x - before_x
-            fill_gaps(buffer, arrival, arriving, message.topic, j, step_us, step_x, weight, rows)
-        elif topic.dequeued > 0:
-            before_us, before_x = topic.dequeued_arrival_us, topic.dequeued_x
+        back_us, on_us, back_x, on_x, _ = gaps(buffer, arrival, arriving, k)
         gain = message.gain
         if k == s:
-            known = j >= 0 or topic.dequeued > 0
-            gain = topic.weight * value(buffer.v[topic.v_start :], arrival.x - before_x) if known else 0.0
+            if topic.queued == 0 and topic.dequeued == 0:  # nothing of the topic was kept before it
+                back_us, back_x = 0, 0.0
+            gain = arrival_gain(buffer, arrival)
         age_us, known_us = buffer.now_us - message.arrival_us, topic.dequeued_arrival_us if topic.dequeued > 0 else 0
         rows[fields.OCCUPIED, column] = 1.0
         rows[fields.RANK, column] = (k + 1) / (s + 1)
-        rows[fields.TIME_BEFORE, column] = message.arrival_us - before_us
-        rows[fields.MOTION_BEFORE, column] = message.x - before_x
+        rows[fields.TIME_BEFORE, column] = back_us
+        rows[fields.MOTION_BEFORE, column] = back_x
+        fill_gaps(buffer, arrival, arriving, message.topic, column, on_us, on_x, weight, rows)
         rows[fields.SIZE, column] = message.size_bytes
         rows[fields.PRIORITY, column] = topic.priority / priority
         rows[fields.WEIGHT, column] = topic.weight / weight
         rows[fields.NO_DROP, column] = topic.no_drop
-        rows[fields.OLDEST, column] = 1.0 if j < 0 and k < s else 0.0
+        rows[fields.OLDEST, column] = 1.0 if k < s and is_first(buffer, k) else 0.0
         rows[fields.OWN, column] = 1.0 if arriving and message.topic == arrival.topic else 0.0
         rows[fields.WAITED, column] = squash(age_us, _SECOND_US)
         rows[fields.SILENCE, column] = squash(max(buffer.now_us - known_us, 0), _SECOND_US)
@@ -115,23 +108,8 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         rows[fields.QUEUED, column] = topic.queued / capacity
         rows[fields.GAIN, column] = gain / weight
         rows[fields.GAIN_PER_BYTE, column] = float(rows[fields.GAIN, column]) / message.size_bytes
-        topic.mark = column
         size_sum += message.size_bytes
         gain_sum += float(rows[fields.GAIN_PER_BYTE, column])
-    for number in range(len(buffer.topics)):
-        topic = buffer.topics[number]
-        j = topic.mark
-        if j == capacity:  # the newcomer: one more step like its last
-            step_us, step_x = 0, 0.0
-            if topic.arrived > 0:
-                step_us, step_x = arrival.arrival_us - topic.previous_us, arrival.x - topic.previous_x
-        elif j >= 0:
-            tail = buffer.slots[j]
-            step_us = max(topic.previous_us - tail.arrival_us, 0) + topic.step_us
-            step_x = max(topic.previous_x - tail.x, 0.0) + topic.step_x
-        else:
-            continue
-        fill_gaps(buffer, arrival, arriving, number, j, step_us, step_x, weight, rows)
     squash_row(rows[fields.SIZE], size_sum / max(count, 1))
     squash_row(rows[fields.GAIN_PER_BYTE], gain_sum / max(count, 1))
 
