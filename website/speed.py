@@ -31,7 +31,7 @@ from bufgym.benchmark.perf import (
 )
 from bufgym.envs.step import StepOutput, write_mask, write_observation
 from bufgym.ground.kernel import compile_here, kernel
-from bufgym.sim import NOTHING_WAITS, Batch
+from bufgym.sim.state import NOTHING_WAITS, Batch
 
 PEERS = {
     "gymnasium": f"gym.make_vec('CartPole-v1', vectorization_mode='{NATIVE}'), in numpy",

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from bufgym.benchmark.table import markdown_table
+from bufgym.benchmark.table import Table
 from bufgym.robot.queue import PolicyQueue
 
 POLICIES = ("drop-oldest", "afr", "learned-motion")
@@ -60,4 +60,4 @@ def report(seconds: float) -> str:
     head = ["policy", "put, median", "99 % within", "without pauses", "of a core", "messages held"]
     rows = [measure(policy, seconds) for policy in POLICIES]
     goals = "Goals: 100 us, 1000 us, 5 % of a core."
-    return "\n".join([about, "", *markdown_table(head, rows), "", goals])
+    return "\n".join([about, "", Table(head, [("", rows)]).markdown(), "", goals])

@@ -10,7 +10,7 @@ from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.benchmark.table import markdown_table
+from bufgym.benchmark.table import Table
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.oracle.measure import regret
@@ -125,7 +125,7 @@ def table(runs: Sequence[LiveRun]) -> str:
         [name, *(form.format(mean(f"{side}_{key}", chosen)) for _, key, form in COLUMNS for side in SIDES)]
         for name, chosen in by_policy(runs).items()
     ]
-    return "\n".join([*markdown_table(head, lines), "", agreement(runs)])
+    return "\n".join([Table(head, [("", lines)]).markdown(), "", agreement(runs)])
 
 
 def save(runs: Sequence[LiveRun], about: str, command: str, folder: Path) -> Path:

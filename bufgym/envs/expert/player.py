@@ -14,19 +14,10 @@ from bufgym.ground.kernel import compile_for, entry, local, located, named
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.policies import Policy
 from bufgym.policies.registry import signatures
-from bufgym.sim import (
-    ARRIVAL_WAITS,
-    NOTHING_WAITS,
-    SOCKET_WAITS,
-    Batch,
-    Senders,
-    answer_of,
-    arrival_of,
-    python_arrival,
-    python_view,
-    view,
-)
-from bufgym.sim.state import batch_type
+from bufgym.sim import Senders
+from bufgym.sim.rollout import answer_of, python_arrival, python_view
+from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch, batch_type
+from bufgym.sim.view import arrival_of, view
 
 
 class Player:
