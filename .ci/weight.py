@@ -8,7 +8,7 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parent.parent
 WINGS = ("papers", "relay", "robot")
 """Rooms that the core does not import (see ``[tool.importlinter]`` in pyproject.toml)."""
-LIMITS = {"package": 49_090, "core": 31_620, "tests": 26_050}
+LIMITS = {"package": 48_790, "core": 31_360, "tests": 25_830}
 """The aim is 40,000 and 25,000 lines of package and core."""
 LONGEST = 350
 """Lines of a file."""

@@ -87,7 +87,7 @@ def page() -> str:
 
 def trained_by(card: Card) -> str:
     """Find the command that made it, on the page of its results."""
-    found = re.search(r"`(python train\.py [^`]*)`", _text(card))
+    found = re.search(r"`((?:v0\.2: )?python train\.py [^`]*)`", _text(card))
     assert found is not None
     return found[1]
 
