@@ -35,8 +35,7 @@ from bufgym.model.observe import (
 )
 from bufgym.oracle.measure import MEASURED, measured
 from bufgym.scenario import Scenario, Streams
-from bufgym.scenario.numbered import numbered
-from bufgym.scenario.pool import Pool
+from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
 from bufgym.sim.senders import Begun
 

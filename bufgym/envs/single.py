@@ -65,7 +65,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
       clairvoyant is the best H or an upper bound of it. The score is 0 for Drop Oldest and 1 for the clairvoyant, NaN
       where they are equal. Computing them takes a tenth of a second after a long episode.
     - ``pool``: take every episode from a fixed set of so many, each drawn once, instead of drawing a new one at each
-      reset. The set, a ``bufgym.scenario.pool.Pool``, is the same for every seed. None for no pool.
+      reset. The set, a ``bufgym.scenario.numbered.Pool``, is the same for every seed. None for no pool.
     - any further argument replaces a parameter of the scenario (``t_max=100``). It is an object or the text that the
       command line takes (``value="saturating:0.5"``, ``traces="lte-synthetic-0"``).
 

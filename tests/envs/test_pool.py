@@ -8,7 +8,7 @@ import pytest
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Streams, Uplink
-from bufgym.scenario.pool import Pool
+from bufgym.scenario.numbered import Pool
 from bufgym.traces import Trace
 
 UPLINK = Uplink(traces=(Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)]),), jitter=0.8, duration_s=0.4)

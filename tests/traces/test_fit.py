@@ -82,7 +82,7 @@ def test_fits_of_few_seconds() -> None:
 
 
 def test_statistics_by_hand() -> None:
-    starts, ends = spells(np.array([True, False, True, True, False]))
+    starts, ends = spells(np.array([1e5, 2e6, 0.0, 4e5, 5e5]))
     assert (starts.tolist(), ends.tolist()) == ([0, 2], [1, 4])
     # 1, -1, 1, -1 about 0: products at lag 1 are all -1, at lag 2 all 1, the variance is 1; no pair at lag 9.
     correlations, pairs = autocorrelation(rows_of([1.0, -1.0, 1.0, -1.0]), (1, 2, 9))
@@ -105,8 +105,6 @@ def test_what_the_fit_refuses() -> None:
     assert [mode_of(name) for name in names] == ["car", "wifi-office", "tram", "bus"]
     with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
         mode_of("0001.csv")
-    with pytest.raises(BufgymError, match="low_bytes_per_s = 0"):
-        fit_links({"a": rows_of([1e6] * 100)}, 0)
 
 
 def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory() -> None:

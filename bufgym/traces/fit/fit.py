@@ -82,12 +82,11 @@ def mode_of(path: StrPath) -> str:
     return "-".join(words)
 
 
-def fit_links(recordings: Mapping[str, Rows], low_bytes_per_s: float = LOW_BYTES_PER_S) -> dict[str, LinkParameters]:
+def fit_links(recordings: Mapping[str, Rows]) -> dict[str, LinkParameters]:
     """Mode -> parameters.
 
     Args:
         recordings: mode -> rates of its recordings, bytes/s.
-        low_bytes_per_s: seconds below it are outages.
 
     Raises:
         BufgymError: no recordings, a mode with under 60 seconds at or above the threshold, a rate that is negative or
@@ -95,24 +94,22 @@ def fit_links(recordings: Mapping[str, Rows], low_bytes_per_s: float = LOW_BYTES
     """
     if not recordings:
         raise BufgymError("no recordings: must be at least one")
-    if not (math.isfinite(low_bytes_per_s) and low_bytes_per_s > 0):
-        raise BufgymError(f"low_bytes_per_s = {low_bytes_per_s}: must be above 0")
-    fitted = {mode: _fit(mode, rows, low_bytes_per_s) for mode, rows in recordings.items()}
-    of_all_modes = _fit_outages([row for rows in recordings.values() for row in rows], low_bytes_per_s)
+    fitted = {mode: _fit(mode, rows) for mode, rows in recordings.items()}
+    of_all_modes = _fit_outages([row for rows in recordings.values() for row in rows])
     borrowed = {mode: _with_borrowed(link, of_all_modes) for mode, link in fitted.items()}
     return {mode: _with_memory(link, recordings[mode]) for mode, link in borrowed.items()}
 
 
-def _fit(mode: str, rows: Rows, low: float) -> LinkParameters:
+def _fit(mode: str, rows: Rows) -> LinkParameters:
     """The parameters without memory."""
     pooled = np.concatenate(rows) if rows else np.zeros(0)
     if not np.isfinite(pooled).all() or (pooled < 0).any():
         raise BufgymError(f"mode {mode}: rates must be finite and >= 0")
-    good = pooled[pooled >= low]
+    good = pooled[pooled >= LOW_BYTES_PER_S]
     if good.size < LEAST_SECONDS:
-        count = f"{good.size} of {pooled.size} s have {low:g} bytes/s or more"
+        count = f"{good.size} of {pooled.size} s have {LOW_BYTES_PER_S:g} bytes/s or more"
         raise BufgymError(f"mode {mode}: {count}: must be at least {LEAST_SECONDS}")
-    far = pooled[np.concatenate([(row >= low) & ~beside_outages(row < low) for row in rows])]
+    far = pooled[np.concatenate([(row >= LOW_BYTES_PER_S) & ~beside_outages(row) for row in rows])]
     return LinkParameters(
         recordings=len(rows),
         seconds=int(pooled.size),
@@ -121,7 +118,7 @@ def _fit(mode: str, rows: Rows, low: float) -> LinkParameters:
         level_share=0.0,
         level_stay_s=_STAYS_S[0],
         fast_memory=0.0,
-        outages=_fit_outages(rows, low),
+        outages=_fit_outages(rows),
     )
 
 
@@ -188,18 +185,20 @@ def _fit_memory(target: Float64Array, pairs: Float64Array, place: float) -> tupl
 # --- outages ---------------------------------------------------------------------------------------------------------
 
 
-def _fit_outages(rows: Rows, low: float) -> OutageParameters | None:
-    lengths_s = outage_lengths(rows, low)
+def _fit_outages(rows: Rows) -> OutageParameters | None:
+    lengths_s = outage_lengths(rows)
     if not lengths_s.size:
         return None
-    pairs = [spells(row < low) for row in rows]
+    pairs = [spells(row) for row in rows]
     cut = [len(row) - (int(ends[-1]) if len(ends) else 0) for row, (_, ends) in zip(rows, pairs, strict=True)]
     first = [max(1, int(starts[0])) for starts, _ in pairs if len(starts)]
     pooled = np.concatenate(rows)
     tail, scale_s = _fit_lengths(lengths_s)
-    share, short_s, long_s = _fit_gaps(outage_gaps(rows, low), np.array(cut, np.float64), first, len(lengths_s))
-    quantiles = _rounded_quantiles(pooled[pooled < low], [k / (LOW_QUANTILES - 1) for k in range(LOW_QUANTILES)])
-    return OutageParameters(len(lengths_s), share, short_s, long_s, shoulder_of(rows, low), tail, scale_s, quantiles)
+    share, short_s, long_s = _fit_gaps(outage_gaps(rows), np.array(cut, np.float64), first, len(lengths_s))
+    quantiles = _rounded_quantiles(
+        pooled[pooled < LOW_BYTES_PER_S], [k / (LOW_QUANTILES - 1) for k in range(LOW_QUANTILES)]
+    )
+    return OutageParameters(len(lengths_s), share, short_s, long_s, shoulder_of(rows), tail, scale_s, quantiles)
 
 
 def _fit_lengths(lengths_s: Float64Array) -> tuple[float, float]:

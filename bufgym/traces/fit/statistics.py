@@ -37,36 +37,34 @@ def autocorrelation(rows: Rows, lags: Sequence[int]) -> tuple[Float64Array, Floa
     return np.array(correlations), np.array(pairs)
 
 
-def spells(low: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """First seconds of the runs of True in bool[n], and the seconds after their last."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], low.astype(np.int8), [0]))))
+def spells(row: Float64Array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """First seconds of the outages, the runs of seconds below LOW_BYTES_PER_S, and the seconds after their last."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], (row < LOW_BYTES_PER_S).astype(np.int8), [0]))))
     return edges[::2], edges[1::2]
 
 
-def outage_lengths(rows: Rows, low_bytes_per_s: float = LOW_BYTES_PER_S) -> Float64Array:
-    """Lengths of the runs of seconds below a rate, s."""
-    pairs = [spells(row < low_bytes_per_s) for row in rows]
-    return np.concatenate([ends - starts for starts, ends in pairs]).astype(np.float64)
+def outage_lengths(rows: Rows) -> Float64Array:
+    """Lengths of the outages, s."""
+    return np.concatenate([ends - starts for starts, ends in map(spells, rows)]).astype(np.float64)
 
 
-def outage_gaps(rows: Rows, low_bytes_per_s: float = LOW_BYTES_PER_S) -> Float64Array:
-    """Times from the end of one such run to the start of the next, s."""
-    pairs = [spells(row < low_bytes_per_s) for row in rows]
-    return np.concatenate([starts[1:] - ends[:-1] for starts, ends in pairs]).astype(np.float64)
+def outage_gaps(rows: Rows) -> Float64Array:
+    """Times from the end of one outage to the start of the next, s."""
+    return np.concatenate([starts[1:] - ends[:-1] for starts, ends in map(spells, rows)]).astype(np.float64)
 
 
-def beside_outages(low: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def beside_outages(row: Float64Array) -> npt.NDArray[np.bool_]:
     """Seconds, bool[n], that are within SHOULDER_S of an outage but not in one."""
-    near = np.zeros(low.size, np.bool_)
-    for start, end in zip(*spells(low), strict=True):
+    near = np.zeros(row.size, np.bool_)
+    for start, end in zip(*spells(row), strict=True):
         near[max(0, start - SHOULDER_S) : end + SHOULDER_S] = True
-    return near & ~low
+    return near & (row >= LOW_BYTES_PER_S)
 
 
-def shoulder_of(rows: Rows, low_bytes_per_s: float) -> float:
+def shoulder_of(rows: Rows) -> float:
     """Mean rate beside outages over the mean rate of other seconds outside outages, at most 1; 1 without any."""
-    near = np.concatenate([row[beside_outages(row < low_bytes_per_s)] for row in rows])
-    far = np.concatenate([row[~beside_outages(row < low_bytes_per_s) & (row >= low_bytes_per_s)] for row in rows])
+    near = np.concatenate([row[beside_outages(row)] for row in rows])
+    far = np.concatenate([row[~beside_outages(row) & (row >= LOW_BYTES_PER_S)] for row in rows])
     return min(1.0, round(float(near.mean() / far.mean()), 2)) if near.size and far.size else 1.0
 
 
@@ -104,7 +102,7 @@ STATISTICS: Final[Mapping[str, Callable[[Rows], float]]] = {
     "autocorrelation at 30 s within a recording": lambda rows: _correlation(30)(centred(rows)),
     "seconds under 500 KB/s, %": lambda rows: 100 * float((np.concatenate(rows) < LOW_BYTES_PER_S).mean()),
     "outages an hour": lambda rows: 3600 * len(outage_lengths(rows)) / sum(map(len, rows)),
-    "rate within 5 s of an outage, % of the others'": lambda rows: 100 * shoulder_of(rows, LOW_BYTES_PER_S),
+    "rate within 5 s of an outage, % of the others'": lambda rows: 100 * shoulder_of(rows),
     "mean outage, s": lambda rows: _of_any(outage_lengths(rows), np.mean),
     "longest outage, s": lambda rows: _of_any(outage_lengths(rows), np.max),
     "mean spacing of outages, s": lambda rows: _of_any(outage_gaps(rows), np.mean),
