@@ -235,7 +235,17 @@ def is_first(buffer: Buffer, k: int) -> bool:
 
 @kernel
 def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int, float, float, float]:
-    """Gaps of slot ``k`` to the messages kept before and after it on its topic; the newcomer is ``len(buffer.slots)``.
+    """``gaps_among`` the messages of the slot's topic."""
+    return gaps_among(buffer, arrival, arriving, k, len(buffer.topics) > 1)
+
+
+@kernel
+def gaps_among(
+    buffer: Buffer, arrival: Any, arriving: bool, k: int, by_topic: bool
+) -> tuple[int, int, float, float, float]:
+    """Gaps of slot ``k`` to the messages kept before and after it; the newcomer is ``len(buffer.slots)``.
+
+    ``by_topic`` counts messages of its own topic alone.
 
     The successor of the newcomer, and of a topic's last message, is still to come: the next step is expected to be as
     long as the last one. Where the socket asks (not ``arriving``), ``arrival`` follows nothing.
@@ -247,10 +257,8 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
     message = arrival if k == s else item(buffer.slots, k)
     at_us, x, topic = message.arrival_us, message.x, message.topic
     from_us, from_x = at_us, x
-    follows = arriving and (
-        len(buffer.topics) == 1 or arrival.topic == topic
-    )  # the arrival is the topic's next message
-    j = before(buffer, k, topic)
+    follows = not by_topic or (arriving and arrival.topic == topic)  # whether the arrival is the next message
+    j = before(buffer, k, topic) if by_topic else k - 1
     if j >= 0:
         from_us, from_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
     elif follows:
@@ -262,7 +270,7 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
     if k == s:
         step_us, step_x = at_us - buffer.previous_us, x - buffer.previous_x
         return back_us, step_us, back_x, step_x, back_x + step_x
-    j = after(buffer, k, topic)
+    j = after(buffer, k, topic) if by_topic else k + 1
     if j == s and not follows:
         past = item(buffer.topics, topic)
         step_us = max(past.previous_us - at_us, 0) + past.step_us
@@ -275,15 +283,8 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
 
 
 @kernel
-def time_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[int, int]:
-    """Times between slot ``k`` and the messages kept before and after it on its topic, us; see ``gaps``."""
-    back_us, on_us, _, _, _ = gaps(buffer, arrival, True, k)
-    return back_us, on_us
-
-
-@kernel
 def motion_gaps(buffer: Buffer, arrival: Any, k: int) -> tuple[float, float]:
-    """Distances in x between slot ``k`` and the messages kept before and after it, as ``time_gaps``."""
+    """Distances in x between slot ``k`` and the messages kept before and after it on its topic; see ``gaps``."""
     _, _, back_x, on_x, _ = gaps(buffer, arrival, True, k)
     return back_x, on_x
 

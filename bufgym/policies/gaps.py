@@ -9,20 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, has_space, loss, motion_gaps, time_gaps
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, gaps, has_space, loss, motion_gaps
 from bufgym.model.qoi import value
 from bufgym.policies.registry import Arrival, Memory, built_in
-
-
-@kernel
-def smallest_time_gap(buffer: Buffer, arrival: Arrival, slots: int) -> int:
-    """The slot, of the first ``slots``, that would leave the smallest merged time gap; the oldest if several do."""
-    victim, smallest = 0, np.inf
-    for k in range(slots):
-        before, after = time_gaps(buffer, arrival, k)
-        if before + after < smallest:
-            victim, smallest = k, float(before + after)
-    return victim
 
 
 @kernel
@@ -33,15 +22,15 @@ def gap_left(buffer: Buffer, arrival: Arrival, victim: int) -> float:
 
 
 @kernel
-def smallest_gap(buffer: Buffer, arrival: Arrival, discount: float) -> int:
-    """The slot that would leave the smallest motion gap, or REJECT for the newcomer; the oldest if several do.
+def smallest_gap(buffer: Buffer, arrival: Arrival, in_time: bool, slots: int, discount: float) -> int:
+    """What leaves the smallest merged gap, in time or motion, of the first ``slots`` and the oldest if several do.
 
-    The gap of slot k of s is discounted by ``discount`` (1 - k / s).
+    The newcomer, slot s, is REJECT. The gap of slot k of s is discounted by ``discount`` (1 - k / s).
     """
     s, victim, smallest = len(buffer.slots), REJECT, np.inf
-    for k in range(s + 1):
-        before, after = motion_gaps(buffer, arrival, k)
-        left = before + after
+    for k in range(slots):
+        before_us, after_us, before, after, _ = gaps(buffer, arrival, True, k)
+        left = float(before_us + after_us) if in_time else before + after
         if k < s:
             left *= 1 - discount * (1 - k / s)
         if left < smallest:
@@ -52,11 +41,9 @@ def smallest_gap(buffer: Buffer, arrival: Arrival, discount: float) -> int:
 @built_in("min-gap", source="online checkpointing, smallest merged gap")
 def min_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged time gap (newcomer included, ties to the oldest)."""
-    s = len(buffer.slots)
     if has_space(buffer, arrival):
         return ACCEPT
-    victim = smallest_time_gap(buffer, arrival, s + 1)
-    return victim if victim < s else REJECT
+    return smallest_gap(buffer, arrival, True, len(buffer.slots) + 1, 0.0)
 
 
 @built_in(
@@ -77,7 +64,7 @@ def even_reject(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     near = arrival.arrival_us - buffer.slots[s - 1].arrival_us < beta * T / (s + 1)
     if near and buffer.evictions == 0:
         return REJECT
-    return smallest_time_gap(buffer, arrival, s)
+    return smallest_gap(buffer, arrival, True, s, 0.0)
 
 
 @built_in("min-motion-gap", source="as min-gap, on the robot's odometry")
@@ -85,7 +72,7 @@ def min_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A full queue drops what leaves the smallest merged motion gap (newcomer included, ties to the oldest)."""
     if has_space(buffer, arrival):
         return ACCEPT
-    return smallest_gap(buffer, arrival, 0.0)
+    return smallest_gap(buffer, arrival, False, len(buffer.slots) + 1, 0.0)
 
 
 @built_in(
@@ -108,13 +95,7 @@ def paced_motion_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     step, _ = motion_gaps(buffer, arrival, s)
     if step < pace * even and buffer.evictions == 0:
         return REJECT
-    victim, smallest = 0, np.inf
-    for k in range(s):
-        before, after = motion_gaps(buffer, arrival, k)
-        merged = (before + after) * (1 - discount * (1 - k / s))
-        if merged < smallest:
-            victim, smallest = k, merged
-    return victim
+    return smallest_gap(buffer, arrival, False, s, discount)
 
 
 @built_in("orbbuf", source="ORBBuf [wang2021orbbuf], released code (Jrdevil-Wang/ORBBuf), with Sim = 1 - V(motion gap)")

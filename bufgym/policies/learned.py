@@ -97,10 +97,6 @@ class Weights(ScorerWeights):
     mix: NDArray[np.float32] | None = None
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
 
-    def parameters(self) -> NDArray[np.float64]:
-        """The policy's numbers."""
-        return self.pack(self.mix)
-
     def reading(self, fields: tuple[str, ...]) -> Weights:
         """Weights for more ``fields`` that give the same decisions; the new fields have weight 0."""
         new = tuple(name for name in fields if name not in self.fields)
@@ -114,16 +110,8 @@ class Weights(ScorerWeights):
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
     """Make the policy of these weights; it works for every L."""
-    return Policy(
-        name,
-        on_arrival,
-        weights=tuple(weights.parameters().tolist()),
-        work=(weights.scratch, SLOTS),
-        source=source,
-        about=summary,
-        reads_rate=not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields),
-        compile=True,
-    )
+    reads_rate = not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields)
+    return weights.policy(name, on_arrival, source=source, about=summary, reads_rate=reads_rate)
 
 
 def random_weights(fields: tuple[str, ...], widths: tuple[int, ...], rng: np.random.Generator) -> Weights:

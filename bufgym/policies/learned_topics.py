@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
@@ -115,21 +114,7 @@ class TopicWeights(ScorerWeights):
     send: Network
     """Scores sending the oldest message of a topic."""
 
-    def parameters(self) -> NDArray[np.float64]:
-        """All weights as numbers for the policy."""
-        return self.pack()
-
 
 def policy(name: str, weights: TopicWeights, summary: str = "", source: str = "") -> Policy:
     """Make the policy of these weights; it works for every L and any topics."""
-    return Policy(
-        name,
-        on_arrival,
-        on_send=on_send,
-        weights=tuple(weights.parameters().tolist()),
-        work=(weights.scratch, SLOTS),
-        source=source,
-        about=summary,
-        compile=True,
-        for_topics=True,
-    )
+    return weights.policy(name, on_arrival, on_send=on_send, source=source, about=summary, for_topics=True)

@@ -18,13 +18,13 @@ import math
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies.registry import Arrival, ClientSettings, Memory, built_in
-from bufgym.policies.schedulers import fits, make_room, oldest, oldest_of_own, topic_of
+from bufgym.policies.schedulers import fits, make_room, oldest, topic_of
 
 
 @kernel
 def overwrite(buffer: Buffer, arrival: Arrival) -> int:
     """Keep one slot a topic, which the newcomer overwrites; ``no_drop`` messages are queued instead."""
-    own = oldest_of_own(buffer, arrival)
+    own = oldest(buffer, arrival, True)
     return own if own != REJECT else make_room(buffer, arrival)
 
 
@@ -157,5 +157,5 @@ def ros_native(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """
     if fits(buffer, arrival):
         return ACCEPT
-    own = oldest_of_own(buffer, arrival)
-    return own if own != REJECT else oldest(buffer, arrival)
+    own = oldest(buffer, arrival, True)
+    return own if own != REJECT else oldest(buffer, arrival, False)

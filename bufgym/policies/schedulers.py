@@ -57,19 +57,10 @@ def makes_room(buffer: Buffer, arrival: Arrival, k: int) -> bool:
 
 
 @kernel
-def oldest(buffer: Buffer, arrival: Arrival) -> int:
-    """The oldest message that makes room, or REJECT."""
+def oldest(buffer: Buffer, arrival: Arrival, own: bool) -> int:
+    """The oldest message that makes room, of any topic or of the newcomer's ``own``, or REJECT."""
     for k in range(len(buffer.slots)):
-        if makes_room(buffer, arrival, k):
-            return k
-    return REJECT
-
-
-@kernel
-def oldest_of_own(buffer: Buffer, arrival: Arrival) -> int:
-    """The oldest message of the newcomer's topic that makes room, or REJECT."""
-    for k in range(len(buffer.slots)):
-        if same_topic(buffer, buffer.slots[k], arrival) and makes_room(buffer, arrival, k):
+        if (not own or same_topic(buffer, buffer.slots[k], arrival)) and makes_room(buffer, arrival, k):
             return k
     return REJECT
 
@@ -94,7 +85,7 @@ def make_room(buffer: Buffer, arrival: Arrival) -> int:
     """Accept a message that fits; else the oldest of its topic goes, else the oldest of the lowest priority."""
     if fits(buffer, arrival):
         return ACCEPT
-    own = oldest_of_own(buffer, arrival)
+    own = oldest(buffer, arrival, True)
     return own if own != REJECT else oldest_of_lowest(buffer, arrival)
 
 

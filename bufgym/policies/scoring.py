@@ -6,8 +6,8 @@ it as
     h = relu(W1 f + b1), then once more if there is a second layer;  score = w h + skip f + b
 
 The parameters of a scorer are one row of numbers: a header, the fields that it reads, its networks one after another,
-and the mixing weights if it has any. ``ScorerWeights.pack`` writes this layout and ``unpack`` reads it; no other code
-depends on it.
+and the mixing weights if it has any. ``ScorerWeights.parameters`` writes this layout and ``unpack`` reads it; no other
+code depends on it.
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
+from bufgym.policies.registry import OnArrival, Policy
 
 HEADER = 6
 """Numbers before the fields: fields read, the context's share of them, widths of both layers, numbers of one network,
 mixing weights."""
 DROP, KEEP, SEND = range(3)
 """Networks of a scorer, in the order of its parameters: they score dropping, accepting and sending a candidate."""
+OF_INPUTS = {"skip", "0.weight"}
+"""Tensors of a network whose first axis is the inputs."""
 
 
 class Scorer(NamedTuple):
@@ -173,10 +176,8 @@ class Network:
 
     def flat(self, order: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
         """All numbers as in ``Scorer.networks``, with the inputs in this order."""
-        parts = [self.skip[order], self.bias.reshape(1)]
-        for k, (weight, bias) in enumerate(self.layers):
-            parts += [(weight if k else weight[order]).reshape(-1), bias]
-        return np.concatenate([*parts, self.out]).astype(np.float64)
+        parts = [tensor[order] if name in OF_INPUTS else tensor for name, tensor in self.tensors().items()]
+        return np.concatenate([part.reshape(-1) for part in parts]).astype(np.float64)
 
     def tensors(self) -> dict[str, NDArray[np.float32]]:
         """Name -> tensor: skip, bias, 0.weight, 0.bias, 1.weight, ..., out."""
@@ -187,10 +188,10 @@ class Network:
 
     def with_inputs(self, n: int) -> Network:
         """A copy with n more inputs at the end, of weight 0."""
-        layers = tuple(
-            (weight if k else np.pad(weight, ((0, n), (0, 0))), bias) for k, (weight, bias) in enumerate(self.layers)
-        )
-        return Network(np.pad(self.skip, (0, n)), self.bias, layers, self.out)
+        tensors = self.tensors()
+        for name in OF_INPUTS & tensors.keys():
+            tensors[name] = np.pad(tensors[name], ((0, n), (0, 0))[: tensors[name].ndim])
+        return Network.of(tensors)
 
     @staticmethod
     def of(tensors: Mapping[str, NDArray[np.float32]]) -> Network:
@@ -250,11 +251,17 @@ class ScorerWeights:
         first, second = self.widths
         return 2 * len(self.fields) - len(self.context) + 2 * first + second + len(self.CONTEXT_NAMES)
 
-    def pack(self, mix: NDArray[np.float32] | None = None) -> NDArray[np.float64]:
+    def parameters(self) -> NDArray[np.float64]:
         """The scorer as parameters for ``unpack``."""
+        mix: NDArray[np.float32] | None = getattr(self, "mix", None)
         order = [self.fields.index(name) for name in (*self.context, *self.slot)]
         places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
         networks = [getattr(self, name).flat(order) for name in self.NETWORKS]
         mixing = np.zeros(0) if mix is None else mix.reshape(-1)
         header = [len(self.fields), len(self.context), *self.widths, len(networks[0]), len(mixing)]
         return np.concatenate([header, places, *networks, mixing])
+
+    def policy(self, name: str, on_arrival: OnArrival, **fields: Any) -> Policy:
+        """Make the policy ``name`` of these weights; it works for every L."""
+        weights, work = tuple(self.parameters().tolist()), (self.scratch, len(self.SLOT_NAMES))
+        return Policy(name, on_arrival, weights=weights, work=work, compile=True, **fields)

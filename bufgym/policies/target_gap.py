@@ -117,7 +117,7 @@ def approach(buffer: Buffer, arrival: Arrival, g: float) -> int:
         head, after = motion_gaps(buffer, arrival, 0)
         if abs(head + after - g) < abs(head - g):
             return 0
-    victim = smallest_gap(buffer, arrival, DISCOUNT)
+    victim = smallest_gap(buffer, arrival, False, s + 1, DISCOUNT)
     if room and gap_left(buffer, arrival, victim) > WITHIN * g:
         return ACCEPT
     return victim
@@ -135,7 +135,7 @@ def target_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     g = target(buffer, arrival, memory)
     if g > 0 and not steady(buffer):
         return approach(buffer, arrival, g)
-    victim = smallest_gap(buffer, arrival, 0.0)
+    victim = smallest_gap(buffer, arrival, False, len(buffer.slots) + 1, 0.0)
     if has_space(buffer, arrival) and (bursty(memory) or not spare(buffer, arrival, victim)):
         return ACCEPT
     return victim

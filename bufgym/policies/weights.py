@@ -22,7 +22,6 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -187,17 +186,12 @@ def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[st
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
-    return _weights(kind, metadata["fields"], tensors), metadata
-
-
-def _weights(kind: Any, fields: Sequence[str], tensors: Tensors) -> Any:
-    """Make weights of that ``Kind``."""
-    weights = kind(tuple(fields), *(Network.of(_below(f"{network}.", tensors)) for network in kind.NETWORKS))
-    return replace(weights, mix=tensors.get(MIX)) if kind is Weights else weights
-
-
-def _below(prefix: str, tensors: Tensors) -> Tensors:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+    mix = {"mix": tensors.pop(MIX)} if MIX in tensors else {}
+    networks = [
+        Network.of({name.removeprefix(f"{n}."): tensors[name] for name in tensors if name.startswith(f"{n}.")})
+        for n in kind.NETWORKS
+    ]
+    return cast(Any, kind)(tuple(metadata["fields"]), *networks, **mix), metadata
 
 
 def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:

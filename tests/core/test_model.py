@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import records
 from bufgym.model import link, qoi
-from bufgym.model.buffer import MESSAGE, arrival_gain, evict, loss, motion_gaps, push, row_width, time_gaps
+from bufgym.model.buffer import MESSAGE, arrival_gain, evict, gaps, loss, motion_gaps, push, row_width
 from bufgym.model.link import FOREVER, Knots, Link, position_at, segment, time_of
 
 pytestmark = pytest.mark.kernels
@@ -60,7 +60,7 @@ def test_gaps_by_hand():
     # Sent: at 0. Queued: at 10 and 30. The newcomer comes at 60; the arrival before it came at 45 and was rejected.
     held = buffer([10, 30], [1.0, 1.5], previous_us=45, previous_x=3.0)
     newcomer = message(60, 5.0)
-    assert [time_gaps(held, newcomer, k) for k in range(3)] == [(10, 20), (20, 30), (30, 15)]
+    assert [gaps(held, newcomer, True, k)[:2] for k in range(3)] == [(10, 20), (20, 30), (30, 15)]
     assert [motion_gaps(held, newcomer, k) for k in range(3)] == [(1.0, 0.5), (0.5, 3.5), (3.5, 2.0)]
     # V = 1 - 0.5^d: slot 0 loses V(1) + V(0.5) - V(1.5) = (1 - 0.5^1)(1 - 0.5^0.5)
     assert loss(held, newcomer, 0) == pytest.approx(0.5 * (1 - 0.5**0.5))

@@ -7,7 +7,7 @@ from cases import log, order, trace
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, motion_gaps, time_gaps
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, gaps
 from bufgym.model.checks import check_window
 from bufgym.model.link import FOREVER, Link
 from bufgym.model.topics import Topic, check_topics
@@ -210,11 +210,11 @@ def test_age_of_information_and_lateness():
 
 def test_gaps_of_a_topic_of_which_nothing_was_sent():
     # Neither the origin of time nor that of x counts: b's first message, its second, and a newcomer of a third topic.
-    gaps = []
+    seen = []
 
     def note(buffer, arrival, memory):
         if arrival.seq == 4:
-            gaps.append([(*time_gaps(buffer, arrival, k), *motion_gaps(buffer, arrival, k)) for k in range(4)])
+            seen.append([gaps(buffer, arrival, True, k)[:4] for k in range(4)])
         return ACCEPT
 
     topics = (Topic("a"), Topic("b"), Topic("c"))
@@ -224,7 +224,7 @@ def test_gaps_of_a_topic_of_which_nothing_was_sent():
     # Slots: 1 (b), 2 (a), 3 (b), newcomer 4 (c). b: 250 us and 2 from 1 to 3, one more such step is expected after 3.
     # a: at the same time as 0 and 2 on in x; likewise.
     expected = [(0, 250, 0, 2), (0, 0, 2, 2), (250, 250, 2, 2), (0, 0, 0, 0)]
-    assert gaps == [expected, expected]
+    assert seen == [expected, expected]
 
 
 def test_the_step_expected_after_a_message_begins_at_the_arrival_that_was_rejected_behind_it():
@@ -233,9 +233,7 @@ def test_the_step_expected_after_a_message_begins_at_the_arrival_that_was_reject
     seen = []
 
     def note(buffer, arrival, memory):
-        seen.append(
-            [(*time_gaps(buffer, arrival, k), *motion_gaps(buffer, arrival, k)) for k in range(len(buffer.slots))]
-        )
+        seen.append([gaps(buffer, arrival, True, k)[:4] for k in range(len(buffer.slots))])
         return REJECT if arrival.seq == 2 else ACCEPT
 
     after_run(episode([0, 0, 0.25, 0.5], [0, 1, 1, 0], x=[0, 1, 4, 5]), (Topic("a"), Topic("b")), on_arrival=note)
@@ -246,15 +244,15 @@ def test_gaps_behind_a_message_that_was_held_back():
     # Nothing was sent before 0, which waits; 1 came 3 ms after it and was rejected, 2 comes 4 ms after that. The gap
     # before 0 is none, and not back from 1. So with topics and without.
     for topics in ((), (Topic("only"),)):
-        gaps = []
+        seen = []
 
-        def note(buffer, arrival, memory, gaps=gaps):
-            between = [time_gaps(buffer, arrival, k) for k in range(len(buffer.slots) + 1)]
-            gaps.append((buffer.dequeued_arrival_us, buffer.dequeued_x, between))
+        def note(buffer, arrival, memory, seen=seen):
+            between = [gaps(buffer, arrival, True, k)[:2] for k in range(len(buffer.slots) + 1)]
+            seen.append((buffer.dequeued_arrival_us, buffer.dequeued_x, between))
             return REJECT if arrival.seq == 1 else ACCEPT
 
         after_run(episode([1, 4, 8], x=[5, 6, 7]), topics, on_arrival=note, on_send=scripted(HOLD, HOLD, HOLD, 0))
-        assert gaps[2] == (1 * MS, 5, [(0, 7 * MS), (7 * MS, 4 * MS)])
+        assert seen[2] == (1 * MS, 5, [(0, 7 * MS), (7 * MS, 4 * MS)])
 
 
 def test_a_rate_limit_comes_before_no_drop():

@@ -13,7 +13,7 @@ from topic_cases import topic_cases
 
 from bufgym import policies, sim
 from bufgym.ground import kernel
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, arrival_gain, before, is_first, loss, motion_gaps, time_gaps
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, arrival_gain, before, gaps, is_first, loss, motion_gaps
 from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
@@ -118,7 +118,7 @@ def agree_on_gaps(senders, twin):
     for k, message in enumerate([*slots, newcomer]):
         lane = twin.lane(message)
         (a_us, b_us), (a, b) = twin.gaps(message, "us"), twin.gaps(message, "x")
-        assert time_gaps(buffer, arrival, k) == (a_us, b_us)
+        assert gaps(buffer, arrival, True, k)[:2] == (a_us, b_us)
         assert motion_gaps(buffer, arrival, k) == (a, b)
         v = twin.rules[lane].v
         assert loss(buffer, arrival, k) == pytest.approx(twin.rules[lane].weight * (v(a) + v(b) - v(a + b)), abs=1e-12)

@@ -89,24 +89,11 @@ TOPIC_CONTEXT_FIELDS = (
 TOPIC_FIELDS = TOPIC_SLOT_FIELDS + TOPIC_CONTEXT_FIELDS
 """Fields observed besides ``FIELDS`` with several topics."""
 
-_COLUMN = {
-    field.name: column
-    for fields in (SLOT_FIELDS + TOPIC_SLOT_FIELDS, CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS)
-    for column, field in enumerate(fields)
-}
-# Where each field stands in the observation of its kind: constants for kernels.
-OCCUPIED, RANK, SIZE = _COLUMN["occupied"], _COLUMN["rank"], _COLUMN["size"]
-TIME_BEFORE, TIME_MERGED = _COLUMN["time_before"], _COLUMN["time_merged"]
-MOTION_BEFORE, MOTION_MERGED = _COLUMN["motion_before"], _COLUMN["motion_merged"]
-LOSS, RELATIVE_LOSS = _COLUMN["loss"], _COLUMN["relative_loss"]
-OCCUPANCY, BACKLOG, BUSY, LEFT = (_COLUMN[name] for name in ("occupancy", "backlog", "busy", "left"))
-ARRIVAL_TIME_GAP, ARRIVAL_MOTION_GAP = _COLUMN["arrival_time_gap"], _COLUMN["arrival_motion_gap"]
-STALLED, DEPARTURES, SERVICE_RATIO = _COLUMN["stalled"], _COLUMN["departures"], _COLUMN["service_ratio"]
-EVEN_VALUE, BEND = _COLUMN["even_value"], _COLUMN["bend"]
-PRIORITY, WEIGHT, NO_DROP, OLDEST, OWN = (_COLUMN[n] for n in ("priority", "weight", "no_drop", "oldest", "own"))
-WAITED, SILENCE, LATENESS, QUEUED = (_COLUMN[name] for name in ("waited", "silence", "lateness", "queued"))
-GAIN, GAIN_PER_BYTE = _COLUMN["gain"], _COLUMN["gain_per_byte"]
-SOCKET_ASKS, IN_FLIGHT = _COLUMN["socket_asks"], _COLUMN["in_flight"]
+# Where each field stands in the observation of its kind, with one queue and with topics: constants for kernels.
+OCCUPIED, RANK, TIME_BEFORE, TIME_MERGED, MOTION_BEFORE, MOTION_MERGED, LOSS, SIZE, RELATIVE_LOSS = range(9)
+PRIORITY, WEIGHT, NO_DROP, OLDEST, OWN, WAITED, SILENCE, LATENESS, QUEUED, GAIN, GAIN_PER_BYTE = range(9, 20)
+OCCUPANCY, BACKLOG, ARRIVAL_TIME_GAP, ARRIVAL_MOTION_GAP, BUSY, LEFT, STALLED, DEPARTURES = range(8)
+SERVICE_RATIO, EVEN_VALUE, BEND, SOCKET_ASKS, IN_FLIGHT = range(8, 13)
 
 
 @dataclass(frozen=True)

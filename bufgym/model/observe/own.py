@@ -87,7 +87,6 @@ def field(
     unit: str = "",
     low: float = 0.0,
     high: float = 1.0,
-    meaning: str = "",
     compile: bool = False,
 ) -> Callable[[Function], Function]:
     """Register the decorated function as the observation field ``name``; it comes back unchanged.
@@ -97,10 +96,9 @@ def field(
         per: "slot": ``f(buffer, arrival, k)`` is asked for each queued message k, and for the newcomer, which is k =
             ``len(buffer.slots)``; or "context": ``f(buffer, arrival)``. ``buffer`` is a ``bufgym.model.buffer.Buffer``,
             ``arrival`` a MESSAGE. Where a free socket asks (several topics), ``arrival`` is the last one that came.
-        unit: for lists; how it is scaled.
+        unit: for lists, as the first line of the function's docstring; how it is scaled.
         low: least value; an empty slot and an ended episode read 0, so low <= 0 <= high.
         high: largest value. A number outside is an error.
-        meaning: one line; by default the first of the function's docstring.
         compile: promises that Numba can compile the function.
 
     Raises:
@@ -116,8 +114,8 @@ def field(
 
     def add(function: Function) -> Function:
         _check_function("field", name, function, 3 if per == "slot" else 2)
-        text = meaning or modules.first_line(function)
-        OWN_FIELDS[name] = OwnField(name, per, "own", unit, text, low, high, function=function, compile=compile)
+        meaning = modules.first_line(function)
+        OWN_FIELDS[name] = OwnField(name, per, "own", unit, meaning, low, high, function=function, compile=compile)
         return function
 
     return add
@@ -127,7 +125,6 @@ def reward_term(
     name: str,
     *,
     unit: str = "",
-    meaning: str = "",
     parameters: Mapping[str, float] | None = None,
     memory: Mapping[str, float] | None = None,
     one_queue: bool = False,
@@ -147,7 +144,7 @@ def reward_term(
     def add(function: Function) -> Function:
         _check_function("reward term", name, function, 2)
         settings = {"parameters": dict(parameters or {}), "memory": dict(memory or {})}
-        text = meaning or modules.first_line(function)
+        text = modules.first_line(function)
         OWN_TERMS[name] = OwnTerm(name, unit, text, function=function, one_queue=one_queue, compile=compile, **settings)
         return function
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps_among
 from bufgym.model.observe import fields
 from bufgym.model.qoi import merging_loss, value
 
@@ -76,7 +76,7 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
     gain = buffer.slots[0].gain if s > 0 else arrival_gain(buffer, arrival)
     for k in range(s + 1):
         message, column = (buffer.slots[k], k) if k < s else (arrival, last)
-        back_us, on_us, back_x, on_x, merged_x = gaps(buffer, arrival, True, k)
+        back_us, on_us, back_x, on_x, merged_x = gaps_among(buffer, arrival, True, k, False)
         if k == s:
             next_gain = value(buffer.v, on_x)
         else:

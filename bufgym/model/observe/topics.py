@@ -37,40 +37,6 @@ def even_gaps(topic: Any, last_us: int, last_x: float) -> tuple[float, float]:
 
 
 @kernel
-def fill_gaps(
-    buffer: Buffer,
-    arrival: Any,
-    arriving: bool,
-    number: int,
-    column: int,
-    step_us: int,
-    step_x: float,
-    weight: float,
-    rows: NDArray[np.floating[Any]],
-) -> None:
-    """Write gaps and losses of the message in ``column``, of topic ``number``, whose successor is one step after it.
-
-    Its row holds the plain gaps to its predecessor. ``weight`` is the largest of all topics.
-    """
-    topic = buffer.topics[number]
-    v = buffer.v[topic.v_start :]
-    before_us, before_x = float(rows[fields.TIME_BEFORE, column]), float(rows[fields.MOTION_BEFORE, column])
-    last_us, last_x = topic.previous_us, topic.previous_x
-    if arriving and number == arrival.topic:
-        last_us, last_x = arrival.arrival_us, arrival.x
-    even_us, even_x = even_gaps(topic, last_us, last_x)
-    lost = max(merging_loss(v, before_x, value(v, before_x), step_x, value(v, step_x)), 0.0)
-    even_gain = value(v, even_x)
-    even_loss = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
-    rows[fields.LOSS, column] = lost * topic.weight / weight
-    rows[fields.RELATIVE_LOSS, column] = squash(lost, even_loss)
-    rows[fields.TIME_MERGED, column] = squash(before_us + step_us, 2 * even_us)
-    rows[fields.MOTION_MERGED, column] = squash(before_x + step_x, 2 * even_x)
-    rows[fields.TIME_BEFORE, column] = squash(before_us, even_us)
-    rows[fields.MOTION_BEFORE, column] = squash(before_x, even_x)
-
-
-@kernel
 def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDArray[np.floating[Any]]) -> None:
     """Write every SLOT_FIELDS and TOPIC_SLOT_FIELDS value into ``rows``, float[fields, L + 1].
 
@@ -93,15 +59,28 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         age_us, known_us = buffer.now_us - message.arrival_us, topic.dequeued_arrival_us if topic.dequeued > 0 else 0
         rows[fields.OCCUPIED, column] = 1.0
         rows[fields.RANK, column] = (k + 1) / (s + 1)
-        rows[fields.TIME_BEFORE, column] = back_us
-        rows[fields.MOTION_BEFORE, column] = back_x
-        fill_gaps(buffer, arrival, arriving, message.topic, column, on_us, on_x, weight, rows)
+        own = arriving and message.topic == arrival.topic
+        last_us, last_x = (arrival.arrival_us, arrival.x) if own else (topic.previous_us, topic.previous_x)
+        even_us, even_x = even_gaps(topic, last_us, last_x)
+        # Rounded as the rows are.
+        rows[fields.TIME_BEFORE, column], rows[fields.MOTION_BEFORE, column] = back_us, back_x
+        before_us, before_x = float(rows[fields.TIME_BEFORE, column]), float(rows[fields.MOTION_BEFORE, column])
+        v = buffer.v[topic.v_start :]
+        lost = max(merging_loss(v, before_x, value(v, before_x), on_x, value(v, on_x)), 0.0)
+        even_gain = value(v, even_x)
+        even_loss = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
+        rows[fields.TIME_BEFORE, column] = squash(before_us, even_us)
+        rows[fields.TIME_MERGED, column] = squash(before_us + on_us, 2 * even_us)
+        rows[fields.MOTION_BEFORE, column] = squash(before_x, even_x)
+        rows[fields.MOTION_MERGED, column] = squash(before_x + on_x, 2 * even_x)
+        rows[fields.LOSS, column] = lost * topic.weight / weight
+        rows[fields.RELATIVE_LOSS, column] = squash(lost, even_loss)
         rows[fields.SIZE, column] = message.size_bytes
         rows[fields.PRIORITY, column] = topic.priority / priority
         rows[fields.WEIGHT, column] = topic.weight / weight
         rows[fields.NO_DROP, column] = topic.no_drop
         rows[fields.OLDEST, column] = 1.0 if k < s and is_first(buffer, k) else 0.0
-        rows[fields.OWN, column] = 1.0 if arriving and message.topic == arrival.topic else 0.0
+        rows[fields.OWN, column] = 1.0 if own else 0.0
         rows[fields.WAITED, column] = squash(age_us, _SECOND_US)
         rows[fields.SILENCE, column] = squash(max(buffer.now_us - known_us, 0), _SECOND_US)
         rows[fields.LATENESS, column] = squash(age_us, topic.deadline_us) if topic.deadline_us < NO_DEADLINE_US else 0.0
