@@ -17,8 +17,8 @@ from bufgym import scenario as scenarios
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, percentile_interval, times_drawn
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.score import paired_difference, scores
-from bufgym.benchmark.tasks import bound
+from bufgym.benchmark.score import scores
+from bufgym.benchmark.tasks.queue import best
 from bufgym.oracle import BASELINE, normalised_score, regret
 from bufgym.policies import registry
 from bufgym.scenario import Scenario, Uplink

@@ -14,11 +14,9 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import policies, scenario
+from bufgym import policies, scenario, sim
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.table import aligned
-from bufgym.benchmark.tasks import bound
-from bufgym.oracle import BASELINE, normalised_score
+from bufgym.oracle import BASELINE, clairvoyant, normalised_score
 from bufgym.sim import NEVER, outcome
 
 

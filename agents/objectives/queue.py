@@ -19,7 +19,7 @@ from agents.objectives.objective import Objective
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.tasks.bound import best
+from bufgym.benchmark.tasks.queue import best
 from bufgym.oracle import BASELINE, EveryLength, regret
 from bufgym.policies import Policy, learned, weights
 from bufgym.policies.learned import Weights

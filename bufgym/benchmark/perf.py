@@ -25,9 +25,8 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
 from bufgym.ground.files import replaced
-from bufgym.ground.kernel import JIT, compile_here, kernel
+from bufgym.ground.kernel import JIT, compile_here
 from bufgym.sim import Senders
-from bufgym.sim.state import NOTHING_WAITS, Batch
 
 ENVIRONMENTS = {"bufgym/Uplink-v0": 10e6, "bufgym/Interruption-v0": 8e6}
 """Decisions a second that their native batches aim at."""

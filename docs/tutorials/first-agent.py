@@ -62,7 +62,6 @@ print(compared)
 from bufgym.benchmark import picture
 from bufgym.scenario import draw
 
-matplotlib.use("agg")
 compared.plot().figure.savefig("first-agent.png")
 
 # %% [markdown]

@@ -44,9 +44,6 @@ rows = bufgym.compare(names, cell, seeds=2).rows
 # line is one robot in one episode.
 
 # %%
-import matplotlib
-
-matplotlib.use("agg")
 import matplotlib.pyplot as plt
 
 figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")

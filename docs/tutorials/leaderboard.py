@@ -64,9 +64,6 @@ for entry in board:
 # ## The picture
 
 # %%
-import matplotlib
-
-matplotlib.use("agg")
 import matplotlib.pyplot as plt
 
 figure, axes = plt.subplots(figsize=(7, 2.6), layout="constrained")

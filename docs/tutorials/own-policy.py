@@ -47,7 +47,6 @@ print(compared)
 from bufgym.benchmark import picture
 from bufgym.scenario import draw
 
-matplotlib.use("agg")
 compared.plot().figure.savefig("own-policy.png")
 
 # %% [markdown]

@@ -57,12 +57,10 @@ print(Path("dropped.csv").read_text().splitlines()[:3])
 # ## The picture
 
 # %%
+import bufgym
 from bufgym.benchmark import picture
 from bufgym.scenario import draw
 
-import bufgym
-
-matplotlib.use("agg")
 compared = bufgym.compare(names, scenario, seeds=1, about="My drive over my link")
 print(compared)
 compared.plot().figure.savefig("own-recording.png")

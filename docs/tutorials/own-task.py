@@ -117,9 +117,6 @@ agents = {"complete": train(0.0), "soon": train(5.0)}
 # how long a message took. `reward_terms` report `waited` for all of them; with a weight of 0 it does not count.
 
 # %%
-import matplotlib
-
-matplotlib.use("agg")
 import matplotlib.pyplot as plt
 
 from bufgym.envs import expert

@@ -33,9 +33,6 @@ for name in names:  # a row for each topic of a run; the run's weighted sum is i
 # The share of each topic's messages that reach the server shows how the schedulers differ.
 
 # %%
-import matplotlib
-
-matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 

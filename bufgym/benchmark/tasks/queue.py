@@ -22,8 +22,9 @@ from bufgym.policies import Policy, names
 from bufgym.scenario import Episode, Scenario
 from bufgym.scenario.numbered import draw
 from bufgym.scenario.suites import Setting
-from bufgym.sim import NEVER, Senders, padded, run
+from bufgym.sim import NEVER, Senders, run
 from bufgym.sim.metrics import outcome
+from bufgym.sim.senders import padded
 
 
 def best(
