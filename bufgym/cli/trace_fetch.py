@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from bufgym.cli.options import Commands, columns, command
+from cyclopts import Parameter
+
+from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
@@ -19,40 +20,40 @@ if TYPE_CHECKING:
 NOT_KNOWN = "not known"
 
 
-def add(commands: Commands) -> None:
-    fetch = command(commands, "fetch", _fetch, "download a public data set of traces, trajectories or recordings")
-    fetch.add_argument("name", nargs="?", metavar="NAME", help="a data set; --list names them")
-    fetch.add_argument("--list", action="store_true", help="name the data sets, or all that is known of NAME")
-    fetch.add_argument("--to", metavar="DIR", help="the folder for data sets, instead of the cache folder")
-    fetch.add_argument(
-        "--from",
-        dest="local_files",
-        nargs="+",
-        default=(),
-        metavar="FILE",
-        help="files fetched by hand: download nothing",
-    )
+def fetch(
+    name: str | None = None,
+    /,
+    *,
+    list: bool = False,
+    to: str | None = None,
+    local_files: Annotated[tuple[str, ...], Parameter(name="--from")] = (),
+) -> None:
+    """Download a public data set of traces, trajectories or recordings.
 
-
-def _fetch(options: argparse.Namespace) -> None:
+    Args:
+        name: A data set; --list names them.
+        list: Name the data sets, or all that is known of one.
+        to: The folder for data sets, instead of the cache folder.
+        local_files: Files fetched by hand: download nothing.
+    """
     from bufgym.traces.datasets.fetch import fetch_dataset
     from bufgym.traces.datasets.table import datasets
 
     table = datasets()
-    if options.name is None:
-        if not options.list:
+    if name is None:
+        if not list:
             raise BufgymError("trace fetch: needs the NAME of a data set (--list names them)")
-        print(_overview(list(table.values())))
+        print(_overview([*table.values()]))
         return
-    if options.name not in table:
-        raise BufgymError(f"{options.name}: no such data set: must be one of {', '.join(table)}")
-    dataset = table[options.name]
-    if options.list:
+    if name not in table:
+        raise BufgymError(f"{name}: no such data set: must be one of {', '.join(table)}")
+    dataset = table[name]
+    if list:
         print(f"{dataset.name}\n{columns(_about(dataset))}\n{_addresses(dataset)}".rstrip())
         return
     bars = _Bars()
     try:
-        fetched = fetch_dataset(dataset, options.to, options.local_files, note=_note, watch=bars.watch)
+        fetched = fetch_dataset(dataset, to, local_files, note=_note, watch=bars.watch)
     finally:
         bars.close()
     print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")

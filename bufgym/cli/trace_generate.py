@@ -1,165 +1,209 @@
-"""``bufgym trace generate``: links, motions and frame sizes from a seed.
-
-A link's options have its generator's parameter names as `dest` and are passed on to the generator.
-"""
+"""``bufgym trace generate``: links, motions and frame sizes from a seed."""
 
 from __future__ import annotations
 
-import argparse
-import inspect
-from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
-from bufgym.cli.options import Commands, Parser, command, count, least_0, natural, number, positive
+from cyclopts import Parameter
+
+from bufgym.cli.options import Count, Least0, Natural, Positive, checked
 from bufgym.ground.errors import BufgymError
 
+if TYPE_CHECKING:
+    from bufgym.traces import Trace
 
-def add(commands: Commands) -> None:
-    """Declare ``generate`` among the commands of ``bufgym trace``."""
-    generate = commands.add_parser(
-        "generate",
-        help="make a link, a motion or frame sizes from a seed",
-        description="Make a link, a motion or frame sizes from a seed, as CSV.",
-    )
-    kinds = generate.add_subparsers(title="kinds", metavar="KIND", required=True)
-    _add_links(kinds)
-    _add_rules(kinds)
-    _add_motion(kinds)
+Out = Annotated[Path, Parameter(alias="-o", help="The CSV to write.")]
+Seed = Annotated[Natural, Parameter(help="Whole number >= 0.")]
+Seconds = Annotated[Positive, Parameter(help="Length, s.")]
 
 
-def _add_links(kinds: Commands) -> None:
-    link = _kind(kinds, "link", _link, "a mobile link as recorded in trams, trains, ... (or in WiFi)", "markov_link")
-    link.add_argument("--mode", required=True, metavar="NAME", help="foot, bicycle, bus, tram, train, car, wifi-...")
-    help = "scale to this mean (default: as recorded)"
-    link.add_argument("--mean", dest="mean_bytes_per_s", type=positive, metavar="BYTES/S", help=help)
-    link.add_argument("--links", metavar="FILE", help="parameters made by 'bufgym trace fit' (default: bufgym's own)")
-    states = _kind(kinds, "gilbert-elliott", _generate, "a link of two states, good and bad", "gilbert_elliott")
-    _option(states, "--good", "good_bytes_per_s", least_0, 10e6, "BYTES/S")
-    _option(states, "--bad", "bad_bytes_per_s", least_0, 0.0, "BYTES/S")
-    _option(states, "--mean-good", "mean_good_s", positive, 20.0, "S", "mean stay")
-    _option(states, "--mean-bad", "mean_bad_s", positive, 2.0, "S", "mean stay")
-    path = _kind(kinds, "roaming", _roaming, "WiFi past access points, with hand-overs", "roaming")
-    _option(path, "--access-points", "access_points", count, 4, "N", "in a row")
-    _option(path, "--spacing", "spacing_m", positive, 50.0, "M", "between them")
-    _option(path, "--speed", "speed_m_per_s", positive, 1.0, "M/S", "of the robot")
-    _option(path, "--gap", "gap_s", least_0, 1.0, "S", "without a link at a hand-over")
+def _pair(text: str) -> tuple[float, ...]:
+    return tuple(float(part) for part in text.split(","))
 
 
-def _add_rules(kinds: Commands) -> None:
-    steady = _kind(kinds, "steady", _generate, "one rate throughout", "steady", seeded=False)
-    _option(steady, "--rate", "bytes_per_s", positive, 10e6, "BYTES/S")
-    help = "a rate that changes evenly (default: Robofleet's 100 to 4 Mbit/s)"
-    ramp = _kind(kinds, "ramp", _generate, help, "ramp", seeded=False)
-    ramp.set_defaults(duration_s=15.0)
-    _option(ramp, "--start", "start_bytes_per_s", least_0, 12.5e6, "BYTES/S")
-    _option(ramp, "--end", "end_bytes_per_s", least_0, 0.5e6, "BYTES/S")
-    tunnel = command(kinds, "tunnel", _generate, "steady, fade, blackout, fade in, steady")
-    tunnel.set_defaults(generator="tunnel")
-    tunnel.add_argument("-o", "--out", required=True, metavar="FILE", help="the CSV to write")
-    _option(tunnel, "--rate", "bytes_per_s", positive, 10e6, "BYTES/S", "outside")
-    for part, seconds in (("before", 20.0), ("fade", 3.0), ("blackout", 10.0), ("recover", 2.0), ("after", 20.0)):
-        _option(tunnel, f"--{part}", f"{part}_s", least_0, seconds, "S", "its length")
+Range = Annotated[
+    tuple[float, ...],
+    checked(_pair, lambda pair: len(pair) == 2 and pair[0] <= pair[1], "two numbers, LOW,HIGH, the lower one first"),
+]
 
 
-def _add_motion(kinds: Commands) -> None:
-    drive = _kind(kinds, "drive", _drive, "the motion of a robot that cruises, turns in place and stops")
-    drive.add_argument("--cruise", type=_range, metavar="LOW,HIGH", help="speeds, m/s (0.5,1.5)")
-    drive.add_argument("--turn", type=_range, metavar="LOW,HIGH", help="turn rates in place, degrees/s (30,60)")
-    frames = _kind(kinds, "frames", _frames, "RGB-D frames whose sizes follow motion and detail (time_s,bytes,x)")
-    frames.add_argument("--motion", metavar="FILE", help="a motion or trajectory, or a shipped name (default: drive)")
-    _option(frames, "--rate-hz", "rate_hz", positive, 30.0, "HZ", "frames a second")
-    _option(frames, "--base", "base_bytes", positive, 230_000.0, "BYTES", "at rest")
+def _write(trace: Trace, out: Path) -> None:
+    from bufgym import traces
 
-
-def _kind(
-    kinds: Commands,
-    name: str,
-    function: Callable[[argparse.Namespace], None],
-    help: str,
-    generator: str | None = None,
-    *,
-    seeded: bool = True,
-) -> Parser:
-    parser = command(kinds, name, function, help)
-    parser.set_defaults(generator=generator)
-    if seeded:
-        _option(parser, "--seed", "seed", natural, 0, "N", "whole number >= 0")
-    _option(parser, "--duration", "duration_s", positive, 300.0, "S", "length in s")
-    parser.add_argument("-o", "--out", required=True, metavar="FILE", help="the CSV to write")
-    return parser
-
-
-def _option(
-    parser: Parser, flag: str, dest: str, type: Callable[[str], float], default: float, unit: str, help: str = ""
-) -> None:
-    """Add the option of a number, with its default stated in the help text."""
-    help = f"{help} (%(default)s)".strip()
-    parser.add_argument(flag, dest=dest, type=type, default=default, metavar=unit, help=help)
-
-
-def _range(text: str) -> tuple[float, float]:
-    """Two numbers, the first not above the second."""
-    parts = text.split(",")
-    if len(parts) != 2:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be two numbers, LOW,HIGH")
-    low, high = number(parts[0]), number(parts[1])
-    if low > high:
-        raise argparse.ArgumentTypeError(f"{text}: the first must not be above the second")
-    return low, high
+    traces.write_csv(trace, out)
+    print(f"wrote {out}: {trace.source}, mean {trace.mean_bytes_per_s / 1e6:.3f} MB/s")
 
 
 # --- links -----------------------------------------------------------------------------------------------------------
 
 
-def _generate(options: argparse.Namespace) -> None:
-    """Write the link that `options.generator` makes from the options named like its parameters."""
+def link(
+    *,
+    mode: str,
+    seed: Seed = 0,
+    duration: Seconds = 300.0,
+    mean: Positive | None = None,
+    links: str | None = None,
+    out: Out,
+) -> None:
+    """Make a mobile link as recorded in trams, trains, ... (or in WiFi).
+
+    Args:
+        mode: foot, bicycle, bus, tram, train, car, wifi-...
+        mean: Scale to this mean, bytes/s (default: as recorded).
+        links: Parameters made by 'bufgym trace fit' (default: bufgym's own).
+    """
     from bufgym import traces
 
-    generator = getattr(traces, options.generator)
-    parameters = inspect.signature(generator).parameters
-    trace = generator(**{name: value for name, value in vars(options).items() if name in parameters})
-    traces.write_csv(trace, options.out)
-    print(f"wrote {options.out}: {trace.source}, mean {trace.mean_bytes_per_s / 1e6:.3f} MB/s")
+    parameters = None if links is None else traces.read_links(links)
+    made: Any = traces.markov_link
+    _write(made(mode, seed, duration, mean_bytes_per_s=mean, links=parameters), out)
 
 
-def _link(options: argparse.Namespace) -> None:
-    from bufgym.traces import read_links
+def gilbert_elliott(
+    *,
+    seed: Seed = 0,
+    duration: Seconds = 300.0,
+    good: Least0 = 10e6,
+    bad: Least0 = 0.0,
+    mean_good: Positive = 20.0,
+    mean_bad: Positive = 2.0,
+    out: Out,
+) -> None:
+    """Make a link of two states, good and bad.
 
-    options.links = None if options.links is None else read_links(options.links)
-    _generate(options)
+    Args:
+        good: Rate, bytes/s.
+        bad: Rate, bytes/s.
+        mean_good: Mean stay, s.
+        mean_bad: Mean stay, s.
+    """
+    from bufgym import traces
+
+    stays = {"mean_good_s": mean_good, "mean_bad_s": mean_bad}
+    _write(traces.gilbert_elliott(seed, duration, good_bytes_per_s=good, bad_bytes_per_s=bad, **stays), out)
 
 
-def _roaming(options: argparse.Namespace) -> None:
-    from bufgym.traces import Corridor
+def roaming(
+    *,
+    seed: Seed = 0,
+    duration: Seconds = 300.0,
+    access_points: Count = 4,
+    spacing: Positive = 50.0,
+    speed: Positive = 1.0,
+    gap: Least0 = 1.0,
+    out: Out,
+) -> None:
+    """Make WiFi past access points, with hand-overs.
 
-    names = ("access_points", "spacing_m", "speed_m_per_s", "gap_s")
-    options.corridor = Corridor(**{name: getattr(options, name) for name in names})
-    _generate(options)
+    Args:
+        access_points: In a row.
+        spacing: Between them, m.
+        speed: Of the robot, m/s.
+        gap: Without a link at a hand-over, s.
+    """
+    from bufgym import traces
+
+    corridor = traces.Corridor(access_points=access_points, spacing_m=spacing, speed_m_per_s=speed, gap_s=gap)
+    _write(traces.roaming(seed, duration, corridor), out)
+
+
+def steady(*, rate: Positive = 10e6, duration: Seconds = 300.0, out: Out) -> None:
+    """Make one rate throughout.
+
+    Args:
+        rate: Bytes/s.
+    """
+    from bufgym import traces
+
+    _write(traces.steady(rate, duration), out)
+
+
+def ramp(*, start: Least0 = 12.5e6, end: Least0 = 0.5e6, duration: Seconds = 15.0, out: Out) -> None:
+    """Make a rate that changes evenly (default: Robofleet's 100 to 4 Mbit/s).
+
+    Args:
+        start: Rate at first, bytes/s.
+        end: Rate at last, bytes/s.
+    """
+    from bufgym import traces
+
+    _write(traces.ramp(start, end, duration), out)
+
+
+def tunnel(
+    *,
+    rate: Positive = 10e6,
+    before: Least0 = 20.0,
+    fade: Least0 = 3.0,
+    blackout: Least0 = 10.0,
+    recover: Least0 = 2.0,
+    after: Least0 = 20.0,
+    out: Out,
+) -> None:
+    """Make a drive through a tunnel: steady, fade, blackout, fade in, steady.
+
+    Args:
+        rate: Outside, bytes/s.
+        before: Length, s.
+        fade: Length, s.
+        blackout: Length, s.
+        recover: Length, s.
+        after: Length, s.
+    """
+    from bufgym import traces
+
+    lengths = {"before_s": before, "fade_s": fade, "blackout_s": blackout, "recover_s": recover, "after_s": after}
+    _write(traces.tunnel(rate, **lengths), out)
 
 
 # --- motion and frames -----------------------------------------------------------------------------------------------
 
 
-def _drive(options: argparse.Namespace) -> None:
-    from bufgym.traces import Driving, drive_motion, write_motion_csv
+def drive(
+    *, seed: Seed = 0, duration: Seconds = 300.0, cruise: Range = (0.5, 1.5), turn: Range = (30.0, 60.0), out: Out
+) -> None:
+    """Make the motion of a robot that cruises, turns in place and stops.
 
-    ranges = {"cruise_m_per_s": options.cruise, "turn_deg_per_s": options.turn}
-    driving = Driving(**{name: limits for name, limits in ranges.items() if limits is not None})
-    motion = drive_motion(options.seed, options.duration_s, driving)
-    write_motion_csv(motion, options.out)
-    print(f"wrote {options.out}: {motion.source}, {motion.total:.3f} views")
+    Args:
+        cruise: Speeds, LOW,HIGH, m/s.
+        turn: Turn rates in place, LOW,HIGH, degrees/s.
+    """
+    from bufgym import traces
+
+    ranges: dict[str, Any] = {"cruise_m_per_s": cruise, "turn_deg_per_s": turn}
+    motion = traces.drive_motion(seed, duration, traces.Driving(**ranges))
+    traces.write_motion_csv(motion, out)
+    print(f"wrote {out}: {motion.source}, {motion.total:.3f} views")
 
 
-def _frames(options: argparse.Namespace) -> None:
+def frames(
+    *,
+    seed: Seed = 0,
+    duration: Seconds = 300.0,
+    motion: str | None = None,
+    rate_hz: Positive = 30.0,
+    base: Positive = 230_000.0,
+    out: Out,
+) -> None:
+    """Make RGB-D frames whose sizes follow motion and detail (time_s,bytes,x).
+
+    Args:
+        motion: A motion or trajectory, or a shipped name (default: drive).
+        rate_hz: Frames a second.
+        base: Bytes at rest.
+    """
     import numpy as np
 
-    from bufgym.traces import FrameModel, Workload, drive_motion, frame_sizes, load_motion, write_workload_csv
+    from bufgym import traces
 
-    frames = options.duration_s * options.rate_hz
-    if not 1 <= frames <= 1e7:
-        raise BufgymError(f"--duration x --rate-hz = {frames:g} frames: must be from 1 to 1e7")
-    motion = load_motion(options.motion) if options.motion else drive_motion(options.seed, options.duration_s)
-    arrival_us = np.rint(np.arange(int(frames)) * (1e6 / options.rate_hz)).astype(np.int64)
-    sizes = frame_sizes(arrival_us, motion, options.seed, FrameModel(base_bytes=options.base_bytes))
-    x = motion.at(arrival_us)
-    write_workload_csv(Workload("frames", arrival_us, sizes, x=x - x[0]), options.out)
-    print(f"wrote {options.out}: {len(sizes)} frames, mean {sizes.mean() / 1e3:.1f} kB")
+    number = duration * rate_hz
+    if not 1 <= number <= 1e7:
+        raise BufgymError(f"--duration x --rate-hz = {number:g} frames: must be from 1 to 1e7")
+    moved = traces.load_motion(motion) if motion else traces.drive_motion(seed, duration)
+    arrival_us = np.rint(np.arange(int(number)) * (1e6 / rate_hz)).astype(np.int64)
+    sizes = traces.frame_sizes(arrival_us, moved, seed, traces.FrameModel(base_bytes=base))
+    x = moved.at(arrival_us)
+    traces.write_workload_csv(traces.Workload("frames", arrival_us, sizes, x=x - x[0]), out)
+    print(f"wrote {out}: {len(sizes)} frames, mean {sizes.mean() / 1e3:.1f} kB")
