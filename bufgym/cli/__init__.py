@@ -15,9 +15,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError
 
 from bufgym import __version__
+from bufgym.cli.options import OPTIONS
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, printable
 
@@ -42,19 +43,7 @@ COMMANDS: dict[str, Any] = {
             "from-bag": "trace_bags:from_bag",
             "from-poses": "trace_bags:from_poses",
             "fit": "trace_fit:fit",
-            "generate": (
-                "Make a link, a motion or frame sizes from a seed, as CSV.",
-                {
-                    "link": "trace_generate:link",
-                    "gilbert-elliott": "trace_generate:gilbert_elliott",
-                    "roaming": "trace_generate:roaming",
-                    "steady": "trace_generate:steady",
-                    "ramp": "trace_generate:ramp",
-                    "tunnel": "trace_generate:tunnel",
-                    "drive": "trace_generate:drive",
-                    "frames": "trace_generate:frames",
-                },
-            ),
+            "generate": "trace_generate:generate",
             "fetch": "trace_fetch:fetch",
         },
     ),
@@ -93,13 +82,8 @@ def app() -> App:
         name="bufgym",
         help="A robot's send buffer is full: which message should go?",
         version=f"bufgym {__version__}",
-        # A list takes one word or more, the last of two equal options counts, and no option has a --no-option.
-        default_parameter=Parameter(
-            consume_multiple=(1, None),
-            allow_repeating=True,
-            negative="",
-            show_default=lambda value: None if value is False else value,
-        ),
+        default_parameter=OPTIONS,
+        help_format="plaintext",
         exit_on_error=False,
         print_error=False,
         suppress_keyboard_interrupt=False,

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from bufgym.cli.options import columns
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.files import read_whole, replaced
 
 
@@ -42,7 +42,7 @@ def reproduce(
         return
     for name in names:
         if name != "all" and name not in papers.FIGURES:
-            raise BufgymError(f"unknown figure {name!r}; known: all, {', '.join(papers.FIGURES)}")
+            raise unknown("figure", name, ["all", *papers.FIGURES])
     chosen = list(papers.FIGURES) if "all" in names else list(dict.fromkeys(names))
     if claims is not None:
         _claims(claims, chosen, out, data)

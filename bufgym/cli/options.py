@@ -17,6 +17,14 @@ from bufgym.ground.errors import BufgymError, install, printable
 MAX_EPISODES = 100_000
 """Limit on episodes of each trace; memory holds a row for each, times policies and capacities."""
 
+OPTIONS = Parameter(
+    consume_multiple=(1, None),
+    allow_repeating=True,
+    negative="",
+    show_default=lambda value: None if value is False or value == "" else value,
+)
+"""How all options are: a list takes one word or more, the last of two equal ones counts, and none has a --no-option."""
+
 # --- types of options ------------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from bufgym.cli.listing import environments
 from bufgym.cli.options import Count, Least0, Natural, PolicyFile, one_policy
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install, unknown
 from bufgym.ground.files import replaced
 
 FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}
@@ -53,7 +53,7 @@ def play(
     known = environments()
     id = env if "/" in env else f"bufgym/{env}"
     if id not in known:
-        raise BufgymError(f"unknown environment {env!r}; known: {', '.join(sorted(known))}")
+        raise unknown("environment", env, sorted(known))
     if out is not None and (out.suffix not in FILMS or not out.parent.is_dir()):
         raise BufgymError(f"--out {out}: must end in {' or '.join(FILMS)}, in a folder that exists")
     if out is not None and importlib.util.find_spec("PIL") is None:

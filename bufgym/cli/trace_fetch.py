@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.progress import DownloadColumn, Progress
 
 from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError
@@ -51,11 +53,8 @@ def fetch(
     if list:
         print(f"{dataset.name}\n{columns(_about(dataset))}\n{_addresses(dataset)}".rstrip())
         return
-    bars = _Bars()
-    try:
-        fetched = fetch_dataset(dataset, to, local_files, note=_note, watch=bars.watch)
-    finally:
-        bars.close()
+    with _bars() as watch:
+        fetched = fetch_dataset(dataset, to, local_files, note=_note, watch=watch)
     print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")
 
 
@@ -109,46 +108,21 @@ def _note(sentence: str) -> None:
     print(sentence, file=sys.stderr)
 
 
-class _Bars:
-    """A progress bar for each file on a terminal with tqdm; elsewhere a line every 10 seconds and at the end."""
+@contextmanager
+def _bars() -> Iterator[Callable[[str], Callable[[int, int | None], None]]]:
+    """A progress bar for each file on a terminal; elsewhere a line when a file is whole."""
+    plain = not sys.stderr.isatty()
+    parts = *Progress.get_default_columns(), DownloadColumn()
+    with Progress(*parts, console=Console(stderr=True), disable=plain) as progress:
 
-    EVERY_S = 10.0
+        def watch(name: str) -> Callable[[int, int | None], None]:
+            task = progress.add_task(name, total=None)
 
-    def __init__(self) -> None:
-        self._bar: Any = None
+            def moved(count: int, total: int | None) -> None:
+                progress.update(task, completed=count, total=total)
+                if plain and count == total:
+                    _note(f"{name}: {count:,} bytes of {total:,}")
 
-    def watch(self, name: str) -> Callable[[int, int | None], None]:
-        self.close()
-        return self._line(name) if not sys.stderr.isatty() else self._tqdm(name)
+            return moved
 
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-    def _tqdm(self, name: str) -> Callable[[int, int | None], None]:
-        try:
-            from tqdm import tqdm
-        except ImportError:
-            return self._line(name)
-        bar = self._bar = tqdm(desc=name, unit="B", unit_scale=True, unit_divisor=1000, leave=False)
-
-        def moved(count: int, total: int | None) -> None:
-            bar.total = total
-            bar.update(count - bar.n)
-            if count == total:
-                bar.refresh()
-
-        return moved
-
-    def _line(self, name: str) -> Callable[[int, int | None], None]:
-        last = time.monotonic()
-
-        def moved(count: int, total: int | None) -> None:
-            nonlocal last
-            now = time.monotonic()
-            if count == total or now - last >= self.EVERY_S:
-                last = now
-                _note(f"{name}: {count:,} bytes" + (f" of {total:,}" if total is not None else ""))
-
-        return moved
+        yield watch

@@ -279,7 +279,7 @@ def test_the_command_writes_traces_motion_and_frames(tmp_path: Path, capsys: Cap
     assert header == "time_s,bytes,x" and len(lines) == 60
     assert float(lines[-1].split(",")[2]) == pytest.approx(load_motion(tmp_path / "m.csv").at(1_966_667))
     for arguments, says in (
-        ("drive --cruise 2,1 -o x.csv", "must not be above the second"),
+        ("drive --cruise 2,1 -o x.csv", "the first not above the second"),
         ("drive --cruise 2 -o x.csv", "must be two numbers"),
         ("link --mode bus --links no.json -o x.csv", "no.json: cannot be read"),
     ):
