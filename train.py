@@ -5,18 +5,27 @@ Results are in runs/NAME/. After a kill, the same command with ``--resume`` goes
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
 from agents.runs import prepare
 from agents.settings import Settings
+from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
 
+app = App("train.py", help_format="plaintext", default_parameter=OPTIONS, error_formatter=lambda said: f"error: {said}")
 
-def main(settings: Settings | None = None) -> None:
+
+@app.default
+def _typed(*, settings: Annotated[Settings, Parameter(name="*")] = Settings()) -> None:  # noqa: B008
+    """Train an agent on a bufgym environment, or on a whole suite, and evaluate it on held-out episodes."""
+    main(settings)
+
+
+def main(settings: Settings) -> None:
     """Train, evaluate, report."""
-    if settings is None:
-        import tyro
-
-        settings = tyro.cli(Settings)
     try:
         folder = prepare(settings)
         # Only once the settings are known to be good: torch takes seconds to load.
@@ -31,4 +40,4 @@ def main(settings: Settings | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    app()

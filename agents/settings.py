@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import shlex
 from dataclasses import asdict, dataclass
-from typing import Annotated, Literal, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
+from typing import Annotated, Literal, NoReturn, get_args, get_origin, get_type_hints
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from bufgym import ENVIRONMENTS
 from bufgym.ground.errors import BufgymError
@@ -35,29 +38,15 @@ _ALONE = {"topics": ("a scheduler", ("evolution",)), "fleet": ("a fleet's agent"
 """Kinds for one suite alone, with the trained agent and its algorithms."""
 
 
-class Range(NamedTuple):
-    """Limits of a setting's numbers: from ``low`` to ``high``, and above 0 if ``positive``."""
-
-    low: float = -math.inf
-    high: float = math.inf
-    positive: bool = False
-
-    def rule(self, value: float) -> str:
-        """The rule that a value breaks; empty if it breaks none."""
-        if not math.isfinite(value):
-            return "must be a finite number"
-        if self.positive and value <= 0:
-            return "must be > 0"
-        if self.low <= value <= self.high:
-            return ""
-        return f"must be >= {self.low}" if math.isinf(self.high) else f"must lie in {self.low}..{self.high}"
+def _number(**limits: float) -> Parameter:
+    return Parameter(validator=Number(**limits))
 
 
-Count = Annotated[int, Range(1)]
-Number = Annotated[int, Range(0)]
-Units = Annotated[int, Range(0, MAX_WIDTH)]
-Share = Annotated[float, Range(0, 1)]
-Positive = Annotated[float, Range(positive=True)]
+Count = Annotated[int, _number(gte=1)]
+Natural = Annotated[int, _number(gte=0)]
+Units = Annotated[int, _number(gte=0, lte=MAX_WIDTH)]
+Share = Annotated[float, _number(gte=0, lte=1)]
+Positive = Annotated[float, _number(gt=0, lt=math.inf)]
 
 
 @dataclass(frozen=True)
@@ -97,7 +86,7 @@ class Settings:
     result. Its workers must be able to import bufgym and agents."""
     address: str = ""
     """Of the cluster's head, such as tcp://host:8786; by default a cluster on this machine is begun and ended."""
-    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    seed: Annotated[int, _number(gte=0, lt=2**31)] = 0
     """The first seed."""
     steps: Count = 1_500_000
     """Decisions to learn from, for each seed."""
@@ -117,7 +106,7 @@ class Settings:
     num_envs: Count = 256
     n_steps: Count = 128
     """Steps in each environment between updates."""
-    batch_size: Annotated[int, Range(2)] = 4096
+    batch_size: Annotated[int, _number(gte=2)] = 4096
     epochs: Count = 4
     """Passes over each batch of experience."""
     learning_rate: Positive = 2e-3
@@ -125,7 +114,7 @@ class Settings:
     gamma: Share = 0.9
     """``retained`` pays at once what a decision costs, so a short sight suffices and keeps the noise of motion out."""
     gae_lambda: Share = 0.9
-    entropy: Annotated[float, Range(0)] = 0.0
+    entropy: Annotated[float, _number(gte=0, lt=math.inf)] = 0.0
     """Weight of the entropy bonus."""
     checkpoint_every: Count = 250_000
     """Steps."""
@@ -133,7 +122,7 @@ class Settings:
     """Steps."""
     validation_episodes: Count = 300
     """About so many in each validation, with a suite over all scenarios and capacities."""
-    test_seeds: Annotated[int, Range(0, 1000)] = 0
+    test_seeds: Annotated[int, _number(gte=0, lte=1000)] = 0
     """Test episodes on each trace of a suite; 0: as many as the suite says."""
     episodes: Count = 200
     """Held-out episodes in the evaluation (without a suite)."""
@@ -184,8 +173,11 @@ class Settings:
         for name, hint in get_type_hints(Settings, include_extras=True).items():
             value = getattr(self, name)
             for part in getattr(hint, "__metadata__", ()):
-                if broken := part.rule(value):
-                    self._refuse(name, broken)
+                for check in part.validator:
+                    try:
+                        check(type(value), value)
+                    except ValueError as broken:
+                        self._refuse(name, str(broken).replace("Must", "must").rstrip("."))
             if get_origin(hint) is Literal and value not in get_args(hint):
                 self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
         if self.start and (self.kind != "queue" or self.algo != "evolution"):

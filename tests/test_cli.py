@@ -11,10 +11,11 @@ import pytest
 from cli_cases import Capsys, Patch, fails, shown
 from PIL import Image
 
-from bufgym import __version__, cli, policies, scenario, traces
+from bufgym import __version__, policies, scenario, traces
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.cli import main
+from bufgym.cli.listing import LISTS
 from bufgym.ground.kernel import JIT
 from bufgym.policies import registry
 from bufgym.traces.generate.shipped import shipped_calls
@@ -29,9 +30,9 @@ def trace(tmp_path: Path) -> str:
 
 def test_list_names_everything_there_is(capsys: Capsys) -> None:
     text = shown(["list"], capsys)
-    names = [*policies.names(), *traces.shipped(), *cli.KINDS, *shipped_calls().values()]
+    names = [*policies.names(), *traces.shipped(), *LISTS, *shipped_calls().values()]
     assert all(name in text for name in (*names, "bufgym/Uplink-v0", "lte", "retained", "service_ratio", "every=3"))
-    for kind in cli.KINDS:
+    for kind in LISTS:
         head, *lines = shown(["list", kind], capsys).splitlines()
         assert head == kind and lines and all(line.startswith("  ") for line in lines)
 
@@ -49,8 +50,8 @@ def test_the_module_runs_as_a_command_and_opens_no_heavy_module() -> None:
 @pytest.mark.parametrize(
     ("command", "naming"),
     [
-        ("", "COMMAND"),
-        ("trace", "VERB"),
+        ("benc", 'Did you mean "bench"?'),
+        ("trace inf", 'Did you mean "info"?'),
         ("trace info missing.csv", "missing.csv"),
         ("trace plot lte-synthetic-0 --out x.doc", "x.doc"),
         ("play --env Moon-v0", "'Moon-v0'"),
@@ -66,7 +67,7 @@ def test_ctrl_c_and_a_reader_that_left(monkeypatch: Patch, capsys: Capsys, tmp_p
     def interrupt(*_: Any, **__: Any) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(cli._LISTS, "policies", interrupt)
+    monkeypatch.setitem(LISTS, "policies", interrupt)
     assert main(["list", "policies"]) == 130
     assert capsys.readouterr().err == "bufgym: stopped\n"
     monkeypatch.setattr("bufgym.benchmark.sweep.run_sweep", interrupt)
@@ -190,6 +191,7 @@ def test_a_users_mistake_is_shown_where_it_is(trace: str, tmp_path: Path, text: 
         ("--interruption --trace x.csv", "--trace cannot go with --interruption"),
         ("--out rows.csv", "rows.csv: without --suite it must be"),
         ("--nonsense", "--nonsense"),
+        ("--size 3", "--size. Did you mean --size-cv?"),
     ],
 )
 def test_bad_options_of_bench(options: str, naming: str, capsys: Capsys) -> None:

@@ -46,7 +46,7 @@ def test_the_container_runs_rules_and_commands_that_there_are() -> None:
     lines = re.sub(r"\\\n\s*", " ", re.sub(r"^#.*\n", "", text, flags=re.MULTILINE)).splitlines()
     setup, warmup = (shlex.split(part) for part in lines[-2].removeprefix("RUN ").split("&&"))
     assert setup == ["make", ".venv/.ready"]
-    assert warmup[0] == ".venv/bin/bufgym" and cli._parser().parse_args(warmup[1:]).command
+    assert warmup[0] == ".venv/bin/bufgym" and cli.app().parse_args(warmup[1:])
     told = re.findall(r"\bmake (\w+)", text) + re.findall(r'"make", "(\w+)"', lines[-1])
     assert {"train", "test"} <= set(told) <= RULES
     assert re.fullmatch(r"FROM python:(3\.\d+)-slim", lines[0])[1] in PYTHONS  # type: ignore[index]

@@ -152,7 +152,7 @@ def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Ro
         return number, error
     except Exception as error:
         # The traceback stays in this process, so the place in the user's file is added here.
-        place = modules.line_of(error, shard.sweep.policy_file)
+        place = modules.line_of(error)
         return number, error if place is None else BufgymError(f"{place}: {type(error).__name__}: {error}")
 
 

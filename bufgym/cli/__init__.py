@@ -1,62 +1,130 @@
 """The command ``bufgym``, a thin layer: each command reads its options and calls the package that does the work.
 
-Each command has a module whose ``add`` puts the command and its options into the parser; ``_parser`` calls each
-``add``. Heavy modules are imported inside the function that needs them. A user's mistake in an option or a file gives
-one line on stderr and exit code 2. Ctrl-C gives exit code 130.
+A command is a function whose parameters are its options. ``COMMANDS`` says where each is; its module is imported when
+it is called, and heavy modules inside the function that needs them. A user's mistake in an option or a file gives one
+line on stderr and exit code 2. Ctrl-C gives exit code 130.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cyclopts import App, CycloptsError
 
 from bufgym import __version__
-from bufgym.cli import (
-    bench,
-    dataset,
-    export,
-    figures,
-    fleet,
-    leaderboard,
-    listing,
-    live,
-    perf,
-    play,
-    relay,
-    report,
-    ros2,
-    topics,
-    traces,
-    tune,
-    warmup,
-)
-from bufgym.cli.listing import _LISTS, KINDS, environments
-from bufgym.cli.options import Parser, split_policies
+from bufgym.cli.options import OPTIONS
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, printable
 
-__all__ = ["KINDS", "_LISTS", "environments", "main", "split_policies"]
+__all__ = ["app", "main"]
+
+COMMANDS: dict[str, Any] = {
+    "list": "listing:listing",
+    "bench": "bench:bench",
+    "topics": "topics:topics",
+    "fleet": "topics:fleet",
+    "report": "results:report",
+    "tune": "results:tune",
+    "leaderboard": "results:leaderboard",
+    "validate": "results:validate",
+    "trace": (
+        "Bandwidth traces and recordings: look at them, convert, fit, generate, fetch.",
+        {
+            "info": "traces:info",
+            "plot": "traces:plot",
+            "validate": "traces:validate",
+            "convert": "traces:convert",
+            "from-bag": "trace_bags:from_bag",
+            "from-poses": "trace_bags:from_poses",
+            "fit": "trace_fit:fit",
+            "generate": "trace_generate:generate",
+            "fetch": "trace_fetch:fetch",
+        },
+    ),
+    "reproduce": "figures:reproduce",
+    "perf": "results:perf",
+    "play": "play:play",
+    "live": (
+        "Policies on real sockets, beside the simulator.",
+        {
+            "send": "live:send",
+            "receive": "live:receive",
+            "link": "live:link",
+            "validate": "live_checks:validate",
+            "view": "live_checks:view",
+            "replay": "live_checks:replay",
+        },
+    ),
+    "ros2": (
+        "A relay between ROS 2 networks, its uplink under a policy.",
+        {"send": "ros2:send", "receive": "ros2:receive"},
+    ),
+    "relay": (
+        "A server for fleets: robots and viewers meet there.",
+        {"serve": "relay:serve", "robot": "relay:robot", "foxglove": "relay:foxglove"},
+    ),
+    "export": "export:export",
+    "dataset": ("Record data sets for imitation and offline learning.", {"make": "export:dataset"}),
+    "warmup": "results:warmup",
+}
+"""Commands in the order of ``--help``: where the function is, or (purpose, commands below it)."""
+
+
+def app() -> App:
+    """The commands and their options."""
+    root = App(
+        name="bufgym",
+        help="A robot's send buffer is full: which message should go?",
+        version=f"bufgym {__version__}",
+        default_parameter=OPTIONS,
+        help_format="plaintext",
+        exit_on_error=False,
+        print_error=False,
+        suppress_keyboard_interrupt=False,
+        result_action="return_value",
+    )
+    return _with(root, COMMANDS)
+
+
+def _with(parent: App, commands: Mapping[str, Any]) -> App:
+    for k, (name, what) in enumerate(commands.items()):
+        if isinstance(what, str):
+            parent.command(f"bufgym.cli.{what}", name=name, sort_key=k)
+        else:
+            parent.command(_with(App(name=name, help=what[0], sort_key=k), what[1]))
+    return parent
+
+
+def _shown(root: App, words: Sequence[str]) -> App:
+    """Import the commands below the one that the words name, whose help shows their purposes; ``root``."""
+    part = root
+    for word in words:
+        if word.startswith("-") or word not in part:
+            break
+        part = part[word]
+    part.resolved_commands()
+    return root
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code."""
-    options: argparse.Namespace = argparse.Namespace()
     _open_output()
     try:
-        options = _parser().parse_args(arguments)
-        options.command(options)
+        words = sys.argv[1:] if arguments is None else arguments
+        code: int | None = _shown(app(), words)(words)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader (head, less) has gone
         _drop_output()
         return 141
-    except KeyboardInterrupt:
-        return _failed(f"stopped{'; the same command resumes it' if getattr(options, 'resumes', False) else ''}", 130)
-    except BufgymError as error:
+    except KeyboardInterrupt as stop:
+        return _failed("; ".join(["stopped", *map(str, stop.args)]), 130)
+    except (BufgymError, CycloptsError) as error:
         return _failed(str(error))
     except OSError as error:
         file = f"{error.filename}: " if error.filename is not None else ""
@@ -66,14 +134,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _drop_output()
         return _failed(f"{file}{error.strerror or error}")
     except Exception as error:
-        policy_file = getattr(options, "policy_file", None)
-        place = modules.line_of(error, policy_file, getattr(options, "scenario_file", None))
+        place = modules.line_of(error)
         if place is not None:
             return _failed(f"{place}: {type(error).__name__}: {error}")
-        if policy_file and type(error).__module__.startswith("numba."):
-            return _failed(f"{policy_file}: a policy with compile=True that Numba cannot compile: {_gist(error)}")
+        if modules.FILES and type(error).__module__.startswith("numba."):
+            return _failed(f"{modules.FILES[-1]}: a policy with compile=True that Numba cannot compile: {_gist(error)}")
         raise
-    return 0
+    return code or 0
 
 
 def _open_output() -> None:
@@ -90,34 +157,6 @@ def _drop_output() -> None:
     """Discard output that the interpreter flushes at its exit."""
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="bufgym", description="A robot's send buffer is full: which message should go?")
-    parser.add_argument("--version", action="version", version=f"bufgym {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    # In the order of --help.
-    for module in (
-        listing,
-        bench,
-        topics,
-        fleet,
-        report,
-        tune,
-        leaderboard,
-        traces,
-        figures,
-        perf,
-        play,
-        live,
-        ros2,
-        relay,
-        export,
-        dataset,
-        warmup,
-    ):
-        module.add(commands)
-    return parser
 
 
 # --- what went wrong, in one line ------------------------------------------------------------------------------------

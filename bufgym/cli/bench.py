@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from bufgym.cli.options import Commands, command, count, load_policies, loaded, refuse
-from bufgym.cli.scenarios import OWN, scenario, scenario_options
-from bufgym.cli.suite import SUITE_OPTIONS, out_options, run_suite, suite_options, target, who_options
-from bufgym.cli.trace_bags import WORKLOAD_OPTIONS
+from cyclopts import Group, Parameter
+
+from bufgym.cli.options import (
+    RESULTS,
+    Count,
+    OutOptions,
+    SuiteOptions,
+    WhoOptions,
+    given,
+    load_policies,
+    loaded,
+    refuse,
+)
+from bufgym.cli.scenarios import InterruptionOptions, OwnOptions, ScenarioOptions, StreamOptions, WorkloadOptions
+from bufgym.cli.suite import run_suite
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 
@@ -19,79 +30,86 @@ if TYPE_CHECKING:
     from bufgym.scenario import Scenario
 
 
-def add(commands: Commands) -> None:
-    bench = command(commands, "bench", _bench, "run policies side by side on the same episodes")
-    suite_options(bench)
-    who_options(bench, "all", "default: 8, or the suite's", "default: 10, or the suite's; a recording: 1")
-    scenario_options(bench)
-    option = bench.add_argument_group("how the buffer decides").add_argument
-    option("--max-bytes", type=count, metavar="B", help="also at most B bytes queued (default: no limit)")
-    option("--decide-at", choices=("arrival", "overflow"), help="ask at every arrival (default), or when full")
-    out = out_options(bench)
-    out.add_argument("--drops", metavar="OUT.csv", help="with --workload: write each message that each policy dropped")
+@Parameter(name="*", group=Group.create_ordered("How the buffer decides"))
+@dataclass(frozen=True)
+class BufferOptions:
+    max_bytes: Count | None = None
+    """Also at most so many bytes queued (default: no limit)."""
+    decide_at: Literal["arrival", "overflow"] | None = None
+    """Ask at every arrival (default), or when full."""
 
 
-_FROZEN = (
-    *("max_bytes", "decide_at", "interruption", "trace", "motion", "fps", "bytes", "size_cv", "seconds", "jitter"),
-    *("scale", "value", "law", "t_min", "t_max", "t_mean", "workload", "drops", *WORKLOAD_OPTIONS, *OWN),
-)
-"""Options that a suite sets itself."""
+def bench(
+    *,
+    suite: SuiteOptions = SuiteOptions(),
+    who: WhoOptions = WhoOptions(),
+    stream: StreamOptions = StreamOptions(),
+    workload: WorkloadOptions = WorkloadOptions(),
+    interruption: InterruptionOptions = InterruptionOptions(),
+    own: OwnOptions = OwnOptions(),
+    buffer: BufferOptions = BufferOptions(),
+    out: OutOptions = OutOptions(),
+    drops: Annotated[str | None, Parameter(group=RESULTS)] = None,
+) -> None:
+    """Run policies side by side on the same episodes.
 
-
-def _bench(options: argparse.Namespace) -> None:
-    load_policies(options.policy_file)
-    if options.suite is not None:
-        refuse(options, _FROZEN, "cannot go with --suite: a suite's episodes are frozen")
-        run_suite(options, "bench")
+    Args:
+        drops: With --workload: write each message that each policy dropped to this CSV file.
+    """
+    load_policies(who.policy_file)
+    scenario = ScenarioOptions(stream, workload, interruption, own)
+    if suite.suite is not None:
+        frozen = scenario.given() | given(buffer) | ({} if drops is None else {"drops": drops})
+        refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
+        run_suite("bench", suite, who, out)
         return
-    refuse(options, SUITE_OPTIONS, "needs --suite")
-    _scenario(options)
+    refuse(given(suite), "needs --suite")
+    if out.file() is not None:
+        raise BufgymError(f"--out {out.out}: without --suite it must be a folder")
+    if drops is not None and workload.workload is None:
+        raise BufgymError("--drops needs --workload")
+    _bench(scenario, who, buffer, out, drops)
 
 
-def _scenario(options: argparse.Namespace) -> None:
+def _bench(
+    options: ScenarioOptions, who: WhoOptions, buffer: BufferOptions, out: OutOptions, drops: str | None
+) -> None:
     """Run the scenario that the options describe."""
     from bufgym import policies
     from bufgym.benchmark import rows as files
     from bufgym.benchmark import table
     from bufgym.benchmark.compare import compare
 
-    if target(options) is not None:
-        raise BufgymError(f"--out {options.out}: without --suite it must be a folder")
-    if options.workload is None:
-        options.seeds = options.seeds or 10
-        if options.drops is not None:
-            raise BufgymError("--drops needs --workload")
-    options.capacity = options.capacity or [8]
-    options.decide_at = options.decide_at or "arrival"
-    specs = loaded(options.policies)[0] or policies.names(for_topics=False)
-    chosen = [policies.get(spec) for spec in specs]
-    if options.decide_at == "overflow" and not options.policies:
+    recorded = options.workload.workload is not None
+    decide_at = buffer.decide_at or "arrival"
+    specs = loaded(who.policies)[0]
+    chosen = [policies.get(spec) for spec in specs or policies.names(for_topics=False)]
+    if decide_at == "overflow" and not specs:
         chosen = [policy for policy in chosen if policy.privileged is None]  # see QueueTask.check
-    form = options.format or ("parquet" if files.has_pyarrow() else "csv")
-    stream, about = scenario(options)
-    if options.out is not None:
+    stream, about = options.scenario(who.seeds)
+    folder = None if out.out is None else Path(out.out)
+    if folder is not None:
         # Before the long work, so that an impossible folder is reported at once.
-        out = Path(options.out)
-        out.mkdir(parents=True, exist_ok=True)
-        if (out / "manifest.json").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "manifest.json").exists():
             raise BufgymError(
-                f"{out}: holds the run of a suite; choose another --out (its rows are never written over)"
+                f"{folder}: holds the run of a suite; choose another --out (its rows are never written over)"
             )
-    settings = {"max_bytes": options.max_bytes, "decide_at": options.decide_at}
-    done = compare(chosen, stream, capacity=options.capacity, seeds=options.seeds, about=about, **settings)
-    rows = done.rows
-    bounds = _bound_notes(rows, stream, options.decide_at) if options.workload is not None else []
+    capacity, seeds = list(who.capacity or (8,)), who.seeds or (1 if recorded else 10)
+    settings: dict[str, Any] = {"max_bytes": buffer.max_bytes, "decide_at": decide_at}
+    done = compare(chosen, stream, capacity=capacity, seeds=seeds, about=about, **settings)
+    bounds = _bound_notes(done.rows, stream, decide_at) if recorded else []
     print("\n".join([str(done), *bounds]))
-    if options.workload is not None:
-        order = dict.fromkeys(entry["policy"] for entry in table.means(rows))
-        _dropped(options, chosen, stream, list(order))
-    if options.out is not None:
-        written = files.write_rows(rows, Path(options.out) / f"rows.{form}")
-        page = Path(options.out) / "table.md"
-        with replaced(page) as temporary:
+    if recorded:
+        order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows)))
+        _dropped(chosen, stream, capacity, seeds, settings, order, drops)
+    if folder is not None:
+        form = out.format or ("parquet" if files.has_pyarrow() else "csv")
+        written = files.write_rows(done.rows, folder / f"rows.{form}")
+        with replaced(folder / "table.md") as temporary:
             text = "\n".join([f"{about}\n\n{done.markdown}", *([""] if bounds else []), *bounds])
             temporary.write_text(text + "\n", encoding="utf-8")
-        print(f"\n{len(rows)} rows in {written}, this table in {page}")
+        print(f"\n{len(done.rows)} rows in {written}, this table in {folder / 'table.md'}")
 
 
 def _bound_notes(rows: Sequence[Mapping[str, Any]], stream: Scenario, decide_at: str) -> list[str]:
@@ -110,20 +128,26 @@ def _bound_notes(rows: Sequence[Mapping[str, Any]], stream: Scenario, decide_at:
     return notes
 
 
-def _dropped(options: argparse.Namespace, chosen: Sequence[Policy], stream: Scenario, order: Sequence[str]) -> None:
-    """Print drops by topic if there are several, with policies in ``order``, and write each drop to --drops."""
+def _dropped(
+    chosen: Sequence[Policy],
+    stream: Scenario,
+    capacity: list[int],
+    seeds: int,
+    settings: dict[str, Any],
+    order: Sequence[str],
+    file: str | None,
+) -> None:
+    """Print drops by topic if there are several, with policies in ``order``, and write each drop to ``file``."""
     from bufgym.benchmark import drops
     from bufgym.scenario import Uplink
 
     assert isinstance(stream, Uplink) and stream.workload is not None
     several = len(stream.workload.summary()) > 1
-    if not several and options.drops is None:
+    if not several and file is None:
         return
-    messages = drops.drops(
-        chosen, stream, options.capacity, options.seeds, max_bytes=options.max_bytes, decide_at=options.decide_at
-    )
-    counts = drops.write_drops(messages, None if options.drops is None else Path(options.drops))
+    messages = drops.drops(chosen, stream, capacity, seeds, **settings)
+    counts = drops.write_drops(messages, None if file is None else Path(file))
     if several and counts:
-        print("\n" + drops.by_topic(counts, stream, order, options.seeds * len(stream.traces)))
-    if options.drops is not None:
-        print(f"\n{counts.total()} dropped messages in {options.drops}")
+        print("\n" + drops.by_topic(counts, stream, order, seeds * len(stream.traces)))
+    if file is not None:
+        print(f"\n{counts.total()} dropped messages in {file}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import sys
 from collections.abc import Callable, Iterator
@@ -10,46 +9,47 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from bufgym.cli.options import Commands, columns, command
-from bufgym.ground.errors import BufgymError
+from bufgym.cli.options import columns
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.files import read_whole, replaced
 
 
-def add(commands: Commands) -> None:
-    reproduce = command(commands, "reproduce", _reproduce, "figures and tables of the papers, our number beside theirs")
-    reproduce.add_argument("names", nargs="*", metavar="NAME", help="which; 'all' for all; none lists them")
-    reproduce.add_argument("--data", metavar="DIR", help="folder of recordings, for the figures that need one")
-    reproduce.add_argument(
-        "--claims",
-        metavar="FILE",
-        help="run every figure and write the page of claims (Markdown); with names: renew the rows of these figures",
-    )
-    reproduce.add_argument("--live", action="store_true", help="robofleet-fig3 to -fig7 on real sockets too")
-    reproduce.add_argument("--out", default="reproduced", metavar="DIR", help="where pictures go (%(default)s)")
+def reproduce(
+    *names: str,
+    data: Path | None = None,
+    claims: Path | None = None,
+    live: bool = False,
+    out: Path = Path("reproduced"),
+) -> None:
+    """Make figures and tables of the papers, our number beside theirs.
 
-
-def _reproduce(options: argparse.Namespace) -> None:
+    Args:
+        names: Which; 'all' for all; none lists them.
+        data: Folder of recordings, for the figures that need one.
+        claims: Run every figure and write the page of claims (Markdown) to this file; with names: renew the rows of
+            these figures.
+        live: robofleet-fig3 to -fig7 on real sockets too.
+        out: Where pictures go.
+    """
     from bufgym import papers
 
-    if options.live and options.claims is not None:
+    if live and claims is not None:
         raise BufgymError("--live: not with --claims, whose numbers are simulated")
-    data = None if options.data is None else Path(options.data)
     if data is not None and not data.is_dir():
         raise BufgymError(f"{data}: no such folder (--data)")
-    if not options.names and options.claims is None:
+    if not names and claims is None:
         print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(papers.FIGURES.items())))
         return
-    for name in options.names:
+    for name in names:
         if name != "all" and name not in papers.FIGURES:
-            raise BufgymError(f"unknown figure {name!r}; known: all, {', '.join(papers.FIGURES)}")
-    names = list(papers.FIGURES) if "all" in options.names else list(dict.fromkeys(options.names))
-    out = Path(options.out)
-    if options.claims is not None:
-        _claims(Path(options.claims), names, out, data)
+            raise unknown("figure", name, ["all", *papers.FIGURES])
+    chosen = list(papers.FIGURES) if "all" in names else list(dict.fromkeys(names))
+    if claims is not None:
+        _claims(claims, chosen, out, data)
         return
     out.mkdir(parents=True, exist_ok=True)
-    for k, name in enumerate(names):
-        print(("\n" if k else "") + _text(name, out, data, named=name in options.names, live=options.live), flush=True)
+    for k, name in enumerate(chosen):
+        print(("\n" if k else "") + _text(name, out, data, named=name in names, live=live), flush=True)
 
 
 def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:

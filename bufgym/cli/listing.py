@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
-from bufgym.cli.options import Commands, columns, command, load_policies, policy_file
+from bufgym.cli.options import PolicyFile, columns, load_policies
 from bufgym.ground.modules import first_line
 
-
-def add(commands: Commands) -> None:
-    listing = command(commands, "list", _list, "what there is: environments, scenarios, policies and more")
-    listing.add_argument("what", nargs="?", choices=KINDS, metavar="KIND", help=f"only one of: {', '.join(KINDS)}")
-    policy_file(listing)
+Kind = Literal["environments", "scenarios", "suites", "policies", "values", "rewards", "observations", "traces"]
 
 
-def _list(options: argparse.Namespace) -> None:
-    load_policies(options.policy_file)
-    sections = [f"{kind}\n{_LISTS[kind]()}" for kind in KINDS if options.what in (None, kind)]
-    print("\n\n".join(sections))
+def listing(what: Kind | None = None, /, *, policy_file: PolicyFile = None) -> None:
+    """List what there is: environments, scenarios, policies and more.
+
+    Args:
+        what: Only these.
+    """
+    load_policies(policy_file)
+    print("\n\n".join(f"{kind}\n{LISTS[kind]()}" for kind in LISTS if what in (None, kind)))
 
 
 def environments() -> dict[str, str]:
@@ -131,7 +131,7 @@ def _list_traces() -> str:
     return columns(rows) if rows else "  none found"
 
 
-_LISTS: dict[str, Callable[[], str]] = {
+LISTS: dict[str, Callable[[], str]] = {
     "environments": _list_environments,
     "scenarios": _list_scenarios,
     "suites": _list_suites,
@@ -141,6 +141,4 @@ _LISTS: dict[str, Callable[[], str]] = {
     "observations": _list_observations,
     "traces": _list_traces,
 }
-
-KINDS = tuple(_LISTS)
 """Arguments of ``list``, in the order of its full output."""

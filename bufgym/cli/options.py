@@ -1,112 +1,178 @@
-"""Parts shared by commands: the parser, types of options, policies by name and from files, printed columns."""
+"""What commands share: types and groups of options, what goes together, policies by name and from files, columns."""
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NoReturn, TypeAlias, TypeVar
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from cyclopts import Group, Parameter
 
 from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError, printable
-
-T = TypeVar("T")
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser that raises BufgymError, as for any other mistake of the user."""
-
-    def error(self, message: str) -> NoReturn:
-        raise BufgymError(f"{message} (see {self.prog} --help)")
-
+from bufgym.ground.errors import BufgymError, install, printable
 
 MAX_EPISODES = 100_000
 """Limit on episodes of each trace; memory holds a row for each, times policies and capacities."""
 
-Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
-"""Result of ``add_subparsers``, to which commands are added."""
-
-
-def command(commands: Commands, name: str, function: Callable[[argparse.Namespace], None], help: str) -> Parser:
-    """Add the command ``name``, which calls ``function`` with its options; return its parser."""
-    parser = commands.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
-    parser.set_defaults(command=function)
-    return parser
-
+OPTIONS = Parameter(
+    consume_multiple=(1, None),
+    allow_repeating=True,
+    negative="",
+    show_default=lambda value: None if value is False or value == "" else value,
+)
+"""How all options are: a list takes one word or more, the last of two equal ones counts, and none has a --no-option."""
 
 # --- types of options ------------------------------------------------------------------------------------------------
 
 
-def _checked(convert: Callable[[str], T], holds: Callable[[T], bool], rule: str) -> Callable[[str], T]:
-    """Make the type of an option: it converts the text, tests it with ``holds``, and names ``rule`` in errors."""
+def checked(convert: Callable[[str], Any], holds: Callable[[Any], bool], rule: str) -> Parameter:
+    """The type of an option: ``convert`` reads the text, ``holds`` tests the value, errors name ``rule``."""
 
-    def parse(text: str) -> T:
+    def parse(_: Any, tokens: Sequence[Any]) -> Any:
+        (token,) = tokens
         try:
-            value = convert(text)
+            value = convert(token.value)
         except ValueError:
             value = None
         if value is None or not holds(value):
-            raise argparse.ArgumentTypeError(f"{text}: must be {rule}")
+            raise ValueError(f"{token.value}: must be {rule}")
         return value
 
-    return parse
+    return Parameter(converter=parse, n_tokens=1, consume_multiple=False, accepts_keys=False)
 
 
-number = _checked(float, math.isfinite, "a finite number")
-positive = _checked(float, lambda number: 0 < number < math.inf, "a number > 0")
-least_0 = _checked(float, lambda number: 0 <= number < math.inf, "a number >= 0")
-count = _checked(int, lambda number: number >= 1, "a whole number >= 1")
-natural = _checked(int, lambda number: number >= 0, "a whole number >= 0")
+def _capacities(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in text.split(","))
 
 
-def episodes(text: str) -> int:
-    """Parse a number of seeds, an integer from 1 to ``MAX_EPISODES``."""
-    seeds = count(text)
-    if seeds > MAX_EPISODES:
-        raise argparse.ArgumentTypeError(f"{text}: must be at most {MAX_EPISODES}")
-    return seeds
+Whole = Annotated[int, checked(int, lambda number: True, "a whole number")]
+Count = Annotated[int, checked(int, lambda number: number >= 1, "a whole number >= 1")]
+Natural = Annotated[int, checked(int, lambda number: number >= 0, "a whole number >= 0")]
+Seeds = Annotated[
+    int, checked(int, lambda number: 1 <= number <= MAX_EPISODES, f"a whole number >= 1 and at most {MAX_EPISODES}")
+]
+Positive = Annotated[float, checked(float, lambda number: 0 < number < math.inf, "a number > 0")]
+Least0 = Annotated[float, checked(float, lambda number: 0 <= number < math.inf, "a number >= 0")]
+Capacities = Annotated[
+    tuple[int, ...],
+    checked(_capacities, lambda Ls: min(Ls) >= 1 and len(set(Ls)) == len(Ls), "whole numbers >= 1, no two alike"),
+]
+"""Distinct integers, as in ``4,8,16``."""
+PolicyFile: TypeAlias = Annotated[
+    str | None,
+    Parameter(help="Python file that registers policies of your own; its code is run, so use only files you trust"),
+]
+"""The option ``--policy-file``; ``load_policies`` runs the file."""
 
 
-def capacities(text: str) -> list[int]:
-    """Parse distinct integers >= 1, as in ``"4,8,16"``."""
-    numbers = [count(part) for part in text.split(",")]
-    for capacity in numbers:
-        if numbers.count(capacity) > 1:
-            raise argparse.ArgumentTypeError(f"{text}: {capacity} is given more than once")
-    return numbers
+# --- groups of options -----------------------------------------------------------------------------------------------
 
 
-def split_policies(text: str) -> list[str]:
-    """Split a list such as ``"afr,decimate:every=2,random"``; a setting belongs to the policy before it."""
-    specs: list[str] = []
-    for part in text.split(","):
-        if "=" in part and ":" not in part and specs:
-            specs[-1] += f",{part}"
-        else:
-            specs.append(part.strip())
-    return specs
+@Parameter(name="*", group=Group.create_ordered("A suite: frozen episodes, scored, with a report"))
+@dataclass(frozen=True)
+class SuiteOptions:
+    suite: str | None = None
+    """Which ('bufgym list suites'; topics and fleet have their own); --out DIR keeps it, a second call resumes it."""
+    split: str | None = None
+    """train, validation or test (default: test)."""
+    data: str | None = None
+    """Folder of recordings, for suites over real links."""
+    jobs: Whole | None = None
+    """Processes side by side (default: one a core)."""
+    backend: str | None = None
+    """loky (default), threading, sequential, ray or dask."""
+    address: str | None = None
+    """Head of the Ray or Dask cluster (default: one on this machine)."""
 
 
-SOURCES = (
-    "; also mine.safetensors, mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what"
-    " makes one; from the current folder too): a zip and a module run code, so use only what you trust"
-)
-"""Help text on sources that ``--policies`` takes besides names, in commands that use ``loaded``."""
+@Parameter(name="*", group=Group.create_ordered("Who runs"))
+@dataclass(frozen=True)
+class WhoOptions:
+    policies: list[str] | None = None
+    """Policies, as in afr,decimate:every=2 (default: all that the task takes, or the suite's); also mine.safetensors,
+    mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what makes one; from the current
+    folder too): a zip and a module run code, so use only what you trust."""
+    capacity: Capacities | None = None
+    """Capacities L, messages, as in 4,8,16 (default: 8; topics: 32; or the suite's)."""
+    seeds: Seeds | None = None
+    """Episodes on each trace (default: 10; topics: 5; a recording: 1; or the suite's)."""
+    policy_file: PolicyFile = None
 
 
-def policies_option(parser: argparse._ActionsContainer, default: str, also: str = "") -> None:
-    """Add the option ``--policies``, which ``policy_specs`` or ``loaded`` reads."""
-    parser.add_argument(
-        "--policies",
-        nargs="+",
-        metavar="A,B:x=1,C",
-        help=f"policies, with settings as in decimate:every=2 (default: {default}){also}",
-    )
+RESULTS = Group.create_ordered("Where results go", sort_key=1)
+
+
+@Parameter(name="*", group=RESULTS)
+@dataclass(frozen=True)
+class OutOptions:
+    out: str | None = None
+    """Write rows and what was run into this folder, or rows alone into this .csv or .parquet file."""
+    format: Literal["csv", "parquet"] | None = None
+    """Format of the rows (default: parquet if it can)."""
+
+    def file(self) -> Path | None:
+        """The file of ``--out``; None for a folder or nothing. Another kind of file is an error."""
+        from bufgym.benchmark.rows import checked_target, has_pyarrow
+
+        if self.format == "parquet" and self.out is not None and not has_pyarrow():
+            raise BufgymError(f"--format parquet needs pyarrow: {install('bench')} (or --format csv)")
+        if self.out is None or not Path(self.out).suffix[1:].isalpha() or Path(self.out).is_dir():
+            return None
+        file = checked_target(self.out)
+        if not file.absolute().parent.is_dir():
+            raise BufgymError(f"{self.out}: no folder to write this file to")
+        return file
+
+
+def given(options: object, *names: str) -> dict[str, Any]:
+    """Select the options of a group that the user gave; ``names``: among these alone."""
+    return {
+        name: value
+        for name, value in vars(options).items()
+        if value is not None and value is not False and (not names or name in names)
+    }
+
+
+def refuse(options: Mapping[str, Any], why: str) -> None:
+    """Raise the error ``--name why`` for the first of these options."""
+    for name in options:
+        raise BufgymError(f"{_flag(name)} {why}")
+
+
+def command_line(command: str, **options: Any) -> str:
+    """Write the command with those of these options that are given."""
+    words = [f"bufgym {command}"]
+    for name, value in options.items():
+        if value is not None and value is not False:
+            text = ",".join(map(str, value)) if isinstance(value, tuple) else value
+            parts = [] if value is True else text if isinstance(text, list) else [text]
+            words += [_flag(name), *(shlex.quote(str(part)) for part in parts)]
+    return " ".join(words)
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+# --- policies --------------------------------------------------------------------------------------------------------
 
 
 def policy_specs(texts: Sequence[str] | None) -> list[str]:
-    """List the policies of ``--policies``, separated by commas or spaces; empty if it was not given."""
-    return [spec for text in texts or () for spec in split_policies(text)]
+    """List the policies of ``--policies``, separated by commas or spaces; empty if it was not given.
+
+    A setting belongs to the policy before it, as in ``afr,red:min_th=1,max_th=2,random``.
+    """
+    specs: list[str] = []
+    for text in texts or ():
+        for k, part in enumerate(text.split(",")):
+            if k and "=" in part and ":" not in part:
+                specs[-1] += f",{part}"
+            else:
+                specs.append(part.strip())
+    return specs
 
 
 def loaded(texts: Sequence[str] | None) -> tuple[list[str], tuple[str, ...]]:
@@ -121,28 +187,13 @@ def loaded(texts: Sequence[str] | None) -> tuple[list[str], tuple[str, ...]]:
     return [sources.load(word) if word in found else word for word in words], found
 
 
-def given(options: argparse.Namespace, names: tuple[str, ...]) -> dict[str, Any]:
-    """Select the options that the user gave."""
-    values = {name: getattr(options, name) for name in names}
-    return {name: value for name, value in values.items() if value is not None and value is not False}
-
-
-def refuse(options: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
-    """Raise the error ``--name why`` for the first of these options that the user gave."""
-    for name in given(options, names):
-        raise BufgymError(f"--{name.replace('_', '-')} {why}")
-
-
-# --- a user's own policies -------------------------------------------------------------------------------------------
-
-
-def policy_file(parser: argparse._ActionsContainer) -> None:
-    """Add the option ``--policy-file``; ``load_policies`` runs the file."""
-    parser.add_argument(
-        "--policy-file",
-        metavar="FILE.py",
-        help="a Python file that registers policies of your own; its code is run, so use only files you trust",
-    )
+def one_policy(text: str, file: str | None = None) -> str:
+    """The single policy of ``--policies``, after the user's file was run."""
+    load_policies(file)
+    names = loaded([text])[0]
+    if len(names) != 1:
+        raise BufgymError(f"--policies {text}: must be one policy")
+    return names[0]
 
 
 def load_policies(path: str | None) -> None:

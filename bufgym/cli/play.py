@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import os
 import re
@@ -12,79 +11,86 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.cli.listing import environments
-from bufgym.cli.options import Commands, command, count, least_0, load_policies, loaded, natural, policy_file
-from bufgym.ground.errors import BufgymError, install
+from bufgym.cli.options import Count, Least0, Natural, PolicyFile, one_policy
+from bufgym.ground.errors import BufgymError, install, unknown
 from bufgym.ground.files import replaced
 
 FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}
 """Suffix of a film -> Pillow's name of the format."""
 
 
-def add(commands: Commands) -> None:
-    play = command(commands, "play", _play, "watch a policy decide, in the terminal")
-    play.add_argument("--policies", default="afr", metavar="NAME", help="the policy, as in bench (%(default)s)")
-    play.add_argument("--env", default="Uplink-v0", help="environment (%(default)s)")
-    play.add_argument("--capacity", type=count, default=8, metavar="L", help="L, messages (%(default)s)")
-    play.add_argument("--seed", type=natural, default=0, help="the episode of this seed in bench (%(default)s)")
-    play.add_argument("--speed", type=least_0, default=5.0, help="decisions a second; 0: no pause (%(default)s)")
-    play.add_argument("--steps", type=count, default=200, help="stop after so many decisions (%(default)s)")
-    play.add_argument("--out", type=Path, metavar="FILE", help=f"write a film in place ({', '.join(FILMS)})")
-    policy_file(play)
+def play(
+    *,
+    policies: str = "afr",
+    env: str = "Uplink-v0",
+    capacity: Count = 8,
+    seed: Natural = 0,
+    speed: Least0 = 5.0,
+    steps: Count = 200,
+    out: Path | None = None,
+    policy_file: PolicyFile = None,
+) -> None:
+    """Watch a policy decide, in the terminal.
 
-
-def _play(options: argparse.Namespace) -> None:
+    Args:
+        policies: The policy, as in bench.
+        env: Environment.
+        capacity: L, messages.
+        seed: The episode of this seed in bench.
+        speed: Decisions a second; 0: no pause.
+        steps: Stop after so many decisions.
+        out: Write a film in place (.gif, .webp, .png).
+    """
     import time
 
     import gymnasium
 
-    from bufgym import policies
     from bufgym.benchmark.run import draw
     from bufgym.envs.expert import Player
+    from bufgym.policies import get
 
-    load_policies(options.policy_file)
-    (name,) = loaded([options.policies])[0]
-    policy = policies.get(name)
+    policy = get(one_policy(policies, policy_file))
     known = environments()
-    id = options.env if "/" in options.env else f"bufgym/{options.env}"
+    id = env if "/" in env else f"bufgym/{env}"
     if id not in known:
-        raise BufgymError(f"unknown environment {options.env!r}; known: {', '.join(sorted(known))}")
-    if options.out is not None and (options.out.suffix not in FILMS or not options.out.parent.is_dir()):
-        raise BufgymError(f"--out {options.out}: must end in {' or '.join(FILMS)}, in a folder that exists")
-    if options.out is not None and importlib.util.find_spec("PIL") is None:
+        raise unknown("environment", env, sorted(known))
+    if out is not None and (out.suffix not in FILMS or not out.parent.is_dir()):
+        raise BufgymError(f"--out {out}: must end in {' or '.join(FILMS)}, in a folder that exists")
+    if out is not None and importlib.util.find_spec("PIL") is None:
         raise BufgymError(f"--out needs matplotlib and Pillow: {install('plot')}")
-    mode = "ansi" if options.out is None else "rgb_array"
-    env: Any = gymnasium.make(id, capacity=options.capacity, render_mode=mode).unwrapped
+    mode = "ansi" if out is None else "rgb_array"
+    world: Any = gymnasium.make(id, capacity=capacity, render_mode=mode).unwrapped
     player = Player(policy)
-    env.reset(options={"episode": draw(env.rows.scenario, options.seed)})
+    world.reset(options={"episode": draw(world.rows.scenario, seed)})
     # On a terminal each picture replaces the one before, unless the user wants no escape codes (no-color.org).
     plain = not sys.stdout.isatty() or bool(os.environ.get("NO_COLOR"))
     clear = "" if plain else "\x1b[H\x1b[J"
-    film: list[Any] | None = None if options.out is None else []
+    film: list[Any] | None = None if out is None else []
 
     def show(title: str) -> None:
-        image = env.render()
+        image = world.render()
         if film is not None:
             film.append(image)
         else:
             print(title + (re.sub(r"\x1b\[[\d;]*m", "", image) if plain else image), flush=True)
 
-    end = f"stopped after {options.steps} decisions (--steps)"
-    for step in range(options.steps):
+    end = f"stopped after {steps} decisions (--steps)"
+    for step in range(steps):
         show(f"{clear}{policy.name}, decision {step + 1}\n")
-        if options.speed and film is None:
-            time.sleep(1 / options.speed)
+        if speed and film is None:
+            time.sleep(1 / speed)
         # An episode that asks for no decision ends with its first step, whatever the action.
-        due = env.rows.senders.batch.senders[0]["waiting"] != 0
-        _, _, ended, _, info = env.step(player.action(env.rows.senders, 0) if due else options.capacity)
+        due = world.rows.senders.batch.senders[0]["waiting"] != 0
+        _, _, ended, _, info = world.step(player.action(world.rows.senders, 0) if due else capacity)
         if ended:
             show("")
             end = f"over: QoI {info['qoi']:.3f}, {info['delivered']} of {info['arrived']} delivered,"
             end += f" {info['dropped']} dropped"
             break
     print(end)
-    if film is not None:
-        _write(film, options.out, options.speed)
-        print(f"wrote {options.out} ({len(film)} pictures)")
+    if film is not None and out is not None:
+        _write(film, out, speed)
+        print(f"wrote {out} ({len(film)} pictures)")
 
 
 def _write(film: Sequence[Any], path: Path, speed: float) -> None:

@@ -1,44 +1,131 @@
-"""``bufgym relay``: a fleet's server, and its robots."""
+"""``bufgym relay``: a fleet's server, its robots, and a viewer."""
 
 from __future__ import annotations
 
-import argparse
-from typing import Any
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
-from bufgym.cli import relay_robots
-from bufgym.cli.live import run_async
-from bufgym.cli.options import Commands, command
+from cyclopts import Group, Parameter
 
-
-def add(commands: Commands) -> None:
-    relay = commands.add_parser("relay", help="a server for fleets: robots and viewers meet there")
-    parts = relay.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    _add_server(parts)
-    relay_robots.add(parts)
+from bufgym.cli import live
+from bufgym.cli.options import Count, Natural, PolicyFile, one_policy
+from bufgym.ground.errors import BufgymError
 
 
-# --- the server ------------------------------------------------------------------------------------------------------
+@Parameter(name="*", group=Group.create_ordered("The relay"))
+@dataclass(frozen=True)
+class SessionOptions:
+    to: str = "ws://127.0.0.1:7420"
+    """URL of the relay."""
+    token_file: str | None = None
+    """Who this is (default: $BUFGYM_RELAY_TOKEN)."""
+    ca: str | None = None
+    """With wss: file (.pem) of who signs the relay's certificate."""
+    certificate: str | None = None
+    """With wss: file (.pem) of this one's own, with its key."""
+
+    def settings(self) -> dict[str, Any]:
+        from bufgym.relay.session import security, token
+
+        return {"token": token(self.token_file), "tls": security(self.ca, self.certificate)}
 
 
-def _add_server(parts: Any) -> None:
-    serve = command(parts, "serve", _serve, "the server, with what a configuration allows; Ctrl-C ends it")
-    serve.add_argument("--config", required=True, metavar="FILE.toml", help="as examples/relay.toml")
-    serve.add_argument("--check", action="store_true", help="only read it and print its permissions")
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
-def _serve(options: argparse.Namespace) -> None:
-    from bufgym.relay import config
+async def serve(*, config: str, check: bool = False) -> None:
+    """Run the server, with what a configuration allows; Ctrl-C ends it.
+
+    Args:
+        config: As examples/relay.toml.
+        check: Only read it and print its permissions.
+    """
+    from bufgym.relay import config as configurations
     from bufgym.robot.extra import needs
 
-    settings = config.load(options.config)
+    settings = configurations.load(config)
     with needs("websockets"):
         from bufgym.relay import policies, server
-    if options.check:
+    if check:
         policies.check(settings.policies)
-        print(f"{options.config}: {len(settings.rules)} rules, {settings.host}:{settings.port}")
+        print(f"{config}: {len(settings.rules)} rules, {settings.host}:{settings.port}")
         return
-    run_async(server.serve_forever(settings, _say))
+    await server.serve_forever(settings, live.say)
 
 
-def _say(text: str) -> None:
-    print(text, flush=True)
+async def robot(
+    *,
+    session: SessionOptions = SessionOptions(),
+    name: str = "robot-1",
+    config: str | None = None,
+    bag: str | None = None,
+    ros: Literal["1", "2"] | None = None,
+    odom: str | None = None,
+    receive: list[str] | None = None,
+    policies: str = "robofleet",
+    policy_file: PolicyFile = None,
+    capacity: Count = 32,
+) -> None:
+    """Run a robot, recorded or of ROS; Ctrl-C ends it.
+
+    Args:
+        config: Its topics, as in examples/client.toml.
+        bag: A recording as a robot, again and again.
+        ros: The topics of this version of ROS, as in --config.
+        odom: With --ros: topic with poses, which give x to the topics that move.
+        receive: With --ros: topics published here if they come.
+        policies: The policy, as in bench.
+        capacity: L, messages.
+    """
+    from bufgym.relay.robot import Robot
+    from bufgym.scenario import read_client
+
+    if bag is not None and ros is not None:
+        raise BufgymError("--bag and --ros: give one of them")
+    policy = one_policy(policies, policy_file)
+    client = None if config is None else read_client(config)
+    streams = None if client is None else client.streams
+    settings: dict[str, Any] = {} if client is None else {"window": client.window, "value": client.value}
+    source: Any
+    if bag is not None:
+        from bufgym.relay.bag import BagSource
+
+        source = BagSource(bag, streams)
+    elif ros is not None:
+        if streams is None:
+            raise BufgymError("--ros needs --config: which topics, and the rules for each")
+        from bufgym.relay.ros import SOURCES
+
+        source = SOURCES[ros](streams, odom, receive or [])
+    else:
+        raise BufgymError("needs --bag or --ros; examples/made_up_robot.py is a robot without either")
+    settings |= session.settings()
+    one = Robot(session.to, name, source, policy=policy, capacity=capacity, say=say, **settings)
+    live.say(f"{name} -> {session.to}; Ctrl-C ends it")
+    await one.run()
+
+
+async def foxglove(
+    *,
+    session: SessionOptions = SessionOptions(),
+    name: str = "foxglove",
+    port: Annotated[Natural, Parameter(help="Where they connect to.")] = 8765,
+    topics: str = "^/",
+) -> None:
+    """Run a viewer that Foxglove and Lichtblick connect to; Ctrl-C ends it.
+
+    Args:
+        topics: Topics to show, a regular expression.
+    """
+    await _bridge(session.to, name, port, topics, **session.settings()).run()
+
+
+def _bridge(url: str, name: str, port: int, topics: str = "^/", **settings: Any) -> Any:
+    from bufgym.relay.foxglove import Bridge
+    from bufgym.relay.session import Session
+
+    bridge = Bridge(Session(url, name, say=say, **settings), port, pattern=topics)
+    live.say(f"ws://{bridge.address}: Foxglove, Lichtblick -> {url}; Ctrl-C ends it")
+    return bridge

@@ -2,68 +2,58 @@
 
 from __future__ import annotations
 
-import argparse
+import contextlib
 
-from bufgym.cli.live import PORT, TRANSPORTS, address, run_async
-from bufgym.cli.options import Commands, command, count, load_policies, loaded, natural, policy_file
-
-CAPACITY = 32
+from bufgym.cli.live import PORT, RECEIVER, Host, Port, Transport, address, say
+from bufgym.cli.options import Count, PolicyFile, one_policy
 
 
-def add(commands: Commands) -> None:
-    ros2 = commands.add_parser("ros2", help="a relay between ROS 2 networks, its uplink under a policy")
-    parts = ros2.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    send = command(parts, "send", _send, "on the robot: subscribe, and send over one uplink; Ctrl-C ends it")
-    send.add_argument("--config", required=True, metavar="FILE.toml", help="topics, as in examples/client.toml")
-    send.add_argument("--to", default=f"127.0.0.1:{PORT}", metavar="HOST:PORT", help="the receiver (%(default)s)")
-    send.add_argument(
-        "--policies", metavar="NAME", help="the policy, as in bench (afr; for several topics learned-scheduler)"
-    )
-    policy_file(send)
-    send.add_argument("--capacity", type=count, default=CAPACITY, metavar="L", help="L, messages (%(default)s)")
-    send.add_argument("--odom", metavar="TOPIC", help="poses, which give x to the topics that move")
-    send.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
-    send.add_argument("--log", metavar="LOG.mcap", help="log every decision there, for live replay")
+async def send(
+    *,
+    config: str,
+    to: str = RECEIVER,
+    policies: str | None = None,
+    policy_file: PolicyFile = None,
+    capacity: Count = 32,
+    odom: str | None = None,
+    transport: Transport = "tcp",
+    log: str | None = None,
+) -> None:
+    """On the robot: subscribe, and send over one uplink; Ctrl-C ends it.
 
-    receive = command(parts, "receive", _receive, "at the other end: receive and republish; Ctrl-C ends it")
-    receive.add_argument("--port", type=natural, default=PORT, help="(%(default)s)")
-    receive.add_argument("--host", default="127.0.0.1", help="address to listen on (%(default)s: this machine alone)")
-    receive.add_argument("--transport", choices=TRANSPORTS, default="tcp", help="(%(default)s)")
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)
-
-
-def _send(options: argparse.Namespace) -> None:
-    import contextlib
-
+    Args:
+        config: Topics, as in examples/client.toml.
+        to: HOST:PORT of the receiver.
+        policies: The policy, as in bench (default: afr; for several topics learned-scheduler).
+        capacity: L, messages.
+        odom: Topic with poses, which give x to the topics that move.
+        log: Log every decision to this file (.mcap), for live replay.
+    """
     from bufgym.robot import LogFile
     from bufgym.robot.ros2.relay import RosSender
     from bufgym.scenario import read_client
 
-    client = read_client(options.config)
-    load_policies(options.policy_file)
-    default = "afr" if len(client.streams) == 1 else "learned-scheduler"
-    (policy,) = loaded([options.policies or default])[0]
-    host, port = address(options.to)
+    client = read_client(config)
+    policy = one_policy(policies or ("afr" if len(client.streams) == 1 else "learned-scheduler"), policy_file)
+    host, port = address(to)
     with contextlib.ExitStack() as stack:
-        log = None if options.log is None else stack.enter_context(LogFile(options.log))
+        file = None if log is None else stack.enter_context(LogFile(log))
         robot = RosSender(
             client,
             host,
             port,
             policy=policy,
-            capacity=options.capacity,
-            odometry=options.odom,
-            transport=options.transport,
-            log=log,
-            say=_say,
+            capacity=capacity,
+            odometry=odom,
+            transport=transport,
+            log=file,
+            say=say,
         )
-        run_async(robot.run())
+        await robot.run()
 
 
-def _receive(options: argparse.Namespace) -> None:
-    from bufgym.robot.ros2.relay import receive
+async def receive(*, port: Port = PORT, host: Host = "127.0.0.1", transport: Transport = "tcp") -> None:
+    """At the other end: receive and republish; Ctrl-C ends it."""
+    from bufgym.robot.ros2 import relay
 
-    run_async(receive(options.port, options.host, options.transport, _say))
+    await relay.receive(port, host, transport, say)

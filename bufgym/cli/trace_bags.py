@@ -5,13 +5,15 @@ Also the options, shared with ``bench``, that choose a part of a recording and s
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from bufgym.cli.options import Commands, command, positive
+from cyclopts import Parameter
+
+from bufgym.cli.options import Positive, given, refuse
 from bufgym.ground.errors import BufgymError, printable
 
 if TYPE_CHECKING:
@@ -19,73 +21,49 @@ if TYPE_CHECKING:
     from bufgym.traces.formats.bags import Bag
     from bufgym.traces.workload import TopicSummary
 
-MOTION_OPTIONS = ("fov_deg", "scene_scale_m", "max_gap_s")
-WORKLOAD_OPTIONS = ("topics", "odom", "bridge_gaps", *MOTION_OPTIONS)
+MOTION = ("fov_deg", "scene_scale_m", "max_gap_s")
+"""Options of ``MotionOptions``."""
 
 
-def add(commands: Commands) -> None:
-    """Declare ``from-bag`` and ``from-poses`` among the commands of ``bufgym trace``."""
-    bag = command(commands, "from-bag", _from_bag, "messages and motion from a robot's recording (extra 'ros')")
-    bag.add_argument(
-        "file", metavar="FILE", help="MCAP, ROS 1 bag, rosbag2 folder or .db3; alone: its topics are listed"
-    )
-    workload_options(bag)
-    bag.add_argument("-o", "--out", metavar="OUT.csv", help="write the workload there (time_s,bytes,topic[,x])")
-    poses = command(commands, "from-poses", _from_poses, "camera motion from a trajectory: TUM, EuRoC or KITTI")
-    poses.add_argument("file", metavar="FILE", help="the trajectory, plain or gzip'd")
-    poses.add_argument(
-        "--format", choices=("tum", "euroc", "kitti"), help="its format (default: recognised by its first line)"
-    )
-    poses.add_argument("--times", metavar="FILE", help="KITTI's times (default: NAME_times.txt beside NAME.txt)")
-    _motion_options(poses)
-    poses.add_argument("--bridge-gaps", action="store_true", help="write it in spite of gaps")
-    poses.add_argument("-o", "--out", metavar="OUT.csv", help="write the motion there (t_s,motion)")
-
-
-def workload_options(parser: argparse._ActionsContainer) -> None:
-    """Add the options that ``workload_arguments`` reads."""
-    option = parser.add_argument
-    option("--topics", nargs="+", metavar="T", help="topics, by name or pattern ('/camera/*'); default: all")
-    option("--odom", metavar="TOPIC", help="take x from the motion on this topic (of tf: TOPIC:PARENT:CHILD)")
-    option("--bridge-gaps", action="store_true", default=None, help="take motion across gaps in it as even")
-    _motion_options(parser)
-
-
-def _motion_options(parser: argparse._ActionsContainer) -> None:
+@Parameter(name="*")
+@dataclass(frozen=True)
+class MotionOptions:
     # A test compares these defaults with those of MotionSettings, which is not imported for a help text.
-    option = parser.add_argument
-    option(
-        "--fov-deg", type=positive, metavar="DEG", help="field of view of a camera that moves like this (default: 60)"
-    )
-    option("--scene-scale-m", type=positive, metavar="M", help="moving this far shows a new scene, m (default: 2)")
-    option("--max-gap-s", type=positive, metavar="S", help="longer times without a pose are gaps, s (default: 1)")
+    fov_deg: Positive | None = None
+    """Field of view of a camera that moves like this, degrees (default: 60)."""
+    scene_scale_m: Positive | None = None
+    """Moving this far shows a new scene, m (default: 2)."""
+    max_gap_s: Positive | None = None
+    """Longer times without a pose are gaps, s (default: 1)."""
+
+    def settings(self) -> MotionSettings | None:
+        """How motion is measured; None if none of the options was given."""
+        from bufgym.traces import MotionSettings
+
+        values = given(self, *MOTION)
+        return MotionSettings(**values) if values else None
 
 
-def motion_settings(options: argparse.Namespace) -> MotionSettings | None:
-    """Read the options for measuring motion; None if none was given."""
-    from bufgym.traces import MotionSettings
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RecordingOptions(MotionOptions):
+    topics: list[str] | None = None
+    """Topics, by name or pattern ('/camera/*'); default: all."""
+    odom: str | None = None
+    """Take x from the motion on this topic (of tf: TOPIC:PARENT:CHILD)."""
+    bridge_gaps: bool = False
+    """Take motion across gaps in it as even."""
 
-    values = {name: getattr(options, name) for name in MOTION_OPTIONS if getattr(options, name) is not None}
-    return MotionSettings(**values) if values else None
-
-
-def workload_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """Collect the given workload options for ``read_workload``; motion options need odometry."""
-    arguments: dict[str, Any] = {}
-    if options.topics is not None:
-        arguments["topics"] = [name for text in options.topics for name in text.split(",") if name]
-    if options.odom is not None:
-        arguments.update(odom=options.odom, bridge_gaps=bool(options.bridge_gaps), settings=motion_settings(options))
-    elif options.bridge_gaps:
-        raise BufgymError("--bridge-gaps needs --odom")
-    return arguments
-
-
-def refuse_motion(options: argparse.Namespace, why: str) -> None:
-    """Raise an error if an option on how motion is measured was given."""
-    for name in MOTION_OPTIONS:
-        if getattr(options, name) is not None:
-            raise BufgymError(f"--{name.replace('_', '-')} {why}")
+    def arguments(self) -> dict[str, Any]:
+        """Collect those given for ``read_workload``; motion options need odometry."""
+        arguments: dict[str, Any] = {}
+        if self.topics is not None:
+            arguments["topics"] = [name for text in self.topics for name in text.split(",") if name]
+        if self.odom is not None:
+            arguments.update(odom=self.odom, bridge_gaps=self.bridge_gaps, settings=self.settings())
+        elif self.bridge_gaps:
+            raise BufgymError("--bridge-gaps needs --odom")
+        return arguments
 
 
 def workload_lines(workload: Workload) -> list[str]:
@@ -108,14 +86,26 @@ def workload_lines(workload: Workload) -> list[str]:
     return lines
 
 
-def _from_bag(options: argparse.Namespace) -> None:
+def from_bag(
+    file: str,
+    /,
+    *,
+    recording: RecordingOptions = RecordingOptions(),
+    out: Annotated[Path | None, Parameter(alias="-o")] = None,
+) -> None:
+    """Take messages and motion from a robot's recording (extra 'ros').
+
+    Args:
+        file: MCAP, ROS 1 bag, rosbag2 folder or .db3; alone: its topics are listed.
+        out: Write the workload to this CSV file (time_s,bytes,topic[,x]).
+    """
     from bufgym.traces import read_bag, workload_from_bag, write_workload_csv
 
-    arguments = workload_arguments(options)
-    if options.odom is None:
-        refuse_motion(options, "needs --odom")
-    bag = read_bag(options.file, arguments.pop("odom", None))
-    if options.topics is None and options.out is None and options.odom is None:
+    arguments = recording.arguments()
+    if recording.odom is None:
+        refuse(given(recording, *MOTION), "needs --odom")
+    bag = read_bag(file, arguments.pop("odom", None))
+    if recording.topics is None and out is None and recording.odom is None:
         print(printable(f"{bag.path} ({bag.kind})") + "\n")
         print("\n".join(_listed(bag, workload_from_bag(bag).summary() if len(bag.time_ns) else [])))
         print("\nchoose with --topics, take motion with --odom, write with -o")
@@ -123,26 +113,44 @@ def _from_bag(options: argparse.Namespace) -> None:
     workload = workload_from_bag(bag, **arguments)
     print(printable(workload.source) + "\n")
     print("\n".join(workload_lines(workload)))
-    if options.out is not None:
-        write_workload_csv(workload, Path(options.out))
-        print(f"wrote {options.out}")
+    if out is not None:
+        write_workload_csv(workload, out)
+        print(f"wrote {out}")
 
 
-def _from_poses(options: argparse.Namespace) -> None:
+def from_poses(
+    file: str,
+    /,
+    *,
+    format: Literal["tum", "euroc", "kitti"] | None = None,
+    times: str | None = None,
+    measured: MotionOptions = MotionOptions(),
+    bridge_gaps: bool = False,
+    out: Annotated[Path | None, Parameter(alias="-o")] = None,
+) -> None:
+    """Take camera motion from a trajectory: TUM, EuRoC or KITTI.
+
+    Args:
+        file: The trajectory, plain or gzip'd.
+        format: Its format (default: recognised by its first line).
+        times: KITTI's times (default: NAME_times.txt beside NAME.txt).
+        bridge_gaps: Write it in spite of gaps.
+        out: Write the motion to this CSV file (t_s,motion).
+    """
     from bufgym.traces import read_motion, write_motion_csv
 
-    motion = read_motion(options.file, motion_settings(options), format=options.format, times=options.times)
+    motion = read_motion(file, measured.settings(), format=format, times=times)
     seconds = motion.duration_us / 1e6
     print(f"{printable(motion.name)}\n  source  {printable(motion.source)}")
     print(f"  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")
     count = len(motion.gaps)
     print(f"  gaps    {count}" + (f", the longest {motion.longest_gap_s:.1f} s" if count else ""))
-    if options.out is None:
+    if out is None:
         return
-    if motion.gaps and not options.bridge_gaps:
-        raise BufgymError(f"{options.file}: has gaps: say --bridge-gaps to take motion across them as even")
-    write_motion_csv(motion, Path(options.out))
-    print(f"wrote {options.out}")
+    if motion.gaps and not bridge_gaps:
+        raise BufgymError(f"{file}: has gaps: say --bridge-gaps to take motion across them as even")
+    write_motion_csv(motion, out)
+    print(f"wrote {out}")
 
 
 def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:

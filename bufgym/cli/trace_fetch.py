@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
 
-from bufgym.cli.options import Commands, columns, command
+from cyclopts import Parameter
+from rich.console import Console
+from rich.progress import DownloadColumn, Progress
+
+from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
@@ -19,42 +22,39 @@ if TYPE_CHECKING:
 NOT_KNOWN = "not known"
 
 
-def add(commands: Commands) -> None:
-    fetch = command(commands, "fetch", _fetch, "download a public data set of traces, trajectories or recordings")
-    fetch.add_argument("name", nargs="?", metavar="NAME", help="a data set; --list names them")
-    fetch.add_argument("--list", action="store_true", help="name the data sets, or all that is known of NAME")
-    fetch.add_argument("--to", metavar="DIR", help="the folder for data sets, instead of the cache folder")
-    fetch.add_argument(
-        "--from",
-        dest="local_files",
-        nargs="+",
-        default=(),
-        metavar="FILE",
-        help="files fetched by hand: download nothing",
-    )
+def fetch(
+    name: str | None = None,
+    /,
+    *,
+    list: bool = False,
+    to: str | None = None,
+    local_files: Annotated[tuple[str, ...], Parameter(name="--from")] = (),
+) -> None:
+    """Download a public data set of traces, trajectories or recordings.
 
-
-def _fetch(options: argparse.Namespace) -> None:
+    Args:
+        name: A data set; --list names them.
+        list: Name the data sets, or all that is known of one.
+        to: The folder for data sets, instead of the cache folder.
+        local_files: Files fetched by hand: download nothing.
+    """
     from bufgym.traces.datasets.fetch import fetch_dataset
     from bufgym.traces.datasets.table import datasets
 
     table = datasets()
-    if options.name is None:
-        if not options.list:
+    if name is None:
+        if not list:
             raise BufgymError("trace fetch: needs the NAME of a data set (--list names them)")
-        print(_overview(list(table.values())))
+        print(_overview([*table.values()]))
         return
-    if options.name not in table:
-        raise BufgymError(f"{options.name}: no such data set: must be one of {', '.join(table)}")
-    dataset = table[options.name]
-    if options.list:
+    if name not in table:
+        raise BufgymError(f"{name}: no such data set: must be one of {', '.join(table)}")
+    dataset = table[name]
+    if list:
         print(f"{dataset.name}\n{columns(_about(dataset))}\n{_addresses(dataset)}".rstrip())
         return
-    bars = _Bars()
-    try:
-        fetched = fetch_dataset(dataset, options.to, options.local_files, note=_note, watch=bars.watch)
-    finally:
-        bars.close()
+    with _bars() as watch:
+        fetched = fetch_dataset(dataset, to, local_files, note=_note, watch=watch)
     print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")
 
 
@@ -108,46 +108,21 @@ def _note(sentence: str) -> None:
     print(sentence, file=sys.stderr)
 
 
-class _Bars:
-    """A progress bar for each file on a terminal with tqdm; elsewhere a line every 10 seconds and at the end."""
+@contextmanager
+def _bars() -> Iterator[Callable[[str], Callable[[int, int | None], None]]]:
+    """A progress bar for each file on a terminal; elsewhere a line when a file is whole."""
+    plain = not sys.stderr.isatty()
+    parts = *Progress.get_default_columns(), DownloadColumn()
+    with Progress(*parts, console=Console(stderr=True), disable=plain) as progress:
 
-    EVERY_S = 10.0
+        def watch(name: str) -> Callable[[int, int | None], None]:
+            task = progress.add_task(name, total=None)
 
-    def __init__(self) -> None:
-        self._bar: Any = None
+            def moved(count: int, total: int | None) -> None:
+                progress.update(task, completed=count, total=total)
+                if plain and count == total:
+                    _note(f"{name}: {count:,} bytes of {total:,}")
 
-    def watch(self, name: str) -> Callable[[int, int | None], None]:
-        self.close()
-        return self._line(name) if not sys.stderr.isatty() else self._tqdm(name)
+            return moved
 
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-    def _tqdm(self, name: str) -> Callable[[int, int | None], None]:
-        try:
-            from tqdm import tqdm
-        except ImportError:
-            return self._line(name)
-        bar = self._bar = tqdm(desc=name, unit="B", unit_scale=True, unit_divisor=1000, leave=False)
-
-        def moved(count: int, total: int | None) -> None:
-            bar.total = total
-            bar.update(count - bar.n)
-            if count == total:
-                bar.refresh()
-
-        return moved
-
-    def _line(self, name: str) -> Callable[[int, int | None], None]:
-        last = time.monotonic()
-
-        def moved(count: int, total: int | None) -> None:
-            nonlocal last
-            now = time.monotonic()
-            if count == total or now - last >= self.EVERY_S:
-                last = now
-                _note(f"{name}: {count:,} bytes" + (f" of {total:,}" if total is not None else ""))
-
-        return moved
+        yield watch

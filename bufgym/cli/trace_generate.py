@@ -1,111 +1,78 @@
 """``bufgym trace generate``: links and motions from a seed.
 
-A link's options have its generator's parameter names as `dest` and are passed on to the generator.
+A link's options are the parameters of the function that makes it, without their units.
 """
 
 from __future__ import annotations
 
-import argparse
 import inspect
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
 
-from bufgym.cli.options import Commands, Parser, command, least_0, natural, positive
+from cyclopts import App, Parameter
 
-
-def add(commands: Commands) -> None:
-    """Declare ``generate`` among the commands of ``bufgym trace``."""
-    generate = commands.add_parser(
-        "generate",
-        help="make a link or a motion from a seed",
-        description="Make a link or a motion from a seed, as CSV.",
-    )
-    kinds = generate.add_subparsers(title="kinds", metavar="KIND", required=True)
-    _add_links(kinds)
-    _add_rules(kinds)
-    _add_motion(kinds)
+from bufgym import traces
+from bufgym.cli.options import Natural, Positive
+from bufgym.traces import Trace
 
 
-def _add_links(kinds: Commands) -> None:
-    link = _kind(kinds, "link", _link, "a mobile link as recorded in trams, trains, ... (or in WiFi)", "markov_link")
-    link.add_argument("--mode", required=True, metavar="NAME", help="foot, bicycle, bus, tram, train, car, wifi-...")
-    help = "scale to this mean (default: as recorded)"
-    link.add_argument("--mean", dest="mean_bytes_per_s", type=positive, metavar="BYTES/S", help=help)
-    link.add_argument("--links", metavar="FILE", help="parameters made by 'bufgym trace fit' (default: bufgym's own)")
+def _option(name: str) -> str:
+    """Take off the unit: ``mean_good_s`` is ``--mean-good``; ``bytes_per_s`` is ``--rate``."""
+    return "rate" if name == "bytes_per_s" else re.sub("_(bytes_per_s|m_per_s|bytes|s|m)$", "", name).replace("_", "-")
 
 
-def _add_rules(kinds: Commands) -> None:
-    steady = _kind(kinds, "steady", _generate, "one rate throughout", "steady", seeded=False)
-    _option(steady, "--rate", "bytes_per_s", positive, 10e6, "BYTES/S")
-    help = "a rate that changes evenly (default: Robofleet's 100 to 4 Mbit/s)"
-    ramp = _kind(kinds, "ramp", _generate, help, "ramp", seeded=False)
-    ramp.set_defaults(duration_s=15.0)
-    _option(ramp, "--start", "start_bytes_per_s", least_0, 12.5e6, "BYTES/S")
-    _option(ramp, "--end", "end_bytes_per_s", least_0, 0.5e6, "BYTES/S")
-    tunnel = command(kinds, "tunnel", _generate, "steady, fade, blackout, fade in, steady")
-    tunnel.set_defaults(generator="tunnel")
-    tunnel.add_argument("-o", "--out", required=True, metavar="FILE", help="the CSV to write")
-    _option(tunnel, "--rate", "bytes_per_s", positive, 10e6, "BYTES/S", "outside")
-    for part, seconds in (("before", 20.0), ("fade", 3.0), ("blackout", 10.0), ("recover", 2.0), ("after", 20.0)):
-        _option(tunnel, f"--{part}", f"{part}_s", least_0, seconds, "S", "its length")
+generate = App(
+    name="generate",
+    help="Make a link or a motion from a seed, as CSV.",
+    default_parameter=Parameter(name_transform=_option),
+)
+Out = Annotated[Path, Parameter(alias="-o", help="The CSV to write.")]
+TYPES: Mapping[str, Any] = {
+    "seed": Natural,
+    "links": Annotated[Any, Parameter(converter=lambda _, tokens: traces.read_links(tokens[0].value), n_tokens=1)],
+}
+"""Types of parameters that are not as the function says."""
+DEFAULTS: Mapping[str, Any] = {
+    **{"seed": 0, "bytes_per_s": 10e6},
+    **{"start_bytes_per_s": 12.5e6, "end_bytes_per_s": 0.5e6},  # Robofleet's
+}
 
 
-def _add_motion(kinds: Commands) -> None:
-    _kind(kinds, "drive", _drive, "the motion of a robot that cruises, turns in place and stops")
+def _link(name: str, about: str, make: Callable[..., Trace]) -> None:
+    """Add the command of a function that makes a link."""
+
+    def command(**settings: Any) -> None:
+        out = settings.pop("out")
+        trace = make(**{**defaults, **settings})
+        traces.write_csv(trace, out)
+        print(f"wrote {out}: {trace.source}, mean {trace.mean_bytes_per_s / 1e6:.3f} MB/s")
+
+    only, its_own = inspect.Parameter.KEYWORD_ONLY, inspect.signature(make, eval_str=True).parameters
+    defaults = {key: DEFAULTS[key] for key in its_own if key in DEFAULTS}
+    parameters = [inspect.Parameter("out", only, annotation=Out)]
+    for key, given in its_own.items():
+        default, annotation = DEFAULTS.get(key, given.default), TYPES.get(key, given.annotation)
+        parameters.append(inspect.Parameter(key, only, default=default, annotation=annotation))
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__doc__ = f"{about}\n\n{inspect.getdoc(make)}"
+    generate.command(command, name=name)
 
 
-def _kind(
-    kinds: Commands,
-    name: str,
-    function: Callable[[argparse.Namespace], None],
-    help: str,
-    generator: str | None = None,
-    *,
-    seeded: bool = True,
-) -> Parser:
-    parser = command(kinds, name, function, help)
-    parser.set_defaults(generator=generator)
-    if seeded:
-        _option(parser, "--seed", "seed", natural, 0, "N", "whole number >= 0")
-    _option(parser, "--duration", "duration_s", positive, 300.0, "S", "length in s")
-    parser.add_argument("-o", "--out", required=True, metavar="FILE", help="the CSV to write")
-    return parser
+_link("link", "A mobile link as recorded in trams, trains, ... (or in WiFi).", traces.markov_link)
+_link("steady", "One rate throughout.", traces.steady)
+_link("ramp", "A rate that changes evenly.", traces.ramp)
+_link("tunnel", "Steady, fade, blackout, fade in, steady.", traces.tunnel)
 
 
-def _option(
-    parser: Parser, flag: str, dest: str, type: Callable[[str], float], default: float, unit: str, help: str = ""
-) -> None:
-    """Add the option of a number, with its default stated in the help text."""
-    help = f"{help} (%(default)s)".strip()
-    parser.add_argument(flag, dest=dest, type=type, default=default, metavar=unit, help=help)
+@generate.command
+def drive(*, seed: Natural = 0, duration: Positive = 300.0, out: Out) -> None:
+    """The motion of a robot that cruises, turns in place and stops.
 
-
-# --- links -----------------------------------------------------------------------------------------------------------
-
-
-def _generate(options: argparse.Namespace) -> None:
-    """Write the link that `options.generator` makes from the options named like its parameters."""
-    from bufgym import traces
-
-    generator = getattr(traces, options.generator)
-    parameters = inspect.signature(generator).parameters
-    trace = generator(**{name: value for name, value in vars(options).items() if name in parameters})
-    traces.write_csv(trace, options.out)
-    print(f"wrote {options.out}: {trace.source}, mean {trace.mean_bytes_per_s / 1e6:.3f} MB/s")
-
-
-def _link(options: argparse.Namespace) -> None:
-    from bufgym.traces import read_links
-
-    options.links = None if options.links is None else read_links(options.links)
-    _generate(options)
-
-
-# --- motion ----------------------------------------------------------------------------------------------------------
-
-
-def _drive(options: argparse.Namespace) -> None:
-    from bufgym.traces import drive_motion, write_motion_csv
-
-    motion = drive_motion(options.seed, options.duration_s)
-    write_motion_csv(motion, options.out)
-    print(f"wrote {options.out}: {motion.source}, {motion.total:.3f} views")
+    Args:
+        duration: Length, s.
+    """
+    motion = traces.drive_motion(seed, duration)
+    traces.write_motion_csv(motion, out)
+    print(f"wrote {out}: {motion.source}, {motion.total:.3f} views")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from bufgym.cli import trace_bags, trace_fetch, trace_fit, trace_generate
-from bufgym.cli.options import Commands, columns, command
+from cyclopts import Parameter
+
+from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError, TraceError, install, printable
 
 if TYPE_CHECKING:
@@ -20,49 +20,21 @@ _MOST_DRAWN = 5_000
 """Most rates in a picture some 1300 pixels wide; more rates are averaged over this many windows."""
 
 
-def add(commands: Commands) -> None:
-    trace = commands.add_parser(
-        "trace",
-        help="bandwidth traces and recordings: look at them, convert, fit, generate, fetch",
-        description="Bandwidth traces and recordings: look at them, convert, fit, generate, fetch.",
-    )
-    verbs = trace.add_subparsers(title="verbs", metavar="VERB", required=True)
-    info = command(verbs, "info", _info, "statistics of bandwidth traces")
-    plot = command(verbs, "plot", _plot, "draw bandwidth traces (needs the extra 'plot')")
-    validate = command(
-        verbs, "validate", _validate, "read each file and say whether it is sound; exit code 1 if not all"
-    )
-    convert = command(verbs, "convert", _convert, "write bandwidth traces in another format and say what was lost")
-    for parser in (info, plot, validate, convert):
-        parser.add_argument("files", nargs="+", metavar="FILE", help="a file, or a shipped name")
-        parser.add_argument("--format", metavar="NAME", help="the files' format, where it is not to be detected")
-        parser.add_argument(
-            "--column", metavar="NAME", help="of UCC files (DL_bitrate, UL_bitrate), or which run of a list"
-        )
-    plot.add_argument("--out", required=True, metavar="FILE", help="the picture to write: .png, .svg or .pdf")
-    convert.add_argument("--to", metavar="NAME", help="csv or mahimahi; by default csv where --out ends in .csv")
-    convert.add_argument("--out", required=True, metavar="PATH", help="the file to write; a folder for several files")
-    trace_bags.add(verbs)
-    trace_fit.add(verbs)
-    trace_generate.add(verbs)
-    trace_fetch.add(verbs)
-
-
-def _load(name: str, options: argparse.Namespace) -> Trace:
-    from bufgym import traces
-
-    return traces.load(name, options.format, column=options.column)
+Files = Annotated[list[str], Parameter(help="A file, or a shipped name.")]
+Format = Annotated[str | None, Parameter(help="The files' format, where it is not to be detected.")]
+Column = Annotated[str | None, Parameter(help="Of UCC files (DL_bitrate, UL_bitrate), or which run of a list.")]
 
 
 # --- info ------------------------------------------------------------------------------------------------------------
 
 
-def _info(options: argparse.Namespace) -> None:
+def info(files: Files, /, *, format: Format = None, column: Column = None) -> None:
+    """Print statistics of bandwidth traces."""
     from bufgym import traces
 
     blocks = []
-    for name in options.files:
-        trace = _load(name, options)
+    for name in files:
+        trace = traces.load(name, format, column=column)
         lines = [
             (key, f"{number:,.6g}" if number < 1e6 else f"{number:,.0f}")
             for key, number in traces.describe(trace).items()
@@ -75,13 +47,14 @@ def _info(options: argparse.Namespace) -> None:
 # --- validate --------------------------------------------------------------------------------------------------------
 
 
-def _validate(options: argparse.Namespace) -> None:
+def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+    """Read each file and say whether it is sound; exit code 1 if not all."""
     from bufgym import traces
 
-    failed, names = 0, options.files
-    for name in names:
+    failed = 0
+    for name in files:
         try:
-            trace = _load(name, options)
+            trace = traces.load(name, format, column=column)
         except TraceError as error:
             failed += 1
             print(f"error  {error}")
@@ -90,25 +63,29 @@ def _validate(options: argparse.Namespace) -> None:
             print(
                 f"OK     {printable(trace.source)}: {summary['duration_s']:.1f} s, mean {summary['mean_KBps']:.1f} KB/s"
             )
-    if len(names) > 1:
-        print(f"{len(names) - failed} of {len(names)} files are sound")
-    if failed:
-        raise SystemExit(1)
+    if len(files) > 1:
+        print(f"{len(files) - failed} of {len(files)} files are sound")
+    return 1 if failed else 0
 
 
 # --- convert ---------------------------------------------------------------------------------------------------------
 
 
-def _convert(options: argparse.Namespace) -> None:
+def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format = None, column: Column = None) -> None:
+    """Write bandwidth traces in another format and say what was lost.
+
+    Args:
+        out: The file to write; a folder for several files.
+        to: csv or mahimahi; by default csv where --out ends in .csv.
+    """
     from bufgym import traces
 
-    out = Path(options.out)
-    to = options.to or ("csv" if out.suffix == ".csv" else None)
+    to = to or ("csv" if out.suffix == ".csv" else None)
     if to not in traces.WRITERS:
         option = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
         raise BufgymError(f"{option}: must be one of {', '.join(traces.WRITERS)}")
-    for name, target in _targets(options.files, out, to):
-        trace = _load(name, options)
+    for name, target in _targets(files, out, to):
+        trace = traces.load(name, format, column=column)
         traces.WRITERS[to](trace, target)
         lost = traces.difference(trace, traces.read_trace(target, to))
         print(printable(f"wrote {target} (format {to}) from {trace.source}: {lost}"))
@@ -134,15 +111,21 @@ def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
 # --- plot ------------------------------------------------------------------------------------------------------------
 
 
-def _plot(options: argparse.Namespace) -> None:
+def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = None) -> None:
+    """Draw bandwidth traces (needs the extra 'plot').
+
+    Args:
+        out: The picture to write: .png, .svg or .pdf.
+    """
+    from bufgym import traces
+
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
-    out = Path(options.out)
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
-    loaded = [_load(name, options) for name in options.files]
+    loaded = [traces.load(name, format, column=column) for name in files]
     figure = Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
     axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
     for axis, trace in zip(axes, loaded, strict=True):

@@ -6,10 +6,12 @@ other exception that escapes is a bug in bufgym.
 
 from __future__ import annotations
 
+import difflib
 import importlib.metadata
 import os
 import re
 import traceback
+from collections.abc import Iterable
 from os import PathLike
 
 _MOST_CHARACTERS = 60
@@ -37,6 +39,14 @@ class BufgymError(ValueError):
 
 class TraceError(BufgymError):
     """A trace or motion file that cannot be read or written; the message names file and line."""
+
+
+def unknown(what: str, name: str, known: Iterable[str], also: str = "") -> BufgymError:
+    """The error for a name that is not among those ``known``: names the one that was meant, or all of them."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, 1)
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}{also}"
+    return BufgymError(f"unknown {what} {name!r}; {hint}")
 
 
 def where(

@@ -21,7 +21,7 @@ _NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """A setting such as ``decimate:every=2`` does not match, as it has "=" after the colon."""
 
 FILES: list[str] = []
-"""Files of the modules imported here. An error that comes from one of them is the caller's own."""
+"""Files that were run or imported here. An error that comes from one of them is the caller's own."""
 
 
 def is_named(text: str) -> bool:
@@ -75,16 +75,17 @@ def run_file(path: str, option: str) -> None:
     module = importlib.util.module_from_spec(spec)
     # Compiled functions are pickled by their module's name.
     sys.modules[spec.name] = module
+    if path not in FILES:
+        FILES.append(path)
     try:
         spec.loader.exec_module(module)
     except SyntaxError as error:
         raise BufgymError(f"{path}, line {error.lineno}: {error.msg}") from None
 
 
-def line_of(error: Exception, *files: str | None) -> str | None:
-    """The line of the caller's code that raised the error, in ``files`` or an imported module; None if elsewhere."""
-    places = (line_in(error, file) for file in [*filter(None, files), *FILES])
-    return next(filter(None, places), None)
+def line_of(error: Exception) -> str | None:
+    """The line of the caller's code that raised the error, in one of ``FILES``; None if elsewhere."""
+    return next(filter(None, (line_in(error, file) for file in FILES)), None)
 
 
 def first_line(documented: Any) -> str:

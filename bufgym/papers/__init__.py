@@ -16,7 +16,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.papers.figure import Figure, report, save_picture, statements
 from bufgym.papers.rows import Rows
 
@@ -54,7 +54,7 @@ def figure(name: str, out: Path | None = None, **options: Any) -> Figure:
 
 def _kind(name: str) -> Any:
     if name not in FIGURES:
-        raise BufgymError(f"unknown figure {name!r}; known: {', '.join(FIGURES)}")
+        raise unknown("figure", name, FIGURES)
     return importlib.import_module(f"bufgym.papers.{name.replace('-', '_')}").Reproduction
 
 

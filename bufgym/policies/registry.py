@@ -37,7 +37,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.kernel import BundleType, compile_for
 from bufgym.ground.modules import first_line
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
@@ -316,7 +316,7 @@ def get(spec: str | Policy | OnArrival) -> Policy:
         return registered_as(spec) or Policy(spec.__name__, spec)
     name = spec.partition(":")[0]
     if name not in _REGISTRY:
-        raise BufgymError(f"unknown policy {name!r}; known: {', '.join(_REGISTRY)}")
+        raise unknown("policy", name, _REGISTRY)
     _, numbers = named_settings("policy", spec)
     entry = _REGISTRY[name]
     if isinstance(entry, Later):

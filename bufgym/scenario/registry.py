@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.qoi import Value
 from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
@@ -93,9 +93,7 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
         spec = checked(found() if callable(found) else found, spec)
     elif isinstance(spec, str):
         if spec not in SCENARIOS:
-            raise BufgymError(
-                f"unknown scenario {spec!r}; known: {', '.join(SCENARIOS)}, and module:function for one's own"
-            )
+            raise unknown("scenario", spec, SCENARIOS, ", and module:function for one's own")
         spec = _named(spec)
     else:
         spec = checked(spec, type(spec).__name__)

@@ -1,6 +1,5 @@
 """Learned policies decide as their weights say: against a slow twin, a fixed policy, and the network they came from."""
 
-import argparse
 import json
 import math
 from dataclasses import replace
@@ -13,10 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from weight_cases import network, score
 
-from bufgym import policies
+from bufgym import cli, policies
 from bufgym import scenario as scenarios
-from bufgym.cli import export as command
-from bufgym.cli.options import Parser
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
@@ -170,10 +167,7 @@ def test_bytes_that_fit_exactly_are_room():
 
 def exported(*words):
     """``bufgym export`` with these words."""
-    parser = Parser(prog="bufgym")
-    command.add(parser.add_subparsers(required=True))
-    options: argparse.Namespace = parser.parse_args(["export", *map(str, words)])
-    options.command(options)
+    cli.app()(["export", *map(str, words)])
 
 
 CAPACITY, WIDTH = 5, 8

@@ -135,7 +135,8 @@ def test_parameters():
 @pytest.mark.parametrize(
     ("spec", "rule"),
     [
-        ("lifo", "unknown policy 'lifo'; known: .*afr"),
+        ("nobody", "unknown policy 'nobody'; known: .*afr"),
+        ("lifo", "unknown policy 'lifo'; did you mean 'fifo'"),
         ("afr:speed=2", "policy afr: no parameter 'speed'; it has: none"),
         ("decimate:every=0", "policy decimate: every = 0.0: must be a number > 0"),
         *((f"decimate:every={wrong}", f"every = {wrong}: must be a number > 0") for wrong in ("-1.0", "nan", "inf")),

@@ -120,7 +120,7 @@ def fingerprint(name: str) -> str:
 
 
 def test_what_is_unknown_or_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(BufgymError, match=r"unknown suite 'lte-v0'; known: interruption-v1, lte-v1"):
+    with pytest.raises(BufgymError, match=r"unknown suite 'lte-v0'; did you mean 'lte-v1'\?"):
         suites.get("lte-v0")
     with pytest.raises(BufgymError, match=r"split = 'tests': must be one of train, validation, test"):
         suites.get("lte-v1").settings("tests")

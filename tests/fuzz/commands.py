@@ -1,9 +1,8 @@
 """Command lines drawn from the parser itself: each ends in 0, or in 2 with one line; the work itself is left out."""
 
-import argparse
 import contextlib
+import functools
 import importlib
-import inspect
 import io
 import os
 import random
@@ -11,6 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any, NoReturn
+
+from cyclopts import App
 
 REPO = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPO))
@@ -22,43 +23,42 @@ VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", 
 
 WORK = """benchmark.run.run benchmark.sweep.run_sweep benchmark.tune.tune benchmark.leaderboard.make
 benchmark.leaderboard.validate benchmark.perf.measure robot.cost.measure traces.datasets.fetch.fetch_dataset
-cli.figures._text cli.play._play cli.live.run_async cli.ros2.run_async
-cli.relay.run_async cli.relay_robots.run_async robot.validate.validate envs.expert.dataset.make"""
+cli.figures._text cli.play.play cli.live.send cli.live.receive cli.live.link cli.ros2.send cli.ros2.receive
+cli.relay.serve cli.relay.robot cli.relay.foxglove robot.validate.validate envs.expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 
 
 def leave_out_work() -> None:
     from bufgym.ground.errors import BufgymError
 
-    def left_out(*given: object, **__: object) -> NoReturn:
-        for one in given:
-            if inspect.iscoroutine(one):  # else Python warns that nobody awaited it
-                one.close()
+    def left_out(*_: object, **__: object) -> NoReturn:
         raise BufgymError("left out")
 
     for path in WORK.split():
         module, name = f"bufgym.{path}".rsplit(".", 1)
         room = importlib.import_module(module)
-        assert hasattr(room, name), path
-        setattr(room, name, left_out)
+        # A command keeps its options.
+        setattr(room, name, functools.wraps(getattr(room, name))(left_out))
 
 
-def drawn(uniform: random.Random, parser: argparse.ArgumentParser) -> list[str]:
+def drawn(uniform: random.Random, command: App) -> list[str]:
     """Some of its options and arguments, with values that may be of their kind or not."""
-    words: list[str] = []
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            name = uniform.choice(list(action.choices))
-            return [*words, name, *drawn(uniform, action.choices[name])]
-        positional = not action.option_strings
-        if isinstance(action, argparse._HelpAction | argparse._VersionAction):
-            if uniform.random() > 0.005:
-                continue
-        elif uniform.random() > (0.95 if positional else 0.15):
+    commands = [name for name in command if not name.startswith("-")]
+    if commands:
+        name = uniform.choice(commands)
+        return [name, *drawn(uniform, command[name])]
+    words = ["--help"] if uniform.random() < 0.005 else []
+    for argument in command.assemble_argument_collection().filter_by(parse=True):
+        if argument.name == "*":
             continue
-        words += [] if positional else [uniform.choice(action.option_strings)]
-        count = {None: 1, 0: 0, "?": 1, "+": uniform.choice([1, 2]), "*": uniform.choice([0, 1, 2])}[action.nargs]
-        pool: list[Any] = list(action.choices) if action.choices and uniform.random() < 0.8 else VALUES
+        positional = argument.field_info.is_positional
+        if uniform.random() > (0.95 if positional else 0.15):
+            continue
+        words += [] if positional else [uniform.choice(argument.names)]
+        flag, many = argument.token_count() == (0, False), argument.token_count()[1]
+        count = 0 if flag else uniform.choice([0, 1, 2]) if many else 1
+        choices = argument.get_choices()
+        pool: list[Any] = list(choices) if choices and uniform.random() < 0.8 else VALUES
         words += [str(uniform.choice(pool)) for _ in range(count)]
     return words
 
@@ -68,7 +68,7 @@ def run(k: int, seed: str) -> None:
 
     from bufgym import cli
 
-    words = drawn(random.Random(f"{seed}-command-{k}"), cli._parser())
+    words = drawn(random.Random(f"{seed}-command-{k}"), cli.app())
     out, err = io.StringIO(), io.StringIO()
     try:
         with limited(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

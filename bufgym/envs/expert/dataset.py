@@ -14,7 +14,7 @@ import gymnasium as gym
 
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.expert.record import KINDS, ROWS, record
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install, unknown
 
 VARIABLE = "MINARI_DATASETS_PATH"
 """Environment variable for the folder of Minari's data sets; unset, ``~/.minari/datasets``."""
@@ -57,7 +57,7 @@ def make(
     env = env if "/" in env else f"bufgym/{env}"
     known = [id for id in gym.registry if id.startswith("bufgym/")]
     if env not in known:
-        raise BufgymError(f"unknown environment {env!r}; known: {', '.join(known)}")
+        raise unknown("environment", env, known)
     if kind not in KINDS:
         raise BufgymError(f"kind = {kind!r}: must be one of {', '.join(KINDS)}")
     name = name or f"{env.lower().rsplit('-', 1)[0]}/{kind}-v0"

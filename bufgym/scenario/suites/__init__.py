@@ -11,7 +11,7 @@ of robots. Messages of one queue have equal sizes, so that the clairvoyant's bou
 
 from __future__ import annotations
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import unknown
 from bufgym.scenario.suites import recorded, shared_uplinks, stress, synthetic
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
 from bufgym.scenario.suites.synthetic import EPISODE_S, RATE_HZ, SIZE_BYTES, motion_value, time_value
@@ -37,5 +37,5 @@ SUITES = {suite.name: suite for suite in (*synthetic.SUITES, *stress.SUITES, *re
 def get(name: str) -> Suite:
     """The suite of that name."""
     if name not in SUITES:
-        raise BufgymError(f"unknown suite {name!r}; known: {', '.join(SUITES)}")
+        raise unknown("suite", name, SUITES)
     return SUITES[name]

@@ -1,0 +1,155 @@
+"""``bufgym report``, ``tune``, ``leaderboard``, ``validate``, ``perf`` and ``warmup``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from bufgym.cli.options import Count, Seeds, Whole, command_line, policy_specs
+from bufgym.ground.errors import BufgymError, printable
+
+DEFAULT = "docs/leaderboard.csv"
+
+
+def report(folder: str, /, *, markdown: bool = False) -> None:
+    """Make the page of a suite's run: one HTML file that works offline.
+
+    Args:
+        folder: Folder of bench --suite --out.
+        markdown: Print tables for a README instead.
+    """
+    from bufgym.benchmark import report as pages
+
+    text = pages.markdown(folder) if markdown else f"wrote {pages.write(folder)}"
+    print("\n".join(map(printable, text.split("\n"))))
+
+
+def tune(
+    suite: str,
+    /,
+    *,
+    policies: list[str] | None = None,
+    split: str = "validation",
+    data: str | None = None,
+    seeds: Seeds | None = None,
+    jobs: Whole | None = None,
+    write: bool = False,
+) -> None:
+    """Choose the policies' parameters on a suite's validation episodes.
+
+    Args:
+        suite: Which ('bufgym list suites').
+        policies: Plain names (default: all that have a grid of settings).
+        split: validation or train; test is refused.
+        data: Folder of recordings, for suites over real links.
+        seeds: Episodes on each trace (default: the suite's).
+        jobs: Processes side by side (default: one a core).
+        write: Keep the choices for bufgym bench --suite.
+    """
+    from bufgym.benchmark import tune as tuning
+
+    choices = tuning.tune(suite, policy_specs(policies), split=split, data=data, seeds=seeds, jobs=jobs)
+    print(tuning.plain(choices))
+    if write:
+        # Another machine has its own folder of recordings.
+        again = command_line(
+            f"tune {suite}",
+            policies=tuple(policies or ()) or None,
+            split=None if split == "validation" else split,
+            seeds=seeds,
+            data=data and "DIR",
+            write=True,
+        )
+        print(f"\nwrote {tuning.write(suite, choices, split=split, command=again)}")
+
+
+def leaderboard(*suites: str, file: Path = Path(DEFAULT), data: str | None = None, jobs: Whole | None = None) -> None:
+    """Run suites and write the leaderboard, CSV and Markdown.
+
+    Args:
+        suites: Which (default: all that need no recordings).
+        file: The leaderboard.
+        data: Folder of recordings, for suites over real links.
+        jobs: Processes side by side (default: one a core).
+    """
+    from bufgym.benchmark import leaderboard as boards
+    from bufgym.scenario.suites import SUITES
+
+    names = suites or [name for name, suite in SUITES.items() if not suite.needs or data]
+    specs = {name: boards.task_of(name).default_policies(name) for name in names}
+    board = boards.make(file, names, specs, data=data, jobs=jobs)
+    print(f"{len(board)} rows in {file}, as Markdown in {file.with_suffix('.md')}")
+
+
+def validate(row: str, /, *, file: Path = Path(DEFAULT), data: str | None = None, jobs: Whole | None = None) -> None:
+    """Run one row of the leaderboard again and compare.
+
+    Args:
+        row: SUITE/POLICY.
+        file: The leaderboard.
+        data: Folder of recordings, for suites over real links.
+        jobs: Processes side by side (default: one a core).
+    """
+    from bufgym.benchmark import leaderboard as boards
+
+    if not file.exists():
+        whose = f"{DEFAULT} is that of bufgym's repository" if file == Path(DEFAULT) else "as --file says"
+        raise BufgymError(f"{file}: no such file ({whose}); bufgym leaderboard --file FILE.csv writes one")
+    entry = boards.find(file, row)
+    again = boards.validate(entry, data=data, jobs=jobs)
+    print(f"{entry.name}: holds")
+    for key, (stated, low, high) in entry.values.items():
+        print(f"  {key}: {again.values[key].value:.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {file}")
+
+
+def perf(
+    *,
+    json: Path | None = None,
+    repeats: Count = 3,
+    queue: bool = False,
+    quick: bool = False,
+) -> None:
+    """Measure bufgym's own speed on this machine.
+
+    Args:
+        json: Also write the figures to this file.
+        repeats: Best of so many.
+        queue: Measure a live queue's cost to a robot instead.
+        quick: Tiny sizes: does it run at all?
+    """
+    from bufgym.benchmark import perf as speed
+
+    sizes = speed.Sizes(4, 4, 20, 5, 20, 1, repeats) if quick else speed.Sizes(repeats=repeats)
+    if not quick and sys.stderr.isatty():
+        print("measuring; this takes about half a minute ...", file=sys.stderr)
+    if queue:
+        from bufgym.robot import cost
+
+        print(cost.report(1 if quick else 20))
+        return
+    figures = speed.measure(sizes)
+    print(speed.report(figures, sizes.repeats))
+    if json is not None:
+        speed.write_json(figures, sizes, json)
+
+
+def warmup() -> None:
+    """Compile beforehand what environments and benchmarks need."""
+    import time
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from multiprocessing import get_context
+
+    from bufgym.benchmark import warmup as compiling
+    from bufgym.ground import kernel
+
+    if not kernel.JIT:
+        print("compilation is off (NUMBA_DISABLE_JIT): nothing to do")
+        return
+    began_s = time.perf_counter()
+    print(f"compiling {len(compiling.PARTS)} parts: {', '.join(compiling.PARTS)}", flush=True)
+    # A process for each core. Code that two of them need is compiled twice, with equal results.
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+        parts = {processes.submit(compiling.compile_part, what): what for what in compiling.PARTS}
+        for number, part in enumerate(as_completed(parts), 1):
+            print(f"{number}/{len(parts)} {parts[part]}: {part.result():.1f} s", flush=True)
+    print(f"ready after {time.perf_counter() - began_s:.0f} s; compiled code is in {kernel.FOLDER}")
