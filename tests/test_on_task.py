@@ -31,6 +31,6 @@ def test_a_task_is_the_mean_of_its_reward() -> None:
     episodes = task.training[0]
     covered = [worth.coverage_of(frames) for frames in episodes[0].arrived(policies.get("drop-oldest"))]
     assert task.measure(policies.get("drop-oldest"), episodes) == pytest.approx(np.mean(covered))
-    assert task.fitness(policies.get("drop-oldest"), 0, False) == -task.measure(policies.get("drop-oldest"), episodes)
+    assert task.fitness(policies.get("drop-oldest"), 0) == -task.measure(policies.get("drop-oldest"), episodes)
     trained_on = {each.link.trace.name for part in task.training for each in part[0].episodes}
     assert trained_on.isdisjoint({trace.name for trace in worth.mapping().traces[-on_task.TEST_LINKS :]})

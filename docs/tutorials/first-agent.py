@@ -59,9 +59,6 @@ print(compared)
 # ## The picture
 
 # %%
-from bufgym.benchmark import picture
-from bufgym.scenario import draw
-
 compared.plot().figure.savefig("first-agent.png")
 
 # %% [markdown]

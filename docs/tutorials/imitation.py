@@ -96,9 +96,6 @@ print(compared)
 # ## The picture
 
 # %%
-from bufgym.benchmark import picture
-from bufgym.scenario import draw
-
 compared.plot().figure.savefig("imitation.png")
 
 # %% [markdown]

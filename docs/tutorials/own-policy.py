@@ -44,9 +44,6 @@ print(compared)
 # ## The picture
 
 # %%
-from bufgym.benchmark import picture
-from bufgym.scenario import draw
-
 compared.plot().figure.savefig("own-policy.png")
 
 # %% [markdown]

@@ -58,8 +58,6 @@ print(Path("dropped.csv").read_text().splitlines()[:3])
 
 # %%
 import bufgym
-from bufgym.benchmark import picture
-from bufgym.scenario import draw
 
 compared = bufgym.compare(names, scenario, seeds=1, about="My drive over my link")
 print(compared)
