@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tyro.conf import Positional
 
 from agents.evaluation import EvaluationSet, Numbers
 from agents.page import columns_of, command, publish, table, written
@@ -201,7 +200,7 @@ def exact(agents: Sequence[Policy]) -> list[str]:
 
 
 def main(
-    run: Positional[Path],
+    run: Path,
     suites: str = "interruption-v1,lte-v1,outage-v1,sustained-v1",
     data: str | None = None,
     seeds: int | None = None,

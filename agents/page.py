@@ -6,7 +6,7 @@ import csv
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import tyro
+from cyclopts import App
 
 from bufgym.benchmark import bootstrap
 from bufgym.benchmark.bootstrap import Interval
@@ -43,6 +43,6 @@ def publish(text: str, out: Path | None) -> None:
 def command(page: Callable[..., None]) -> None:
     """Run a page's function as a command: its arguments are the options; a mistake ends in one line."""
     try:
-        tyro.cli(page)
+        App(default_command=page)()
     except BufgymError as error:
         raise SystemExit(f"error: {error}") from None

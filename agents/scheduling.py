@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tyro.conf import Positional
-
 from agents.page import command, publish, written
 from agents.runs import MODEL, read_settings
 from bufgym import policies
@@ -48,7 +46,7 @@ rest.
 """
 
 
-def main(run: Positional[Path], out: Path | None = None) -> None:
+def main(run: Path, out: Path | None = None) -> None:
     """The results of a finished run's schedulers, as a page.
 
     Args:
