@@ -39,8 +39,8 @@ CARDS = {
         decides="what to drop from one queue, of any L",
         sees="the queue, the clock and the socket",
         limits="trained on the same episodes as learned-motion",
-        fails="In blackouts it has nearly twice the regret of `min-motion-gap`, which sees motion. Where V saturates it has"
-        " up to ten times that of AFR or Drop Oldest ([stress-v1](stress.md)).",
+        fails="In blackouts it has nearly twice the regret of `min-motion-gap`, which sees motion. Where V saturates it"
+        " has up to ten times that of AFR or Drop Oldest ([stress-v1](stress.md)).",
     ),
     "learned-scheduler": Card(
         results="topics.md",
