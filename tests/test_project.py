@@ -47,7 +47,7 @@ def test_one_version_everywhere() -> None:
 
     version = bufgym.__version__
     settings = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))
-    assert settings["tool"]["hatch"]["version"]["path"] == "bufgym/__init__.py"
+    assert settings["tool"]["hatch"]["version"]["path"] == "bufgym/ground/__init__.py"
     assert f"\nversion: {version}\n" in (REPO / "CITATION.cff").read_text(encoding="utf-8")
     try:
         installed = importlib.metadata.version("bufgym")

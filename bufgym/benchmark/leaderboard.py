@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__
 from bufgym.benchmark import folder
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
@@ -18,6 +17,7 @@ from bufgym.benchmark.summary import shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import Table
 from bufgym.benchmark.tasks import TASKS, Task
+from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8, replaced
 from bufgym.scenario import suites

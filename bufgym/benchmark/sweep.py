@@ -20,13 +20,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__, policies
+from bufgym import policies
 from bufgym.benchmark import cluster, folder, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
 from bufgym.benchmark.run import bar, by_trace, check_distinct, run
 from bufgym.benchmark.tasks import Task
-from bufgym.ground import modules
+from bufgym.ground import __version__, modules
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
 from bufgym.scenario import suites

@@ -18,13 +18,14 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from bufgym import __version__, policies
+from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import Table, decimal
+from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites

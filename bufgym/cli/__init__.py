@@ -17,9 +17,8 @@ from typing import Any
 
 from cyclopts import App, CycloptsError
 
-from bufgym import __version__
 from bufgym.cli.options import OPTIONS
-from bufgym.ground import modules
+from bufgym.ground import __version__, modules
 from bufgym.ground.errors import BufgymError, printable
 
 __all__ = ["app", "main"]

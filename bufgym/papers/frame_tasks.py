@@ -12,9 +12,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
-from bufgym import __version__
 from bufgym.benchmark import cluster
 from bufgym.benchmark.run import bar
+from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.extra import library
 from bufgym.papers.perception.recordings import open_sequence

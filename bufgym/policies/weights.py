@@ -30,7 +30,7 @@ import safetensors
 from numpy.typing import NDArray
 from safetensors.numpy import save as serialized
 
-from bufgym import __version__
+from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_whole, replaced
 from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, TOPIC_FIELDS

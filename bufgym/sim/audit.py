@@ -6,16 +6,14 @@ So every benchmark run is checked at its end: a policy that changed a message or
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.model.qoi import information
+from bufgym.scenario import Episode
 from bufgym.sim.state import NEVER, Batch
-
-if TYPE_CHECKING:
-    from bufgym.sim.senders import Senders
 
 ARRIVAL = "a message that arrived is not as the episode has it"
 QUEUED = "a queued message is not as it arrived"
@@ -30,10 +28,8 @@ _ROUNDING = 1e-9
 """Tolerance: H is added up in another order here."""
 
 
-def touched(senders: Senders, i: int) -> str:
-    """What does not agree with the episode in sender ``i``'s finished run; empty if all does."""
-    batch, episode = senders.batch, senders.episodes[i]
-    assert episode is not None
+def touched(batch: Batch, i: int, episode: Episode, topic_table: NDArray[Any]) -> str:
+    """What does not agree with the episode or the topics' rules in sender ``i``'s finished run; empty if all does."""
     sender, arrivals = np.asarray(batch.senders)[i], np.asarray(episode.arrivals)
     log = np.asarray(batch.log[i])[: len(arrivals)]
     if not _same(batch.arrivals[i, : len(arrivals)], arrivals, _MESSAGE):
@@ -54,7 +50,7 @@ def touched(senders: Senders, i: int) -> str:
     counted = sent == sender["dequeued"] and gone == sender["evicted"] + sender["rejected"]
     if not counted or sent + gone + len(queued) != sender["next"]:
         return LOG
-    if not _same(batch.topics[i], senders.topic_table, _RULES):
+    if not _same(batch.topics[i], topic_table, _RULES):
         return TOPIC
     gained = _gained(batch, i, arrivals[batch.order[i, : sender["credited"]]])
     return QOI if abs(gained - sender["delivered_gain"]) > _ROUNDING * max(1.0, gained) else ""

@@ -189,7 +189,7 @@ class Senders:
     def check_untouched(self, policy: Policy) -> None:
         """Raise if ``policy`` has written to its view while it ran every sender to its end."""
         for i, episode in enumerate(self.episodes):
-            if episode is not None and (found := touched(self, i)):
+            if episode is not None and (found := touched(self.batch, i, episode, self.topic_table)):
                 raise BufgymError(
                     f"policy {policy.name}: wrote to what it may only read: {found} (run {i + 1} of the batch)"
                 )

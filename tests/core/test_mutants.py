@@ -81,9 +81,10 @@ FORGERIES = [
 @pytest.mark.parametrize(("finding", "write"), [pytest.param(n, w, id=name) for n, name, w in FORGERIES])
 def test_a_run_is_searched_for_everything_a_policy_may_not_write(finding, write):
     senders = finished()
-    assert audit.touched(senders, 0) == ""
+    given = senders.batch, 0, senders.episodes[0], senders.topic_table
+    assert audit.touched(*given) == ""
     write(senders.batch)
-    assert audit.touched(senders, 0) == finding
+    assert audit.touched(*given) == finding
 
 
 # --- the clairvoyant's beam ------------------------------------------------------------------------------------------

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym import __version__, policies
+from bufgym import policies
+from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, printable
 from bufgym.ground.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits

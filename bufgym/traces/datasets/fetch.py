@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 from urllib.parse import urljoin
 
-from bufgym import __version__
-from bufgym.ground import files
+from bufgym.ground import __version__, files
 from bufgym.ground.errors import BufgymError, where
 from bufgym.traces.datasets.table import Dataset, Remote, datasets
 from bufgym.traces.datasets.unpack import ending, unpack
