@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING
 import gymnasium as _gym
 
 from bufgym.ground import __version__ as __version__
+from bufgym.ground.errors import BufgymError as BufgymError
 from bufgym.ground.modules import on_demand as _on_demand
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy
 
-__all__ = ["ENVIRONMENTS", "ON_TASKS", "Comparison", "compare", "make_policy"]
+__all__ = ["ENVIRONMENTS", "ON_TASKS", "BufgymError", "Comparison", "compare", "make_policy"]
 
 ENVIRONMENTS = {
     "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)"),

@@ -30,8 +30,7 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 
 import bufgym
-from bufgym import policies, scenario
-from bufgym.ground.errors import BufgymError
+from bufgym import BufgymError, policies, scenario
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 TEST = ["lte-synthetic-6", "lte-synthetic-7"]

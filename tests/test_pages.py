@@ -102,23 +102,32 @@ def test_python_and_make_are_given_what_they_take() -> None:
             assert (REPO / (settings[-1] if program == "-m" else program)).is_file(), line
 
 
-def test_what_the_programs_import_is_there() -> None:
+def test_programs_import_public_names_alone() -> None:
     programs = [block for block in blocks() if block.language == "python"]
-    programs += [Block(path.name, "python", path.read_text(encoding="utf-8")) for path in TUTORIALS]
+    paths = [*TUTORIALS, *sorted((REPO / "examples").rglob("*.py"))]
+    programs += [Block(path.name, "python", path.read_text(encoding="utf-8")) for path in paths]
     for page, _, text in programs:
         for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.ImportFrom) and str(node.module).startswith(("bufgym", "agents")):
-                for name in node.names:
-                    assert _is_there(str(node.module), name.name), (page, node.module, name.name)
+            if isinstance(node, ast.ImportFrom):
+                private = [name.name for name in node.names if not _is_public(str(node.module), name.name)]
+                assert not private, (page, node.module, private)
             elif isinstance(node, ast.Import):
-                named = [name.name for name in node.names if name.name.startswith(("bufgym", "agents"))]
-                assert all(importlib.util.find_spec(name) for name in named), (page, named)
+                named = [name.name for name in node.names if name.name.startswith("bufgym")]
+                assert all(importlib.util.find_spec(name).submodule_search_locations for name in named), (page, named)
 
 
-def _is_there(module: str, name: str) -> bool:
-    if module == "bufgym.robot.ros2":  # it needs ROS 2
-        return importlib.util.find_spec(module) is not None
-    return hasattr(importlib.import_module(module), name) or importlib.util.find_spec(f"{module}.{name}") is not None
+def _is_public(module: str, name: str) -> bool:
+    """Whether a room lists the name in ``__all__``, or has a room of this name."""
+    if module.split(".")[0] == "agents":
+        return hasattr(importlib.import_module(module), name)
+    if module.split(".")[0] != "bufgym" or module == "bufgym.robot.ros2":  # it needs ROS 2
+        return True
+    below = (
+        importlib.util.find_spec(f"{module}.{name}")
+        if importlib.util.find_spec(module).submodule_search_locations
+        else None
+    )
+    return name in importlib.import_module(module).__all__ or bool(below and below.submodule_search_locations)
 
 
 def test_links_and_pictures_lead_somewhere() -> None:

@@ -15,8 +15,9 @@ from bufgym.ground.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym.envs.fleet import FleetEnv, parallel_env
+    from bufgym.envs.observation import ObservationForm
 
-__all__ = ["FleetEnv", "FleetVecEnv", "SenderEnv", "SenderVectorEnv", "parallel_env"]
+__all__ = ["FleetEnv", "FleetVecEnv", "ObservationForm", "SenderEnv", "SenderVectorEnv", "parallel_env"]
 
 
-__getattr__ = on_demand(__name__, FleetEnv="fleet", parallel_env="fleet")
+__getattr__ = on_demand(__name__, FleetEnv="fleet", ObservationForm="observation", parallel_env="fleet")

@@ -8,8 +8,9 @@
 the environment is in when it is asked.
 """
 
+from bufgym.envs.expert import dataset
 from bufgym.envs.expert.experts import PolicyExpert, online, policy
 from bufgym.envs.expert.hindsight import Clairvoyant, clairvoyant
 from bufgym.envs.expert.player import Player
 
-__all__ = ["Clairvoyant", "Player", "PolicyExpert", "clairvoyant", "online", "policy"]
+__all__ = ["Clairvoyant", "Player", "PolicyExpert", "clairvoyant", "dataset", "online", "policy"]
