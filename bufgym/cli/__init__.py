@@ -24,53 +24,54 @@ from bufgym.ground.errors import BufgymError, printable
 __all__ = ["app", "main"]
 
 COMMANDS: dict[str, Any] = {
-    "list": "listing:listing",
-    "bench": "bench:bench",
-    "topics": "topics:topics",
-    "fleet": "topics:fleet",
-    "report": "results:report",
-    "tune": "results:tune",
-    "leaderboard": "results:leaderboard",
-    "validate": "results:validate",
+    "list": "cli.listing:listing",
+    "bench": "cli.bench:bench",
+    "topics": "cli.topics:topics",
+    "fleet": "cli.topics:fleet",
+    "report": "cli.results:report",
+    "tune": "cli.results:tune",
+    "leaderboard": "cli.results:leaderboard",
+    "validate": "cli.results:validate",
     "trace": (
         "Bandwidth traces and recordings: look at them, convert, fit, generate, fetch.",
         {
-            "info": "traces:info",
-            "plot": "traces:plot",
-            "validate": "traces:validate",
-            "convert": "traces:convert",
-            "from-bag": "trace_bags:from_bag",
-            "from-poses": "trace_bags:from_poses",
-            "fit": "trace_fit:fit",
-            "generate": "trace_generate:generate",
-            "fetch": "trace_fetch:fetch",
+            "info": "cli.traces:info",
+            "plot": "cli.traces:plot",
+            "validate": "cli.traces:validate",
+            "convert": "cli.traces:convert",
+            "from-bag": "cli.trace_bags:from_bag",
+            "from-poses": "cli.trace_bags:from_poses",
+            "fit": "cli.trace_fit:fit",
+            "generate": "cli.trace_generate:generate",
+            "fetch": "cli.trace_fetch:fetch",
         },
     ),
-    "reproduce": "figures:reproduce",
-    "perf": "results:perf",
-    "play": "play:play",
+    "reproduce": "papers.commands:reproduce",
+    "perf": "cli.results:perf",
+    "play": "cli.play:play",
     "live": (
         "Policies on real sockets, beside the simulator.",
         {
-            "send": "live:send",
-            "receive": "live:receive",
-            "link": "live:link",
-            "validate": "live_checks:validate",
-            "view": "live_checks:view",
-            "replay": "live_checks:replay",
+            "send": "robot.commands:send",
+            "receive": "robot.commands:receive",
+            "link": "robot.commands:link",
+            "validate": "robot.checks:validate",
+            "view": "robot.checks:view",
+            "replay": "robot.checks:replay",
+            "cost": "robot.cost:cost",
         },
     ),
     "ros2": (
         "A relay between ROS 2 networks, its uplink under a policy.",
-        {"send": "ros2:send", "receive": "ros2:receive"},
+        {"send": "robot.ros2.commands:send", "receive": "robot.ros2.commands:receive"},
     ),
     "relay": (
         "A server for fleets: robots and viewers meet there.",
-        {"serve": "relay:serve", "robot": "relay:robot", "foxglove": "relay:foxglove"},
+        {"serve": "relay.commands:serve", "robot": "relay.commands:robot", "foxglove": "relay.commands:foxglove"},
     ),
-    "export": "export:export",
-    "dataset": ("Record data sets for imitation and offline learning.", {"make": "export:dataset"}),
-    "warmup": "results:warmup",
+    "export": "robot.c.commands:export",
+    "dataset": ("Record data sets for imitation and offline learning.", {"make": "cli.dataset:dataset"}),
+    "warmup": "cli.results:warmup",
 }
 """Commands in the order of ``--help``: where the function is, or (purpose, commands below it)."""
 
@@ -94,7 +95,7 @@ def app() -> App:
 def _with(parent: App, commands: Mapping[str, Any]) -> App:
     for k, (name, what) in enumerate(commands.items()):
         if isinstance(what, str):
-            parent.command(f"bufgym.cli.{what}", name=name, sort_key=k)
+            parent.command(f"bufgym.{what}", name=name, sort_key=k)
         else:
             parent.command(_with(App(name=name, help=what[0], sort_key=k), what[1]))
     return parent

@@ -106,7 +106,6 @@ def perf(
     *,
     json: Path | None = None,
     repeats: Count = 3,
-    queue: bool = False,
     quick: bool = False,
 ) -> None:
     """Measure bufgym's own speed on this machine.
@@ -114,7 +113,6 @@ def perf(
     Args:
         json: Also write the figures to this file.
         repeats: Best of so many.
-        queue: Measure a live queue's cost to a robot instead.
         quick: Tiny sizes: does it run at all?
     """
     from bufgym.benchmark import perf as speed
@@ -122,11 +120,6 @@ def perf(
     sizes = speed.Sizes(4, 4, 20, 5, 20, 1, repeats) if quick else speed.Sizes(repeats=repeats)
     if not quick and sys.stderr.isatty():
         print("measuring; this takes about half a minute ...", file=sys.stderr)
-    if queue:
-        from bufgym.robot import cost
-
-        print(cost.report(1 if quick else 20))
-        return
     figures = speed.measure(sizes)
     print(speed.report(figures, sizes.repeats))
     if json is not None:

@@ -12,6 +12,7 @@ import time
 import numpy as np
 
 from bufgym.benchmark.table import Table
+from bufgym.cli.options import Positive
 from bufgym.robot.queue import PolicyQueue
 
 POLICIES = ("drop-oldest", "afr", "learned-motion")
@@ -24,7 +25,7 @@ WITHOUT_PAUSE = 1000
 
 
 def measure(policy: str, seconds: float) -> list[str]:
-    """Cells of ``report``: frames put for so long, then as many as WITHOUT_PAUSE without a pause."""
+    """Cells of the table: frames put for so long, then as many as WITHOUT_PAUSE without a pause."""
     queue, body = PolicyQueue(policy, CAPACITY), bytes(SIZE_BYTES)
 
     def send() -> None:
@@ -54,10 +55,16 @@ def measure(policy: str, seconds: float) -> list[str]:
     return [policy, *times, f"{100 * core:.2f} %", str(held)]
 
 
-def report(seconds: float) -> str:
-    """The costs as a table. The share of a core is the whole process's, with both threads and their waiting."""
+def cost(*, seconds: Positive = 20.0) -> None:
+    """Print what a live queue costs a robot, policy by policy.
+
+    The share of a core is the whole process's, with both threads and their waiting.
+
+    Args:
+        seconds: How long frames come, for each policy.
+    """
     about = f"PolicyQueue, L = {CAPACITY}: {SIZE_BYTES} bytes at {RATE_HZ:g} Hz, a link of {LINK_HZ:g} Hz"
     head = ["policy", "put, median", "99 % within", "without pauses", "of a core", "messages held"]
     rows = [measure(policy, seconds) for policy in POLICIES]
     goals = "Goals: 100 us, 1000 us, 5 % of a core."
-    return "\n".join([about, "", Table(head, [("", rows)]).markdown(), "", goals])
+    print("\n".join([about, "", Table(head, [("", rows)]).markdown(), "", goals]))

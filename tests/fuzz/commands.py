@@ -23,8 +23,9 @@ VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", 
 
 WORK = """benchmark.run.run benchmark.sweep.run_sweep benchmark.tune.tune benchmark.leaderboard.make
 benchmark.leaderboard.validate benchmark.perf.measure robot.cost.measure traces.datasets.fetch.fetch_dataset
-cli.figures._text cli.play.play cli.live.send cli.live.receive cli.live.link cli.ros2.send cli.ros2.receive
-cli.relay.serve cli.relay.robot cli.relay.foxglove robot.validate.validate envs.expert.dataset.make"""
+papers.commands._text cli.play.play robot.commands.send robot.commands.receive robot.commands.link
+robot.ros2.commands.send robot.ros2.commands.receive relay.commands.serve relay.commands.robot
+relay.commands.foxglove robot.cost.cost robot.validate.validate envs.expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 
 

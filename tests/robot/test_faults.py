@@ -13,7 +13,6 @@ import pytest
 from live_cases import in_order, meeting_port, put, receiving, sending
 from loop_cases import beside, until
 
-from bufgym.cli.live import Transport
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.robot import LogFile, PolicyQueue, read_log, replay
@@ -21,6 +20,7 @@ from bufgym.robot import buses as libraries
 from bufgym.robot.bus_channel import BusChannel, BusServer
 from bufgym.robot.buses import BUSES
 from bufgym.robot.channels import TRANSPORTS, TcpChannel
+from bufgym.robot.commands import Transport
 from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Frame, FrameError, header, parse
 from bufgym.robot.receiver import Received, Recording, listener
 from bufgym.robot.sender import Sender

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from bufgym.cli.live import REDRAW_S, redraw
 from bufgym.cli.options import Count, PolicyFile, Positive, command_line, load_policies, loaded
 from bufgym.ground.errors import BufgymError
+from bufgym.robot.commands import REDRAW_S, redraw
 
 if TYPE_CHECKING:
     from bufgym.robot.validate import Play

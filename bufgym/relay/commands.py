@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from bufgym.cli import live
 from bufgym.cli.options import Count, Natural, PolicyFile, one_policy
 from bufgym.ground.errors import BufgymError
+from bufgym.robot import commands as live
 
 
 @Parameter(name="*", group=Group.create_ordered("The relay"))

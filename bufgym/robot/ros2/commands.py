@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 
-from bufgym.cli.live import PORT, RECEIVER, Host, Port, Transport, address, say
 from bufgym.cli.options import Count, PolicyFile, one_policy
+from bufgym.robot.commands import PORT, RECEIVER, Host, Port, Transport, address, say
 
 
 async def send(

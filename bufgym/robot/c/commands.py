@@ -1,0 +1,71 @@
+"""``bufgym export``: agents as files of weights, policies in C."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from cyclopts import Group, Parameter
+
+from bufgym.cli.options import Count, given, refuse
+from bufgym.ground.errors import BufgymError
+
+
+@Parameter(name="*", group=Group.create_ordered("Weights (--to safetensors)"))
+@dataclass(frozen=True)
+class WeightOptions:
+    name: str | None = None
+    """The policy's name; must be given."""
+    about: str | None = None
+    """A sentence on the purpose of its training."""
+
+
+@Parameter(name="*", group=Group.create_ordered("C (--to c): one C99 header that decides as Python does"))
+@dataclass(frozen=True)
+class COptions:
+    capacity: Count | None = None
+    """L, messages (default: 16)."""
+    max_bytes: Count | None = None
+    """Bytes queued at most (default: no limit)."""
+    value: str | None = None
+    """V as in saturating:4 (default: exponential:0.618)."""
+
+
+def export(
+    model: str,
+    /,
+    out: str,
+    *,
+    to: Literal["safetensors", "c"] = "safetensors",
+    weights: WeightOptions = WeightOptions(),
+    c: COptions = COptions(),
+) -> None:
+    """Write a trained agent as a file of weights, read without torch; or a policy in C.
+
+    A model.zip holds pickles, so reading it can run any code: export models of your own alone.
+
+    Args:
+        model: Of a run of train.py: model.safetensors, or model.zip (--network slots). For C: a policy's name, as afr,
+            or a .safetensors of weights.
+        out: File to write.
+        to: Kind of file.
+    """
+    from bufgym import policies
+    from bufgym.model import qoi
+
+    written: object
+    if to == "c":
+        from bufgym.robot import c as header
+
+        refuse(given(weights), "belongs to --to safetensors")
+        policy = policies.load(model) if model.endswith(".safetensors") else policies.get(model)
+        value = qoi.load(c.value or "exponential:0.618")
+        written = header.write(policy, out, c.capacity or 16, value, c.max_bytes)
+    else:
+        from bufgym import sb3
+
+        refuse(given(c), "belongs to --to c")
+        if weights.name is None:
+            raise BufgymError("--name must be given: the policy's name")
+        written = sb3.export(model, out, name=weights.name, about=weights.about or "")
+    print(f"wrote {written}")
