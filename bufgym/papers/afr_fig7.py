@@ -24,7 +24,7 @@ RESAMPLES = 2000
 CONFIDENCE = 0.95
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
 """Policy -> AFR's error relative to the policy's error, less 1, as the paper roughly gives it."""
-SHOWN = ("drop-oldest", "random", "afr", "learned-motion")
+SHOWN = ("drop-oldest", "random", "afr")
 """Policies whose maps are drawn, at the smallest L and the paper's alignment."""
 SLICE = 30_000
 """Number of points drawn of a map."""

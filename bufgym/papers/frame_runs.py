@@ -23,7 +23,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from bufgym import traces
-from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES, STYLES
+from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES
 from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views
@@ -36,16 +36,15 @@ RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect"}
 """Name -> description of the recording; 7-scenes needs a folder of recordings."""
 
 POLICIES = {
-    "drop-oldest": STYLES["drop-oldest"],
-    "random": STYLES["random"],
-    IMAGES: ("ORBBuf, images", COLOURS["pink"], "D"),
-    "orbbuf": ("ORBBuf, motion", "#882255", "d"),
-    "afr": STYLES["afr"],
-    "min-motion-gap": ("min-motion-gap", COLOURS["orange"], "v"),
-    "learned-motion": ("learned-motion", COLOURS["sky"], "P"),
-    "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"], "*"),
+    "drop-oldest": ("Drop Oldest", COLOURS["drop-oldest"]),
+    "random": ("Random", COLOURS["random"]),
+    IMAGES: ("ORBBuf, images", COLOURS["pink"]),
+    "orbbuf": ("ORBBuf, motion", "#882255"),
+    "afr": ("AFR", COLOURS["afr"]),
+    "min-motion-gap": ("min-motion-gap", COLOURS["orange"]),
+    "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"]),
 }
-"""Policy -> label, colour, marker. The clairvoyant plans for motion QoI."""
+"""Policy -> label, colour. The clairvoyant plans for motion QoI."""
 
 
 def fade() -> Trace:
