@@ -56,7 +56,6 @@ KINDS: Final = {
     "CompressedImage": Kind("sensor_msgs/msg/CompressedImage", "cam"),
     "PointCloud2": Kind("sensor_msgs/msg/PointCloud2", "lidar"),
     "PoseStamped": Kind("geometry_msgs/msg/PoseStamped", "map"),
-    "Odometry": Kind("nav_msgs/msg/Odometry", "odom"),
     "RobofleetStatus": Kind(_STATUS_TYPE, None),
 }
 
@@ -70,7 +69,6 @@ def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters:
         "CompressedImage": _compressed_image,
         "PointCloud2": _point_cloud2,
         "PoseStamped": lambda uniform: {"pose": _pose(uniform)},
-        "Odometry": _odometry,
         "RobofleetStatus": _robofleet_status,
     }[kind]
     fields: Content = build(uniform, **parameters)
@@ -112,31 +110,19 @@ def _compressed_image(uniform: np.random.Generator, data_bytes: int = 75_000, fo
     return {"format": format, "data": data}
 
 
-def _point_cloud2(uniform: np.random.Generator, points: int = 10_000, point_step: int = 16) -> Content:
-    """Points x, y, z and intensity, each a float32, then zeros up to ``point_step`` bytes a point."""
-    cloud = np.zeros((points, point_step), np.uint8)
-    cloud[:, :16] = uniform.uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
+def _point_cloud2(uniform: np.random.Generator, points: int = 10_000) -> Content:
+    """Points x, y, z and intensity, each a float32."""
+    cloud = uniform.uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
     names = ("x", "y", "z", "intensity")
     return {
         "height": 1,
         "width": points,
         "fields": [{"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate(names)],
         "is_bigendian": False,
-        "point_step": point_step,
-        "row_step": points * point_step,
+        "point_step": 16,
+        "row_step": 16 * points,
         "data": cloud.ravel(),
         "is_dense": True,
-    }
-
-
-def _odometry(uniform: np.random.Generator) -> Content:
-    """A pose and a twist on the ground, each with a diagonal covariance."""
-    ahead, turning = uniform.uniform(0, 2), uniform.uniform(-1, 1)
-    twist = {"linear": {"x": ahead, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turning}}
-    return {
-        "child_frame_id": "base_link",
-        "pose": {"pose": _pose(uniform), "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
-        "twist": {"twist": twist, "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
     }
 
 
