@@ -15,14 +15,25 @@ pytest.importorskip("flatbuffers", reason="extra robofleet")
 
 from flatbuffers.number_types import Float32Flags
 from flatbuffers.table import Table
+from rosbags.typesys import get_types_from_msg
 
 from bufgym.ground.errors import BufgymError, install
 from bufgym.papers import encodings
-from bufgym.papers.encodings import content, encode, stores
+from bufgym.papers.encodings import KINDS, Kind, content, encode, stores
 from bufgym.papers.robofleet_table1 import PAPER, Reproduction, fitted
 
 HEADER = 4 + 8 + 4  # seq, stamp, length of frame_id
 STATUS = {"status": "on", "is_ok": True, "battery_level": 1.0, "location": "lab"}
+
+
+@pytest.fixture(autouse=True)
+def status(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A short message of Robofleet's own, to be counted by hand."""
+    of, fields = "amrl_msgs/msg/RobofleetStatus", "string status\nbool is_ok\nfloat32 battery_level\nstring location\n"
+    monkeypatch.setitem(KINDS, "RobofleetStatus", Kind(of, ""))
+    for store in stores().values():
+        if of not in store.fielddefs:
+            store.register(get_types_from_msg(fields, of))
 
 
 def size(kind: str, encoding: str, **parameters: Any) -> int:
