@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.papers.correlation import spearman_over
 from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.frame_runs import POLICIES, FrameFigure
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, spearman_over
 from bufgym.papers.rows import Row, Rows, listed, table
 
 MEASURES = {

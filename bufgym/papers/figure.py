@@ -157,13 +157,11 @@ def source(text: Mapping[str, Any]) -> str:
 
 
 def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """Fill in the facts and wrap each paragraph; paragraphs that begin with spaces stay indented."""
-    lines: list[str] = []
-    for paragraph in text.format(**facts).rstrip().split("\n\n"):
-        indent = " " * (len(paragraph) - len(paragraph.lstrip(" ")))
-        words = " ".join(paragraph.split())
-        lines += textwrap.wrap(words, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
-    return lines
+    """Fill in the facts and wrap each paragraph; what begins with spaces stays indented."""
+    indent = " " * (len(text) - len(text.lstrip(" ")))
+    wrapper = textwrap.TextWrapper(WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    paragraphs = text.format(**facts).split("\n\n")
+    return [line for paragraph in paragraphs for line in wrapper.wrap(" ".join(paragraph.split()))]
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------

@@ -26,11 +26,7 @@ from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")
 RATES_HZ = {"PointCloud2": 5.0, "CompressedImage": 2.0, "LaserScan": 10.0}
-KIND_COLOURS = {
-    "PointCloud2": COLOURS["afr"],
-    "CompressedImage": COLOURS["drop-oldest"],
-    "LaserScan": COLOURS["random"],
-}
+KIND_COLOURS = dict(zip(RATES_HZ, (COLOURS["afr"], COLOURS["drop-oldest"], COLOURS["random"]), strict=True))
 PAPER_RATIO = 5.0
 ABOUT = (4.0, 6.0)
 """Range of ratios that we accept as "about 5 times"."""

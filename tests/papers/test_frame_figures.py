@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bufgym.papers import afr_fig7, afr_fig8, afr_overlap, frame_tasks
-from bufgym.papers.correlation import spearman, spearman_over
+from bufgym.papers.frame_runs import spearman, spearman_over
 from bufgym.papers.frame_tasks import FrameTask, carry_out
 from bufgym.papers.rows import Rows
 from bufgym.traces import Trace
