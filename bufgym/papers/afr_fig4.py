@@ -70,6 +70,8 @@ def steps(capacity: int = PAPER_L, last_T: int = PAPER_T[1], policy: str = "afr"
 class Reproduction(Figure):
     """Fig. 4 for the paper's L = 8 and T from 8 to 18."""
 
+    SIZE_INCHES = (7.5, 5.3)
+
     def simulate(self) -> Rows:
         kept = (step for step in steps() if step.T >= PAPER_L)
         return Rows(step._asdict() | {"kept": " ".join(map(str, step.kept))} for step in kept)
@@ -85,9 +87,6 @@ class Reproduction(Figure):
     def claims(self, rows: Rows) -> dict[str, Any]:
         same = [row["dropped"] == PAPER_DROPS[row["T"]] for row in rows if row["T"] in PAPER_DROPS]
         return {"drops": all(same), "same": sum(same), "compared": len(same)}
-
-    def size_inches(self, rows: Rows) -> tuple[float, float]:
-        return 7.5, 0.34 * len(rows) + 1.6
 
     def draw(self, rows: Rows, figure: Any) -> None:
         axes = figure.add_subplot()

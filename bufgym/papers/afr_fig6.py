@@ -79,7 +79,7 @@ class Reproduction(LinkFigure):
             "demand": self.demand / 1e6,
             "frame_kb": self.size_bytes / 1e3,
             "under": int((rates < self.demand).sum()),
-            "carried": self.share_carried(),
+            "carried": float(np.average(rates, weights=self.streamed[0])) / self.demand,
         }
 
     def draw(self, rows: Rows, figure: Any) -> None:

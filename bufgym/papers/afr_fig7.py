@@ -14,17 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
-from bufgym.papers.correlation import spearman
 from bufgym.papers.figure import heat_table
-from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun
+from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, FrameFigure, FrameRun, spearman
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import Rows
 
 RESAMPLES = 2000
-CONFIDENCE = 0.95
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
 """Policy -> AFR's error relative to the policy's error, less 1, as the paper roughly gives it."""
-SHOWN = ("drop-oldest", "random", "afr", "learned-motion")
+SHOWN = ("drop-oldest", "random", "afr")
 """Policies whose maps are drawn, at the smallest L and the paper's alignment."""
 SLICE = 30_000
 """Number of points drawn of a map."""

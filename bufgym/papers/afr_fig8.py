@@ -52,7 +52,7 @@ class Reproduction(FrameFigure):
         }
         runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
         facts: dict[str, Any] = {"about": self.about(), "offsets": self.offsets, "runs": runs}
-        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count", "learned_count"), "not run")
+        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count"), "not run")
         facts["counts"] = "; ".join(
             f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
             for name, counts in broken.items()
@@ -79,9 +79,6 @@ class Reproduction(FrameFigure):
                 facts["afr"] = everywhere(lambda counts: counts["afr"] / runs < 0.1)
                 facts["third"] = everywhere(lambda counts: counts["afr"] <= THIRD * counts["drop-oldest"])
                 facts["large"] = failures(large, policy="afr") == 0 if large else None
-        if {"afr", "learned-motion"} <= set(self.policies):
-            facts["learned"] = everywhere(lambda counts: counts["learned-motion"] <= counts["afr"])
-            facts["learned_count"] = each(".0f", ("learned-motion", "afr"))
         return facts
 
     def size_inches(self, rows: Rows) -> tuple[float, float]:

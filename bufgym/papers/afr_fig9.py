@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import time
+import timeit
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,12 +97,8 @@ def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions:
     rounds = max(1, decisions // len(arrivals))
     start, memory = policy.new_memory(2, buffer.capacity)
     loop(buffer, arrivals, memory, start, on_arrival, 1)
-    fastest = np.inf
-    for _ in range(REPEATS):
-        start_ns = time.perf_counter_ns()
-        loop(buffer, arrivals, memory, start, on_arrival, rounds)
-        fastest = min(fastest, time.perf_counter_ns() - start_ns)
-    return float(fastest) / (rounds * len(arrivals)) / 1e3
+    timed = timeit.repeat(lambda: loop(buffer, arrivals, memory, start, on_arrival, rounds), number=1, repeat=REPEATS)
+    return 1e6 * min(timed) / (rounds * len(arrivals))
 
 
 def called_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], calls: int) -> tuple[float, float]:

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.papers.correlation import spearman_over
 from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.frame_runs import POLICIES, FrameFigure
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, spearman_over
 from bufgym.papers.rows import Row, Rows, listed, table
 
 MEASURES = {
@@ -79,14 +78,10 @@ class Reproduction(FrameFigure):
             shown = self.runs.where(recording=recording)
             cells = [
                 [POLICIES[policy][0], *(f"{shown.mean(column, policy=policy):.3f}" for column in (*MEASURES, *TASKS))]
-                for policy in ranked(shown, "rmse_mm")
+                for policy in sorted(self.policies, key=lambda name: shown.mean("rmse_mm", policy=name))
             ]
             heads = ["policy", *MEASURES.values(), *TASKS.values()]
             lines += [f"{recording}, mean of all runs (of failures: their part):", *table([heads, *cells]), ""]
-            for column in (*MEASURES, "rmse_mm"):
-                order = " > ".join(POLICIES[policy][0] for policy in ranked(shown, column))
-                lines.append(f"best first by {(MEASURES | TASKS)[column]}: {order}")
-            lines.append("")
         return lines[:-1]
 
     def claims(self, rows: Rows) -> dict[str, Any]:
@@ -133,12 +128,6 @@ class Reproduction(FrameFigure):
         for axes in panels[:, 0]:
             axes.set_ylabel("Spearman's correlation\n(lower is better)")
         legend_below(figure, 5, panels[0, 0])
-
-
-def ranked(runs: Rows, column: str) -> list[str]:
-    """Rank the policies by their mean over all runs, best first: a measure's highest, or a harm's lowest."""
-    sign = -1 if column in MEASURES else 1
-    return sorted(runs.distinct("policy"), key=lambda policy: sign * runs.mean(column, policy=policy))
 
 
 def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.float64]:

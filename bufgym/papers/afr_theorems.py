@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.model import qoi
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
 from bufgym.papers.rows import Row, Rows
 from bufgym.scenario import Interruption
@@ -33,9 +32,6 @@ from bufgym.sim import metrics
 
 ROUNDING = 1e-12
 """Relative tolerance of comparisons that are not between integers."""
-
-FALLS = (35, 36)
-"""Consecutive T between which H of AFR falls, for L = 8 and V(d) = 1 - 0.618^d."""
 
 VIOLATIONS = ("above_oracle", "oracle_above_ideal", "below_bound", "below_sharper", "below_oldest", "uneven", "unequal")
 """Columns that each count the violations of one statement."""
@@ -123,12 +119,7 @@ class Reproduction(Figure):
         return rows.listing({"L": ("L", "")} | bounds | worst, left=0)
 
     def claims(self, rows: Rows) -> dict[str, Any]:
-        v = qoi.exponential(0.618)
         counts = {name: int(rows.column(name).sum()) for name in VIOLATIONS}
-        falls = [
-            f"  T = {T}: H - 1 = {sum(v(float(g)) for g in gaps):.3f}, gaps {' '.join(map(str, gaps))}"
-            for T, gaps in zip(FALLS, gaps_of("afr", 8, FALLS), strict=True)
-        ]
         return {
             "theorem-1": counts["above_oracle"] == counts["oracle_above_ideal"] == 0,
             "theorem-2": counts["below_bound"] == 0,
@@ -141,7 +132,6 @@ class Reproduction(Figure):
             "pairs": self.max_capacity * self.last_T,
             "worst_8": rows.mean("worst", L=min(8, self.max_capacity)),
             "bound_8": bound(min(8, self.max_capacity)),
-            "falls": "\n\n".join(falls),
         }
 
     def draw(self, rows: Rows, figure: Any) -> None:

@@ -33,8 +33,6 @@ Content = dict[str, Any]
 
 ENCODINGS: Final = ("ros1", "cdr", "robofleet", "robofleet-bare", "json", "json-numbers")
 
-_STATUS_TYPE: Final = "amrl_msgs/msg/RobofleetStatus"
-_STATUS_FIELDS: Final = "string status\nbool is_ok\nfloat32 battery_level\nstring location\n"
 _TIME: Final = "builtin_interfaces/msg/Time"
 
 
@@ -46,8 +44,8 @@ class Kind(NamedTuple):
 
     type: str
     """Its ROS type."""
-    frame_id: str | None
-    """The frame_id of its header by default; None if it has no header."""
+    frame_id: str
+    """The frame_id of its header by default."""
 
 
 KINDS: Final = {
@@ -56,8 +54,6 @@ KINDS: Final = {
     "CompressedImage": Kind("sensor_msgs/msg/CompressedImage", "cam"),
     "PointCloud2": Kind("sensor_msgs/msg/PointCloud2", "lidar"),
     "PoseStamped": Kind("geometry_msgs/msg/PoseStamped", "map"),
-    "Odometry": Kind("nav_msgs/msg/Odometry", "odom"),
-    "RobofleetStatus": Kind(_STATUS_TYPE, None),
 }
 
 
@@ -69,16 +65,11 @@ def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters:
         "NavSatFix": _nav_sat_fix,
         "CompressedImage": _compressed_image,
         "PointCloud2": _point_cloud2,
-        "PoseStamped": lambda uniform: {"pose": _pose(uniform)},
-        "Odometry": _odometry,
-        "RobofleetStatus": _robofleet_status,
+        "PoseStamped": _pose_stamped,
     }[kind]
-    fields: Content = build(uniform, **parameters)
-    if KINDS[kind].frame_id is None:
-        return fields
     stamp = {"sec": 1_600_000_000, "nanosec": 123_456_789}
     name = KINDS[kind].frame_id if frame_id is None else frame_id
-    return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **fields}
+    return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **build(uniform, **parameters)}
 
 
 def _laser_scan(uniform: np.random.Generator, beams: int = 1080) -> Content:
@@ -112,45 +103,27 @@ def _compressed_image(uniform: np.random.Generator, data_bytes: int = 75_000, fo
     return {"format": format, "data": data}
 
 
-def _point_cloud2(uniform: np.random.Generator, points: int = 10_000, point_step: int = 16) -> Content:
-    """Points x, y, z and intensity, each a float32, then zeros up to ``point_step`` bytes a point."""
-    cloud = np.zeros((points, point_step), np.uint8)
-    cloud[:, :16] = uniform.uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
+def _point_cloud2(uniform: np.random.Generator, points: int = 10_000) -> Content:
+    """Points x, y, z and intensity, each a float32."""
+    cloud = uniform.uniform(-50, 50, (points, 4)).astype("<f4").view(np.uint8)
     names = ("x", "y", "z", "intensity")
     return {
         "height": 1,
         "width": points,
         "fields": [{"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate(names)],
         "is_bigendian": False,
-        "point_step": point_step,
-        "row_step": points * point_step,
+        "point_step": 16,
+        "row_step": 16 * points,
         "data": cloud.ravel(),
         "is_dense": True,
     }
 
 
-def _odometry(uniform: np.random.Generator) -> Content:
-    """A pose and a twist on the ground, each with a diagonal covariance."""
-    ahead, turning = uniform.uniform(0, 2), uniform.uniform(-1, 1)
-    twist = {"linear": {"x": ahead, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": turning}}
-    return {
-        "child_frame_id": "base_link",
-        "pose": {"pose": _pose(uniform), "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
-        "twist": {"twist": twist, "covariance": np.diag(uniform.uniform(0, 0.1, 6)).ravel()},
-    }
-
-
-def _pose(uniform: np.random.Generator) -> Content:
+def _pose_stamped(uniform: np.random.Generator) -> Content:
     """A pose on the ground, in the full precision of float64."""
     x, y, yaw = uniform.uniform(-50, 50), uniform.uniform(-50, 50), uniform.uniform(-math.pi, math.pi)
     turn = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
-    return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}
-
-
-def _robofleet_status(uniform: np.random.Generator) -> Content:
-    """A robot's report to the fleet about its own state."""
-    battery = float(np.float32(uniform.uniform(0, 1)))
-    return {"status": "autonomous", "is_ok": True, "battery_level": battery, "location": "building 1, floor 2"}
+    return {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}}
 
 
 # --- encodings -------------------------------------------------------------------------------------------------------
@@ -178,13 +151,10 @@ def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topi
 
 @functools.cache
 def stores() -> dict[str, Any]:
-    """ "ros1" and "cdr" -> the message definitions of ROS 1 Noetic and ROS 2 Humble, with Robofleet's status."""
+    """ "ros1" and "cdr" -> the message definitions of ROS 1 Noetic and ROS 2 Humble."""
     typesys = library("rosbags.typesys", "ros")
-    made = {"ros1": typesys.get_typestore(typesys.Stores.ROS1_NOETIC)}
-    made["cdr"] = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    for store in made.values():
-        store.register(typesys.get_types_from_msg(_STATUS_FIELDS, _STATUS_TYPE))
-    return made
+    kinds = {"ros1": typesys.Stores.ROS1_NOETIC, "cdr": typesys.Stores.ROS2_HUMBLE}
+    return {encoding: typesys.get_typestore(kind) for encoding, kind in kinds.items()}
 
 
 def _typed(store: Any, type_name: str, value: Content) -> Any:

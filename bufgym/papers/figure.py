@@ -2,8 +2,7 @@
 
 A ``Figure`` is a figure, table or theorem of a paper. Its dataclass fields are its options. ``simulate`` returns the
 numbers, ``claims`` tests the paper's sentences with them, and ``draw`` makes the picture. The sentences are in
-``afr.toml`` and ``robofleet.toml``, and our own in ``own.toml``. Each figure has a section with its sentences and the
-text around them.
+``afr.toml`` and ``robofleet.toml``. Each figure has a section with its sentences and the text around them.
 """
 
 from __future__ import annotations
@@ -127,7 +126,7 @@ class Figure(ABC):
 def statements() -> dict[str, dict[str, Any]]:
     """Map each figure's name to its texts: title, setup, notes, and the paper's sentences under claims."""
     texts: dict[str, dict[str, Any]] = {}
-    for part in ("afr", "robofleet", "own"):
+    for part in ("afr", "robofleet"):
         with (Path(__file__).parent / f"{part}.toml").open("rb") as file:
             texts |= tomllib.load(file)
     return texts
@@ -158,13 +157,11 @@ def source(text: Mapping[str, Any]) -> str:
 
 
 def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """Fill in the facts and wrap each paragraph; paragraphs that begin with spaces stay indented."""
-    lines: list[str] = []
-    for paragraph in text.format(**facts).rstrip().split("\n\n"):
-        indent = " " * (len(paragraph) - len(paragraph.lstrip(" ")))
-        words = " ".join(paragraph.split())
-        lines += textwrap.wrap(words, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
-    return lines
+    """Fill in the facts and wrap each paragraph; what begins with spaces stays indented."""
+    indent = " " * (len(text) - len(text.lstrip(" ")))
+    wrapper = textwrap.TextWrapper(WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    paragraphs = text.format(**facts).split("\n\n")
+    return [line for paragraph in paragraphs for line in wrapper.wrap(" ".join(paragraph.split()))]
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ link, so the fade comes earlier by as much. k runs from 0, the paper's alignment
 from __future__ import annotations
 
 import functools
+import math
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,9 +22,12 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bufgym import traces
-from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES, STYLES
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
+from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES
+from bufgym.papers.extra import library
 from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views
@@ -36,16 +40,17 @@ RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect"}
 """Name -> description of the recording; 7-scenes needs a folder of recordings."""
 
 POLICIES = {
-    "drop-oldest": STYLES["drop-oldest"],
-    "random": STYLES["random"],
-    IMAGES: ("ORBBuf, images", COLOURS["pink"], "D"),
-    "orbbuf": ("ORBBuf, motion", "#882255", "d"),
-    "afr": STYLES["afr"],
-    "min-motion-gap": ("min-motion-gap", COLOURS["orange"], "v"),
-    "learned-motion": ("learned-motion", COLOURS["sky"], "P"),
-    "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"], "*"),
+    "drop-oldest": ("Drop Oldest", COLOURS["drop-oldest"]),
+    "random": ("Random", COLOURS["random"]),
+    IMAGES: ("ORBBuf, images", COLOURS["pink"]),
+    "orbbuf": ("ORBBuf, motion", "#882255"),
+    "afr": ("AFR", COLOURS["afr"]),
+    "min-motion-gap": ("min-motion-gap", COLOURS["orange"]),
+    "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"]),
 }
-"""Policy -> label, colour, marker. The clairvoyant plans for motion QoI."""
+"""Policy -> label, colour. The clairvoyant plans for motion QoI."""
+RESAMPLES, CONFIDENCE = 1000, 0.95
+"""Bootstrap of a rank correlation."""
 
 
 def fade() -> Trace:
@@ -162,3 +167,21 @@ class FrameFigure(Figure):
                 f"of which the link {self.link.name} carries {carried / demand:.0%}."
             )
         return "\n\n".join(parts)
+
+
+def spearman(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Correlate two samples by rank; the result is in [-1, 1], or NaN if one sample does not vary."""
+    if np.ptp(a) == 0 or np.ptp(b) == 0:
+        return math.nan
+    return float(library("scipy.stats").spearmanr(a, b).statistic)
+
+
+def spearman_over(a: NDArray[np.float64], b: NDArray[np.float64], group: NDArray[np.int64], label: str) -> Interval:
+    """Correlate with a bootstrap interval that draws whole groups, because members of a group are dependent."""
+    members = [np.flatnonzero(group == g) for g in np.unique(group)]
+    rng = stream(0, label)
+    numbers = [spearman(a, b)]
+    for _ in range(RESAMPLES):
+        drawn = np.concatenate([members[k] for k in rng.integers(0, len(members), len(members))])
+        numbers.append(spearman(a[drawn], b[drawn]))
+    return percentile_interval(np.array(numbers), CONFIDENCE)

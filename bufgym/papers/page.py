@@ -17,9 +17,8 @@ from bufgym.papers.figure import facts_of, source, statements
 PAPERS = {
     "afr": "AFR [wang2022afr]",
     "robofleet": "Robofleet [sikand2021robofleet]",
-    "small": "Beside the papers: a link small enough to be solved",
 }
-"""Prefix of a section's name -> the paper with its key in references.bib, or our own claims."""
+"""Prefix of a section's name -> the paper with its key in references.bib."""
 
 VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}
 

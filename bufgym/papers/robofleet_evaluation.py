@@ -120,10 +120,6 @@ class Sent:
         """Select the messages that arrived at the sender in this time."""
         return self._only(np.flatnonzero((from_s <= self.arrival_s) & (self.arrival_s < until_s)))
 
-    def received_hz(self, until_s: float) -> float:
-        """Messages a second that reached the server by ``until_s``."""
-        return float((self.received_s <= until_s).sum() / until_s)
-
     def _only(self, kept: NDArray[np.intp]) -> Sent:
         return Sent(self.topic[kept], self.consumer[kept], self.arrival_s[kept], self.received_s[kept])
 

@@ -26,11 +26,7 @@ from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")
 RATES_HZ = {"PointCloud2": 5.0, "CompressedImage": 2.0, "LaserScan": 10.0}
-KIND_COLOURS = {
-    "PointCloud2": COLOURS["afr"],
-    "CompressedImage": COLOURS["drop-oldest"],
-    "LaserScan": COLOURS["random"],
-}
+KIND_COLOURS = dict(zip(RATES_HZ, (COLOURS["afr"], COLOURS["drop-oldest"], COLOURS["random"]), strict=True))
 PAPER_RATIO = 5.0
 ABOUT = (4.0, 6.0)
 """Range of ratios that we accept as "about 5 times"."""
@@ -87,8 +83,6 @@ class Reproduction(CloudFigure):
         ratios = {key: ratio(cell) for key, cell in cells.items()}
         about = [key for key, r in ratios.items() if ABOUT[0] <= r <= ABOUT[1]]
         less = sum(r < ABOUT[0] for r in ratios.values())
-        finite = [cell for cell in cells.values() if min(cell) > 0 and math.isfinite(cell[0])]
-        nearer = [abs(math.log(cell[2] / cell[0])) < abs(math.log(cell[1] / cell[2])) for cell in finite]
         lengths = {
             group: ", ".join(f"{d:g} s" for *g, d in about if (*g,) == group)
             for group in dict.fromkeys((kind, mbit) for kind, mbit, _ in about)
@@ -105,8 +99,6 @@ class Reproduction(CloudFigure):
             "less": less,
             "more": len(cells) - less - len(about),
             "about": "; ".join(f"{kind} at {mbit:g} Mbit/s {shown}" for (kind, mbit), shown in lengths.items()),
-            "nearer": sum(nearer),
-            "finite": len(finite),
         }
 
     def tables(self, rows: Rows) -> list[str]:

@@ -121,7 +121,6 @@ class Reproduction(ClientFigure):
 
     def claims(self, rows: Rows) -> dict[str, Any]:
         first = rows.where(image_priority=self.image_priorities[0], bad_mbit_per_s=self.shown)
-        native = first.where(sender="ros-native", topic="PoseStamped")
         lost = sum(row["lost"] for row in rows.where(sender="robofleet", topic="PoseStamped"))
         medians = (
             f"{PROGRAMS[name].label.split(',')[0]} "
@@ -152,9 +151,6 @@ class Reproduction(ClientFigure):
             "topics": "; ".join(_rules_of(kind) for kind in TOPICS),
             "demand": sum(BYTES[kind][1] * hz for kind, (hz, _) in TOPICS.items()) / MBIT,
             "shown": self.shown,
-            "native_lost": native.mean("lost_in_zone") / native.mean("arrived_in_zone"),
-            "pose_mbit": BYTES["PoseStamped"][0] * TOPICS["PoseStamped"][0] / MBIT,
-            "third": self.shown / len(TOPICS),
             "medians": ", ".join(medians),
         }
 

@@ -2,13 +2,12 @@
 
 The paper [sikand2021robofleet] names types and bytes, not contents. We build a message of each type that has the
 paper's bytes as ROS binary, then encode the same message in the other ways. The text states our own choices of beams,
-topics and content. PointCloud2, PoseStamped and Odometry are in the paper's experiments but not in its table.
+topics and content. PointCloud2 and PoseStamped are in the paper's experiments but not in its table.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -48,30 +47,23 @@ class Reproduction(Figure):
     """Beams of the LaserScan; its frame_id is made as long as the paper's size needs."""
     points: int = 10_000
     """Points of the PointCloud2, which the paper's table leaves out."""
-    point_step: int = 16
-    """Bytes per point."""
-    topic: str = "/robot/topic"
-    """Topic name written in the flatbuffer and the JSON."""
-    seed: int = 0
-    """Seed of every message's content."""
 
-    RULES = {"points": whole(1, 10**6), "point_step": whole(16, 256)}
+    RULES = {"points": whole(1, 10**6)}
     SIZE_INCHES = (9.0, 4.8)
 
     @cached_property
     def messages(self) -> dict[str, Content]:
         """Map each kind to the message that is encoded."""
-        messages = fitted(self.beams, self.seed)
+        messages = fitted(self.beams)
         for kind in KINDS:
-            cloud = {"points": self.points, "point_step": self.point_step}
-            parameters: dict[str, Any] = cloud if kind == "PointCloud2" else {}
-            messages.setdefault(kind, content(kind, seed=self.seed, **parameters))
+            parameters: dict[str, Any] = {"points": self.points} if kind == "PointCloud2" else {}
+            messages.setdefault(kind, content(kind, **parameters))
         return messages
 
     def simulate(self) -> Rows:
         rows = Rows()
         for (kind, message), encoding in itertools.product(self.messages.items(), ENCODINGS):
-            bytes_, paper = len(encode(kind, message, encoding, self.topic)), of_paper(kind, encoding)
+            bytes_, paper = len(encode(kind, message, encoding)), of_paper(kind, encoding)
             ratio = None if paper is None else f"{bytes_ / paper:.4f}"
             rows.append(
                 {"message": kind, "encoding": encoding, "bytes": bytes_, "paper_bytes": paper, "ours_to_paper": ratio}
@@ -104,68 +96,13 @@ class Reproduction(Figure):
                 (("ros", "ros1"), ("flatbuffer", "robofleet"), ("json", "json-numbers"))
             )
         }
-        others = {"others": ", ".join(kind for kind in sizes if kind not in PAPER)}
-        return equal | listed | others | self._contents() | self._flatbuffers(sizes) | self._json(sizes)
-
-    def _contents(self) -> dict[str, Any]:
-        """Give the choices with which the ROS binaries have the paper's bytes."""
         scan, fix, image = (self.messages[kind] for kind in PAPER)
-        beams, letters = len(scan["ranges"]), len(scan["header"]["frame_id"])
-        others = (f"{beams + (letters - n) // 4:,} and {n}" for n in range(letters % 4, 17, 4) if n != letters)
-        return {
-            "scan_letters": letters,
-            "other_scans": " or ".join(others),
+        contents = {
+            "scan_letters": len(scan["header"]["frame_id"]),
             "fix_letters": len(fix["header"]["frame_id"]),
             "jpeg_bytes": len(image["data"]),
         }
-
-    def _flatbuffers(self, sizes: dict[str, dict[str, int]]) -> dict[str, Any]:
-        """Compare flatbuffer sizes with the paper's, and find how much longer than ROS binary an image can be."""
-        added = [sizes[kind]["robofleet"] - sizes[kind]["robofleet-bare"] for kind in PAPER]
-        scan = self.messages["LaserScan"]
-        zero = len(encode("LaserScan", {**scan, "header": {**scan["header"], "seq": 0}}, "robofleet-bare"))
-        # Alignment in this table is at most 4 bytes, so these lengths cover all differences.
-        longer = []
-        for a, b, c, seq in itertools.product(*[range(4)] * 3, range(2)):
-            image = content("CompressedImage", frame_id="c" * a, format="f" * b, data_bytes=100 + c)
-            image["header"]["seq"] = seq
-            flat, ros = (len(encode("CompressedImage", image, encoding)) for encoding in ("robofleet-bare", "ros1"))
-            longer.append(flat - ros)
-        gap = PAPER["CompressedImage"][1] - PAPER["CompressedImage"][0]
-        return {
-            "least_added": min(added),
-            "most_added": max(added),
-            "over": ", ".join(f"{k} {sizes[k]['robofleet-bare'] - PAPER[k][1]:+d} bytes" for k in PAPER),
-            "zero_scan": zero,
-            "zero_over": zero - PAPER["LaserScan"][1],
-            "image_gap": gap,
-            "least_longer": min(longer),
-            "most_longer": max(longer),
-            "possible": "They can" if min(longer) <= gap <= max(longer) else "So the paper's two numbers cannot",
-        }
-
-    def _json(self, sizes: dict[str, dict[str, int]]) -> dict[str, Any]:
-        """Compare JSON sizes with the paper's, and find message content that would make them equal."""
-
-        def bytes_(kind: str, **changed: Any) -> int:
-            return len(encode(kind, self.messages[kind] | changed, "json-numbers", self.topic))
-
-        image, (ros, _, paper) = sizes["CompressedImage"], PAPER["CompressedImage"]
-        nearest = min(("json", "json-numbers"), key=lambda encoding: abs(image[encoding] - paper))
-        full = sizes["LaserScan"]["json-numbers"]
-        null = bytes_("LaserScan", ranges=np.full_like(self.messages["LaserScan"]["ranges"], np.inf))
-        envelope = len(json.dumps({"op": "publish", "topic": self.topic, "msg": 0}, separators=(",", ":"))) - 1
-        return {
-            "paper_json": paper / ros,
-            "base64_json": image["json"] / ros,
-            "number_json": image["json-numbers"] / ros,
-            "nearest": nearest,
-            "nearest_ratio": image[nearest] / paper,
-            "paper_scan_json": PAPER["LaserScan"][2],
-            "no_return": (full - PAPER["LaserScan"][2]) / (full - null),
-            "fix_json": sizes["NavSatFix"]["json-numbers"] - envelope,
-            "zero_fix_json": bytes_("NavSatFix", position_covariance=np.zeros(9)) - envelope,
-        }
+        return equal | listed | contents | {"others": ", ".join(kind for kind in sizes if kind not in PAPER)}
 
     def draw(self, rows: Rows, figure: Any) -> None:
         sizes = sizes_of(rows)
@@ -200,20 +137,19 @@ def of_paper(kind: str, encoding: str) -> int | None:
     return PAPER[kind][COLUMN[encoding]] if kind in PAPER and encoding in COLUMN else None
 
 
-def fitted(beams: int, seed: int = 0) -> dict[str, Content]:
+def fitted(beams: int) -> dict[str, Content]:
     """Build a message of each of the paper's types whose ROS binary is as long as the paper's."""
 
-    def bytes_(kind: str, **parameters: Any) -> int:
-        return len(encode(kind, content(kind, **parameters), "ros1"))
+    def lacks(kind: str, **parameters: Any) -> int:
+        """Bytes that the paper's message has beyond this one."""
+        return PAPER[kind][0] - len(encode(kind, content(kind, **parameters), "ros1"))
 
-    letters = PAPER["LaserScan"][0] - bytes_("LaserScan", beams=beams, frame_id="")
+    letters = lacks("LaserScan", beams=beams, frame_id="")
     if not 0 <= letters <= MAX_FRAME_ID:
         rule = f"{PAPER['LaserScan'][0]} bytes would need a frame_id of {letters} letters, must be 0 to {MAX_FRAME_ID}"
         raise BufgymError(f"beams = {beams}: {rule}")
-    scan = content("LaserScan", beams=beams, frame_id="l" * letters, seed=seed)
-    letters = PAPER["NavSatFix"][0] - bytes_("NavSatFix", frame_id="")
-    fix = content("NavSatFix", frame_id="g" * letters, seed=seed)
-    least = 4
-    data_bytes = PAPER["CompressedImage"][0] - bytes_("CompressedImage", data_bytes=least) + least
-    image = content("CompressedImage", data_bytes=data_bytes, seed=seed)
-    return {"LaserScan": scan, "NavSatFix": fix, "CompressedImage": image}
+    return {
+        "LaserScan": content("LaserScan", beams=beams, frame_id="l" * letters),
+        "NavSatFix": content("NavSatFix", frame_id="g" * lacks("NavSatFix", frame_id="")),
+        "CompressedImage": content("CompressedImage", data_bytes=4 + lacks("CompressedImage", data_bytes=4)),
+    }

@@ -8,8 +8,6 @@ run of near neighbours, and later a hole as long as they took to send. So a mess
 neighbours then still lie no farther apart than the link sends at the fastest of its recent rates. No transmission is
 lost this way. The remaining room should fill up within ``HORIZON_US``, since messages waiting at the end of the stream
 are sent too; so the messages lie a little closer.
-
-On a small, exactly solved link, early drops make up most of the best policy's gain (``bufgym reproduce small-link``).
 """
 
 from __future__ import annotations

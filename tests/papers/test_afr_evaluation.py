@@ -1,41 +1,14 @@
-"""Fig. 6 to 8 of the AFR paper: facts of the recorded link, the policies' order, and small runs without recordings."""
+"""Fig. 6 of the AFR paper and the size of a frame: facts of the recorded link, and recordings that are missing."""
 
 import csv
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from bufgym.benchmark.run import draw
 from bufgym.cli import main
 from bufgym.ground.errors import BufgymError
-from bufgym.papers import NEEDS_DATA, afr_fig8_gap, figure, run
-from bufgym.papers import afr_evaluation as common
-from bufgym.scenario.suites import motion_value
+from bufgym.papers import NEEDS_DATA, figure, run
 from bufgym.traces import Trace, write_csv
-
-LTE = {"trace": "lte-synthetic-0"}
-SHIPPED: dict[str, Any] = {**LTE, "motion": ["drive-0"], "frames": 60, "capacities": (3,), "sweep_kb": (300,)}
-"""A small run that needs no folder of recordings."""
-
-
-def test_a_setting_for_each_size_and_camera(tmp_path: Path) -> None:
-    """60 frames last 2 s: 2 MB/s on average of 30 x 200 kB; the 6 MB/s later do not count."""
-    path = tmp_path / "link.csv"
-    write_csv(Trace.steps([(1, 3e6), (1, 1e6), (1, 6e6)], name="link"), path)
-    options: dict[str, Any] = {"trace": str(path), "motion": "drive-0", "frames": 60, "size_bytes": 200_000}
-    stream = figure("afr-fig7-qoi", **options, sweep_kb=(300, 100))
-    assert isinstance(stream, common.StreamFigure)
-    settings = stream.settings(timed=True)
-    sizes = [(kb, camera) for kb in (100, 200, 300) for camera in ("drive-0", "time")]
-    assert [(s.size_kb, s.camera) for s in settings] == sizes
-    assert settings[0].uplink.value == motion_value() and settings[0].uplink.max_messages == 60
-    assert stream.share_carried() == pytest.approx(1 / 3)
-    # Runs begin at the start of the link and anywhere on the camera.
-    (setting,) = (s for s in stream.settings(timed=False) if s.size_kb == 200)
-    episodes = [draw(setting.uplink, seed) for seed in range(3)]
-    assert all(e.link.offset_us == 0 for e in episodes)
-    assert len({float(e.arrivals["x"][-1]) for e in episodes}) == 3
 
 
 def test_fig6_names_the_seconds_under_500_KB_per_s(tmp_path: Path) -> None:
@@ -50,23 +23,12 @@ def test_fig6_names_the_seconds_under_500_KB_per_s(tmp_path: Path) -> None:
     assert not facts["low-seconds"] and facts["low_seconds"] == "1"
     assert fig6.tables(rows) == ["Second 1: 400.0 KB/s, from 1.00 to 2.00 s of the trace."]
     assert (facts["under"], facts["seconds"], facts["overload"]) == (1, 3, False)  # under the demand of 6 MB/s
+    assert facts["carried"] == pytest.approx(18.4 / 18)
     # Frames kept are counted by the second of their arrival.
     write_csv(Trace.constant(1e8, 30.0, name="wide"), path)
     rows = figure("afr-frame-size", trace=str(path), frames=750, capacities=(5,), runs=1, sweep_kb=(300,)).simulate()
     assert set(rows.column("dropped")) == {0}
     assert all(abs(row[f"kept_in_second_{s}"] - 30) <= 1 for row in rows for s in (21, 23))
-
-
-def test_fig8_counts_runs_whose_longest_gap_exceeds_the_threshold() -> None:
-    options: dict[str, Any] = SHIPPED | {"frames": 150, "size_bytes": 900_000}
-    rows = figure("afr-fig8-gap", **options, runs=2, more_runs=4).simulate().where(size_kb=900)
-    assert len(rows) == len(common.STYLES) * 4
-    gaps = sorted(float(r["longest_gap_views"]) for r in rows if r["policy"] == "drop-oldest")
-    assert len(set(gaps)) == 4
-    between = (gaps[1] + gaps[2]) / 2
-    assert afr_fig8_gap.failures(rows, between, policy="drop-oldest") == 50
-    assert afr_fig8_gap.failures(rows, gaps[-1], policy="drop-oldest") == 0  # exceeds, not reaches
-    assert afr_fig8_gap.failures(rows, gaps[0] - 1e-9, policy="drop-oldest", L=3) == 100
 
 
 def test_recordings_that_are_missing_are_named(tmp_path: Path) -> None:

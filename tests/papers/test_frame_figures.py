@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bufgym.papers import afr_fig7, afr_fig8, afr_overlap, frame_tasks
-from bufgym.papers.correlation import spearman, spearman_over
+from bufgym.papers.frame_runs import spearman, spearman_over
 from bufgym.papers.frame_tasks import FrameTask, carry_out
 from bufgym.papers.rows import Rows
 from bufgym.traces import Trace
@@ -48,7 +48,7 @@ def test_spearman() -> None:
 
 def fig8_claims(broken: dict[tuple[str, str, int], int], data: Path | None, *capacities: int) -> dict[str, Any]:
     """Claims where of ten runs so many fail: by recording, policy and L; none where nothing is said."""
-    policies = ("drop-oldest", "afr", "learned-motion")
+    policies = ("drop-oldest", "afr")
     rows = Rows(
         {"recording": r, "k": k, "L": L, "policy": p, "failed": k < broken.get((r, p, L), 0), "failed_at": None}
         for r in ("room", "7-scenes")[: 1 + (data is not None)]
@@ -62,20 +62,20 @@ def fig8_claims(broken: dict[tuple[str, str, int], int], data: Path | None, *cap
 
 
 def test_the_claims_of_fig8_count_failures(tmp_path: Path) -> None:
-    """Of ten runs at each of two L Drop Oldest breaks 6, AFR 2 and the agent 1, at L = 5 alone."""
-    broken = {("room", "drop-oldest", 5): 4, ("room", "drop-oldest", 15): 2, ("room", "afr", 5): 2}
-    broken["room", "learned-motion", 5] = 1
-    facts = fig8_claims(broken, None, 5, 15)
-    assert facts["counts"] == "room: Drop Oldest 6, AFR 2, learned-motion 1"
+    """Of ten runs at each of two L Drop Oldest breaks 6 and AFR 2, at L = 5 alone."""
+    facts = fig8_claims(
+        {("room", "drop-oldest", 5): 4, ("room", "drop-oldest", 15): 2, ("room", "afr", 5): 2}, None, 5, 15
+    )
+    assert facts["counts"] == "room: Drop Oldest 6, AFR 2"
     assert (facts["oldest_rate"], facts["afr_rate"]) == ("room 30%", "room 10%")
-    assert (facts["third_count"], facts["learned_count"]) == ("room 2 against 6", "room 1 against 2")
-    assert facts["third"] and facts["large"] and facts["learned"]
+    assert facts["third_count"] == "room 2 against 6"
+    assert facts["third"] and facts["large"]
     assert not facts["oldest"] and not facts["afr"]  # 30 % of the runs, and 10 %
-    # A claim holds on every recording: on 7-Scenes AFR breaks one and the agent two.
+    # A claim holds on every recording: on 7-Scenes AFR breaks one.
     (tmp_path / "rgbd_7scenes").mkdir()
     broken = {("room", "drop-oldest", 5): 5, ("7-scenes", "drop-oldest", 5): 5, ("7-scenes", "afr", 5): 1}
-    facts = fig8_claims(broken | {("7-scenes", "learned-motion", 5): 2}, tmp_path, 5)
-    assert facts["oldest"] and facts["third"] and not facts["learned"] and facts["large"] is None  # no L above 10
+    facts = fig8_claims(broken, tmp_path, 5)
+    assert facts["oldest"] and facts["third"] and facts["large"] is None  # no L above 10
     assert not facts["afr"] and facts["afr_rate"] == "room 0%; 7-scenes 10%"
 
 

@@ -24,8 +24,6 @@ SMALL: dict[str, dict[str, Any]] = {
     "afr-fig5": {"runs": 50 if JIT else 3, "last_T": 40 if JIT else 18},
     "afr-fig6": LTE,
     "afr-frame-size": SHORT,
-    "afr-fig7-qoi": {**SHORT, "motion": ["drive-0"]},
-    "afr-fig8-gap": {**SHORT, "motion": ["drive-0"], "more_runs": 3},
     "afr-vs-random": {"max_capacity": 8, "last_T": 20},
     "afr-theorems": {"max_capacity": 4, "last_T": 40},
     "afr-fig9": {"decisions": 1000, "calls": 100, "images": 3 if JIT else 0},
@@ -33,9 +31,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "afr-fig8": FRAMES,
     "afr-overlap": {**FRAMES, "capacity": 2, "distances": (1, 4, 8), "motions": (0.05, 0.1)},
     "afr-qoi-task": {**FRAMES, "offsets": 3},
-    "small-link": {"capacities": (2, 3), "runs": 3, "arrivals": 12, "depth": 3},
     "robofleet-table1": {"points": 50},
-    "robofleet-table2": {"topics": (1, 5), "rate_hz": 2, "seconds": 1},
     "robofleet-fig3": {"rates_hz": (5, 100), "duration_s": 0.5, "runs": 1},
     "robofleet-fig4": {"dropouts_s": (1,), "links_mbit_per_s": (100,), "kinds": ("CompressedImage",), "runs": 2},
     "robofleet-fig5": {"fall_s": 3, "stay_s": 1, "runs": 1},
@@ -47,12 +43,11 @@ SMALL: dict[str, dict[str, Any]] = {
 OF_FRAMES = [name for name, options in SMALL.items() if "offsets" in options]
 NEEDS_LIBRARIES = {
     "robofleet-table1": ("rosbags", "flatbuffers"),
-    "robofleet-table2": ("rosbags", "websockets", "re2"),
     **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy")),
 }
 
 CLAIMS = Path(__file__).parent.parent.parent / "docs" / "claims.md"
-SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9", "robofleet-table2"}
+SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in SLOW)) for n in FIGURES])
@@ -136,15 +131,9 @@ def test_unknown_names_and_unusable_options_are_refused() -> None:
         ("afr-fig99", {}, "unknown figure 'afr-fig99'; did you mean 'afr-fig9'"),
         ("afr-fig5", {"rums": 3}, "afr-fig5: no option 'rums'; it has: runs, last_T, seed"),
         ("afr-fig5", {"runs": 0}, "must be|need"),
-        ("afr-fig5", {"last_T": 0}, "must be|need"),
         ("afr-fig2", {"turn_degrees": 0}, "must be|need"),
-        ("afr-fig9", {"calls": 0}, "must be|need"),
-        ("afr-theorems", {"max_capacity": 0}, "must be|need"),
         ("afr-vs-random", {"last_T": 3}, "must be|need"),
         ("afr-fig6", LTE | {"size_bytes": 0}, "size_bytes = 0"),
-        ("afr-fig7-qoi", SHORT | {"runs": 0}, "runs = 0"),
-        ("afr-fig7-qoi", SHORT | {"motion": "freiburg1_desk"}, "tum_rgbd/freiburg1_desk.groundtruth"),
-        ("afr-fig8-gap", SHORT | {"motion": ["drive-0"], "runs": 5, "more_runs": 4}, "runs = 5, more_runs = 4"),
         *((f"robofleet-fig{k}", {"runs": 0}, "runs = 0: must be a whole number >= 1") for k in range(3, 8)),
         *((f"robofleet-fig{k}", {"round_trip_ms": -1}, "round_trip_ms = -1: must be a n") for k in range(3, 8)),
         ("robofleet-fig4", {"kinds": ("Laser",)}, "must be some of PointCloud2, CompressedImage, LaserScan"),

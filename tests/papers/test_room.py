@@ -24,15 +24,15 @@ def scene(*things: list[float], balls: int | None = None, stride: int = SMALL) -
 
 def test_a_wall_ahead_is_three_metres_away_in_every_pixel() -> None:
     """z is measured along the axis, not along the ray; above and below the ceiling and floor come nearer."""
-    depth = scene().true_depth(0)
+    depth = scene().rendered(0, noisy=False)[0]
     assert depth[8:17] == pytest.approx(np.full((9, 32), 3.0))
     # The topmost row looks up by 240 / 585: the ceiling, 1 m above, is 585 / 240 = 2.4375 m away.
     assert depth[0] == pytest.approx(np.full(32, 2.4375))
     # A ball's nearest point is its radius before its centre; a box turned by 45 degrees shows its edge.
     ball, turn = scene([4.5, 2, 1, 0.25, 0, 0, 0, 0], balls=1), np.pi / 4
-    assert ball.true_depth(0)[12, 16] == pytest.approx(1.25)
+    assert ball.rendered(0, noisy=False)[0][12, 16] == pytest.approx(1.25)
     box = scene([4.5, 2, 1, 0.5, 0.5, 0.5, np.cos(turn), np.sin(turn)])
-    assert box.true_depth(0)[12, 16] == pytest.approx(1.5 - np.sqrt(0.5))
+    assert box.rendered(0, noisy=False)[0][12, 16] == pytest.approx(1.5 - np.sqrt(0.5))
 
 
 def test_a_kinects_depth_has_steps_and_shadows() -> None:

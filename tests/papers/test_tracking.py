@@ -86,7 +86,7 @@ def test_a_known_movement_is_found_again() -> None:
     moved[:3, 3] = 0.03, 0.02, 0.01
     poses = np.stack([still.poses[0], still.poses[0] @ moved])
     sequence = MadeUpRoom("moved", still.scene, still.time_us, poses, 0, stride=4)
-    depths = [sequence.true_depth(k) for k in range(2)]
+    depths = [sequence.rendered(k, noisy=False)[0] for k in range(2)]
     grid = VoxelGrid((-0.2, -0.2, -0.2), (136, 116, 76))
     tracker = Tracker(sequence.camera, grid)
     tracker.add(depths[0], poses[0])

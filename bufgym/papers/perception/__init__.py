@@ -25,13 +25,13 @@ __all__ = [
 ]
 # fmt: on
 
-_MODULES = {
-    "frames": ("Sequence",),
-    "recordings": ("open_sequence",),
-    "mapping": ("fuse", "grid_of", "map_error", "points_of"),
-    "orb": ("OrbSimilarity", "orbbuf_by"),
-    "room": ("made_up_room",),
-    "tracking": ("Tracker", "difference", "jumped", "track"),
-    "views": ("Coverage", "seen_shares"),
-}
-__getattr__ = on_demand(__name__, **{name: module for module, names in _MODULES.items() for name in names})
+__getattr__ = on_demand(
+    __name__,
+    **dict.fromkeys(("fuse", "grid_of", "map_error", "points_of"), "mapping"),
+    **dict.fromkeys(("OrbSimilarity", "orbbuf_by"), "orb"),
+    **dict.fromkeys(("Tracker", "difference", "jumped", "track"), "tracking"),
+    **dict.fromkeys(("Coverage", "seen_shares"), "views"),
+    Sequence="frames",
+    made_up_room="room",
+    open_sequence="recordings",
+)

@@ -80,7 +80,7 @@ COMPARED: Final = 3
 """Further images that the last of so many decisions compares."""
 
 
-def decision_ms(sequence: Sequence, decisions: int = 50) -> NDArray[np.float64]:
+def decision_ms(sequence: Sequence, decisions: int) -> NDArray[np.float64]:
     """float64[decisions]: times of one decision as the paper has it, ms.
 
     A message went and one came: the features of the new image are computed, and the similarity of each neighbour of

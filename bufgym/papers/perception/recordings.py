@@ -17,7 +17,7 @@ from collections.abc import Sequence as Seq
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -49,25 +49,7 @@ _ENDS: Final = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
 """First bytes of an image file -> last bytes of a complete one."""
 
 
-class ZippedFile(NamedTuple):
-    """An image file in an archive."""
-
-    archive: zipfile.ZipFile
-    path: Path
-
-    def content(self) -> bytes:
-        """Read the file."""
-        try:
-            if self.archive.getinfo(self.path.name).file_size > _MOST_IMAGE_BYTES:
-                raise BufgymError(f"{self.path}: must be at most {_MOST_IMAGE_BYTES} bytes")
-            return self.archive.read(self.path.name)
-        except KeyError:
-            raise BufgymError(f"{self.path}: no such file, but a pose") from None
-        except (zipfile.BadZipFile, OSError, EOFError) as error:
-            raise BufgymError(f"{self.path}: damaged ({error})") from None
-
-
-File = Path | ZippedFile
+File = Path | zipfile.Path
 
 
 @dataclass(eq=False)
@@ -87,35 +69,42 @@ class ImageFiles(Sequence):
     def depth(self, k: int) -> Depth:
         units = self._decoded(self.depths[k])
         if units.dtype != np.uint16 or units.ndim != 2:
-            raise BufgymError(f"{_named(self.depths[k])}: must be a depth image, 16 bits a pixel, one channel")
+            raise BufgymError(f"{self.depths[k]}: must be a depth image, 16 bits a pixel, one channel")
         units[units == 65535] = 0  # some recorders write that for "nothing measured"
         return (units / self.units_per_m).astype(np.float32)
 
     def image(self, k: int) -> Image:
         image = self._decoded(self.images[k])
         if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)):
-            raise BufgymError(f"{_named(self.images[k])}: must be a picture, 8 bits, one channel or three")
+            raise BufgymError(f"{self.images[k]}: must be a picture, 8 bits, one channel or three")
         return image
 
     def _decoded(self, file: File) -> np.ndarray:
-        data = file.content() if isinstance(file, ZippedFile) else read_whole(file, _MOST_IMAGE_BYTES)
+        data = read_whole(file, _MOST_IMAGE_BYTES) if isinstance(file, Path) else _unzipped(file)
         end = next((end for begin, end in _ENDS.items() if data.startswith(begin)), None)
         if end is None:
-            raise BufgymError(f"{_named(file)}: must be a PNG or JPEG image")
+            raise BufgymError(f"{file}: must be a PNG or JPEG image")
         pixels = None
         if end in data[-64:]:  # of a cut file the library would guess the rest, or write to the terminal
             cv2 = library("cv2")
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None:
-            raise BufgymError(f"{_named(file)}: truncated or damaged: must be a whole image")
+            raise BufgymError(f"{file}: truncated or damaged: must be a whole image")
         if pixels.shape[:2] != (self.camera.height, self.camera.width):
             size, rule = f"{pixels.shape[1]} x {pixels.shape[0]}", f"must be {self.camera.width} x {self.camera.height}"
-            raise BufgymError(where(str(_named(file)), None, size, rule, field="size"))
+            raise BufgymError(where(str(file), None, size, rule, field="size"))
         return np.asarray(pixels)
 
 
-def _named(file: File) -> Path:
-    return file.path if isinstance(file, ZippedFile) else file
+def _unzipped(file: zipfile.Path) -> bytes:
+    try:
+        if file.root.getinfo(file.at).file_size > _MOST_IMAGE_BYTES:
+            raise BufgymError(f"{file}: must be at most {_MOST_IMAGE_BYTES} bytes")
+        return file.read_bytes()
+    except KeyError:
+        raise BufgymError(f"{file}: no such file, but a pose") from None
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise BufgymError(f"{file}: damaged ({error})") from None
 
 
 def open_sequence(path: str | PathLike[str]) -> Sequence:
@@ -157,7 +146,7 @@ def _packed(folder: Path, depth: Path) -> Sequence:
             raise BufgymError(f"{path}: no such file") from None
         except (zipfile.BadZipFile, OSError) as error:
             raise BufgymError(f"{path}: truncated, or no zip archive ({error})") from None
-        files.append([ZippedFile(archive, path / f"{k:04d}.{kind}") for k in range(len(lines))])
+        files.append([zipfile.Path(archive, f"{k:04d}.{kind}") for k in range(len(lines))])
     depths, images = files
     return ImageFiles(folder.name, camera, _at_30_hz(len(lines)), poses, depths, images)
 

@@ -66,12 +66,8 @@ class MadeUpRoom(Sequence):
     def image(self, k: int) -> Image:
         return self.rendered(k)[1]
 
-    def true_depth(self, k: int) -> Depth:
-        """The depth of frame k without a Kinect's noise and gaps."""
-        return self.rendered(k, noisy=False)[0]
-
     def rendered(self, k: int, noisy: bool = True) -> tuple[Depth, Image]:
-        """Depth and picture of frame k."""
+        """Depth and picture of frame k; without ``noisy`` the depth is true, with no gaps."""
         if not 0 <= k < len(self):
             raise BufgymError(f"frame {k}: must be from 0 to {len(self) - 1}")
         shape = (self.camera.height, self.camera.width)

@@ -110,36 +110,33 @@ class Coverage:
     message by message. Coverage measures runs and rewards them at their end.
     """
 
-    def __init__(self, sequence: Sequence, cell_m: float = CELL_M, least_views: int = LEAST_VIEWS) -> None:
+    def __init__(self, sequence: Sequence, least_views: int = LEAST_VIEWS) -> None:
         """Look at every frame of the sequence once.
 
         Raises:
             BufgymError: no cell was seen by so many frames.
         """
-        cells = [np.unique(_cells(sequence, k, cell_m)) for k in range(len(sequence))]
+        cells = [np.unique(_cells(sequence, k)) for k in range(len(sequence))]
         every, number, views = np.unique(np.concatenate(cells), return_inverse=True, return_counts=True)
         frame = np.repeat(np.arange(len(cells)), [len(rows) for rows in cells])
         counts = views >= least_views
         if not counts.any():
-            raise BufgymError(f"{sequence.name}: no cell of {cell_m:g} m was seen by {least_views} of its frames")
+            raise BufgymError(f"{sequence.name}: no cell of {CELL_M:g} m was seen by {least_views} of its frames")
         saw = np.zeros((len(cells), len(every)), np.bool_)
         saw[frame, number] = True
         self._saw = np.packbits(saw[:, counts], axis=1)
         self.cells = int(counts.sum())
         """Number of cells that count."""
 
-    def seen(self, frames: Iterable[int]) -> NDArray[np.uint8]:
-        """Cells that these frames have seen, a bit for each."""
-        return np.asarray(np.bitwise_or.reduce(self._saw[np.fromiter(frames, np.int64)], axis=0), np.uint8)
-
     def share(self, frames: Iterable[int]) -> float:
         """Part of all cells that these frames have seen, in [0, 1]."""
-        return int(np.bitwise_count(self.seen(frames)).sum()) / self.cells
+        seen = np.bitwise_or.reduce(self._saw[np.fromiter(frames, np.int64)], axis=0)
+        return int(np.bitwise_count(seen).sum()) / self.cells
 
 
-def _cells(sequence: Sequence, k: int, cell_m: float) -> NDArray[np.int64]:
+def _cells(sequence: Sequence, k: int) -> NDArray[np.int64]:
     """Cell of each point that frame k measured, 20 bits for each of x, y and z, int64[points]."""
     pose = sequence.poses[k]
     world = points_of(sequence.depth(k), sequence.camera, near_m=0.0, far_m=np.inf) @ pose[:3, :3].T + pose[:3, 3]
-    x, y, z = np.floor(world / cell_m).astype(np.int64).T + 2**19
+    x, y, z = np.floor(world / CELL_M).astype(np.int64).T + 2**19
     return np.asarray((x << 40) + (y << 20) + z, np.int64)

@@ -1,13 +1,7 @@
 """Scenario and rewards of `bufgym/Mapping-v0`: a made-up room is filmed, and the reward is the frames' worth.
 
-Every episode sends the same recording of a made-up room over a different part of a shipped link. At its end each of
-these terms rates the frames that arrived, in [0, 1]:
-
-| term | meaning | for |
-|---|---|---|
-| `covered` | the part of the scene that some frame has seen | a map; the default |
-| `followed` | the least part of a frame that the one before it has seen | fast stand-in for tracking |
-| `tracked` | how far tracking gets along the frames, as a part of all | tracking, seconds an episode |
+Every episode sends the same recording of a made-up room over a different part of a shipped link. At its end the terms
+`covered`, `followed` and `tracked` rate the frames that arrived, in [0, 1].
 
 Train on `followed` and evaluate with `tracked`: ``reward={"followed": 1, "tracked": 0}`` reports `tracked` without
 counting it.
