@@ -33,7 +33,7 @@ FIXED = {"afr": "blue", "drop-oldest": "vermillion", "clairvoyant": "ink"}
 SPARE = ("green", "orange", "purple", "sky")
 """Colours of the best other policies, in order."""
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     **{"svg.fonttype": "none", "svg.hashsalt": "bufgym", "text.parse_math": False, "font.size": 9},
     **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), PALETTE["ink"]),
     **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), PALETTE["axis"]),

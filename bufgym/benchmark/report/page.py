@@ -38,7 +38,7 @@ def html(run: SuiteRun, summary: Summary) -> str:
     template = "summary" if summary.scores is None else "scores"
     return environment.get_template(f"{template}.html.jinja").render(
         charts={chart.id: chart for chart in drawn},
-        css=jinja2.utils.markupsafe.Markup(_asset("page.css")),
+        css=_asset("page.css"),
         manifest=run.manifest,
         summary=summary,
         intro=[run.manifest["about"], *tables.intro(run)[1:]],
