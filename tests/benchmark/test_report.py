@@ -15,7 +15,7 @@ from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
 from bufgym.benchmark import report
-from bufgym.benchmark.report import charts
+from bufgym.benchmark.report import timeline
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import FleetScenario, suites
@@ -114,12 +114,12 @@ def shortened(scenario: Any) -> Any:
 def test_outcomes_and_the_longest_gap_by_hand() -> None:
     """0, 2 and 4 arrive: steps in x of 1.0 and 3.5. What was dropped between 2 and 4 lies in the longest gap."""
     lane = {"received": [[0, 0, 0], [2, 0, 0], [4, 0, 0]], "dropped": [[1, 2.0], [3, 3.0]]}
-    gap = charts.longest_gap(TIMELINE["x"], [0, 2, 4])
+    gap = timeline.longest_gap(TIMELINE["x"], [0, 2, 4])
     assert gap == (2, 4)
-    kept, dropped, in_gap, left = charts.KEPT, charts.DROPPED, charts.IN_GAP, charts.LEFT
-    assert charts.log(6, lane, gap) == [kept, dropped, kept, in_gap, kept, left]
-    assert charts.longest_gap(TIMELINE["x"], [3]) is None
-    assert charts.longest_gap([0, 1, 2], [0, 1, 2]) == (0, 1)  # the first of equals
+    kept, dropped, in_gap, left = timeline.KEPT, timeline.DROPPED, timeline.IN_GAP, timeline.LEFT
+    assert timeline.log(6, lane, gap) == [kept, dropped, kept, in_gap, kept, left]
+    assert timeline.longest_gap(TIMELINE["x"], [3]) is None
+    assert timeline.longest_gap([0, 1, 2], [0, 1, 2]) == (0, 1)  # the first of equals
 
 
 def refusal(folder: Path) -> str:

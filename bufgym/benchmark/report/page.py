@@ -8,13 +8,13 @@ from importlib.resources import files
 from bufgym.benchmark import table
 from bufgym.benchmark.bootstrap import CONFIDENCE, RESAMPLES
 from bufgym.benchmark.folder import SuiteRun
-from bufgym.benchmark.report import charts, tables
+from bufgym.benchmark.report import charts, tables, timeline
 from bufgym.benchmark.report.charts import Context
 from bufgym.benchmark.score import DISCRIMINATIVE, REFERENCE, CellScore
 from bufgym.benchmark.summary import Summary, title
 from bufgym.ground.errors import BufgymError, install
 
-CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, charts.timeline)
+CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, timeline.timeline)
 """Functions that make the charts; each returns None if the run has nothing to show."""
 
 
