@@ -14,7 +14,7 @@ QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "-
 QUIET += ["--disable-component-update", "--disable-sync"]
 
 
-def embedded(page: str, pattern: str = r'<script type="application/json" id="figures">(.*?)</script>') -> Any:
+def embedded(page: str, pattern: str) -> Any:
     """The data in a page's text, of which nothing ends its script."""
     (found,) = re.findall(pattern, page, re.MULTILINE)
     assert "<" not in found

@@ -19,7 +19,6 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common import env_util
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor, get_monitor_files
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 import bufgym
 from bufgym.benchmark.run import draw
@@ -132,22 +131,20 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
         envs.set_options([{}, {}])
 
 
-def test_the_arguments_of_stable_baselines3s_own(tmp_path: Path) -> None:
+def test_a_monitor_file(tmp_path: Path) -> None:
     """T = 20 always: each episode has 20 decisions, and what it delivers is written to the folder as Monitor does."""
-    twice = gym.wrappers.vector.TransformReward
-    given: dict[str, Any] = {"env_kwargs": {"t_max": 20, "law": "fixed"}, "capacity": L, "seed": 5, "start_index": 2}
-    given |= {"wrapper_class": twice, "wrapper_kwargs": {"func": lambda reward: 2 * reward}}
-    given |= {"monitor_kwargs": {"info_keywords": ("qoi", "dropped")}, "monitor_dir": str(tmp_path)}
-    envs = make_vec_env("bufgym/Interruption-v0", n_envs=3, **given)
-    assert envs.num_envs == 3 and envs.env_is_wrapped(twice) == [True] * 3
+    given: dict[str, Any] = {"t_max": 20, "law": "fixed", "capacity": L, "seed": 5}
+    keywords = ("qoi", "dropped")
+    envs = make_vec_env("bufgym/Interruption-v0", 3, monitor_dir=str(tmp_path), info_keywords=keywords, **given)
+    assert envs.num_envs == 3
     envs.reset()
     for _ in range(40):
         *_, infos = envs.step(np.full(3, L + 1))
-    assert infos[0]["episode"]["r"] == pytest.approx(2 * (infos[0]["qoi"] - 1))
+    assert infos[0]["episode"]["r"] == pytest.approx(infos[0]["qoi"] - 1)
     assert infos[0]["episode"]["dropped"] == infos[0]["dropped"] == 20 - L
     envs.close()
     (file,) = get_monitor_files(str(tmp_path))  # which ``load_results`` reads with pandas
-    assert Path(file).name == "2.monitor.csv" and len([*tmp_path.iterdir()]) == 1
+    assert Path(file).name == "0.monitor.csv" and len([*tmp_path.iterdir()]) == 1
     header, *lines = Path(file).read_text().splitlines()
     assert json.loads(header[1:])["env_id"] == "bufgym/Interruption-v0"
     results = list(csv.DictReader(lines))
@@ -156,51 +153,16 @@ def test_the_arguments_of_stable_baselines3s_own(tmp_path: Path) -> None:
     assert [float(row["r"]) for row in results] == pytest.approx([infos[0]["episode"]["r"]] * 6, abs=1e-6)
 
 
-FLATTEN = gym.wrappers.FlattenObservation
-
-
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("id", "settings", "says"),
     [
-        ({"vec_env_cls": DummyVecEnv}, "the native batch is the VecEnv"),
-        ({"wrapper_class": FLATTEN}, "wrapper_class = FlattenObservation: a native batch takes"),
-        ({"wrapper_class": lambda env: env}, "wrapper_class = <lambda>"),
-        ({"wrapper_kwargs": {"a": 1}}, "no wrapper_class"),
-        ({"monitor_kwargs": {"reset_keywords": ("a",)}}, "monitor_kwargs['reset_keywords']"),
-        ({"num_envs": 2}, "stable-baselines3 calls it n_envs"),
+        ("bufgym/Interruption-v0", {"num_envs": 2}, "stable-baselines3 calls it n_envs"),
+        ("CartPole-v1", {}, "has no native batch"),
     ],
 )
-def test_what_a_native_batch_cannot_do_is_an_error(arguments: dict[str, Any], says: str) -> None:
-    with pytest.raises(BufgymError) as caught:
-        make_vec_env("bufgym/Interruption-v0", **arguments)
-    assert says in str(caught.value)
-
-
-def test_what_has_no_native_batch_gets_stable_baselines3s_own(tmp_path: Path) -> None:
-    def make(**settings: Any) -> gym.Env[Any, Any]:
-        return gym.make("bufgym/Interruption-v0", **settings)
-
-    given = {"monitor_dir": str(tmp_path), "wrapper_class": FLATTEN, "env_kwargs": SMALL["bufgym/Interruption-v0"]}
-    envs = make_vec_env(make, 2, 0, **given)  # type: ignore[arg-type]
-    assert isinstance(envs, DummyVecEnv) and envs.env_is_wrapped(FLATTEN) == [True] * 2
-    envs.close()
-
-
-def test_any_vector_environment_that_resets_in_the_same_step_will_do() -> None:
-    envs = make_vec_env("CartPole-v1", 3, seed=0)
-    assert envs.reset().shape == (3, 4)  # type: ignore[union-attr]
-    ended = []
-    for _ in range(30):
-        _, _, dones, infos = envs.step(np.zeros(3, int))
-        ended += [infos[i] for i in np.flatnonzero(dones)]
-    assert ended and all(info["terminal_observation"].shape == (4,) for info in ended)
-    assert all(info["episode"]["r"] == info["episode"]["l"] for info in ended)
-    assert envs.get_attr("gravity", 1) == [9.8]
-    envs.set_attr("gravity", 5.0, indices=[1])
-    assert envs.get_attr("gravity") == [9.8, 5.0, 9.8]
-    assert envs.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * 3
-    assert not is_masking_supported(envs)
-    envs.close()
+def test_what_a_native_batch_cannot_do_is_an_error(id: str, settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(BufgymError, match=says):
+        make_vec_env(id, **settings)
     with pytest.raises(BufgymError, match="SAME_STEP"):
         GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2))
 
@@ -298,7 +260,7 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
     scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym/Uplink-v0", 2, **WORLD)
     with pytest.raises(BufgymError, match="policy ppo: trained for L = 3, not for L = 5; only a network that scores"):
         run(as_policy(untrained(PPO, "MultiInputPolicy")), [scenario.episode(20)], 5, scenario.value)
-    pole = untrained(PPO, "MlpPolicy", make_vec_env("CartPole-v1", 2)).policy
+    pole = untrained(PPO, "MlpPolicy", env_util.make_vec_env("CartPole-v1", 2)).policy
     flat = untrained(PPO, "MlpPolicy", flat_env())
     recurrent = RecurrentPPO("MultiInputLstmPolicy", uplink, batch_size=16, n_steps=8)
     for model, fields, says in (

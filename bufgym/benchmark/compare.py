@@ -132,11 +132,12 @@ def compare(
     """
     several = [policies] if isinstance(policies, str | Path | Policy) or callable(policies) else policies
     chosen = [make_policy(policy) for policy in several]
+    files = tuple(os.fspath(p) for p in several if isinstance(p, Path) or (isinstance(p, str) and sources.is_source(p)))
     capacities = [capacity] if isinstance(capacity, int) else list(capacity or ())
     if isinstance(on, str) and on in suites.SUITES:
         if settings:
             raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
-        return _on_suite(chosen, on, capacities, seeds, progress)
+        return _on_suite(chosen, files, on, capacities, seeds, progress)
     if isinstance(on, str) and on.isidentifier() and on not in scenario.SCENARIOS:
         close = difflib.get_close_matches(on, [*scenario.SCENARIOS, *suites.SUITES], 1)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join([*scenario.SCENARIOS, *suites.SUITES])}"
@@ -160,14 +161,24 @@ def compare(
     return Comparison(rows, about or label or repr(stream), shown.plain(), shown.markdown(), shown.html())
 
 
-def _on_suite(chosen: Sequence[Policy], name: str, capacities: Sequence[int], seeds: Any, progress: bool) -> Comparison:
-    """``compare`` on the test split of a suite. Its processes know policies by name, so they must be registered."""
-    if unknown := [policy.name for policy in chosen if policy.name not in policies.names() and ":" not in policy.name]:
-        raise BufgymError(f"policy {unknown[0]}: register it to run it on a suite, whose processes know it by name")
+def _on_suite(
+    chosen: Sequence[Policy], files: tuple[str, ...], name: str, capacities: Sequence[int], seeds: Any, progress: bool
+) -> Comparison:
+    """``compare`` on the test split of a suite. Its processes know policies by name, or load them from ``files``."""
+    registered = {*policies.names(), *policies.names(named_only=True)}
+    for policy in chosen:
+        base = policy.name.partition(":")[0]
+        if base not in registered or policies.get(base).on_arrival is not policy.on_arrival:
+            raise BufgymError(
+                f"policy {policy.name}: register it to run it on a suite, whose processes know it by name"
+            )
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
-    sweep = Sweep(suites.get(name).name, tuple(policy.name for policy in chosen), "test", tuple(capacities), seeds)
+    names = tuple(policy.name for policy in chosen)
+    sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=files)
+    # Other processes can't know what a user's own code registered in this one.
+    own = any(not policy.on_arrival.__module__.startswith("bufgym.") for policy in chosen) and not files
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        rows = run_sweep(sweep, out, form="csv", progress=progress)
+        rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
         return Comparison(rows, f"suite {name}", report.plain(out), report.markdown(out), report.html(out))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
+import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,18 +78,15 @@ def drops(
 def write_drops(drops: Iterable[Drop], path: Path | None) -> Counter[tuple[str, int, str]]:
     """Write drops as CSV, or nowhere if ``path`` is None; count them by policy, capacity and topic."""
     counts: Counter[tuple[str, int, str]] = Counter()
-    with contextlib.ExitStack() as stack:
-        writer: Any = None
-        if path is not None:
-            temporary = stack.enter_context(replaced(path))
-            writer = csv.writer(
-                stack.enter_context(temporary.open("w", encoding="utf-8", newline="")), lineterminator="\n"
-            )
-            writer.writerow(Drop._fields)
+    with (
+        nullcontext() if path is None else replaced(path) as target,
+        open(target or os.devnull, "w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(Drop._fields)
         for drop in drops:
             counts[drop.policy, drop.capacity, drop.topic] += 1
-            if writer is not None:
-                writer.writerow(drop)
+            writer.writerow(drop)
     return counts
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
+from bufgym.benchmark.table import Table
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT, compile_here
 from bufgym.sim import Senders
@@ -155,11 +156,10 @@ def _rollouts(sizes: Sizes) -> Iterator[Figure]:
 
 def report(figures: Sequence[Figure], repeats: int) -> str:
     """Figures beside their targets, then their definitions."""
-    rows = [
-        (f.name, f"{_human(f.value)} {f.unit}", f.target and f"(target {_human(f.target)} {f.unit})") for f in figures
+    measured = [
+        [f.name, f"{_human(f.value)} {f.unit}", f"{_human(f.target)} {f.unit}" if f.target else ""] for f in figures
     ]
-    widths = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
-    lines = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {target or ''}".rstrip() for name, value, target in rows]
+    lines = [Table(["", "measured", "target"], [("", measured)]).plain()]
     lines += ["", f"Best of {repeats} repeats each, one thread. Actions drawn beforehand among the valid ones."]
     if not JIT:
         lines.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")

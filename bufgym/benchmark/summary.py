@@ -64,9 +64,6 @@ class Summary:
             return len(self.cells)
         return self.scores.counted
 
-    def __str__(self) -> str:
-        return plain(self)
-
     @property
     def standings(self) -> dict[str, Standing]:
         """Over all cells, by policy."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
-from stable_baselines3.common import env_util
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
@@ -31,80 +30,45 @@ from bufgym.ground.errors import BufgymError
 
 
 def make_vec_env(
-    env_id: str | Callable[..., gym.Env[Any, Any]],
+    env_id: str,
     n_envs: int = 1,
     seed: int | None = None,
-    start_index: int = 0,
+    *,
     monitor_dir: str | None = None,
-    wrapper_class: Callable[..., Any] | None = None,
-    env_kwargs: dict[str, Any] | None = None,
-    vec_env_cls: type[Any] | None = None,
-    vec_env_kwargs: dict[str, Any] | None = None,
-    monitor_kwargs: dict[str, Any] | None = None,
-    wrapper_kwargs: dict[str, Any] | None = None,
-    **kwargs: Any,
+    info_keywords: Sequence[str] = (),
+    **settings: Any,
 ) -> VecEnv:
-    """Make ``n_envs`` environments for stable-baselines3, with the arguments of its own ``make_vec_env``.
+    """Make ``n_envs`` rows of a native batch for stable-baselines3.
 
-    The native batch is used if the id has one that can reset in the same step, as all of bufgym's can. Otherwise it is
-    stable-baselines3's own batch of single environments. With a ``seed``, environment i starts from seed + i at the
-    first reset. ``kwargs`` go to the environment, as ``env_kwargs`` do.
-
-    On the native batch ``monitor_dir`` gets one file, ``<start_index>.monitor.csv``, with the episodes of all rows;
-    ``load_results`` reads it. ``monitor_kwargs`` are ``info_keywords`` and ``override_existing``. ``wrapper_class`` is
-    a ``gymnasium.vector.VectorWrapper``. Wrappers of single environments and ``vec_env_cls`` are errors there.
+    Args:
+        env_id: an id whose native batch can reset in the same step, as all of bufgym's can.
+        n_envs: rows.
+        seed: row i starts from seed + i at the first reset.
+        monitor_dir: folder that gets one file, ``0.monitor.csv``, with the episodes of all rows; ``load_results`` reads
+            it.
+        info_keywords: entries of an episode's last info that the file and ``episode`` get besides.
+        settings: of the environment.
     """
-    own = _settings(env_kwargs) | kwargs
-    if "num_envs" in own:
-        raise BufgymError(f"num_envs = {own['num_envs']}: stable-baselines3 calls it n_envs")
+    if "num_envs" in settings:
+        raise BufgymError(f"num_envs = {settings['num_envs']}: stable-baselines3 calls it n_envs")
     if not _has_native_batch(env_id):
-        arguments = (start_index, monitor_dir, wrapper_class, own, vec_env_cls, vec_env_kwargs, monitor_kwargs)
-        return env_util.make_vec_env(env_id, n_envs, seed, *arguments, wrapper_kwargs)
-    if vec_env_cls is not None or vec_env_kwargs:
-        raise BufgymError(f"vec_env_cls and vec_env_kwargs: the native batch is the VecEnv; {_INSTEAD}")
-    envs: Any = gym.make_vec(
-        str(env_id),
-        n_envs,
-        vectorization_mode="vector_entry_point",
-        **{"autoreset_mode": AutoresetMode.SAME_STEP, **own},
-    )
-    if wrapper_class is not None:
-        if not (isinstance(wrapper_class, type) and issubclass(wrapper_class, VectorWrapper)):
-            name = getattr(wrapper_class, "__name__", repr(wrapper_class))
-            raise BufgymError(
-                f"wrapper_class = {name}: a native batch takes a gymnasium.vector.VectorWrapper; {_INSTEAD}"
-            )
-        envs = wrapper_class(envs, **_settings(wrapper_kwargs))
-    elif wrapper_kwargs:
-        raise BufgymError("wrapper_kwargs: there is no wrapper_class to give them to")
-    monitor = {"info_keywords": (), "override_existing": True, **_settings(monitor_kwargs)}
-    keywords, override = monitor.pop("info_keywords"), monitor.pop("override_existing")
-    for name in monitor:
-        raise BufgymError(
-            f"monitor_kwargs[{name!r}]: a native batch knows info_keywords, override_existing; {_INSTEAD}"
-        )
+        instead = "stable_baselines3.common.env_util.make_vec_env has single environments"
+        raise BufgymError(f"env_id = {env_id!r}: has no native batch that resets in the same step; {instead}")
+    options: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, **settings}
+    envs: Any = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **options)
     results = None
     if monitor_dir is not None:
-        header: dict[str, Any] = {"t_start": time.time(), "env_id": str(env_id)}
-        results = ResultsWriter(str(Path(monitor_dir) / str(start_index)), header, tuple(keywords), override)
-    batch = GymVecEnv(envs, results=results, info_keywords=keywords)
+        header: dict[str, Any] = {"t_start": time.time(), "env_id": env_id}
+        results = ResultsWriter(str(Path(monitor_dir) / "0"), header, tuple(info_keywords))
+    batch = GymVecEnv(envs, results=results, info_keywords=info_keywords)
     if seed is not None:
         batch.seed(seed)
-        batch.action_space.seed(seed + start_index)
+        batch.action_space.seed(seed)
     return batch
 
 
-_INSTEAD = "stable_baselines3.common.env_util.make_vec_env has single environments"
-
-
-def _settings(given: dict[str, Any] | None) -> dict[str, Any]:
-    return dict(given or {})
-
-
-def _has_native_batch(env_id: Any) -> bool:
+def _has_native_batch(env_id: str) -> bool:
     """Whether Gymnasium knows the id and a native batch of it that can reset in the same step."""
-    if not isinstance(env_id, str):
-        return False
     entry = gym.spec(env_id).vector_entry_point
     native = load_env_creator(entry) if isinstance(entry, str) else entry
     # Gymnasium's own native batches support NEXT_STEP only.

@@ -1,12 +1,15 @@
 """``bufgym.compare``: the same rows as the benchmark's, as text, Markdown, a data frame and a picture."""
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import bufgym
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
+from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import REJECT, registry
 
@@ -35,6 +38,22 @@ def test_a_scenario_by_name_or_made_and_policies_of_each_kind() -> None:
 def test_a_suite_by_name() -> None:
     done = bufgym.compare(["afr"], "interruption-v1", capacity=2, seeds=1, progress=False)
     assert {row["policy"] for row in done.rows} == {"afr", "drop-oldest"} and "afr" in done.table()
+
+
+def test_a_suite_takes_files_and_named_policies_and_those_registered_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A suite's processes load a file themselves; a policy registered in this process runs in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+    shipped = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
+    shutil.copy(shipped["learned-ppo"], "mine.safetensors")
+    options: dict[str, Any] = {"capacity": 2, "seeds": 1, "progress": False}
+    done = bufgym.compare([Path("mine.safetensors"), "learned-ppo"], "interruption-v1", **options)
+    assert {row["policy"] for row in done.rows} == {"mine", "learned-ppo", "drop-oldest"}
+    policies.register("stubborn")(stubborn)
+    done = bufgym.compare(stubborn, "interruption-v1", **options)
+    assert {row["policy"] for row in done.rows} == {"stubborn", "drop-oldest"}
 
 
 def test_a_picture() -> None:

@@ -268,7 +268,7 @@ def test_a_bad_sweep_writes_nothing(tmp_path: Path, small: Sweep, change: dict[s
 
 def test_the_command_line_prints_scores_and_the_report_reads_them(tmp_path: Path, small: Sweep, capsys: Capsys) -> None:
     pytest.importorskip("jinja2")
-    pytest.importorskip("plotly")
+    pytest.importorskip("matplotlib")
     out = tmp_path / "a folder"
     words = ["bench", "--suite", "small-v1", "--policies", "afr,random", "--backend", "sequential", "--out", out]
     said = shown(words, capsys)

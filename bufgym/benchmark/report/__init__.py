@@ -21,7 +21,7 @@ def write(folder: str | Path) -> Path:
     """Write ``report.html`` into the folder of a run; return its path.
 
     Raises:
-        BufgymError: for a folder without a run, a broken file in it, rows that can't be scored, or where plotly or
+        BufgymError: for a folder without a run, a broken file in it, rows that can't be scored, or where matplotlib or
             Jinja is not installed.
     """
     run, summary = _read(folder)

@@ -1,21 +1,44 @@
-"""Charts as plain dictionaries for plotly; every statistic in them comes from the summary."""
+"""Charts of the report, drawn by matplotlib as SVG for the page; every statistic in them comes from the summary."""
 
 from __future__ import annotations
 
+import io
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import Interval, written
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.folder import SuiteRun
-from bufgym.benchmark.report import style
-from bufgym.benchmark.report.style import Figure
 from bufgym.benchmark.score import CellScore
 from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.benchmark.table import REGRET_AT_MOST, means, percent
+from bufgym.ground.errors import BufgymError, install
+
+PALETTE = {
+    **{"ink": "#1b1f24", "grid": "#e7eaee", "axis": "#a3abb5", "muted": "#a2aab4"},
+    **{"blue": "#0072b2", "vermillion": "#d55e00", "green": "#009e73"},
+    **{"orange": "#c98500", "purple": "#b9568f", "sky": "#3f9fd6", "link": "#6b7681"},
+}
+"""Name of the style sheet's colour -> the light colour, which charts are drawn in. The page has the name in its place,
+so that a chart is light or dark with the page."""
+
+FIXED = {"afr": "blue", "drop-oldest": "vermillion", "clairvoyant": "ink"}
+"""Policies that look the same in every report."""
+
+SPARE = ("green", "orange", "purple", "sky")
+"""Colours of the best other policies, in order."""
+
+STYLE: dict[Any, Any] = {
+    **{"svg.fonttype": "none", "svg.hashsalt": "bufgym", "text.parse_math": False, "font.size": 9},
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), PALETTE["ink"]),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), PALETTE["axis"]),
+    **{"axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True},
+    **{"axes.grid": True, "grid.color": PALETTE["grid"], "legend.frameon": False},
+}
 
 
 @dataclass(frozen=True)
@@ -24,8 +47,7 @@ class Chart:
 
     id: str  # of its section
     alt: str  # text for readers who can't see it
-    choices: list[tuple[str, list[str]]]  # (label, options), the default option first
-    panels: Mapping[tuple[str, ...], list[Figure]]  # one option of each choice -> figures shown side by side
+    panels: list[tuple[str, str]]  # (what it is of, or nothing for a single one, SVG)
 
 
 @dataclass(frozen=True)
@@ -34,29 +56,62 @@ class Context:
 
     run: SuiteRun
     summary: Summary
-    colours: dict[str, str]  # of highlighted policies
+    colours: dict[str, str]  # names of highlighted policies' colours
 
     @classmethod
     def of(cls, run: SuiteRun, summary: Summary) -> Context:
-        ranked = [standing.policy for standing in summary.overall if standing.ranked]
-        return cls(run, summary, style.colours(ranked, summary.baseline))
+        fixed = dict(FIXED)
+        if summary.baseline not in fixed:
+            fixed[summary.baseline] = fixed.pop("drop-oldest")
+        others = [s.policy for s in summary.overall if s.ranked and s.policy not in fixed]
+        return cls(run, summary, {**fixed, **dict(zip(others, SPARE, strict=False))})
 
     @property
     def cells(self) -> list[CellScore]:
-        """Scores of every cell; empty without scores."""
-        return [] if self.summary.scores is None else self.summary.scores.cells
+        """Scores of every cell whose regret is known; empty without scores."""
+        cells = [] if self.summary.scores is None else self.summary.scores.cells
+        return [cell for cell in cells if not math.isnan(cell.regret.value)]
 
     def colour(self, policy: str) -> str:
-        return self.colours.get(policy, style.MUTED)
+        """Name of the colour."""
+        return self.colours.get(policy, "muted")
 
-    def order(self, policies: Sequence[str]) -> list[str]:
-        """Put muted policies first, so that highlighted ones are drawn on top."""
-        return sorted(policies, key=lambda name: name in self.colours)
+    def paint(self, policy: str) -> str:
+        """The colour that a chart is drawn in."""
+        return PALETTE[self.colour(policy)]
 
 
-def with_interval(value: Interval, write: Callable[[float], str]) -> str:
-    """Format value and interval."""
-    return " ".join(filter(None, written(value, write)))
+def svg(draw: Callable[[Any], None], height: float) -> str:
+    """Let ``draw`` fill a figure of 9 by ``height`` inches; return it as an SVG element."""
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise BufgymError(f"the report needs matplotlib and Jinja: {install('report')}") from None
+    out = io.StringIO()
+    with matplotlib.rc_context(STYLE):
+        figure = Figure((9, height), layout="constrained")
+        draw(figure)
+        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(out, format="svg", transparent=True, metadata=nothing)
+    names = {colour: name for name, colour in PALETTE.items()}
+    text = out.getvalue()
+    return re.sub(
+        r"(fill|stroke): (#[0-9a-f]{6})",
+        lambda found: f"{found[1]}: var(--{names[found[2]]})" if found[2] in names else found[0],
+        text[text.index("<svg") :],
+    )
+
+
+def set_lanes(axes: Any, names: Sequence[str]) -> None:
+    """One lane for each policy, the last on top."""
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(-0.7, len(names) - 0.3)
+    axes.tick_params(axis="y", length=0)
+
+
+def _lanes_height(names: Sequence[str]) -> float:
+    return 0.8 + 0.2 * max(len(names), 3)
 
 
 # --- ranking ---------------------------------------------------------------------------------------------------------
@@ -67,13 +122,15 @@ def ranking(context: Context) -> Chart | None:
     quantities = {quantity.key: quantity for quantity in context.summary.quantities}
     if not _known(context, quantities[context.summary.rank_by]):
         return None
-    panels = [
-        _dots(context, quantity, quantities.get("iqm") if quantity.key == "score" else None)
-        for quantity in quantities.values()
-        if quantity.drawn and _known(context, quantity)
-    ]
+    shown = [quantity for quantity in quantities.values() if quantity.drawn and _known(context, quantity)]
+    names = [standing.policy for standing in reversed(context.summary.overall)]
+
+    def draw(figure: Any) -> None:
+        for axes, quantity in zip(figure.subplots(1, len(shown), squeeze=False, sharey=True)[0], shown, strict=True):
+            _dots(context, axes, names, quantity, "iqm" if quantity.key == "score" else None)
+
     alt = "Each policy's place in the ranking with intervals; the numbers are in the table above"
-    return Chart("ranking", alt, [], {(): panels})
+    return Chart("ranking", alt, [("", svg(draw, _lanes_height(names)))])
 
 
 def _known(context: Context, quantity: Quantity) -> dict[str, Interval]:
@@ -86,7 +143,7 @@ def _known(context: Context, quantity: Quantity) -> dict[str, Interval]:
     }
 
 
-def _dots(context: Context, quantity: Quantity, second: Quantity | None) -> Figure:
+def _dots(context: Context, axes: Any, names: list[str], quantity: Quantity, second: str | None) -> None:
     """Draw one lane for each policy, with a tick for a second quantity. A line marks the baseline.
 
     Values more than two interquartile ranges beyond the quartiles are written at the edge.
@@ -94,128 +151,101 @@ def _dots(context: Context, quantity: Quantity, second: Quantity | None) -> Figu
     known, standings = _known(context, quantity), context.summary.standings
     first, third = np.percentile([value for value, *_ in known.values()], [25, 75]).tolist()
     floor, ceiling = first - 2 * (third - first) - 1e-3, third + 2 * (third - first) + 1e-3
-    inside = [interval for interval in known.values() if floor <= interval.value <= ceiling]
-    low, high = min(interval.low for interval in inside), max(interval.high for interval in inside)
-    low, high = low - 0.04 * (high - low) - 1e-6, high + 0.04 * (high - low) + 1e-6
-    data, notes = [], []
-    for policy, interval in known.items():
-        value, colour, name = interval.value, context.colour(policy), style.text(policy)
-        if interval not in inside:
-            edge: dict[str, Any] = {"x": low, "xanchor": "left", "xshift": 2}
-            if value > ceiling:
-                edge = {"x": high, "xanchor": "right", "xshift": -2}
+    for policy, (value, low, high) in known.items():
+        lane, colour = names.index(policy), context.paint(policy)
+        if not floor <= value <= ceiling:
             words = f"{quantity.write(value)} ▸" if value > ceiling else f"◂ {quantity.write(value)}"
-            notes.append(style.note(words, y=name, **edge))
+            place: dict[str, Any] = {"x": 0, "ha": "left"} if value < floor else {"x": 1, "ha": "right"}
+            axes.text(y=lane, s=words, va="center", transform=axes.get_yaxis_transform(), **place)
             continue
-        symbol = "circle" if standings[policy].ranked else "circle-open"
-        bars = {"type": "data", "symmetric": False, "color": colour, "thickness": 2, "width": 0}
-        bars |= {"array": [interval.high - value], "arrayminus": [value - interval.low]}
-        hover = f"<b>%{{y}}</b><br>{quantity.title} {with_interval(interval, quantity.write)}"
-        marker: dict[str, Any] = {"color": colour, "size": 9, "symbol": symbol}
-        data.append(style.scatter([value], [name], hover, marker=marker, error_x=bars))
-        if second is not None and not math.isnan(standings[policy][second.key].value):
-            beside = standings[policy][second.key]
-            hover = f"<b>%{{y}}</b><br>{second.title} {with_interval(beside, second.write)}"
-            marker = {"color": colour, "size": 8, "symbol": "line-ns-open", "line": {"width": 1.5}}
-            data.append(style.scatter([beside.value], [name], hover, marker=marker))
-    axis = style.axis(quantity.title, range=[low, high], nticks=7)
+        face = colour if standings[policy].ranked else "none"
+        axes.plot([low, high], [lane, lane], color=colour, linewidth=2)
+        axes.plot(value, lane, "o", color=colour, markerfacecolor=face)
+        if second is not None and not math.isnan(standings[policy][second].value):
+            axes.plot(standings[policy][second].value, lane, "|", color=colour, markersize=8)
+    axes.set_xlabel(quantity.title)
     if quantity.write is percent:
-        axis["tickformat"] = ".0%"
-    layout = style.lanes(list(reversed(known)), xaxis=axis, annotations=notes)
+        axes.xaxis.set_major_formatter("{x:.0%}")
+    set_lanes(axes, names)
     compared = known.get(quantity.versus or context.summary.baseline)
-    layout["shapes"] = [] if compared is None else [style.line("x", compared.value)]
-    return {"data": data, "layout": layout}
+    if compared is not None:
+        axes.axvline(compared.value, color=PALETTE["axis"], zorder=0.5)
 
 
 # --- regret against something -----------------------------------------------------------------------------------------
 
 
 def capacities(context: Context) -> Chart | None:
-    """Draw regret against L for one scenario at a time; None with a single capacity."""
-    cells = context.cells
-    if len({cell.capacity for cell in cells}) < 2:
-        return None
-    x = {"title": "capacity L, messages", "type": "log"}
-    panels: dict[tuple[str, ...], list[Figure]] = {}
-    for scenario in dict.fromkeys(cell.scenario for cell in cells):
-        curves = _curves([c for c in cells if c.scenario == scenario], lambda c: float(c.capacity))
-        if curves:
-            panels[(scenario,)] = [_regret_curves(context, curves, x)]
-    if not panels:
-        return None
+    """Draw regret against L for each scenario; None with a single capacity."""
     alt = "Regret of each policy against the capacity L, with intervals"
-    return Chart("capacities", alt, [("Scenario", [scenario for (scenario,) in panels])], panels)
+    return _against(context, "capacities", alt, "capacity L, messages", lambda c: c.scenario, lambda c: c.capacity)
 
 
 def outages(context: Context) -> Chart | None:
     """Draw regret against the outage's length for each V and capacity; None with fewer than two lengths."""
     scenarios = context.run.manifest["scenarios"]
     lengths = {name: float(s["outage_s"]) for name, s in scenarios.items() if s.get("outage_s") is not None}
-    cells = [cell for cell in context.cells if cell.scenario in lengths]
-    panels: dict[tuple[str, ...], list[Figure]] = {}
-    values = list(dict.fromkeys(str(scenarios[cell.scenario].get("value", "")) for cell in cells))
-    sizes = middle_first({cell.capacity for cell in cells})
-    x = {"title": "length of the outage, s", "type": "log"}
-    for value in values:
-        same = [c for c in cells if str(scenarios[c.scenario].get("value", "")) == value]
-        for capacity in sizes:
-            curves = _curves([c for c in same if c.capacity == capacity], lambda c: lengths[c.scenario])
-            panels[(value, str(capacity))] = [_regret_curves(context, curves, x)] if curves else []
-    if len({lengths[cell.scenario] for cell in cells}) < 2 or not any(panels.values()):
+    return _against(
+        context,
+        "outages",
+        "Regret of each policy against the length of the outage, with intervals",
+        "length of the outage, s",
+        lambda cell: f"V = {scenarios[cell.scenario].get('value', '')}, L = {cell.capacity}",
+        lambda cell: lengths.get(cell.scenario, math.nan),
+    )
+
+
+def _against(
+    context: Context,
+    id: str,
+    alt: str,
+    title: str,
+    panel_of: Callable[[CellScore], str],
+    at: Callable[[CellScore], float],
+) -> Chart | None:
+    """Draw regret against ``at``, a panel for each ``panel_of``; None with fewer than two places on the axis."""
+    cells = [cell for cell in context.cells if not math.isnan(at(cell))]
+    if len({at(cell) for cell in cells}) < 2:
         return None
-    choices = [("Value of a step", values), ("Capacity L", [str(size) for size in sizes])]
-    return Chart("outages", "Regret of each policy against the length of the outage, with intervals", choices, panels)
-
-
-Curve = list[tuple[float, CellScore]]
-"""(position on the axis, cell), from left to right."""
-
-
-def _curves(cells: Sequence[CellScore], at: Callable[[CellScore], float]) -> dict[str, Curve]:
-    """Group the cells by policy; cells without a regret are left out."""
-    curves: dict[str, Curve] = {}
+    panels: dict[str, dict[str, list[CellScore]]] = {}
     for cell in sorted(cells, key=at):
-        if not math.isnan(cell.regret.value):
-            curves.setdefault(cell.policy, []).append((at(cell), cell))
-    return curves
+        panels.setdefault(panel_of(cell), {}).setdefault(cell.policy, []).append(cell)
+    order = dict.fromkeys(map(panel_of, cells))  # of the manifest
+    return Chart(id, alt, [(name, _regret_curves(context, panels[name], title, at)) for name in order])
 
 
-def _regret_curves(context: Context, curves: dict[str, Curve], x: dict[str, Any]) -> Figure:
-    """Draw lines and bands; the legend names highlighted lines."""
-    low, high = regret_range([cell.regret.value for curve in curves.values() for _, cell in curve])
-    data: list[dict[str, Any]] = []
-    for policy in context.order(list(curves)):
-        curve, colour, out = curves[policy], context.colour(policy), policy in context.colours
-        xs = [at for at, _ in curve]
-        if out:
-            band = [c.regret.low for _, c in curve] + [c.regret.high for _, c in curve][::-1]
-            area: dict[str, Any] = {"fill": "toself", "fillcolor": colour, "opacity": 0.16, "line": {"width": 0}}
-            bounds = [max(y, low) for y in band]
-            data.append(style.scatter(xs + xs[::-1], bounds, mode="lines", showlegend=False, **area))
-        data.append(
-            style.scatter(
-                xs,
-                [max(c.regret.value, low) for _, c in curve],
-                "<b>%{fullData.name}</b>, %{x}<br>regret %{text}",
-                mode="lines+markers",
-                cliponaxis=False,
-                name=style.text(policy),
-                showlegend=out,
-                line={"color": colour, "width": 2 if out else 1, "dash": "dot" if policy == "clairvoyant" else "solid"},
-                opacity=1 if out else 0.55,
-                marker={"size": 6 if out else 4, "color": colour},
-                text=[
-                    f"{with_interval(c.regret, percent)}<br>QoI {with_interval(c.qoi, '{:.2f}'.format)}"
-                    for _, c in curve
-                ],
+def _regret_curves(
+    context: Context, curves: Mapping[str, Sequence[CellScore]], title: str, at: Callable[[CellScore], float]
+) -> str:
+    """Draw lines and bands, highlighted policies on top; the legend names these."""
+    cells = [cell for curve in curves.values() for cell in curve]
+    low, high = regret_range([cell.regret.value for cell in cells])
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        axes.set_xscale("log")
+        for policy in sorted(curves, key=lambda name: name in context.colours):
+            colour, out = context.paint(policy), policy in context.colours
+            xs = [at(cell) for cell in curves[policy]]
+            value, bottom, top = (
+                np.maximum(part, low) for part in zip(*(c.regret for c in curves[policy]), strict=True)
             )
-        )
-    ticks = sorted({at for curve in curves.values() for at, _ in curve})
-    across = style.axis(**x, showgrid=False, tickvals=ticks, ticktext=[f"{tick:g}" for tick in ticks])
-    across["range"] = [math.log10(ticks[0]) - 0.03, math.log10(ticks[-1]) + 0.03]
-    title = regret_title(cell for curve in curves.values() for _, cell in curve)
-    up = style.log_axis(title, low, high, style.short_percent)
-    return {"data": data, "layout": style.layout(430, xaxis=across, yaxis=up, showlegend=True)}
+            if out:
+                axes.fill_between(xs, bottom, top, color=colour, alpha=0.16, linewidth=0)
+            dash = ":" if policy == "clairvoyant" else "-"
+            label = policy if out else None
+            axes.plot(
+                xs, value, dash, marker=".", color=colour, linewidth=2 if out else 0.8, label=label, clip_on=False
+            )
+        ticks = sorted({at(cell) for cell in cells})
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.xaxis.minorticks_off()
+        axes.grid(visible=False, axis="x")
+        axes.set_xlabel(title)
+        _log_axis(axes, "y", low, high, regret_title(cells), short_percent)
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+
+    return svg(draw, 4.2)
 
 
 def regret_title(cells: Iterable[CellScore]) -> str:
@@ -231,78 +261,64 @@ def regret_range(regrets: Sequence[float]) -> tuple[float, float]:
     return min(positive) / 1.4, min(max(positive) * 1.4, 1.0)
 
 
-def middle_first(sizes: set[int]) -> list[int]:
-    """Sort the sizes in ascending order, but put the middle one first, as the default to show."""
-    ordered = sorted(sizes)
-    middle = ordered[len(ordered) // 2 : len(ordered) // 2 + 1]
-    return middle + [size for size in ordered if size not in middle]
+def short_percent(share: float) -> str:
+    """0.2 % on an axis."""
+    return f"{share * 100:g} %"
+
+
+def _log_axis(axes: Any, side: str, low: float, high: float, title: str, write: Callable[[float], str]) -> None:
+    """Make an axis logarithmic, with ticks at 1, 2 and 5, or at powers of ten where it is long."""
+    steps = (1,) if high / low > 3000 else (1, 2, 5)
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks = [tick for tick in (m * 10.0**e for e in powers for m in steps) if low <= tick <= high]
+    axes.set(**{f"{side}scale": "log", f"{side}lim": (low, high), f"{side}label": title})
+    axes.set(**{f"{side}ticks": ticks, f"{side}ticklabels": [write(tick) for tick in ticks]})
+    axes.tick_params(axis=side, which="minor", length=0, labelbottom=False, labelleft=False)
 
 
 # --- costs besides information: delay at the sender, age at the server ------------------------------------------------
+
 
 LONG = 8.0
 """Ratio of largest to smallest value from which an axis is logarithmic."""
 
 
 def delays(context: Context) -> Chart | None:
-    """Regret, sojourn time and age of information side by side, for each scenario and capacity."""
-    cells: dict[tuple[str, int], dict[str, CellScore]] = {}
+    """Regret, sojourn time and age of information side by side, for each scenario at the middle capacity."""
+    sizes = sorted({cell.capacity for cell in context.cells})
+    scenarios: dict[str, dict[str, CellScore]] = {}
     for cell in context.cells:
-        if not math.isnan(cell.regret.value):
-            cells.setdefault((cell.scenario, cell.capacity), {})[cell.policy] = cell
-    if not cells:
-        return None
-    scenarios = list(dict.fromkeys(scenario for scenario, _ in cells))
-    sizes = middle_first({capacity for _, capacity in cells})
-    panels: dict[tuple[str, ...], list[Figure]] = {}
-    for scenario in scenarios:
-        entries = means([row for row in context.run.rows if row["scenario"] == scenario])
-        for capacity in sizes:
-            scored = cells.get((scenario, capacity), {})
-            by_policy = {m["policy"]: m for m in entries if m["capacity"] == capacity and m["policy"] in scored}
-            panels[scenario, str(capacity)] = [_three(context, scored, by_policy)] if by_policy else []
-    choices = [("Scenario", scenarios), ("Capacity L", [str(size) for size in sizes])]
+        if cell.capacity == sizes[len(sizes) // 2]:
+            scenarios.setdefault(cell.scenario, {})[cell.policy] = cell
+    panels = []
+    for scenario, cells in scenarios.items():
+        capacity = sizes[len(sizes) // 2]
+        rows = [row for row in context.run.rows if (row["scenario"], row["capacity"]) == (scenario, capacity)]
+        panels.append((f"{scenario}, L = {capacity}", _three(context, cells, means(rows))))
     alt = "Regret, mean sojourn time and mean age of information of each policy"
-    return Chart("delays", alt, choices, panels)
+    return Chart("delays", alt, panels) if panels else None
 
 
-def _three(context: Context, cells: Mapping[str, CellScore], entries: Mapping[str, Mapping[str, Any]]) -> Figure:
+def _three(context: Context, cells: Mapping[str, CellScore], entries: Sequence[Mapping[str, Any]]) -> str:
     """Three columns of dots over the same lanes, least regret on top."""
-    names = sorted(entries, key=lambda name: cells[name].regret.value, reverse=True)
-    data: list[dict[str, Any]] = []
+    names = sorted(cells, key=lambda name: cells[name].regret.value, reverse=True)
+    by_policy = {entry["policy"]: entry for entry in entries}
+    low, high = regret_range([cell.regret.value for cell in cells.values()])
+    columns = [(regret_title(cells.values()), [max(cells[name].regret.value, low) for name in names])]
+    for key, title in ("mean_sojourn_s", "mean sojourn time, s"), ("mean_age_s", "mean age of information, s"):
+        columns.append((title, [by_policy[name][key] for name in names]))
 
-    def column(values: Sequence[float], title: str, words: Sequence[str]) -> None:
-        data.append(
-            style.scatter(
-                values,
-                [style.text(name) for name in names],
-                f"<b>%{{y}}</b><br>{title} %{{text}}",
-                cliponaxis=False,
-                xaxis=f"x{len(data) + 1}" if data else "x",
-                marker={"color": [context.colour(name) for name in names], "size": 9},
-                text=list(words),
-            )
-        )
+    def draw(figure: Any) -> None:
+        for k, axes in enumerate(figure.subplots(1, 3, sharey=True)):
+            title, values = columns[k]
+            axes.scatter(values, range(len(names)), color=[context.paint(name) for name in names], clip_on=False)
+            positive = [value for value in values if value > 0]  # NaN where nothing was delivered
+            if k == 0:
+                _log_axis(axes, "x", low / 1.15, high, title, short_percent)
+            elif positive and max(positive) / min(positive) >= LONG:
+                _log_axis(axes, "x", min(positive) / 1.3, max(positive) * 1.3, title, "{:g}".format)
+            else:
+                axes.set(xlabel=title, xlim=(0, 1.1 * max(positive, default=1)))
+            set_lanes(axes, names)
 
-    low, high = regret_range([cells[name].regret.value for name in names])
-    regrets = [max(cells[name].regret.value, low) for name in names]
-    measure = regret_title(cells[name] for name in names)
-    column(regrets, measure, [with_interval(cells[name].regret, percent) for name in names])
-    place = {"domain": [0, 0.31], "tickangle": 0}
-    axes = {"xaxis": style.log_axis(measure, low / 1.15, high, style.short_percent, (1, 3), **place)}
-    for key, title, start in (
-        ("mean_sojourn_s", "mean sojourn time", 0.345),
-        ("mean_age_s", "mean age of information", 0.69),
-    ):
-        values = [entries[name][key] for name in names]
-        column(values, title, [f"{value:.3g} s" for value in values])
-        place = {"domain": [start, start + 0.31], "tickangle": 0}
-        axes[f"xaxis{len(data)}"] = _seconds_axis(f"{title}, s", values, **place)
-    return {"data": data, "layout": style.lanes(names, grid=True, **axes)}
-
-
-def _seconds_axis(title: str, values: Sequence[float], **changes: Any) -> dict[str, Any]:
-    positive = [value for value in values if value > 0]  # NaN where nothing was delivered
-    if positive and max(positive) / min(positive) >= LONG:
-        return style.log_axis(title, min(positive) / 1.3, max(positive) * 1.3, "{:g}".format, **changes)
-    return style.axis(title, rangemode="tozero", nticks=6, **changes)
+    return svg(draw, _lanes_height(names))

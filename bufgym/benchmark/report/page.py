@@ -1,34 +1,44 @@
-"""Page of a run and its summary, made of templates, style sheet, script, plotly and the charts' numbers."""
+"""Page of a run and its summary, made of templates, style sheet and charts."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
 from importlib.resources import files
-from typing import Any
 
 from bufgym.benchmark import table
 from bufgym.benchmark.bootstrap import CONFIDENCE, RESAMPLES
 from bufgym.benchmark.folder import SuiteRun
-from bufgym.benchmark.report import charts, tables
-from bufgym.benchmark.report.charts import Chart, Context
-from bufgym.benchmark.report.timeline import timeline
+from bufgym.benchmark.report import charts, tables, timeline
+from bufgym.benchmark.report.charts import Context
 from bufgym.benchmark.score import DISCRIMINATIVE, REFERENCE, CellScore
 from bufgym.benchmark.summary import Summary, title
 from bufgym.ground.errors import BufgymError, install
 
-CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, timeline)
+CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, timeline.timeline)
 """Functions that make the charts; each returns None if the run has nothing to show."""
 
 
 def html(run: SuiteRun, summary: Summary) -> str:
     """Render the whole page in one self-contained file."""
+    try:
+        import jinja2
+    except ImportError:
+        raise BufgymError(f"the report needs matplotlib and Jinja: {install('report')}") from None
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_asset),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"score": table.score, "percent": table.percent}
     context = Context.of(run, summary)
+    drawn = [chart for chart in (draw(context) for draw in CHARTS) if chart is not None]
     cells = list(dict.fromkeys((row["scenario"], row["capacity"]) for row in run.rows))
-    return rendered(
-        "summary" if summary.scores is None else "scores",
-        [chart for chart in (draw(context) for draw in CHARTS) if chart is not None],
+    template = "summary" if summary.scores is None else "scores"
+    return environment.get_template(f"{template}.html.jinja").render(
+        charts={chart.id: chart for chart in drawn},
+        css=_asset("page.css"),
         manifest=run.manifest,
         summary=summary,
         intro=[run.manifest["about"], *tables.intro(run)[1:]],
@@ -54,56 +64,8 @@ def html(run: SuiteRun, summary: Summary) -> str:
     )
 
 
-def rendered(template: str, drawn: Sequence[Chart], **words: Any) -> str:
-    """Render a page with charts from a template and its variables ``words``."""
-    jinja2, graphs, plotly_js = _libraries()
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_asset),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"score": table.score, "percent": table.percent}
-    markup = jinja2.utils.markupsafe.Markup
-    charts = {chart.id: chart for chart in drawn}
-    return str(
-        environment.get_template(f"{template}.html.jinja").render(
-            charts=charts,
-            css=markup(_asset("page.css")),
-            js=markup(_asset("page.js")),
-            plotly=markup(plotly_js),
-            figures=markup(_figures(charts, graphs)),
-            **words,
-        )
-    )
-
-
-def _libraries() -> tuple[Any, Any, str]:
-    """Jinja, plotly's figures, and plotly's script."""
-    try:
-        import jinja2
-        import plotly.graph_objects as graphs
-        from plotly.offline import get_plotlyjs
-    except ImportError:
-        raise BufgymError(f"the report needs plotly and Jinja: {install('report')}") from None
-    return jinja2, graphs, get_plotlyjs()
-
-
 def _asset(name: str) -> str:
     return (files("bufgym.benchmark.report") / name).read_text(encoding="utf-8")
-
-
-def _figures(drawn: dict[str, Chart], graphs: Any) -> str:
-    """Encode all charts as JSON for a script element; plotly checks every name and value."""
-    figures = {
-        id: {
-            "\n".join(options): [graphs.Figure(figure).to_plotly_json() for figure in panel]
-            for options, panel in chart.panels.items()
-        }
-        for id, chart in drawn.items()
-    }
-    return json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _shade(cell: CellScore) -> str:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from html import escape as escape
 from typing import NamedTuple
 
 from bufgym.benchmark.folder import SuiteRun
-from bufgym.benchmark.report import style
 from bufgym.benchmark.score import CellScore, Scores, Standing
 from bufgym.benchmark.summary import Summary, pair, title
 from bufgym.benchmark.summary import plain as blocks
@@ -152,4 +152,4 @@ def _marks(heat: HeatMap, scenario: str, capacity: int) -> str:
 
 def _plain(name: str) -> str:
     """Escape a name so that Markdown shows it as written."""
-    return style.text(name).replace("|", "\\|").replace("*", "\\*")
+    return escape(name, quote=False).replace("|", "\\|").replace("*", "\\*")

@@ -8,23 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.report import style
-from bufgym.benchmark.report.charts import Chart, Context
-from bufgym.benchmark.report.style import Figure
+from bufgym.benchmark.report.charts import PALETTE, Chart, Context, set_lanes, svg
 
 DROPPED, IN_GAP, KEPT, LEFT = 0, 1, 2, 3
 """Outcomes of a message: dropped, dropped within the longest gap, delivered, still queued at the end."""
 
-COLOURS = ("var(--lane)", "var(--gap)", "var(--kept)", "var(--axis)")
+_OUTCOMES = ("#a3abb540", "#e2884a", "#0072b2", "#a3abb5")
+"""Colour of each, in a picture that is the same on light and dark pages."""
 
 
 def timeline(context: Context) -> Chart | None:
-    """Draw the chart; None if the run left no timeline."""
+    """Draw the link's capacity above one lane per policy; None if the run left no timeline."""
     episode = context.run.timeline
     if episode is None:
         return None
     alt = "Capacity of the link over time, and for each policy which messages were delivered and which were dropped"
-    return Chart("timeline", alt, [], {(): [_figure(episode)]})
+    lanes = episode["policies"]
+    names = sorted(lanes, key=lambda name: lanes[name]["qoi"])  # the best lane is on top
+    return Chart("timeline", alt, [("", svg(lambda figure: _episode(figure, episode, names), 1.8 + 0.2 * len(names)))])
 
 
 def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] | None:
@@ -32,8 +33,7 @@ def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] 
 
     Returns (from, to), or None with fewer than two messages.
     """
-    pairs = list(pairwise(received))
-    return max(pairs, key=lambda pair: x[pair[1]] - x[pair[0]]) if pairs else None
+    return max(pairwise(received), key=lambda pair: x[pair[1]] - x[pair[0]], default=None)
 
 
 def log(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -> list[int]:
@@ -47,89 +47,29 @@ def log(messages: int, lane: Mapping[str, Any], gap: tuple[int, int] | None) -> 
     return [int(outcome) for outcome in outcomes]
 
 
-def _figure(episode: Mapping[str, Any]) -> Figure:
+def _episode(figure: Any, episode: Mapping[str, Any], names: Sequence[str]) -> None:
+    from matplotlib.colors import ListedColormap
+
     at, x = episode["arrival_s"], episode["x"]
-    names = sorted(episode["policies"], key=lambda name: episode["policies"][name]["qoi"])  # the best lane is on top
-    rows, hover, notes = [], [], []
-    for name in names:
-        lane = episode["policies"][name]
-        gap = longest_gap(x, [entry[0] for entry in lane["received"]])
-        rows.append(log(len(at), lane, gap))
-        hover.append(_hover(at, lane))
-        cells = [f"{lane['qoi']:.1f}", "–", "–"]
-        if gap is not None:
-            cells[1:] = f"{x[gap[1]] - x[gap[0]]:.2f}", f"{at[gap[1]] - at[gap[0]]:.1f}"
-        notes += _columns(cells, y=style.text(name), yref="y2")
-    notes += _columns(["QoI", "gap, x", "gap, s"], y=1, yref="y2 domain", yanchor="bottom")
-    lanes = 19 * len(names)
-    height = 150 + 46 + lanes + 54
-    # Shares of the height for the two parts, link and lanes.
-    inside = height - 16 - 44
-    layout = style.layout(height, annotations=notes, bargap=0)
-    layout["margin"] = {**layout["margin"], "r": 146}
-    layout["xaxis"] = style.axis("time, s", anchor="y2", range=[at[0], at[-1]])
-    layout["yaxis"] = style.axis("Mbit/s", domain=[(lanes + 46) / inside, 1], rangemode="tozero", nticks=4)
-    layout["yaxis2"] = style.axis(domain=[0, lanes / inside], showgrid=False, ticks="", showline=False, type="category")
-    layout["yaxis2"]["fixedrange"] = True
-    return {"data": [*_link(episode), _lanes(at, names, rows, hover)], "layout": layout}
-
-
-def _columns(cells: Sequence[str], **place: Any) -> list[dict[str, Any]]:
-    """Numbers to the right of the lanes, one below the other."""
-    ends = (44, 92, 140)
-    right = {"x": 1, "xref": "paper", "xanchor": "right", **place}
-    return [style.note(cell, xshift=end, **right) for cell, end in zip(cells, ends, strict=True)]
-
-
-def _hover(at: Sequence[float], lane: Mapping[str, Any]) -> list[str]:
-    words = ["still queued at the end"] * len(at)
-    for seq, when in lane["dropped"]:
-        words[seq] = f"dropped {when:.2f} s"
-    for seq, dequeued, transmitted in lane["received"]:
-        words[seq] = f"sent {dequeued:.2f} s, delivered {transmitted:.2f} s"
-    return words
-
-
-def _link(episode: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Capacity as a filled step curve, demand as a dashed line, Mbit/s."""
-    times = list(episode["rate"]["t_s"])
-    curve = style.scatter(
-        times,
-        [rate * 8e-6 for rate in episode["rate"]["bytes_per_s"]],
-        "link %{y:.2f} Mbit/s at %{x:.1f} s",
-        mode="lines",
-        line={"shape": "hv", "width": 1, "color": "var(--link)"},
-        fill="tozeroy",
-        fillcolor="var(--link-fill)",
-    )
-    demand = episode.get("demand_bytes_per_s")
-    if demand is None or not times:
-        return [curve]
-    dashed = style.scatter(
-        [episode["arrival_s"][0], episode["arrival_s"][-1]],
-        [demand * 8e-6] * 2,
-        "demand %{y:.2f} Mbit/s",
-        mode="lines",
-        line={"dash": "dash", "width": 1.5, "color": "var(--vermillion)"},
-    )
-    return [curve, dashed]
-
-
-def _lanes(at: Sequence[float], names: list[str], rows: list[list[int]], hover: list[list[str]]) -> dict[str, Any]:
-    """Draw all lanes as one image, which stays small for thousands of messages."""
-    shades = [[edge, colour] for k, colour in enumerate(COLOURS) for edge in (k / 4, (k + 1) / 4)]
-    return {
-        "type": "heatmap",
-        "x": style.rounded(at),
-        "y": [style.text(name) for name in names],
-        "z": rows,
-        "text": hover,
-        "zmin": -0.5,
-        "zmax": 3.5,
-        "colorscale": shades,
-        "showscale": False,
-        "ygap": 3,
-        "xaxis": "x",
-        "yaxis": "y2",
-        "hovertemplate": "<b>%{y}</b>, arrived at %{x:.2f} s<br>%{text}<extra></extra>",
-    }
+    link, lanes = figure.subplots(2, sharex=True, height_ratios=(1.2, 0.2 * len(names)))
+    rate = [bytes_per_s * 8e-6 for bytes_per_s in episode["rate"]["bytes_per_s"]]
+    link.fill_between(episode["rate"]["t_s"], rate, step="post", color=PALETTE["link"], alpha=0.3, linewidth=0.8)
+    if episode.get("demand_bytes_per_s") is not None:
+        link.axhline(episode["demand_bytes_per_s"] * 8e-6, color=PALETTE["vermillion"], linestyle="--")
+    link.set(ylabel="Mbit/s", ylim=(0, None), xlim=(at[0], at[-1] if len(at) > 1 else at[0] + 1))
+    gaps = [longest_gap(x, [entry[0] for entry in episode["policies"][name]["received"]]) for name in names]
+    rows = [log(len(at), episode["policies"][name], gap) for name, gap in zip(names, gaps, strict=True)]
+    # Each message's tick lasts until the next arrives.
+    edges, colours = [*at, 2 * at[-1] - at[-2] if len(at) > 1 else at[-1] + 1], ListedColormap(_OUTCOMES)
+    bounds = np.arange(len(names) + 1) - 0.5
+    lanes.pcolormesh(edges, bounds, np.array(rows), cmap=colours, vmin=-0.5, vmax=3.5, rasterized=True)
+    set_lanes(lanes, names)
+    lanes.grid(visible=False)
+    lanes.set_xlabel("time, s")
+    numbers = [("QoI", "gap, x", "gap, s")]
+    for name, gap in zip(names, gaps, strict=True):
+        steps = ("–", "–") if gap is None else (f"{x[gap[1]] - x[gap[0]]:.2f}", f"{at[gap[1]] - at[gap[0]]:.1f}")
+        numbers.append((f"{episode['policies'][name]['qoi']:.1f}", *steps))
+    for place, column in zip((1.07, 1.14, 1.21), zip(*numbers, strict=True), strict=True):
+        for lane, words in zip((len(names), *range(len(names))), column, strict=True):
+            lanes.text(place, lane, words, ha="right", va="center", transform=lanes.get_yaxis_transform())
