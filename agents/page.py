@@ -10,6 +10,7 @@ from cyclopts import App
 
 from bufgym.benchmark import bootstrap
 from bufgym.benchmark.bootstrap import Interval
+from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 
 
@@ -43,6 +44,6 @@ def publish(text: str, out: Path | None) -> None:
 def command(page: Callable[..., None]) -> None:
     """Run a page's function as a command: its arguments are the options; a mistake ends in one line."""
     try:
-        App(default_command=page)()
+        App(default_command=page, default_parameter=OPTIONS)()
     except BufgymError as error:
         raise SystemExit(f"error: {error}") from None

@@ -1,16 +1,13 @@
-"""Choices of ``bufgym tune`` in ``tuned.json``, which ``bufgym bench --suite`` uses as variants of policies."""
+"""Choices of ``python -m agents.tune`` in ``tuned.json``: ``bufgym bench --suite`` uses them as variants of policies."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from bufgym import policies
 from bufgym.benchmark.checked_json import read_object
 from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import replaced
 
 FILE = Path(__file__).with_name("tuned.json")
 """{suite: {policy: {"setting", "score", "default_score", "split", "command", "bufgym", ...}}}."""
@@ -41,13 +38,3 @@ def tuned(suite: str) -> list[str]:
         if setting.parameters != default.parameters:
             settings.append(setting.name)
     return settings
-
-
-def write(suite: str, entries: Mapping[str, Mapping[str, Any]]) -> Path:
-    """Replace this suite's entries by policy; return the file's path."""
-    suites = read() if FILE.exists() else {}
-    suites.setdefault(suite, {}).update({policy: dict(entry) for policy, entry in entries.items()})
-    # Sorted, so that the file does not depend on the order of the runs.
-    with replaced(FILE) as temporary:
-        temporary.write_text(json.dumps(suites, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    return FILE

@@ -29,7 +29,6 @@ COMMANDS: dict[str, Any] = {
     "topics": "cli.topics:topics",
     "fleet": "cli.topics:fleet",
     "report": "cli.results:report",
-    "tune": "cli.results:tune",
     "leaderboard": "cli.results:leaderboard",
     "validate": "cli.results:validate",
     "trace": (

@@ -144,7 +144,7 @@ def refuse(options: Mapping[str, Any], why: str) -> None:
 
 def command_line(command: str, **options: Any) -> str:
     """Write the command with those of these options that are given."""
-    words = [f"bufgym {command}"]
+    words = [command]
     for name, value in options.items():
         if value is not None and value is not False:
             text = ",".join(map(str, value)) if isinstance(value, tuple) else value

@@ -1,11 +1,11 @@
-"""``bufgym report``, ``tune``, ``leaderboard``, ``validate``, ``perf`` and ``warmup``."""
+"""``bufgym report``, ``leaderboard``, ``validate``, ``perf`` and ``warmup``."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-from bufgym.cli.options import Count, Seeds, Whole, command_line, policy_specs
+from bufgym.cli.options import Count, Whole
 from bufgym.ground.errors import BufgymError, printable
 
 DEFAULT = "docs/leaderboard.csv"
@@ -22,45 +22,6 @@ def report(folder: str, /, *, markdown: bool = False) -> None:
 
     text = pages.markdown(folder) if markdown else f"wrote {pages.write(folder)}"
     print("\n".join(map(printable, text.split("\n"))))
-
-
-def tune(
-    suite: str,
-    /,
-    *,
-    policies: list[str] | None = None,
-    split: str = "validation",
-    data: str | None = None,
-    seeds: Seeds | None = None,
-    jobs: Whole | None = None,
-    write: bool = False,
-) -> None:
-    """Choose the policies' parameters on a suite's validation episodes.
-
-    Args:
-        suite: Which ('bufgym list suites').
-        policies: Plain names (default: all that have a grid of settings).
-        split: validation or train; test is refused.
-        data: Folder of recordings, for suites over real links.
-        seeds: Episodes on each trace (default: the suite's).
-        jobs: Processes side by side (default: one a core).
-        write: Keep the choices for bufgym bench --suite.
-    """
-    from bufgym.benchmark import tune as tuning
-
-    choices = tuning.tune(suite, policy_specs(policies), split=split, data=data, seeds=seeds, jobs=jobs)
-    print(tuning.plain(choices))
-    if write:
-        # Another machine has its own folder of recordings.
-        again = command_line(
-            f"tune {suite}",
-            policies=tuple(policies or ()) or None,
-            split=None if split == "validation" else split,
-            seeds=seeds,
-            data=data and "DIR",
-            write=True,
-        )
-        print(f"\nwrote {tuning.write(suite, choices, split=split, command=again)}")
 
 
 def leaderboard(*suites: str, file: Path = Path(DEFAULT), data: str | None = None, jobs: Whole | None = None) -> None:

@@ -57,7 +57,7 @@ def run_suite(
         changes=changes,
     )
     again = command_line(
-        command,
+        f"bufgym {command}",
         suite=suite.name,
         split=None if options.split == "test" else options.split,
         policies=tuple(who.policies or ()) or None,

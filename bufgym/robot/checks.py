@@ -70,7 +70,7 @@ def validate(
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if out is not None:
         again = command_line(
-            "live validate",
+            "bufgym live validate",
             trace=trace,
             policies=policies,
             policy_file=policy_file,

@@ -1,4 +1,4 @@
-"""``bufgym tune``: search for a policy's best setting on a suite's validation episodes.
+"""Search for a policy's best setting on a suite's validation episodes: ``python -m agents.tune SUITE``.
 
 Many policies have a parameter that their source chose for another stream than a robot's. To judge them fairly, each
 meets a suite twice: with its source's parameters, and with parameters from a grid search on the validation split. The
@@ -10,6 +10,7 @@ interval of the difference, see ``score``, lies above 0. The choices are kept in
 
 from __future__ import annotations
 
+import json
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from agents.page import command
 from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.bootstrap import Interval, written
@@ -25,8 +27,10 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import Table, decimal
+from bufgym.cli.options import Seeds, Whole, command_line, policy_specs
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import replaced
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
 
@@ -247,23 +251,66 @@ def plain(choices: Sequence[Choice]) -> str:
     return "\n".join(out).rstrip()
 
 
-def write(suite: str, choices: Sequence[Choice], *, split: str, command: str) -> Path:
+def keep(suite: str, choices: Sequence[Choice], *, split: str, again: str) -> Path:
     """Write the choices to ``tuned.json``, replacing earlier ones for the same policies; return its path."""
-    entries = {
-        choice.policy: {
+    suites = tuned.read() if tuned.FILE.exists() else {}
+    for choice in choices:
+        suites.setdefault(suite, {})[choice.policy] = {
             "setting": choice.chosen.spec,
             "score": _rounded(choice.chosen.score.value),
             "default_score": _rounded(choice.default.score.value),
             "regret": _rounded(choice.chosen.regret.value),
             "default_regret": _rounded(choice.default.regret.value),
             "split": split,
-            "command": command,
+            "command": again,
             "bufgym": __version__,
         }
-        for choice in choices
-    }
-    return tuned.write(suite, entries)
+    # Sorted, so that the file does not depend on the order of the runs.
+    with replaced(tuned.FILE) as temporary:
+        temporary.write_text(json.dumps(suites, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return tuned.FILE
 
 
 def _rounded(number: float) -> float | None:
     return None if math.isnan(number) else round(number, 6) + 0.0  # no -0.0
+
+
+def main(
+    suite: str,
+    /,
+    *,
+    policies: list[str] | None = None,
+    split: str = "validation",
+    data: str | None = None,
+    seeds: Seeds | None = None,
+    jobs: Whole | None = None,
+    write: bool = False,
+) -> None:
+    """Choose the policies' parameters on a suite's validation episodes.
+
+    Args:
+        suite: Which ('bufgym list suites').
+        policies: Plain names (default: all that have a grid of settings).
+        split: validation or train; test is refused.
+        data: Folder of recordings, for suites over real links.
+        seeds: Episodes on each trace (default: the suite's).
+        jobs: Processes side by side (default: one a core).
+        write: Keep the choices for bufgym bench --suite.
+    """
+    choices = tune(suite, policy_specs(policies), split=split, data=data, seeds=seeds, jobs=jobs)
+    print(plain(choices))
+    if write:
+        # Another machine has its own folder of recordings.
+        again = command_line(
+            f"python -m agents.tune {suite}",
+            policies=tuple(policies or ()) or None,
+            split=None if split == "validation" else split,
+            seeds=seeds,
+            data=data and "DIR",
+            write=True,
+        )
+        print(f"\nwrote {keep(suite, choices, split=split, again=again)}")
+
+
+if __name__ == "__main__":
+    command(main)

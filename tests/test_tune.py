@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import fails, shown
+from cyclopts import App
 
+from agents import tune
+from agents.tune import Choice
 from bufgym import policies
-from bufgym.benchmark import tune, tuned
+from bufgym.benchmark import tuned
 from bufgym.benchmark.tasks import TASKS
-from bufgym.benchmark.tune import Choice
+from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, suites
@@ -46,7 +48,9 @@ default_policies = TASKS["queue"].default_policies
 
 
 def cli(words: str, capsys: pytest.CaptureFixture[str]) -> str:
-    return shown(["tune", *words.split(), "--jobs", 1], capsys)
+    app = App(default_command=tune.main, default_parameter=OPTIONS, result_action="return_value")
+    app([*words.split(), "--jobs", "1"])
+    return capsys.readouterr().out
 
 
 def test_the_best_setting_of_a_suite_worked_out_by_hand(splits: list[str]) -> None:
@@ -142,13 +146,14 @@ def test_where_no_cell_is_discriminative_regrets_are_compared() -> None:
 def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[str]) -> None:
     text = cli("tiny-twelve --policies decimate,lifespan --seeds 3", capsys)
     assert "best, chosen" in text and "default, best, chosen" in text and not tuned.FILE.exists()
-    fails(["tune", "tiny-twelve", "--split", "test", "--write"], "never chosen on test episodes", capsys)
+    with pytest.raises(BufgymError, match="never chosen on test episodes"):
+        cli("tiny-twelve --split test --write", capsys)
     assert not tuned.FILE.exists()
     cli("tiny-twelve --policies decimate,lifespan --seeds 3 --write", capsys)
     entry = tuned.read()["tiny-twelve"]["decimate"]
     assert entry["setting"] == "decimate:every=4" and entry["split"] == "validation"
     assert entry["score"] == pytest.approx(1) and entry["score"] > entry["default_score"]
-    assert entry["command"] == "bufgym tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
+    assert entry["command"] == "python -m agents.tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
     # A second suite leaves the first alone; lifespan stays at its default.
     cli("tiny-nine --policies decimate --write", capsys)
     assert [tuned.tuned(name) for name in (*LENGTHS, "lte-v1")] == [["decimate:every=4"], [], []]
@@ -180,6 +185,8 @@ def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(set(specs)) == len(specs)
         for policy, entry in entries.items():
             assert entry["setting"] in tune.settings(policy) and entry["split"] == "validation"
-            assert entry["command"].startswith(f"bufgym tune {suite}") and entry["command"].endswith("--write")
+            assert entry["command"].startswith(f"python -m agents.tune {suite}") and entry["command"].endswith(
+                "--write"
+            )
             assert (entry["setting"] == policy) == (entry["setting"] not in tuned.tuned(suite))
     assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tuned.FILE.read_text(encoding="utf-8")
