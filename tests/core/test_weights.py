@@ -171,7 +171,7 @@ def test_shipped_agents_are_read_when_they_are_asked_for(path, monkeypatch):
 def test_fields_beside_the_tables_are_read_by_name(path):
     # What weights were trained on before these fields came is still what it was.
     assert weights.observation_hash(names=("rank",)) == weights.observation_hash()
-    fields = ("rank", "rate_short", "bend_large", "room")
+    fields = ("rank", "rate_short", "rate_long", "time_to_free")
     weights.save(path, random_weights(QUEUE, fields), ABOUT)
     read, metadata = weights.read(path)
     assert read.context == fields[1:]

@@ -7,20 +7,32 @@ every index and the ends of every slice, which is a fifth of a rollout's instruc
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numba.extending
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel.switch import JIT
+JIT = not cast(Any, numba.config).DISABLE_JIT
+"""False where compilation is off and every kernel runs as its Python source."""
 
 
 def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Zeroed records whose fields read as attributes (``a[i].field``) in kernels, compiled or not."""
     zeros = np.zeros(shape, dtype)
     return zeros if JIT else zeros.view(np.recarray)
+
+
+Bundle = TypeVar("Bundle", bound=NamedTuple)
+
+
+def named(arrays: Bundle) -> Bundle:
+    """The same memory, as records whose fields read as attributes in plain Python too."""
+    made: Bundle = cast(Any, type(arrays))(
+        *(array.view(np.recarray) if isinstance(array, np.ndarray) and array.dtype.names else array for array in arrays)
+    )
+    return made
 
 
 def item(array: NDArray[Any], k: int) -> Any:
