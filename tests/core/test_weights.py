@@ -233,7 +233,6 @@ def test_metadata_that_are_no_json_object_are_refused(path, text, rule):
         (QUEUE, "name", "\ud800", "must be non-empty"),
         (QUEUE, "about", ["no", "text"], "must be one line of text"),
         (QUEUE, "bufgym", None, "must be text"),
-        (QUEUE, "thins", True, "thins = True: this bufgym lets a learned agent decide alone"),
         (QUEUE, "observation", "0" * 64, "trained on other observations than this bufgym's: train it again"),
         (TOPICS, "observation", weights.observation_hash(), "trained on other observations than this bufgym's"),
         (QUEUE, "fields", "time_merged", "must be a list of at least one field"),
