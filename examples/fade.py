@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from bufgym import policies
-from bufgym.model import qoi
-from bufgym.model.link import Link
+from bufgym.model import Link, qoi
 from bufgym.scenario import Episode, messages
 from bufgym.sim import outcome, run
 from bufgym.traces import Trace

@@ -18,7 +18,7 @@ from typing import Final
 
 from made_up_robot import CONFIG, MadeUp
 
-from bufgym.model.link import Link
+from bufgym.model import Link
 from bufgym.policies import Policy, get
 from bufgym.relay import Config, Foxglove, Robot, Rule, Server, compiled
 from bufgym.robot import ShapedLink

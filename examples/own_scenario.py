@@ -12,8 +12,7 @@ import numpy as np
 
 import bufgym
 from bufgym import scenario
-from bufgym.model import qoi
-from bufgym.model.link import Link
+from bufgym.model import Link, qoi
 from bufgym.traces import Trace
 
 

@@ -31,7 +31,7 @@ from torch.distributions import Categorical
 
 import bufgym
 from bufgym import policies, scenario
-from bufgym.ground.errors import BufgymError
+from bufgym.ground import BufgymError
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 TEST = ["lte-synthetic-6", "lte-synthetic-7"]

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bufgym import scenario
-from bufgym.model import qoi
-from bufgym.model.link import Link
+from bufgym.model import Link, qoi
 from bufgym.traces import Trace
 
 

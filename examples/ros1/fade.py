@@ -37,7 +37,7 @@ from fade import (
     simulated,
 )
 
-from bufgym.model.link import Link
+from bufgym.model import Link
 from bufgym.robot import ShapedLink
 
 PORT = 11399

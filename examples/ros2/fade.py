@@ -36,7 +36,7 @@ from fade import (
     simulated,
 )
 
-from bufgym.model.link import Link
+from bufgym.model import Link
 from bufgym.robot import ShapedLink
 
 DOMAIN = 20 + os.getpid() % 40 * 2
