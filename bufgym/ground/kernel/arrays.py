@@ -77,26 +77,14 @@ def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 
 def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """LLVM's code of ``stretch``."""
+    """LLVM's code of ``stretch`` and ``table``."""
     from numba.np import arrayobj
 
     whole = context.make_array(signature.args[0])(context, builder, arguments[0])
     place = _place(context, builder, signature, arguments, arguments[1:3])
     view = context.make_array(signature.return_type)(context, builder)
-    size, shape = whole.itemsize, [arguments[3]]
-    cast(Any, arrayobj).populate_array(view, place, shape, [size], size, whole.meminfo, whole.parent)
-    return view._getvalue()
-
-
-def _table(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """LLVM's code of ``table``."""
-    from numba.np import arrayobj
-
-    whole = context.make_array(signature.args[0])(context, builder, arguments[0])
-    place = _place(context, builder, signature, arguments, arguments[1:3])
-    view = context.make_array(signature.return_type)(context, builder)
-    size, shape = whole.itemsize, list(arguments[3:5])
-    steps = [builder.mul(shape[1], size), size]
+    size, shape = whole.itemsize, list(arguments[3:])
+    steps = [*(builder.mul(columns, size) for columns in shape[1:]), size]
     cast(Any, arrayobj).populate_array(view, place, shape, steps, size, whole.meminfo, whole.parent)
     return view._getvalue()
 
@@ -125,5 +113,5 @@ def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: C
 _compile_as(item, lambda array, k: array.dtype, _read)
 _compile_as(at, lambda array, i, k: array.dtype, _read)
 _compile_as(stretch, lambda array, i, first, length: array.copy(ndim=1), _view)
-_compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _table)
+_compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _view)
 _compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)
