@@ -52,7 +52,7 @@ def agent(seed: int = 1) -> weights.Weights:
 def test_an_agent_that_reads_more_decides_the_same_at_first() -> None:
     """New inputs are zeros in every layer and in the mixing."""
     old = with_vector(agent(), np.random.default_rng(2).normal(size=len(to_vector(agent()))))
-    new = old.reading(LINK)
+    new = queue.reading(old, LINK)
     assert new.fields == LINK
     assert new.mix is not None and new.mix.shape == (len(new.context), len(new.slot)) == (10, 5)
     slow = Trace.steps([(1.0, 3_000_000), (2.0, 250_000), (7.0, 2_357_000)])

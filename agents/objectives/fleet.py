@@ -50,7 +50,7 @@ def fleet_of(suite: str, split: str) -> FleetScenario:
 def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
     """The agent with scorers that also read these fields, at weight 0, and may mix all."""
     mix = np.zeros((len(agent.context), len(agent.slot)), np.float32) if agent.mix is None else agent.mix
-    return replace(agent, mix=mix).reading(more)
+    return queue.reading(replace(agent, mix=mix), more)
 
 
 # --- episodes --------------------------------------------------------------------------------------------------------

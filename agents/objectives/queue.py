@@ -7,6 +7,7 @@ On interruptions the regret is *exact* over every length T (``oracle.EveryLength
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -21,8 +22,9 @@ from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.tasks.queue import best
 from bufgym.oracle import BASELINE, EveryLength, regret
-from bufgym.policies import Policy, learned, weights
+from bufgym.policies import Policy, weights
 from bufgym.policies.learned import Weights
+from bufgym.policies.scoring import OF_INPUTS, Network
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import Senders
 
@@ -45,12 +47,40 @@ WORST = 3.0
 
 def start(fields: tuple[str, ...], width: int, rng: np.random.Generator) -> Weights:
     """Drop by the smallest merged gap (of motion, if seen), older messages rather; accept with room."""
-    weights = learned.random_weights(fields, (width,) if width else (), rng)
+    drop, accept = (small_network(len(fields), (width,) if width else (), rng) for _ in range(2))
+    weights = Weights(fields, drop, accept)
     merged = next(name for name in ("motion_merged", "index_merged", "time_merged") if name in fields)
     weights.drop.skip[fields.index(merged)] = -10.0
     weights.drop.skip[fields.index("rank")] = -0.4
     weights.accept.bias[0] = 5.0
     return replace(weights, mix=np.zeros((len(weights.context), len(weights.slot)), np.float32))
+
+
+def small_network(inputs: int, widths: tuple[int, ...], rng: np.random.Generator) -> Network:
+    """Small random weights in the hidden layers, zeros elsewhere."""
+    layers = tuple(
+        (rng.normal(0, 1 / np.sqrt(a), (a, b)).astype(np.float32), np.zeros(b, np.float32))
+        for a, b in itertools.pairwise([inputs, *widths])
+    )
+    out = np.zeros(widths[-1] if widths else 0, np.float32)
+    return Network(np.zeros(inputs, np.float32), np.zeros(1, np.float32), layers, out)
+
+
+def reading(weights: Weights, fields: tuple[str, ...]) -> Weights:
+    """Weights for more ``fields`` that give the same decisions; the new fields have weight 0."""
+    new = tuple(name for name in fields if name not in weights.fields)
+
+    def widened(network: Network) -> Network:
+        tensors = network.tensors()
+        for name in OF_INPUTS & tensors.keys():
+            tensors[name] = np.pad(tensors[name], ((0, len(new)), (0, 0))[: tensors[name].ndim])
+        return Network.of(tensors)
+
+    more = replace(weights, fields=weights.fields + new, drop=widened(weights.drop), accept=widened(weights.accept))
+    if weights.mix is None:
+        return more
+    rows, columns = len(more.context) - len(weights.context), len(more.slot) - len(weights.slot)
+    return replace(more, mix=np.pad(weights.mix, ((0, rows), (0, columns))))
 
 
 # --- the regret in a suite's cells -----------------------------------------------------------------------------------
@@ -219,7 +249,7 @@ class QueueObjective(Objective):
         """The rule "smallest merged gap", or an earlier agent."""
         settings, fields = self.settings, self.settings.observed
         if settings.start:
-            return weights.read(settings.start)[0].reading(fields)
+            return reading(weights.read(settings.start)[0], fields)
         return start(fields, settings.hidden, np.random.default_rng(self.seed))
 
     def measure(self, policy: Policy, episodes: Sequence[SuiteObjective], part: int | None = None) -> float:

@@ -1,4 +1,4 @@
-"""Choices of ``python -m agents.tune`` in ``tuned.json``: ``bufgym bench --suite`` uses them as variants of policies."""
+"""Choices of ``python -m agents.tune`` in ``tuned.json``: ``bufgym bench --suite`` uses them as variants."""
 
 from __future__ import annotations
 

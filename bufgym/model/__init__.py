@@ -1,7 +1,16 @@
 """Terms of the model: Quantity of Information, messages and their buffer, the link, topics."""
 
-from bufgym.model import qoi
-from bufgym.model.link import Link
-from bufgym.model.topics import Topic
+from typing import TYPE_CHECKING
 
-__all__ = ["Link", "Topic", "qoi"]
+from bufgym.ground.modules import on_demand
+
+if TYPE_CHECKING:
+    from bufgym.model import observe, qoi
+    from bufgym.model.buffer import Buffer
+    from bufgym.model.link import Link
+    from bufgym.model.qoi import Value
+    from bufgym.model.topics import Topic
+
+__all__ = ["Buffer", "Link", "Topic", "Value", "observe", "qoi"]
+
+__getattr__ = on_demand(__name__, Buffer="buffer", Link="link", Topic="topics", Value="qoi")

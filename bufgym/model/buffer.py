@@ -128,9 +128,6 @@ class Buffer(NamedTuple):
     """Messages dequeued since the previous arrival."""
     service_ratio: float
     """Running mean of departures per arrival: 1 when the link keeps up, 0 when it stands still."""
-    period_square: float
-    """Running mean of the squared time between arrivals, us^2. Its excess over ``period_us`` ** 2 measures how bursty
-    arrivals are."""
     drained_bytes: int
     """Bytes that left the socket between the previous arrival and this one."""
     drained_us: int

@@ -183,9 +183,11 @@ def integer_plan(episode: Episode, capacity: int, max_bytes: int, v: Value) -> N
     return kept
 
 
-@register(
-    "oracle", privileged=integer_plan, named_only=True, source="AFR paper, Sec. III-C, in whole numbers", compile=True
-)
-def follow_integer_plan(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-    """Knows T beforehand: the best whole-numbered gaps in one interruption, the only place where it plays."""
-    return ACCEPT if memory[arrival.seq] > 0 else REJECT
+register(
+    "oracle",
+    privileged=integer_plan,
+    named_only=True,
+    source="AFR paper, Sec. III-C, in whole numbers",
+    about="Knows T beforehand: the best whole-numbered gaps in one interruption, the only place where it plays.",
+    compile=True,
+)(follow)

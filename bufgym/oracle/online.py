@@ -44,8 +44,6 @@ class OnlineOptimum:
 
     capacity: int
     """L, messages."""
-    value_function: Value
-    """V."""
     probabilities: NDArray[np.float64]
     """float64[t_max + 1]: P(T = t) for t = 0..t_max, the longest possible length."""
     objective: str
@@ -134,7 +132,7 @@ def online_optimum(
         value += best[0]  # the set of messages 1..L
     for array in (p, decisions):
         array.flags.writeable = False
-    return OnlineOptimum(L, v, p, objective, float(value), decisions)
+    return OnlineOptimum(L, p, objective, float(value), decisions)
 
 
 @kernel

@@ -38,6 +38,7 @@ __all__ = [
     "make_room",
     "names",
     "register",
+    "register_later",
 ]
 
 

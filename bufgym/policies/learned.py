@@ -16,8 +16,7 @@ The file is safetensors with JSON metadata: reading it runs nothing.
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ from bufgym.model.observe import (
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import DROP, KEEP, Network, ScorerWeights, begin, divide, read_context, score, unpack
 
-__all__ = ["NAMES", "Network", "Weights", "policy", "random_weights"]
+__all__ = ["NAMES", "Network", "Weights", "policy"]
 
 SLOT_NAMES = tuple(field.name for field in (*SLOT_FIELDS, *ON_BOARD_SLOT_FIELDS))
 CONTEXT_NAMES = tuple(field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS))
@@ -97,32 +96,8 @@ class Weights(ScorerWeights):
     mix: NDArray[np.float32] | None = None
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
 
-    def reading(self, fields: tuple[str, ...]) -> Weights:
-        """Weights for more ``fields`` that give the same decisions; the new fields have weight 0."""
-        new = tuple(name for name in fields if name not in self.fields)
-        drop, accept = (network.with_inputs(len(new)) for network in (self.drop, self.accept))
-        more = replace(self, fields=self.fields + new, drop=drop, accept=accept)
-        if self.mix is None:
-            return more
-        rows, columns = (len(more.context) - len(self.context), len(more.slot) - len(self.slot))
-        return replace(more, mix=np.pad(self.mix, ((0, rows), (0, columns))))
-
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
     """Make the policy of these weights; it works for every L."""
     reads_rate = not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields)
     return weights.policy(name, on_arrival, source=source, about=summary, reads_rate=reads_rate)
-
-
-def random_weights(fields: tuple[str, ...], widths: tuple[int, ...], rng: np.random.Generator) -> Weights:
-    """Small random weights in the hidden layers, zeros elsewhere."""
-
-    def network() -> Network:
-        layers = tuple(
-            (rng.normal(0, 1 / np.sqrt(inputs), (inputs, outputs)).astype(np.float32), np.zeros(outputs, np.float32))
-            for inputs, outputs in itertools.pairwise([len(fields), *widths])
-        )
-        out = np.zeros(widths[-1] if widths else 0, np.float32)
-        return Network(np.zeros(len(fields), np.float32), np.zeros(1, np.float32), layers, out)
-
-    return Weights(fields, network(), network())

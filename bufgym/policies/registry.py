@@ -31,7 +31,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, Concatenate, NamedTuple, ParamSpec, cast, get_type_hints
+from typing import Any, NamedTuple, cast, get_type_hints
 
 import numba
 import numpy as np
@@ -53,7 +53,6 @@ OnDequeue = Callable[[Buffer, Memory], bool]
 OnSend = Callable[[Buffer, Memory], int]
 Privileged = Callable[[Any, int, int, Any], Memory]
 Functions = tuple[OnArrival, OnDeparture, OnDequeue, OnSend]
-Fields = ParamSpec("Fields")
 
 
 def _ignore(buffer: Buffer, memory: Memory) -> None:
@@ -241,39 +240,34 @@ class Later(NamedTuple):
 _REGISTRY: dict[str, Policy | Later] = {}
 
 
-def _registration(
-    make: Callable[Concatenate[str, OnArrival, Fields], Policy],
-) -> Callable[Concatenate[str, Fields], Callable[[OnArrival], OnArrival]]:
-    def register(name: str, /, *args: Fields.args, **kwargs: Fields.kwargs) -> Callable[[OnArrival], OnArrival]:
-        """Register the decorated function as the policy ``name``; it comes back unchanged.
+def register(name: str, /, **fields: Any) -> Callable[[OnArrival], OnArrival]:
+    """Register the decorated function as the policy ``name``; it comes back unchanged.
 
-        Keywords are the fields of ``Policy``: ``parameters``, ``memory``, ``on_departure``, ``compile`` and so on.
-        A function may replace itself, as a notebook's cell runs again.
+    Keywords are the fields of ``Policy``: ``parameters``, ``memory``, ``on_departure``, ``compile`` and so on.
+    A function may replace itself, as a notebook's cell runs again.
 
-        Raises:
-            BufgymError: the name is empty, holds one of ``:,=`` or a blank, or another policy has it.
-        """
+    Raises:
+        BufgymError: the name is empty, holds one of ``:,=`` or a blank, or another policy has it.
+    """
+    known = _REGISTRY.get(name)
+    if isinstance(known, Later) or (known is not None and known.on_arrival.__module__.startswith("bufgym.")):
+        raise BufgymError(f"policy {name!r}: a built-in policy has this name")
+    check_name("policy", name)
+
+    def add(on_arrival: OnArrival) -> OnArrival:
+        if not callable(on_arrival):
+            raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
         known = _REGISTRY.get(name)
-        if isinstance(known, Later) or (known is not None and known.on_arrival.__module__.startswith("bufgym.")):
-            raise BufgymError(f"policy {name!r}: a built-in policy has this name")
-        check_name("policy", name)
+        if isinstance(known, Policy) and _place(known.on_arrival) != _place(on_arrival):
+            raise BufgymError(f"policy {name!r}: the function {_place(known.on_arrival)} has this name")
+        policy = Policy(name, on_arrival, **fields)
+        for what, entries in (("parameters", policy.parameters), ("memory", policy.memory)):
+            if not isinstance(entries, Mapping):
+                raise BufgymError(f"policy {name!r}: {what} = {entries!r}: must map names to numbers")
+        _REGISTRY[name] = policy
+        return on_arrival
 
-        def add(on_arrival: OnArrival) -> OnArrival:
-            if not callable(on_arrival):
-                raise BufgymError(f"policy {name!r}: {on_arrival!r} is not a function")
-            known = _REGISTRY.get(name)
-            if isinstance(known, Policy) and _place(known.on_arrival) != _place(on_arrival):
-                raise BufgymError(f"policy {name!r}: the function {_place(known.on_arrival)} has this name")
-            policy = make(name, on_arrival, *args, **kwargs)
-            for what, entries in (("parameters", policy.parameters), ("memory", policy.memory)):
-                if not isinstance(entries, Mapping):
-                    raise BufgymError(f"policy {name!r}: {what} = {entries!r}: must map names to numbers")
-            _REGISTRY[name] = policy
-            return on_arrival
-
-        return add
-
-    return register
+    return add
 
 
 def _place(function: OnArrival) -> str:
@@ -281,7 +275,6 @@ def _place(function: OnArrival) -> str:
     return f"{function.__module__}.{function.__qualname__}"
 
 
-register = _registration(Policy)
 built_in = functools.partial(register, compile=True)
 """The same for bufgym's own policies, which run compiled."""
 

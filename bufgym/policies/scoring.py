@@ -186,13 +186,6 @@ class Network:
             tensors |= {f"{k}.weight": weight, f"{k}.bias": bias}
         return tensors | {"out": self.out}
 
-    def with_inputs(self, n: int) -> Network:
-        """A copy with n more inputs at the end, of weight 0."""
-        tensors = self.tensors()
-        for name in OF_INPUTS & tensors.keys():
-            tensors[name] = np.pad(tensors[name], ((0, n), (0, 0))[: tensors[name].ndim])
-        return Network.of(tensors)
-
     @staticmethod
     def of(tensors: Mapping[str, NDArray[np.float32]]) -> Network:
         """Make the network of these ``tensors``."""

@@ -51,8 +51,6 @@ MAX_WIDTH = 256
 """Most units of a hidden layer."""
 KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
-RULES = ("shortcuts", "thins")
-"""Flags of agents that left decisions to rules; bufgym 0.2 wrote them."""
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
 """Metadata that ``save`` itself writes."""
 MIX = "drop.mix"
@@ -219,9 +217,6 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     name, about, fields = metadata["name"], metadata.get("about", ""), metadata.get("fields")
     if not name or not name.isprintable() or any(c in ":,= " for c in name):
         refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
-    for flag in RULES:
-        if metadata.get(flag):
-            refuse(flag, "this bufgym lets a learned agent decide alone: export it again, or use target-gap")
     if not isinstance(about, str) or not about.isprintable():
         refuse("about", "must be one line of text")
     if metadata["observation"] != observation_hash(kind is TopicWeights, fields if isinstance(fields, list) else ()):

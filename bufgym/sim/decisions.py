@@ -39,9 +39,8 @@ def arrive(batch: Batch, i: int) -> int:
     if sender.next > 0:
         gap_us = arrives_us - sender.previous_us
         if sender.next == 1:
-            sender.period_us, sender.period_square = float(gap_us), float(gap_us) * gap_us
+            sender.period_us = float(gap_us)
         sender.period_us += _PERIOD_WEIGHT * (gap_us - sender.period_us)
-        sender.period_square += _PERIOD_WEIGHT * (float(gap_us) * gap_us - sender.period_square)
         sender.service_ratio += _SERVICE_WEIGHT * (sender.departures - sender.service_ratio)
         if sender.measures == 1:
             measure_rate(batch, i)

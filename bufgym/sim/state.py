@@ -97,7 +97,6 @@ SENDER = np.dtype(
         ("departures", np.int64),  # messages dequeued since the previous arrival
         ("period_us", np.float64),  # running mean of the time between arrivals
         ("service_ratio", np.float64),  # running mean of departures per arrival
-        ("period_square", np.float64),  # running mean of the squared time between arrivals, us^2
         ("left_bytes", np.int64),  # in the socket when the present arrival came
         ("sent_bytes", np.int64),  # bytes that had left the socket by then
         ("sending_us", np.int64),  # time that the link had carried this sender's bytes by then

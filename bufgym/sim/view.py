@@ -67,7 +67,6 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.period_us,
         sender.departures,
         sender.service_ratio,
-        sender.period_square,
         sender.drained_bytes,
         sender.drained_us,
         1e6 * sender.short_rate,

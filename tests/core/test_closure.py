@@ -166,31 +166,6 @@ def test_a_change_recompiles_what_calls_it_and_nothing_else(tmp_path: Path) -> N
     assert "afr" in again and "drop_oldest" not in again
 
 
-@needs_compilation
-def test_a_stale_callee_is_never_used(tmp_path: Path) -> None:
-    """The caller's own file does not change; what it calls does, and a constant of that."""
-    (tmp_path / "bufgym").symlink_to(REPO / "bufgym")
-    (tmp_path / "number.py").write_text("STEP = 1\n")
-    head = "from bufgym.ground.kernel import kernel\n"
-    callee = head + "from number import STEP\n@kernel\ndef callee(k):\n    return k + STEP\n"
-    (tmp_path / "callee.py").write_text(callee)
-    caller = head + "from callee import callee\n@kernel\ndef caller(k):\n    return callee(k)\n"
-    (tmp_path / "caller.py").write_text(caller)
-
-    def run(answer: int) -> list[str]:
-        return compiled(tmp_path, f"from caller import caller\nassert caller(40) == {answer}, caller(40)")
-
-    assert set(run(41)) == {"caller", "callee"}
-    assert run(41) == []
-    (tmp_path / "number.py").write_text("STEP = 2\n")
-    assert set(run(42)) == {"caller", "callee"}
-    (tmp_path / "callee.py").write_text(callee.replace("k + STEP", "k - STEP"))
-    assert set(run(38)) == {"caller", "callee"}
-    (tmp_path / "number.py").write_text("STEP = 1\n")
-    (tmp_path / "callee.py").write_text(callee)
-    assert run(41) == []  # code of the earlier source is still there
-
-
 def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
     """No constant that a kernel reads is told by its address."""
     from bufgym.ground.kernel import closure as module

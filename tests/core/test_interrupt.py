@@ -71,15 +71,3 @@ def test_the_result_and_the_error_arrive() -> None:
     assert interruptible(lambda: threading.current_thread()) is not threading.main_thread()
     with pytest.raises(ZeroDivisionError):
         interruptible(lambda: 1 // (len(np.zeros(1)) - 1))
-
-
-def test_outside_the_main_thread_no_other_is_begun() -> None:
-    here: list[bool] = []
-
-    def beside() -> None:
-        here.append(interruptible(threading.current_thread) is threading.current_thread())
-
-    thread = threading.Thread(target=beside)
-    thread.start()
-    thread.join()
-    assert here == [True]

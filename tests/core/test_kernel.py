@@ -1,6 +1,5 @@
 """Where compiled code is kept: it rests on the sources as they are, and neither damage nor a lack of room is fatal."""
 
-import gc
 import os
 import subprocess
 import sys
@@ -232,14 +231,3 @@ def test_a_bundle_made_in_a_kernel_is_handed_on_by_address() -> None:
         return doubled(made) + doubled(made) + numbers[0]
 
     assert twice(np.array([100.0, 3.0])) == 6 + 12 + 100
-
-
-@needs_compilation
-def test_garbage_is_collected_again_after_compiling() -> None:
-    @kernel
-    def fails(k: int) -> int:
-        return _no_kernel(k)
-
-    with pytest.raises(numba.core.errors.TypingError):
-        fails(1)
-    assert gc.isenabled()

@@ -15,7 +15,6 @@ from bufgym.model import qoi
 from bufgym.oracle import by_length, ideal, integer, law
 from bufgym.scenario import Interruption, Streams, registry
 from bufgym.sim import run
-from bufgym.sim.metrics import outcome
 
 # The number of examples is set where one of them is hundreds of runs.
 
@@ -33,14 +32,6 @@ def test_by_hand():
     # With room for all, nothing is lost: T + 1 gaps of 1.
     assert integer(5, 3, v) == ideal(5, 3, v) == 4 * 0.5
     assert integer(1, 0, v) == 0.5
-
-
-@kernels
-@pytest.mark.parametrize(("L", "T"), [(1, 1), (2, 7), (3, 9)])
-def test_the_policy_of_this_name_keeps_these_gaps(L, T):
-    v = qoi.exponential(0.5)
-    (row,) = [outcome(run(policies.get("oracle"), [Interruption(t_max=T).episode(T)], L, v), 0)]
-    assert row.qoi == pytest.approx(1 + integer(L, T, v), abs=1e-12) and row.invalid == 0
 
 
 @kernels
@@ -66,15 +57,6 @@ def test_is_the_best_of_all_subsets(v, L, T):
     )
     assert integer(L, T, v) == pytest.approx(best, abs=1e-12)
     assert ideal(L, T, v) >= best - 1e-12
-
-
-@kernels
-def test_they_meet_where_gaps_come_out_even():
-    v = qoi.exponential()
-    # L = 8: nine gaps. T + 1 = 18, 36, 72 are 9 times 2, 4, 8; 19 is not.
-    for T in (17, 35, 71):
-        assert integer(8, T, v) == pytest.approx(ideal(8, T, v), abs=1e-12)
-    assert integer(8, 18, v) < ideal(8, 18, v) - 1e-4
 
 
 LENGTHS = range(1, 81)

@@ -11,7 +11,7 @@ from policy_cases import V, drops, interruption, kept, stream, worst_ratio
 
 from bufgym import policies
 from bufgym.model.link import Link
-from bufgym.policies import ACCEPT, REJECT, afr, aqm
+from bufgym.policies import ACCEPT, REJECT, afr
 from bufgym.policies.checkpointing import growing_gap
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.sim import run
@@ -214,59 +214,6 @@ def test_codel_drops_ever_faster():
     exact = 110 + np.cumsum([0, *(100 / np.sqrt(np.arange(1, 3)))])
     assert exact == pytest.approx([110, 210, 280.7], abs=0.05)
     assert times_ms == np.ceil(exact).tolist()  # the socket takes a message each ms
-
-
-@kernels
-def test_codel_leaves_a_good_queue_alone():
-    # Bursts of 4 each 10 ms: none waits for 5 ms. With a standing queue below two messages nothing is dropped either,
-    # however old they are: a message of 100 ms is never over target when one waits behind it at most.
-    arrivals = messages(np.repeat(np.arange(15) * 10 * MS, 4), 1_000)
-    episode = Episode(arrivals, Link(Trace.constant(1e6, 20)))
-    assert log(run(policies.get("codel"), [episode], 8, V))["dropped_us"] == {}
-    slow = stream("codel", 30, 100 * MS, 2, size_bytes=150_000)
-    assert int(slow.batch.senders["rejected"][0]) > 0
-    assert int(slow.batch.senders["evicted"][0]) == 0
-
-
-@kernels
-@pytest.mark.parametrize(("intervals", "count"), [(15.9, 4), (8, 4), (16, 1)])
-def test_codel_goes_on_where_it_was_soon_after_a_dropping_state(intervals, count):
-    # The last dropping state began with 2 drops and ended with 6. Up to 16 intervals of 100 ms after its next drop was
-    # due the new one begins with the 4 between, later with 1: the next drop follows 100 / sqrt(count) ms on.
-    now_us, memory = 10_000_000, policies.get("codel").new_memory()[0]
-    memory[[aqm.DROPS, aqm.LAST_DROPS, aqm.FIRST_ABOVE]] = 6, 2, 1
-    memory[aqm.DROP_NEXT] = now_us - intervals * 100 * MS
-    buffer = queue_of(3, 8, policies.get("codel").parameter_array)._replace(now_us=now_us, backlog_bytes=3)
-    buffer.slots["size_bytes"] = 1
-    assert policies.get("codel").on_dequeue(buffer, memory)
-    assert memory[aqm.DROP_NEXT] == now_us + 100 * MS / np.sqrt(count)
-    assert memory[aqm.DROPS] == memory[aqm.LAST_DROPS] == count
-
-
-@kernels
-def test_red_drops_with_p_over_1_minus_count_p():
-    # Half full, between 1/4 and 3/4: p_b = 0.1 x 1/2 = 0.05. Then 0.05 / (1 - 0.05 count): uniform over 20 arrivals.
-    policy = policies.get("red:weight=1")  # the average is the occupancy
-    memory = policy.new_memory()[0]
-
-    def red(s, uniform, memory):
-        return policy.on_arrival(queue_of(s, 8, policy.parameter_array), newcomer(uniform), memory)
-
-    least, most = 0.0, 1 - 1e-9
-    for count in range(19):
-        p = 0.05 / (1 - 0.05 * count)
-        for uniform, decision in ((p - 1e-9, REJECT), (p + 1e-9, ACCEPT)):
-            assert red(4, uniform, memory.copy()) == decision
-        assert red(4, most, memory) == ACCEPT
-    assert red(4, most, memory) == REJECT  # the 20th in any case
-    # Below 1/4 none, from 3/4 on all.
-    for s, uniform, decision in ((1, least, ACCEPT), (6, most, REJECT), (8, most, REJECT)):
-        assert red(s, uniform, memory.copy()) == decision
-    # It counts from the first arrival above the threshold, or from the last drop.
-    memory[:] = 0.0, 5.0
-    assert red(0, 0.0, memory) == ACCEPT
-    draws = (0.0501, ACCEPT), (0.0527, ACCEPT), (0.0555, REJECT), (0.0527, ACCEPT), (0.0555, REJECT)
-    assert [red(4, uniform, memory) for uniform, _ in draws] == [decision for _, decision in draws]
 
 
 ROOT = Path(__file__).parents[2]

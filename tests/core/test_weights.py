@@ -171,7 +171,7 @@ def test_shipped_agents_are_read_when_they_are_asked_for(path, monkeypatch):
 def test_fields_beside_the_tables_are_read_by_name(path):
     # What weights were trained on before these fields came is still what it was.
     assert weights.observation_hash(names=("rank",)) == weights.observation_hash()
-    fields = ("rank", "rate_short", "bend_large", "room")
+    fields = ("rank", "rate_short", "rate_long", "time_to_free")
     weights.save(path, random_weights(QUEUE, fields), ABOUT)
     read, metadata = weights.read(path)
     assert read.context == fields[1:]
@@ -233,7 +233,6 @@ def test_metadata_that_are_no_json_object_are_refused(path, text, rule):
         (QUEUE, "name", "\ud800", "must be non-empty"),
         (QUEUE, "about", ["no", "text"], "must be one line of text"),
         (QUEUE, "bufgym", None, "must be text"),
-        (QUEUE, "thins", True, "thins = True: this bufgym lets a learned agent decide alone"),
         (QUEUE, "observation", "0" * 64, "trained on other observations than this bufgym's: train it again"),
         (TOPICS, "observation", weights.observation_hash(), "trained on other observations than this bufgym's"),
         (QUEUE, "fields", "time_merged", "must be a list of at least one field"),

@@ -6,12 +6,10 @@ check the compiled code against its own text.
 """
 
 from bufgym.ground.kernel.announce import compile_silently
-from bufgym.ground.kernel.arrays import at, item, prefetch, records, stretch, table
+from bufgym.ground.kernel.arrays import JIT, at, item, named, prefetch, records, stretch, table
 from bufgym.ground.kernel.bundle import BundleType, bundle, local
 from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
 from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, interruptible, kernel, located
-from bufgym.ground.kernel.meanwhile import named
-from bufgym.ground.kernel.switch import JIT
 
 __all__ = [
     "FOLDER",

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from typing import Any, cast
 
 from numba.core import event
 
 PATIENCE_S = 1.0
-"""Compiling time after which the notice appears, s."""
+"""Compiling time of one kernel after which the notice appears, s."""
 NOTICE = "bufgym: compiling, once (about 10 s; bufgym warmup does it beforehand)"
 
 
 class _Announcer(event.Listener):
-    """Writes ``NOTICE`` to stderr once a process has spent ``PATIENCE_S`` compiling.
+    """Writes ``NOTICE`` to stderr once, when a kernel takes more than ``PATIENCE_S`` to compile.
 
     Numba reports each kernel that it compiles, with those compiled on the way; it does not report kernels from the
     cache.
@@ -23,7 +22,7 @@ class _Announcer(event.Listener):
 
     def __init__(self) -> None:
         self.done = False
-        self._depth, self._spent_s, self._began_s = 0, 0.0, 0.0
+        self._depth = 0
         self._timer: threading.Timer | None = None
 
     def on_start(self, compiling: Any) -> None:
@@ -31,8 +30,7 @@ class _Announcer(event.Listener):
             return
         self._depth += 1
         if self._depth == 1 and not self.done:
-            self._began_s = time.perf_counter()
-            self._timer = threading.Timer(max(0.0, PATIENCE_S - self._spent_s), self.say)
+            self._timer = threading.Timer(PATIENCE_S, self.say)
             self._timer.daemon = True
             self._timer.start()
 
@@ -43,7 +41,6 @@ class _Announcer(event.Listener):
         if self._depth == 0 and self._timer is not None:
             self._timer.cancel()
             self._timer = None
-            self._spent_s += time.perf_counter() - self._began_s
 
     def say(self) -> None:
         if not self.done and sys.stderr is not None:

@@ -7,20 +7,32 @@ every index and the ends of every slice, which is a fifth of a rollout's instruc
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numba.extending
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel.switch import JIT
+JIT = not cast(Any, numba.config).DISABLE_JIT
+"""False where compilation is off and every kernel runs as its Python source."""
 
 
 def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Zeroed records whose fields read as attributes (``a[i].field``) in kernels, compiled or not."""
     zeros = np.zeros(shape, dtype)
     return zeros if JIT else zeros.view(np.recarray)
+
+
+Bundle = TypeVar("Bundle", bound=NamedTuple)
+
+
+def named(arrays: Bundle) -> Bundle:
+    """The same memory, as records whose fields read as attributes in plain Python too."""
+    made: Bundle = cast(Any, type(arrays))(
+        *(array.view(np.recarray) if isinstance(array, np.ndarray) and array.dtype.names else array for array in arrays)
+    )
+    return made
 
 
 def item(array: NDArray[Any], k: int) -> Any:
@@ -65,26 +77,14 @@ def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 
 def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """LLVM's code of ``stretch``."""
+    """LLVM's code of ``stretch`` and ``table``."""
     from numba.np import arrayobj
 
     whole = context.make_array(signature.args[0])(context, builder, arguments[0])
     place = _place(context, builder, signature, arguments, arguments[1:3])
     view = context.make_array(signature.return_type)(context, builder)
-    size, shape = whole.itemsize, [arguments[3]]
-    cast(Any, arrayobj).populate_array(view, place, shape, [size], size, whole.meminfo, whole.parent)
-    return view._getvalue()
-
-
-def _table(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """LLVM's code of ``table``."""
-    from numba.np import arrayobj
-
-    whole = context.make_array(signature.args[0])(context, builder, arguments[0])
-    place = _place(context, builder, signature, arguments, arguments[1:3])
-    view = context.make_array(signature.return_type)(context, builder)
-    size, shape = whole.itemsize, list(arguments[3:5])
-    steps = [builder.mul(shape[1], size), size]
+    size, shape = whole.itemsize, list(arguments[3:])
+    steps = [*(builder.mul(columns, size) for columns in shape[1:]), size]
     cast(Any, arrayobj).populate_array(view, place, shape, steps, size, whole.meminfo, whole.parent)
     return view._getvalue()
 
@@ -113,5 +113,5 @@ def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: C
 _compile_as(item, lambda array, k: array.dtype, _read)
 _compile_as(at, lambda array, i, k: array.dtype, _read)
 _compile_as(stretch, lambda array, i, first, length: array.copy(ndim=1), _view)
-_compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _table)
+_compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _view)
 _compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)

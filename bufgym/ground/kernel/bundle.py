@@ -18,7 +18,7 @@ from numba import extending, types
 from numba.core import cgutils, datamodel
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 
-from bufgym.ground.kernel.switch import JIT
+from bufgym.ground.kernel.arrays import JIT
 
 Class = TypeVar("Class", bound=type)
 Bundle = TypeVar("Bundle")

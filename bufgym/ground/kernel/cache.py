@@ -18,9 +18,9 @@ from typing import Any, cast
 from numba.core import compiler, serialize
 
 from bufgym.ground.files import PACKAGE, replaced
+from bufgym.ground.kernel.arrays import JIT
 from bufgym.ground.kernel.closure import TOOLS, closure, told_types
 from bufgym.ground.kernel.pipeline import PART, PartLibrary, set_environments
-from bufgym.ground.kernel.switch import JIT
 
 
 def _writable(folder: Path) -> bool:

@@ -13,10 +13,10 @@ from numba.core import types
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
+from bufgym.ground.kernel.arrays import JIT
 from bufgym.ground.kernel.cache import Code, NotKeptError, only_kept
 from bufgym.ground.kernel.meanwhile import FEW, Meanwhile, is_possible
 from bufgym.ground.kernel.pipeline import PartCompiler, WholeCompiler
-from bufgym.ground.kernel.switch import JIT
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Result = TypeVar("Result")

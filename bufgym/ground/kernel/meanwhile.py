@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, cast
 
 import filelock
 import numpy as np
@@ -23,21 +23,12 @@ from numba.core import serialize
 from numba.core.registry import CPUDispatcher
 
 from bufgym.ground.kernel.announce import say
+from bufgym.ground.kernel.arrays import named
 from bufgym.ground.kernel.cache import FOLDER
 from bufgym.ground.processes import COMPILES, compiling
 
 FEW = 8
 """Rows of a batch that plain Python is fast enough for."""
-
-Bundle = TypeVar("Bundle", bound=NamedTuple)
-
-
-def named(arrays: Bundle) -> Bundle:
-    """The same memory, as records whose fields read as attributes in plain Python too."""
-    records: Bundle = cast(Any, type(arrays))(
-        *(array.view(np.recarray) if isinstance(array, np.ndarray) and array.dtype.names else array for array in arrays)
-    )
-    return records
 
 
 class Meanwhile:

@@ -7,7 +7,6 @@ the translation made it. The kernel that Python calls links its parts, inlines t
 
 from __future__ import annotations
 
-import gc
 from typing import Any, cast
 
 from llvmlite import binding
@@ -141,33 +140,6 @@ class _LocalBundles(_Pass):  # type: ignore[misc]
         return changed
 
 
-class Typing:
-    """Numba's typing context, which remembers the result of each operation on numbers."""
-
-    def __init__(self, context: Any) -> None:
-        self._context = context
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._context, name)
-
-    def resolve_function_type(self, function: Any, arguments: Any, named: Any) -> Any:
-        """Signature of ``function`` for arguments of these types."""
-        if (
-            named
-            or not isinstance(function, types.Function)
-            or not all(isinstance(kind, _NUMBERS) for kind in arguments)
-        ):
-            return self._context.resolve_function_type(function, arguments, named)
-        key = function, tuple(arguments)
-        if key not in _SIGNATURES:
-            _SIGNATURES[key] = self._context.resolve_function_type(function, arguments, named)
-        return _SIGNATURES[key]
-
-
-_NUMBERS = (types.Integer, types.Float, types.Boolean)
-_SIGNATURES: dict[Any, Any] = {}
-
-
 class WholeCompiler(_Compiler):  # type: ignore[misc]
     """Compiler of the kernels that Python calls."""
 
@@ -178,19 +150,8 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
         self, typing: Any, target: Any, library: Any, arguments: Any, result: Any, flags: Any, names: Any
     ) -> None:
         super().__init__(typing, target, library, arguments, result, flags, names)
-        self.state.typingctx = Typing(typing)
         self.state.library = self.library(target.codegen(), type(self).__name__)
         self.state.library.enable_object_caching()
-
-    def compile_extra(self, function: Any) -> Any:
-        """Compile ``function``. Garbage is collected afterwards: a search among all these objects takes long."""
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            return super().compile_extra(function)
-        finally:
-            if collects:
-                gc.enable()
 
     def define_pipelines(self) -> list[Any]:
         """Numba's own passes, with ``_NoneFields`` before all that look at types."""

@@ -1,7 +1,6 @@
 """Built-in fields outside the tables, computed if an environment's ``fields`` or a learned policy names them.
 
-They describe the link's rate as the robot's own socket shows it, the rhythm of arrivals, V's shape, the room under B,
-and each slot's gaps counted in messages.
+They describe the link's rate as the robot's own socket shows it, and each slot's gaps counted in messages.
 """
 
 from __future__ import annotations
@@ -14,10 +13,9 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.ground.modules import first_line
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
+from bufgym.model.buffer import Buffer
 from bufgym.model.observe.own import OWN_FIELDS, Function, OwnField
-from bufgym.model.observe.queue import TINY, squash
-from bufgym.model.qoi import merging_loss, value
+from bufgym.model.observe.queue import squash
 
 ON_BOARD_FIELDS: list[OwnField] = []
 """Context fields, in the order in which ``observe_on_board`` writes them."""
@@ -53,15 +51,6 @@ def demand(buffer: Buffer, arrival: Any) -> float:
 
 
 @_field("context", "link", "g/(g+r), r = demand")
-def rate_last(buffer: Buffer, arrival: Any) -> float:
-    "the link's rate since the previous arrival, as far as there was something to send; else rate_short"
-    rate = buffer.short_rate_bytes_per_s
-    if buffer.drained_us > 0:
-        rate = 1e6 * buffer.drained_bytes / buffer.drained_us
-    return squash(rate, demand(buffer, arrival))
-
-
-@_field("context", "link", "g/(g+r), r = demand")
 def rate_short(buffer: Buffer, arrival: Any) -> float:
     "the link's rate, a running mean over about 0.1 s; demand: a message of mean size at each arrival"
     return squash(buffer.short_rate_bytes_per_s, demand(buffer, arrival))
@@ -94,60 +83,14 @@ def time_to_free(buffer: Buffer, arrival: Any) -> float:
     return at_rate / (at_rate + buffer.short_rate_bytes_per_s * max(buffer.period_us, 1.0))
 
 
-# --- arrivals, V and B -----------------------------------------------------------------------------------------------
-
-
-@_field("context", "time", "g/(g+r), r = 1")
-def burstiness(buffer: Buffer, arrival: Any) -> float:
-    "squared coefficient of variation of the times between arrivals: 0 = regular, 0.5 = as of a Poisson process"
-    square = buffer.period_us * buffer.period_us
-    return squash(max(buffer.period_square - square, 0.0), square)
-
-
-@kernel
-def bend_at(buffer: Buffer, arrival: Any, evens: float) -> float:
-    """(2 V(d) - V(2 d)) / V(d) at d = ``evens`` even motion spacings, of the newcomer's topic."""
-    v, gap = buffer.v, arrival.x - buffer.dequeued_x
-    if len(buffer.topics) > 1:
-        v = v[buffer.topics[arrival.topic].v_start :]
-    d = max(evens * gap / (buffer.capacity + 1), 0.0)
-    gain = value(v, d)
-    return float(min(max(merging_loss(v, d, gain, d, gain) / max(gain, TINY), 0.0), 1.0))
-
-
-@_field("context", "value", "fraction")
-def bend_small(buffer: Buffer, arrival: Any) -> float:
-    "the bend of V at a quarter of the even motion spacing"
-    return bend_at(buffer, arrival, 0.25)
-
-
-@_field("context", "value", "fraction")
-def bend_large(buffer: Buffer, arrival: Any) -> float:
-    "the bend of V at four times the even motion spacing"
-    return bend_at(buffer, arrival, 4.0)
-
-
-@_field("context", "queue", "g/(g+r), r = L + 1 messages of mean size")
-def room(buffer: Buffer, arrival: Any) -> float:
-    "bytes free under B; 1 where there is no byte limit"
-    if buffer.max_bytes >= UNLIMITED_BYTES:
-        return 1.0
-    return squash(max(buffer.max_bytes - buffer.backlog_bytes, 0), (buffer.capacity + 1) * mean_bytes(buffer, arrival))
-
-
 @kernel
 def observe_on_board(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
     """Write every value of ``ON_BOARD_FIELDS`` into ``context`` (float[fields])."""
-    context[0] = rate_last(buffer, arrival)
-    context[1] = rate_short(buffer, arrival)
-    context[2] = rate_medium(buffer, arrival)
-    context[3] = rate_long(buffer, arrival)
-    context[4] = rate_trend(buffer, arrival)
-    context[5] = time_to_free(buffer, arrival)
-    context[6] = burstiness(buffer, arrival)
-    context[7] = bend_small(buffer, arrival)
-    context[8] = bend_large(buffer, arrival)
-    context[9] = room(buffer, arrival)
+    context[0] = rate_short(buffer, arrival)
+    context[1] = rate_medium(buffer, arrival)
+    context[2] = rate_long(buffer, arrival)
+    context[3] = rate_trend(buffer, arrival)
+    context[4] = time_to_free(buffer, arrival)
 
 
 # --- gaps in messages ------------------------------------------------------------------------------------------------

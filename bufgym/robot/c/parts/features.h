@@ -26,15 +26,6 @@ static inline double bufgym_even_gap(const struct bufgym_queue *q, const struct 
     return gain;
 }
 
-/* (2 V(d) - V(2 d)) / V(d) at d = so many even motion spacings. */
-static inline double bufgym_bend_at(const struct bufgym_queue *q, const struct bufgym_message *arrival, double evens)
-{
-    const double spacing = evens * (arrival->x - q->dequeued_x) / (BUFGYM_CAPACITY + 1);
-    const double d = spacing > 0.0 ? spacing : 0.0, gain = bufgym_value(d);
-    const double bend = bufgym_merging_loss(d, gain, d, gain) / (gain > @TINY@ ? gain : @TINY@);
-    return bend < 0.0 ? 0.0 : bend > 1.0 ? 1.0 : bend;
-}
-
 /* The fields of the context. */
 static inline void bufgym_observe_context(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
@@ -45,10 +36,7 @@ static inline void bufgym_observe_context(struct bufgym_queue *q, const struct b
     const double mean_bytes = (double)(q->backlog_bytes + arrival->size_bytes) / (q->occupancy + 1);
     const double period_us = q->period_us > 1.0 ? q->period_us : 1.0;
     const double demand = 1e6 * mean_bytes / period_us;
-    const double square = q->period_us * q->period_us, spare = q->period_square - square;
     const double short_rate = 1e6 * q->short_rate, long_rate = 1e6 * q->long_rate, left = 1e6 * (double)q->left_bytes;
-    const double last_rate = q->drained_us > 0 ? 1e6 * (double)q->drained_bytes / (double)q->drained_us : short_rate;
-    const int64_t room = BUFGYM_MAX_BYTES - q->backlog_bytes;
     double even_loss;
 
     context[BUFGYM_OCCUPANCY] = (double)q->occupancy / L;
@@ -64,18 +52,11 @@ static inline void bufgym_observe_context(struct bufgym_queue *q, const struct b
     context[BUFGYM_EVEN_VALUE] = bufgym_even_gap(q, arrival, &even_loss);
     context[BUFGYM_BEND] = even_loss / (context[BUFGYM_EVEN_VALUE] > @TINY@ ? context[BUFGYM_EVEN_VALUE] : @TINY@);
 
-    context[BUFGYM_RATE_LAST] = bufgym_squash(last_rate, demand);
     context[BUFGYM_RATE_SHORT] = bufgym_squash(short_rate, demand);
     context[BUFGYM_RATE_MEDIUM] = bufgym_squash(1e6 * q->medium_rate, demand);
     context[BUFGYM_RATE_LONG] = bufgym_squash(long_rate, demand);
     context[BUFGYM_RATE_TREND] = bufgym_squash(short_rate, long_rate);
     context[BUFGYM_TIME_TO_FREE] = q->busy > 0 && q->left_bytes > 0 ? left / (left + short_rate * period_us) : 0.0;
-    context[BUFGYM_BURSTINESS] = bufgym_squash(spare > 0.0 ? spare : 0.0, square);
-    context[BUFGYM_BEND_SMALL] = bufgym_bend_at(q, arrival, 0.25);
-    context[BUFGYM_BEND_LARGE] = bufgym_bend_at(q, arrival, 4.0);
-    context[BUFGYM_ROOM] = 1.0;
-    if (BUFGYM_MAX_BYTES < BUFGYM_UNLIMITED)
-        context[BUFGYM_ROOM] = bufgym_squash(room > 0 ? (double)room : 0.0, spread * mean_bytes);
 }
 
 /* The fields of each candidate: empty slots are 0, the newcomer is the last. */

@@ -51,7 +51,7 @@ struct bufgym_queue {
     double previous_x;
     int64_t departures; /* messages dequeued since then */
     /* running means over about 8 arrivals: time between them, its square; over 16: departures per arrival */
-    double period_us, period_square, service_ratio;
+    double period_us, service_ratio;
     /* the link's rate, bytes/us: running means over about 0.1 s, 0.5 s and 2 s of sending */
     double short_rate, medium_rate, long_rate;
     int64_t sent_bytes, sending_us;     /* all until the arrival before */
@@ -127,13 +127,9 @@ static inline void bufgym_note(struct bufgym_queue *q, const struct bufgym_messa
         q->previous_x = arrival->x;
     } else {
         int64_t gap_us = arrival->arrival_us - q->previous_us;
-        double square = (double)gap_us * (double)gap_us;
-        if (q->arrived == 1) {
+        if (q->arrived == 1)
             q->period_us = (double)gap_us;
-            q->period_square = square;
-        }
         q->period_us += 0.125 * ((double)gap_us - q->period_us);
-        q->period_square += 0.125 * (square - q->period_square);
         q->service_ratio += 0.0625 * ((double)q->departures - q->service_ratio);
         bufgym_measure_rate(q);
     }
