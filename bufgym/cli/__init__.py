@@ -38,7 +38,6 @@ COMMANDS: dict[str, Any] = {
         {
             "info": "traces:info",
             "plot": "traces:plot",
-            "validate": "traces:validate",
             "convert": "traces:convert",
             "from-bag": "trace_bags:from_bag",
             "from-poses": "trace_bags:from_poses",

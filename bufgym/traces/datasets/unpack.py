@@ -14,7 +14,7 @@ import tarfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import unpacked_limit
@@ -110,7 +110,7 @@ _UNPACKERS: Final[dict[str, Callable[[Path, Path, Check], None]]] = {".tar.gz": 
 class _Bounded(io.RawIOBase):
     """The decompressed bytes of a tar file, a limited number at once."""
 
-    def __init__(self, archive: Path, inner: IO[bytes]) -> None:
+    def __init__(self, archive: Path, inner: gzip.GzipFile) -> None:
         self._archive, self._inner = archive, inner
         self.seek, self.tell = inner.seek, inner.tell  # type: ignore[method-assign]
 

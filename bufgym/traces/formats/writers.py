@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,10 +18,8 @@ from bufgym.traces.formats.tables import CSV_HEADER
 from bufgym.traces.formats.text import write_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array, Trace
 
-# Lines of at most 11 digits, as many as fit into the reader's 4 GiB.
-MAX_PACKETS: Final = 3 * 10**8
-
-_CHUNK_PACKETS: Final = 10**6
+# Lines of at most 11 digits, as many as fit into the reader's 128 MiB.
+MAX_PACKETS: Final = 10**7
 
 
 def write_csv(trace: Trace, path: StrPath) -> None:
@@ -51,14 +49,14 @@ def write_mahimahi(trace: Trace, path: StrPath) -> None:
     then. A trace that came from Mahimahi is preserved exactly (its packets of ms 0 as packets of ms 1).
 
     Raises:
-        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**7 s, 3 * 10**8
+        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**7 s, 10**7
             packets).
     """
     packets = trace.total_bytes // PACKET_BYTES
     if packets > MAX_PACKETS or trace.duration_us > MAX_DURATION_S * US_PER_S:
         rule = f"the trace must last at most {MAX_DURATION_S} s and hold at most {MAX_PACKETS} packets"
         raise fault(path, f"cannot be written: {rule}")
-    write_text(path, _stamps(trace, packets))
+    write_text(path, (f"{stamp}\n" for stamp in _stamps(trace, packets)))
 
 
 WRITERS: Final[dict[str, Callable[[Trace, StrPath], None]]] = {"csv": write_csv, "mahimahi": write_mahimahi}
@@ -100,16 +98,12 @@ def difference(trace: Trace, copy: Trace) -> Difference:
     return Difference(copy.duration_us - trace.duration_us, copy.total_bytes - trace.total_bytes, largest)
 
 
-def _stamps(trace: Trace, packets: int) -> Iterator[str]:
-    """The lines of all packets that are through by the end, and one more if the last is through before the end."""
-    end_ms, last_ms = -(-trace.duration_us // 1000), 0
-    for first in range(1, packets + 1, _CHUNK_PACKETS):
-        due = np.arange(first, min(first + _CHUNK_PACKETS, packets + 1), dtype=np.int64) * PACKET_BYTES
-        stamps_ms = -(-_transmitted_us(trace, due) // 1000)
-        last_ms = int(stamps_ms[-1])
-        yield "".join(f"{stamp}\n" for stamp in stamps_ms.tolist())
-    if last_ms < end_ms:
-        yield f"{end_ms}\n"
+def _stamps(trace: Trace, packets: int) -> list[int]:
+    """The ms of all packets that are through by the end, and of one more if the last is through before the end."""
+    end_ms = -(-trace.duration_us // 1000)
+    due = np.arange(1, packets + 1, dtype=np.int64) * PACKET_BYTES
+    stamps_ms: list[int] = (-(-_transmitted_us(trace, due) // 1000)).tolist()
+    return stamps_ms if packets and stamps_ms[-1] == end_ms else [*stamps_ms, end_ms]
 
 
 def _transmitted_us(trace: Trace, due: Int64Array) -> Int64Array:
