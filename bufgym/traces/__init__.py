@@ -21,7 +21,7 @@ from bufgym.traces.formats.motions import read_motion, write_motion_csv
 from bufgym.traces.formats.recordings import read_workload, workload_from_bag
 from bufgym.traces.formats.trajectories import read_poses
 from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
-from bufgym.traces.formats.writers import WRITERS, Difference, difference, write_csv, write_mahimahi
+from bufgym.traces.formats.writers import WRITERS, difference, write_csv, write_mahimahi
 from bufgym.traces.generate import (
     drive_motion,
     fitted_links,
@@ -41,7 +41,6 @@ from bufgym.traces.workload import Workload
 __all__ = [
     "FORMATS",
     "WRITERS",
-    "Difference",
     "Motion",
     "MotionSettings",
     "Poses",

@@ -1,13 +1,13 @@
 """Bandwidth traces into files, and how much a copy differs from its original.
 
 `write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms, so any other trace loses something.
-`difference` compares the trace with its copy.
+`difference` says how much.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -62,40 +62,21 @@ def write_mahimahi(trace: Trace, path: StrPath) -> None:
 WRITERS: Final[dict[str, Callable[[Trace, StrPath], None]]] = {"csv": write_csv, "mahimahi": write_mahimahi}
 
 
-class Difference(NamedTuple):
-    """How a copy of a trace differs from the trace.
-
-    Attributes:
-        duration_us: how much longer the copy lasts, microseconds.
-        total_bytes: how many more bytes the copy carries in all.
-        largest_bytes: the greatest difference between the cumulative bytes of both at any one time, >= 0.
-    """
-
-    duration_us: int
-    total_bytes: int
-    largest_bytes: float
-
-    def __str__(self) -> str:
-        if not any(self):
-            return "nothing lost"
-        parts = [f"total {self.total_bytes:+d} bytes", f"at most {self.largest_bytes:.6g} bytes off at any time"]
-        if self.duration_us:
-            parts.append(f"duration {self.duration_us / 1000:+g} ms")
-        return ", ".join(parts)
-
-
-def difference(trace: Trace, copy: Trace) -> Difference:
-    """How far `copy` is from `trace`, up to the end of the shorter one.
+def difference(trace: Trace, copy: Trace) -> str:
+    """How far `copy` is from `trace` in all, and at any one time up to the end of the shorter one, in words.
 
     Between knots both are straight lines, so they are farthest apart at a knot of one of them.
     """
-    end_us = min(trace.duration_us, copy.duration_us)
-    largest = 0.0
+    largest_bytes = 0.0
     for times in (trace.time_us, copy.time_us):
-        inside = times[times <= end_us]
+        inside = times[times <= min(trace.duration_us, copy.duration_us)]
         original, copied = (np.interp(inside, link.time_us, link.cumulative_bytes) for link in (trace, copy))
-        largest = max(largest, float(np.abs(original - copied).max()))
-    return Difference(copy.duration_us - trace.duration_us, copy.total_bytes - trace.total_bytes, largest)
+        largest_bytes = max(largest_bytes, float(np.abs(original - copied).max()))
+    bytes_more, us_more = copy.total_bytes - trace.total_bytes, copy.duration_us - trace.duration_us
+    if not (largest_bytes or bytes_more or us_more):
+        return "nothing lost"
+    lost = f"total {bytes_more:+d} bytes, at most {largest_bytes:.6g} bytes off at any time"
+    return f"{lost}, duration {us_more / 1000:+g} ms" if us_more else lost
 
 
 def _stamps(trace: Trace, packets: int) -> list[int]:
