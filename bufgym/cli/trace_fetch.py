@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from rich.console import Console
-from rich.progress import DownloadColumn, Progress
 
 from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError
@@ -53,12 +49,8 @@ def fetch(
     if list:
         print(f"{dataset.name}\n{columns(_about(dataset))}\n{_addresses(dataset)}".rstrip())
         return
-    with _bars() as watch:
-        fetched = fetch_dataset(dataset, to, local_files, note=_note, watch=watch)
+    fetched = fetch_dataset(dataset, to, local_files, note=lambda sentence: print(sentence, file=sys.stderr))
     print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")
-
-
-# --- output -----------------------------------------------------------------------------------------------------------
 
 
 def _overview(table: list[Dataset]) -> str:
@@ -99,30 +91,3 @@ def _results(fetched: list[Fetched]) -> list[tuple[str, str]]:
     first = fetched[0].path
     lines.append(("at", str(first if len(fetched) == 1 else first.parent)))
     return lines + [("unpacked", str(file.unpacked)) for file in fetched if file.unpacked is not None]
-
-
-# --- progress ---------------------------------------------------------------------------------------------------------
-
-
-def _note(sentence: str) -> None:
-    print(sentence, file=sys.stderr)
-
-
-@contextmanager
-def _bars() -> Iterator[Callable[[str], Callable[[int, int | None], None]]]:
-    """A progress bar for each file on a terminal; elsewhere a line when a file is whole."""
-    plain = not sys.stderr.isatty()
-    parts = *Progress.get_default_columns(), DownloadColumn()
-    with Progress(*parts, console=Console(stderr=True), disable=plain) as progress:
-
-        def watch(name: str) -> Callable[[int, int | None], None]:
-            task = progress.add_task(name, total=None)
-
-            def moved(count: int, total: int | None) -> None:
-                progress.update(task, completed=count, total=total)
-                if plain and count == total:
-                    _note(f"{name}: {count:,} bytes of {total:,}")
-
-            return moved
-
-        yield watch

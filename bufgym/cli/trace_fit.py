@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from bufgym.cli.options import Count, columns, command_line
+from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
@@ -21,9 +22,6 @@ def fit(
     suite: str | None = None,
     data: str | None = None,
     out: Annotated[Path, Parameter(alias="-o")],
-    page: Path | None = None,
-    sets: Count = 199,
-    held_out: Count | None = None,
 ) -> None:
     """Fit the parameters of generated links to recordings.
 
@@ -33,47 +31,36 @@ def fit(
         suite: Or the links that these suites (A,B) train on; the mode is the suite's name without its version.
         data: The folder of recordings that the suites need.
         out: The parameters to write (.json).
-        page: Also write a page (.md) that compares recordings and generated links.
-        sets: Generated sets for the page; the p-values are multiples of 1 / (N + 1).
-        held_out: Recordings of each mode that the page holds out at most, a fit each (default: all).
     """
-    from bufgym.traces.fit.fit import fit_links
-    from bufgym.traces.fit.page import check_page, write_page
-    from bufgym.traces.fit.statistics import LOW_BYTES_PER_S
+    from bufgym.traces.fit import LOW_BYTES_PER_S, fit_links
     from bufgym.traces.generate.parameters import write_links
 
-    if page is not None:
-        check_page(page)
-    if suite is None:
-        if not files:
-            raise BufgymError("trace fit: needs recordings, FILE ... or --suite NAME")
-        if data is not None:
-            raise BufgymError("--data: needs --suite")
-        rows = _of_files(files, mode)
-        made_by = command_line(" ".join(["trace fit", *_patterns(files)]), mode=mode) + f" -o {out.name}"
-    else:
-        if files or mode:
-            raise BufgymError("--suite: cannot go with FILE or --mode")
-        rows = _of_suites(suite.split(","), data)
-        made_by = command_line("trace fit", suite=suite, data=data and "DIR") + f" -o {out.name}"
+    rows, words = recordings_of(files, mode, suite, data)
     links = fit_links(rows)
-    write_links(links, out, LOW_BYTES_PER_S, made_by)
+    write_links(links, out, LOW_BYTES_PER_S, f"bufgym trace fit {words} -o {out.name}")
     print(columns([(mode, f"{link.recordings} recordings", f"{link.seconds} s") for mode, link in links.items()]))
     print(f"wrote {out}")
-    if page is not None:
-        made_by += f" --page {page.name}" + ("" if held_out is None else f" --held-out {held_out}")
-        write_page(links, rows, page, made_by, sets, held_out)
-        print(f"wrote {page}")
 
 
-def _of_files(files: tuple[str, ...], mode: str | None) -> dict[str, list[Float64Array]]:
-    """Collect rates by mode from the files."""
-    from bufgym.traces.fit.fit import mode_of, rates_of
+def recordings_of(
+    files: Sequence[str], mode: str | None, suite: str | None, data: str | None
+) -> tuple[dict[str, list[Float64Array]], str]:
+    """Collect the rates of recordings by mode; also return the words of a command line that ask for them."""
+    from bufgym.traces.fit import mode_of, rates_of
 
+    if suite is not None:
+        if files or mode:
+            raise BufgymError("--suite: cannot go with FILE or --mode")
+        return _of_suites(suite.split(","), data), f"--suite {suite}" + (" --data DIR" if data else "")
+    if not files:
+        raise BufgymError("trace fit: needs recordings, FILE ... or --suite NAME")
+    if data is not None:
+        raise BufgymError("--data: needs --suite")
     rows: dict[str, list[Float64Array]] = {}
     for file in sorted(set(files)):
         rows.setdefault(mode or mode_of(file), []).append(rates_of(file))
-    return {mode: rows[mode] for mode in sorted(rows)}
+    words = [*_patterns(files), *(["--mode", mode] if mode else [])]
+    return {mode: rows[mode] for mode in sorted(rows)}, " ".join(words)
 
 
 def _of_suites(names: list[str], data: str | None) -> dict[str, list[Float64Array]]:
@@ -89,7 +76,7 @@ def _of_suites(names: list[str], data: str | None) -> dict[str, list[Float64Arra
     return rows
 
 
-def _patterns(files: tuple[str, ...]) -> list[str]:
+def _patterns(files: Sequence[str]) -> list[str]:
     """Write each folder's files as a pattern relative to their common folder."""
     folders = {(Path(file).resolve().parent, Path(file).suffix) for file in files}
     top = Path(os.path.commonpath([folder for folder, _ in folders]))

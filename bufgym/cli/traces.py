@@ -1,7 +1,8 @@
-"""``bufgym trace``: describe, plot, validate and convert bandwidth traces. Other verbs have modules of their own."""
+"""``bufgym trace``: describe, plot and convert bandwidth traces. Other verbs have modules of their own."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,44 +29,25 @@ Column = Annotated[str | None, Parameter(help="Of UCC files (DL_bitrate, UL_bitr
 # --- info ------------------------------------------------------------------------------------------------------------
 
 
-def info(files: Files, /, *, format: Format = None, column: Column = None) -> None:
-    """Print statistics of bandwidth traces."""
+def info(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+    """Print statistics of bandwidth traces; exit code 2 if one is not sound."""
     from bufgym import traces
 
-    blocks = []
-    for name in files:
-        trace = traces.load(name, format, column=column)
+    failed = 0
+    for k, name in enumerate(files):
+        try:
+            trace = traces.load(name, format, column=column)
+        except TraceError as error:
+            failed += 1
+            print(f"bufgym: error: {error}", file=sys.stderr)
+            continue
         lines = [
             (key, f"{number:,.6g}" if number < 1e6 else f"{number:,.0f}")
             for key, number in traces.describe(trace).items()
         ]
         knots = ("knots", f"{len(trace.time_us)}")
-        blocks.append(f"{printable(trace.name)}\n" + columns([("source", trace.source), knots, *lines]))
-    print("\n\n".join(blocks))
-
-
-# --- validate --------------------------------------------------------------------------------------------------------
-
-
-def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
-    """Read each file and say whether it is sound; exit code 1 if not all."""
-    from bufgym import traces
-
-    failed = 0
-    for name in files:
-        try:
-            trace = traces.load(name, format, column=column)
-        except TraceError as error:
-            failed += 1
-            print(f"error  {error}")
-        else:
-            summary = traces.describe(trace)
-            print(
-                f"OK     {printable(trace.source)}: {summary['duration_s']:.1f} s, mean {summary['mean_KBps']:.1f} KB/s"
-            )
-    if len(files) > 1:
-        print(f"{len(files) - failed} of {len(files)} files are sound")
-    return 1 if failed else 0
+        print("\n" * (k > failed) + f"{printable(trace.name)}\n{columns([('source', trace.source), knots, *lines])}")
+    return 2 if failed else 0
 
 
 # --- convert ---------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
 workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
 
 This room holds `Trace`, `Motion` and `Workload`, and `shipped`, which loads them by name. `formats` reads and writes
-files, `generate` makes links and motions, `fit` fits links to recordings and compares both, and `datasets`
+files, `generate` makes links and motions, `fit` fits links to recordings, and `datasets`
 fetches public recordings.
 
 An argument out of its range raises a BufgymError. A file that cannot be read or written, or that breaks a rule of its
@@ -21,7 +21,7 @@ from bufgym.traces.formats.motions import read_motion, write_motion_csv
 from bufgym.traces.formats.recordings import read_workload, workload_from_bag
 from bufgym.traces.formats.trajectories import read_poses
 from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
-from bufgym.traces.formats.writers import WRITERS, Difference, difference, write_csv, write_mahimahi
+from bufgym.traces.formats.writers import WRITERS, difference, write_csv, write_mahimahi
 from bufgym.traces.generate import (
     drive_motion,
     fitted_links,
@@ -41,7 +41,6 @@ from bufgym.traces.workload import Workload
 __all__ = [
     "FORMATS",
     "WRITERS",
-    "Difference",
     "Motion",
     "MotionSettings",
     "Poses",

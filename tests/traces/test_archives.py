@@ -1,5 +1,6 @@
 """Archives from strangers: unpacked inside their folder, or refused."""
 
+import gzip
 import io
 import random
 import re
@@ -26,8 +27,8 @@ def zipped(path: Path, contents: Members, method: int = zipfile.ZIP_DEFLATED) ->
     return path
 
 
-def tarred(path: Path, *contents: tuple[str, bytes], kind: bytes = tarfile.REGTYPE, mode: str = "w:gz") -> Path:
-    with tarfile.open(path, mode) as archive:  # type: ignore[call-overload]
+def tarred(path: Path, *contents: tuple[str, bytes], kind: bytes = tarfile.REGTYPE) -> Path:
+    with tarfile.open(path, "w:gz") as archive:
         for name, content in contents:
             info = tarfile.TarInfo(name)
             info.size, info.type, info.linkname = len(content), kind, "elsewhere"
@@ -37,8 +38,7 @@ def tarred(path: Path, *contents: tuple[str, bytes], kind: bytes = tarfile.REGTY
 
 def test_archives_unpack(tmp_path: Path) -> None:
     contents = [("top/log.txt", b"1 2\n"), ("top/deep/er.bin", DATA)]
-    modes = {"a.tgz": "w:gz", "a.tar.gz": "w:gz", "a.tar.bz2": "w:bz2", "a.tar.xz": "w:xz", "a.tar": "w"}
-    packed = [tarred(tmp_path / name, *contents, mode=mode) for name, mode in modes.items()]
+    packed = [tarred(tmp_path / name, *contents) for name in ("a.tgz", "a.tar.gz")]
     for archive in (zipped(tmp_path / "a.zip", {**dict(contents), "__MACOSX/top/._log.txt": b"junk"}), *packed):
         out = tmp_path / f"{archive.name}.out"
         unpack(archive, out)
@@ -84,8 +84,8 @@ def test_what_is_no_file_comes_twice_or_is_too_much_is_refused(tmp_path: Path, m
     # tarfile would read an extended header of any announced length into memory.
     info = tarfile.TarInfo("x")
     info.type, info.size = tarfile.XHDTYPE, 2**31
-    (tmp_path / "a.tar").write_bytes(info.tobuf(tarfile.USTAR_FORMAT) + bytes(10_240))
-    refused(tmp_path / "a.tar", "a header of 2147483648 bytes: must be at most")
+    tgz.write_bytes(gzip.compress(info.tobuf(tarfile.USTAR_FORMAT) + bytes(10_240)))
+    refused(tgz, "a header of 2147483648 bytes: must be at most")
     monkeypatch.setattr(unpacking, "MAX_MEMBERS", 3)
     refused(zipped(path, {f"{k}": b"" for k in range(4)}), "or 3 files: must be less")
     refused(tarred(tgz, *((f"{k}", b"") for k in range(4))), "or 3 files: must be less")

@@ -1,6 +1,6 @@
 """Recordings of robots, in every container: the same drive reads the same, and what is broken or too much says so."""
 
-import lzma
+import gzip
 import math
 import os
 import sqlite3
@@ -201,9 +201,9 @@ def test_a_recording_unpacks_to_no_more_than_it_may(tmp_path: Path, monkeypatch:
     chunks = cases.write_mcap(tmp_path / "b.mcap", [(ms, "/t", "x", bytes(50_000)) for ms in range(60)])
     refused(chunks, "unpacks to more than")
     # Refused from the header's own number, before a byte is written.
-    zeros, header = tmp_path / "zeros.tar.xz", tarfile.TarInfo("zeros.csv")
+    zeros, header = tmp_path / "zeros.tgz", tarfile.TarInfo("zeros.csv")
     header.size = 10_000_000
-    with lzma.open(zeros, "wb", preset=0) as file:
+    with gzip.open(zeros, "wb") as file:
         file.write(header.tobuf() + bytes(header.size))
     with pytest.raises(BufgymError, match=r"unpacks to more than \d+ bytes"):
         unpack(zeros, tmp_path / "zeros")

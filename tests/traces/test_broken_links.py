@@ -28,7 +28,7 @@ BROKEN = [
     ("1\n\n5\n4\n", r"line 4: time in ms = 4: must not be before the line above \(5\)"),
     ("1\n99999999999\n", "line 2: time in ms = 99999999999: must be at most 10000000000"),
     ("1\n2 3\n", "line 2: '2 3': must have 1 columns, has 2"),
-    ("0\n0\n", "line 2: time in ms = 0: the last time must be after ms 0"),
+    ("0\n0\n", ": time in ms = 0: the last time must be after ms 0"),
     ("1\n" + "2" * 5000, "line 2: 2222.*: must be at most 4096 characters"),
     (b"1\n\xff\xfe\n", "line 2: .*must be UTF-8 text"),
     (HEADER, "holds no measurement"),
@@ -88,9 +88,8 @@ LIMITS = [
     (text_files, "MAX_TEXT_BYTES", 30, "1\n" * 500, "more than 30 bytes of text"),
     (text_files, "MAX_LINES", 3, HEADER + "1,1,1\n2,1,1\n3,1,1\n", "line 4: more than 3 .*must be fewer"),
     (text_files, "MAX_LINES", 30, "\n" * 40, "line 31: more than 30 .*must be fewer"),
-    (mahimahi, "MAX_TIMES", 3, "1\n2\n2\n3\n4\n", "line 5: more than 3 different times: must be fewer"),
-    (mahimahi, "_CHUNK_BYTES", 1000, "\n".join(map(str, range(4321))) + "\n4l\n5000", "line 4322: time in ms = 4l"),
-    (text_files, "MAX_LINES", 10**8, "[" + " " * 2**24, "more than 16777216 bytes of JSON"),
+    (mahimahi, "MAX_BYTES", 9, "1\n2\n2\n3\n4\n", ": more than 9 bytes: must be at most"),
+    (text_files, "MAX_LINES", 10**8, "[" + " " * 2**24, "more than 16777216 bytes: must"),
 ]
 
 
@@ -99,15 +98,6 @@ def test_reading_stops_at_each_limit(tmp_path: Path, monkeypatch: pytest.MonkeyP
         with monkeypatch.context() as patch, pytest.raises(TraceError, match=says):
             patch.setattr(module, limit, value)
             read_trace(written(tmp_path, gzip.compress(text.encode())))
-
-
-def test_mahimahi_limits_odd_lines_but_not_bare_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mahimahi, "MAX_LINES", 50)
-    monkeypatch.setattr(mahimahi, "_CHUNK_BYTES", 64)
-    for end in ("\n", "\r\n"):
-        assert read_trace(written(tmp_path, f"7{end}" * 100)).total_bytes == 150_000
-    with pytest.raises(TraceError, match=r"line \d+: more than 50 lines so far in blocks that are not all bare"):
-        read_trace(written(tmp_path, "7\n" + "\n" * 200))
 
 
 def test_a_format_must_be_known_and_said_where_two_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

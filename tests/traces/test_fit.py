@@ -11,13 +11,13 @@ from bufgym.ground.errors import BufgymError
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
 from bufgym.traces import write_csv
-from bufgym.traces.fit.compare import compare, held_out, ks_distance
-from bufgym.traces.fit.fit import fit_links, mode_of, rates_of
-from bufgym.traces.fit.statistics import autocorrelation, spells
+from bufgym.traces.fit import autocorrelation, fit_links, mode_of, rates_of, spells
 from bufgym.traces.generate import LinkParameters, OutageParameters, markov_link, read_links
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import LINKS, UPLINKS
 from bufgym.traces.trace import Float64Array
+from website.compare_links import compare, held_out, ks_distance
+from website.fit import main as write_page
 
 KNOWN = LinkParameters(
     recordings=20,
@@ -39,7 +39,7 @@ def recordings(link: LinkParameters = KNOWN, first_seed: int = 0) -> list[Float6
 def quick(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Fits try each memory on some hundred seconds only, but in the night."""
     if request.node.get_closest_marker("nightly") is None:
-        monkeypatch.setattr("bufgym.traces.fit.fit._TRIAL_S", 500)
+        monkeypatch.setattr("bufgym.traces.fit._TRIAL_S", 500)
 
 
 def rows_of(values: list[float]) -> list[Float64Array]:
@@ -126,10 +126,11 @@ def test_the_command_writes_parameters_and_a_page(tmp_path: Path, capsys: Capsys
         write_csv(markov_link("known", seed, 200, links={"known": KNOWN}), file)
     out, page, figure = tmp_path / "links.json", tmp_path / "page.md", tmp_path / "figures" / "link-known.svg"
     fit = ["trace", "fit", "-o", out]
-    assert "3 recordings" in shown([*fit, *files[::-1], "--page", page, "--sets", "9"], capsys) and figure.exists()
+    assert "3 recordings" in shown([*fit, *files[::-1]], capsys)
+    write_page([str(out), str(page), *files, "--sets", "9"])
     text, fitted = page.read_text(), read_links(out)
     assert "| autocorrelation at 30 s |" in text and str(tmp_path) not in text + out.read_text()
-    assert "![known: recordings and generated links](figures/link-known.svg)" in text
+    assert "![known: recordings and generated links](figures/link-known.svg)" in text and figure.exists()
     shown([*fit, *files], capsys)  # in any order
     assert read_links(out) == fitted and fitted["known"].seconds == 600
     shown([*fit, *files, "--mode", "walk"], capsys)
@@ -157,7 +158,6 @@ def test_what_the_command_refuses(tmp_path: Path, capsys: Capsys) -> None:
         ("", "needs recordings, FILE ... or --suite NAME"),
         ("a.csv --suite lte-v1", "--suite: cannot go with FILE or --mode"),
         ("a.csv --data .", "--data: needs --suite"),
-        ("a.csv --page x.html", "--page x.html: must end in .md"),
     ):
         fails(["trace", "fit", *words.split(), "-o", tmp_path / "b.json"], says, capsys)
     assert not (tmp_path / "b.json").exists()

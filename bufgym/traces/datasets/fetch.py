@@ -13,11 +13,10 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal
 from urllib.parse import urljoin
 
 from bufgym.ground import __version__, files
@@ -34,12 +33,6 @@ RETRIES: Final = 2
 """Further attempts after the first has failed."""
 
 Origin = Literal["downloaded", "there already", "copied"]
-Note: TypeAlias = Callable[[str], None]
-"""Called with a sentence about what is being done."""
-Progress: TypeAlias = Callable[[int, int | None], None]
-"""Called with about the bytes on disk, and the file's length (None if the server does not say)."""
-Watch: TypeAlias = Callable[[str], Progress]
-"""Called with a file's name; returns what is called with the progress of its download."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +63,7 @@ def fetch_dataset(
     to: StrPath | None = None,
     local_files: Sequence[StrPath] = (),
     *,
-    note: Note | None = None,
-    watch: Watch | None = None,
+    note: Callable[[str], None] = lambda sentence: None,
 ) -> list[Fetched]:
     """Put a data set into `to`/NAME.
 
@@ -80,7 +72,6 @@ def fetch_dataset(
         to: the folder for data sets, by default `cache_folder()`.
         local_files: files fetched by hand, recognised by name or checksum; if there are any, nothing is downloaded.
         note: called with what happens, in sentences.
-        watch: called with the name of each file before its download, for a callback that reports the progress.
 
     Returns:
         The files, in the order of the data set or of `local_files`.
@@ -100,7 +91,6 @@ def fetch_dataset(
             f"{dataset.name}: the address of its files is not known: fetch them by hand from {dataset.page} and "
             f"name them with --from FILE"
         )
-    note = note or (lambda sentence: None)
     root = cache_folder() if to is None else Path(to)
     folder = root / dataset.name
     with os_errors(folder, "written"):
@@ -114,7 +104,7 @@ def fetch_dataset(
     try:
         if local_files:
             return [_copied(dataset, folder, Path(file)) for file in local_files]
-        return [_downloaded(remote, folder, note, watch) for remote in dataset.files]
+        return [_downloaded(remote, folder, note) for remote in dataset.files]
     finally:
         lock.release()
 
@@ -122,59 +112,54 @@ def fetch_dataset(
 # --- one file ---------------------------------------------------------------------------------------------------------
 
 
-def _downloaded(remote: Remote, folder: Path, note: Note, watch: Watch | None) -> Fetched:
+def _downloaded(remote: Remote, folder: Path, note: Callable[[str], None]) -> Fetched:
     target = folder / remote.path
     if target.is_file():
         checksum = _sha256(target)
         if remote.sha256 in (None, checksum):
             return _settled(remote, target, checksum, "there already")
         note(f"{target}: changed since it was fetched: fetching it again")
+    note(f"downloading {remote.address}")
     scratch = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(scratch, ignore_errors=True)  # of a process that was killed
     try:
-        _download(remote, scratch / "file", watch(remote.path) if watch is not None else lambda count, total: None)
+        _download(remote, scratch / "file")
         return _placed(remote, scratch / "file", target, "downloaded")
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _download(remote: Remote, part: Path, progress: Progress) -> None:
+def _download(remote: Remote, part: Path) -> None:
     import pooch
 
     pooch.get_logger().setLevel("WARNING")
-    meter = _Meter(remote.address, progress)
     downloader = pooch.HTTPDownloader(
-        progressbar=meter,
+        progressbar=_Limit(remote.address),
         timeout=SILENCE_S,
         headers={"User-Agent": f"bufgym/{__version__}", "Accept-Encoding": "identity"},
         hooks={"response": _refuse_plain},
     )
-    cache = pooch.create(
-        part.parent,
-        base_url="",
-        registry={part.name: remote.sha256},
-        urls={part.name: remote.address},
-        retry_if_failed=RETRIES,
-    )
-    with _failures(remote.address):
+    registry, urls = {part.name: remote.sha256}, {part.name: remote.address}
+    cache = pooch.create(part.parent, base_url="", registry=registry, urls=urls, retry_if_failed=RETRIES)
+    try:
         cache.fetch(part.name, downloader=downloader)
-    count = part.stat().st_size
-    if meter.total and count != meter.total:
-        raise BufgymError(f"{remote.address}: the connection was cut after {count} of {meter.total} bytes")
+    except BufgymError:
+        raise
+    except (OSError, ValueError) as error:
+        raise BufgymError(f"{remote.address}: {_said(error)}") from None
 
 
-class _Meter:
-    """What pooch calls a progress bar."""
+class _Limit:
+    """What pooch calls a progress bar: hears of every piece of a file, and stops one without end."""
 
-    def __init__(self, address: str, progress: Progress) -> None:
+    def __init__(self, address: str) -> None:
+        self._address = address
         self.total = self._count = 0
-        self._address, self._progress = address, progress
 
     def update(self, count: int) -> None:
         self._count += count
         if self._count > MAX_BYTES:
             raise BufgymError(f"{self._address}: sends more than {MAX_BYTES} bytes: must be less")
-        self._progress(min(self._count, self.total or self._count), self.total or None)
 
     def reset(self) -> None:
         self._count = 0
@@ -190,33 +175,26 @@ def _refuse_plain(response: Any, **options: Any) -> None:
         raise BufgymError(f"{response.url}: redirects to {to}, which is not allowed")
 
 
-@contextmanager
-def _failures(address: str) -> Iterator[None]:
-    """Turn what goes wrong on the way into one sentence."""
+def _said(error: Exception) -> str:
+    """What went wrong on the way, in one sentence."""
     from requests import exceptions
 
-    try:
-        yield
-    except BufgymError:
-        raise
-    except exceptions.HTTPError as error:
+    if isinstance(error, exceptions.HTTPError):
         said = str(error).partition(" for url")[0]
-        rule = f"the server says {said}"
         if said.startswith("404"):
-            rule = "no such file on the server (404); it may have moved: fetch it by hand, then use --from"
-        raise BufgymError(f"{address}: {rule}") from None
-    except exceptions.SSLError as error:
-        raise BufgymError(f"{address}: no safe connection to the server ({_reason(error)})") from None
-    except exceptions.Timeout:
-        raise BufgymError(f"{address}: the server does not respond") from None
-    except (exceptions.ConnectionError, exceptions.ChunkedEncodingError) as error:
-        raise BufgymError(f"{address}: no network, no such server, or it broke off ({_reason(error)})") from None
-    except exceptions.RequestException as error:
-        raise BufgymError(f"{address}: cannot be downloaded ({_reason(error)})") from None
-    except OSError as error:
-        raise BufgymError(f"{address}: cannot be written to the disk: {error.strerror or error}") from None
-    except ValueError as error:  # pooch's: the checksum; or an address that is none
-        raise BufgymError(f"{address}: {str(error).partition('. ')[0]}; not kept") from None
+            return "no such file on the server (404); it may have moved: fetch it by hand, then use --from"
+        return f"the server says {said}"
+    if isinstance(error, exceptions.SSLError):
+        return f"no safe connection to the server ({_reason(error)})"
+    if isinstance(error, exceptions.Timeout):
+        return "the server does not respond"
+    if isinstance(error, exceptions.ConnectionError | exceptions.ChunkedEncodingError):
+        return f"no network, no such server, or it broke off ({_reason(error)})"
+    if isinstance(error, exceptions.RequestException):
+        return f"cannot be downloaded ({_reason(error)})"
+    if isinstance(error, OSError):
+        return f"cannot be written to the disk: {error.strerror or error}"
+    return f"{str(error).partition('. ')[0]}; not kept"  # pooch's: the checksum; or an address that is none
 
 
 def _reason(error: BaseException) -> str:

@@ -24,6 +24,7 @@ interval, 10**6 Mbit/s. `text.py` has the limits of text files.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,27 +33,20 @@ from typing import Final
 from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
-from bufgym.traces.formats.logs import UCC_COLUMNS, fits_nyu, fits_sabre, fits_ucc, read_nyu, read_sabre, read_ucc
+from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.speed_tests import (
+    INTERVAL,
+    REMARK,
+    RULER,
+    RUN,
     RUNS,
-    fits_iperf3,
-    fits_nuttcp,
-    fits_runs,
     read_iperf3,
     read_nuttcp,
     read_runs,
 )
-from bufgym.traces.formats.tables import (
-    CSV_HEADER,
-    RATES_HEADER,
-    numbers,
-    read_belgium,
-    read_csv,
-    read_mbit,
-    read_rates,
-)
-from bufgym.traces.formats.text import is_header, open_text
+from bufgym.traces.formats.tables import CSV_HEADER, RATES_HEADER, read_belgium, read_csv, read_mbit, read_rates
+from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace
 
 _SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json", ".list", ".out")
@@ -64,7 +58,7 @@ class Format:
 
     layout: str
     """What a line looks like, in words."""
-    fits: Callable[[str], bool]
+    fits: Callable[[str], object]
     """Whether a first line is one of this format."""
     read: Callable[..., Knots]
     """Reads a file's knots; with `columns`, the one to read is its second argument."""
@@ -72,18 +66,27 @@ class Format:
     """The columns to choose from, the default first; empty where there is no choice."""
 
 
+def _cells(*patterns: str, between: str = r"\s+") -> Callable[[str], object]:
+    """Whether a line is cells of these patterns."""
+    return re.compile(between.join(patterns)).fullmatch
+
+
 FORMATS: Final[dict[str, Format]] = {
-    "mahimahi": Format("one number, the ms of a packet", numbers(1), read_mahimahi),
+    "mahimahi": Format("one number, the ms of a packet", _cells(NUMBER), read_mahimahi),
     "csv": Format(f"header {CSV_HEADER}", lambda text: is_header(text, CSV_HEADER), read_csv),
-    "mbit": Format("two numbers, s and Mbit/s", numbers(2), read_mbit),
-    "belgium": Format("six numbers", numbers(6), read_belgium),
+    "mbit": Format("two numbers, s and Mbit/s", _cells(NUMBER, NUMBER), read_mbit),
+    "belgium": Format("six numbers", _cells(*[NUMBER] * 6), read_belgium),
     "rates": Format(f"header {RATES_HEADER}", lambda text: is_header(text, RATES_HEADER), read_rates),
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
-    "nyu": Format("number,unit with a unit such as Mbits/sec", fits_nyu, read_nyu),
-    "sabre": Format("JSON list", fits_sabre, read_sabre),
-    "nuttcp": Format("nuttcp's log", fits_nuttcp, read_nuttcp),
-    "iperf3": Format("JSON object", fits_iperf3, read_iperf3),
-    "runs": Format("Run 1, or ###", fits_runs, read_runs, RUNS),
+    "nyu": Format(
+        "number,unit with a unit such as Mbits/sec",
+        _cells(NUMBER, f"(?:{'|'.join(NYU_BITS)})", between=r"\s*,\s*"),
+        read_nyu,
+    ),
+    "sabre": Format("JSON list", _cells(r"\["), read_sabre),
+    "nuttcp": Format("nuttcp's log", lambda text: INTERVAL.fullmatch(text) or REMARK.fullmatch(text), read_nuttcp),
+    "iperf3": Format("JSON object", _cells(r"\{"), read_iperf3),
+    "runs": Format("Run 1, or ###", lambda text: RUN.fullmatch(text) or RULER.fullmatch(text), read_runs, RUNS),
 }
 
 

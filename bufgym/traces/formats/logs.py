@@ -15,7 +15,7 @@ from typing import Any, Final, NoReturn
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
-from bufgym.traces.formats.text import Line, is_number, open_text, split_cells
+from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 
 UCC_COLUMNS: Final = ("DL_bitrate", "UL_bitrate")
@@ -27,7 +27,7 @@ MAX_UCC_STEP_S: Final = 5
 _MAX_KBIT_PER_S: Final = MAX_MBIT_PER_S * 1000
 _UCC_TIME: Final = "Timestamp"
 _UCC_TIME_FORMAT: Final = "%Y.%m.%d_%H.%M.%S"
-_NYU_BITS: Final = {"bits/sec": 1, "Kbits/sec": 10**3, "Mbits/sec": 10**6, "Gbits/sec": 10**9}
+NYU_BITS: Final = {"bits/sec": 1, "Kbits/sec": 10**3, "Mbits/sec": 10**6, "Gbits/sec": 10**9}
 _SHOWN_CHARACTERS: Final = 40
 
 
@@ -80,28 +80,17 @@ def _stamp(line: Line, text: str) -> datetime:
         raise line.error(text, "must be a time as 2019.12.16_13.40.04", _UCC_TIME) from None
 
 
-def fits_nyu(text: str) -> bool:
-    """A number and one of iPerf's units."""
-    cells = split_cells(text)
-    return len(cells) == 2 and is_number(cells[0]) and cells[1] in _NYU_BITS
-
-
 def read_nyu(path: StrPath) -> Knots:
     """Each line is the rate of 1 s with its unit; bytes are rounded to whole numbers."""
     intervals = Intervals()
     with open_text(path) as file:
         for line in file.lines():
             value, unit = line.columns(2, ",")
-            if unit not in _NYU_BITS:
-                raise line.error(unit, f"must be one of {', '.join(_NYU_BITS)}", "unit")
-            most = MAX_MBIT_PER_S * 10**6 / _NYU_BITS[unit]
-            intervals.add(line, US_PER_S, round(line.decimal(unit, value, 0, most) * _NYU_BITS[unit] / 8))
+            if unit not in NYU_BITS:
+                raise line.error(unit, f"must be one of {', '.join(NYU_BITS)}", "unit")
+            most = MAX_MBIT_PER_S * 10**6 / NYU_BITS[unit]
+            intervals.add(line, US_PER_S, round(line.decimal(unit, value, 0, most) * NYU_BITS[unit] / 8))
     return intervals.knots(path)
-
-
-def fits_sabre(text: str) -> bool:
-    """The opening bracket of a list."""
-    return text.startswith("[")
 
 
 def read_sabre(path: StrPath) -> Knots:

@@ -25,16 +25,11 @@ MAX_INTERVAL_S: Final = 3600
 """Longest interval of a speed test, s; a longer one does not measure a changing link."""
 
 _STAMP: Final = r"(?:\[[0-9T:.+ -]+\] *)?"
-_INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%)(.*)")
-_REMARK: Final = re.compile(_STAMP + r"(?:nuttcp(?:-[tr])?:.*|[0-9.]+ +MB +/.*%.*|(?:Start|End) time: *[0-9]+|)")
+INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%)(.*)")
+REMARK: Final = re.compile(_STAMP + r"(?:nuttcp(?:-[tr])?:.*|[0-9.]+ +MB +/.*%.*|(?:Start|End) time: *[0-9]+|)")
 _MBIT_PER_MB: Final = 2**20 * 8e-6
 # The interval's length is printed with two decimals.
 _LENGTH_ERROR: Final = 0.02
-
-
-def fits_nuttcp(text: str) -> bool:
-    """A remark of nuttcp or a first interval, with or without a stamp of time before it."""
-    return bool(text) and (_INTERVAL.fullmatch(text) or _REMARK.fullmatch(text)) is not None
 
 
 def read_nuttcp(path: StrPath) -> Knots:
@@ -46,11 +41,11 @@ def read_nuttcp(path: StrPath) -> Knots:
     intervals = Intervals()
     with open_text(path) as file:
         for line in file.lines():
-            match = _INTERVAL.fullmatch(line.text)
+            match = INTERVAL.fullmatch(line.text)
             if match is None:
                 if "error" in line.text.lower():
                     raise line.error(line.text, "must be a run that succeeded")
-                if not _REMARK.fullmatch(line.text):
+                if not REMARK.fullmatch(line.text):
                     raise line.error(line.text, "must be an interval, MB / sec = Mbps, or a remark of nuttcp")
                 continue
             megabytes = line.decimal("MB", match[1], 0, MAX_INTERVAL_BYTES / 2**20)
@@ -67,11 +62,6 @@ def read_nuttcp(path: StrPath) -> Knots:
 
 # Of one interval to the next; both are the same clock, written with six decimals.
 _MAX_STEP_S: Final = 1e-3
-
-
-def fits_iperf3(text: str) -> bool:
-    """The opening bracket of an object."""
-    return text.startswith("{")
 
 
 def read_iperf3(path: StrPath) -> Knots:
@@ -115,13 +105,8 @@ RUNS: Final = tuple(f"run {number}" for number in range(1, MAX_RUNS + 1))
 RUN_STEP_S: Final = 0.1
 """Time between the samples of a run without times, s; runs with times have this step."""
 
-_RUN: Final = re.compile(r"Run ([0-9]{1,3})")
-_RULER: Final = re.compile(r"#{3,}")
-
-
-def fits_runs(text: str) -> bool:
-    """The heading of a run, or the ruler above it."""
-    return (_RUN.fullmatch(text) or _RULER.fullmatch(text)) is not None
+RUN: Final = re.compile(r"Run ([0-9]{1,3})")
+RULER: Final = re.compile(r"#{3,}")
 
 
 def read_runs(path: StrPath, column: str = RUNS[0]) -> Knots:
@@ -155,13 +140,13 @@ def runs_of(path: StrPath) -> dict[str, list[Line]]:
     runs: dict[str, list[Line]] = {}
     for number, content in enumerate(text.split("\n"), 1):
         line = Line(path, number, content.strip())
-        match = _RUN.fullmatch(line.text)
+        match = RUN.fullmatch(line.text)
         if match is not None:
             name = f"run {int(match[1])}"
             if name not in RUNS or name in runs:
                 raise line.error(match[1], f"must be from 1 to {MAX_RUNS}, and no run's above", "Run")
             runs[name] = []
-        elif line.text and not _RULER.fullmatch(line.text):
+        elif line.text and not RULER.fullmatch(line.text):
             if not runs:
                 raise line.error(line.text, "must come under a heading, Run 1")
             runs[next(reversed(runs))].append(line)

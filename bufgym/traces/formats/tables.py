@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.text import Line, TextFile, is_header, is_number, open_text
+from bufgym.traces.formats.text import Line, TextFile, is_header, open_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
@@ -64,16 +64,6 @@ def after_header(file: TextFile, header: str) -> Iterator[Line]:
     if not is_header(first.text, header):
         raise first.error(first.text, f"must be the header {header}")
     return lines
-
-
-def numbers(count: int) -> Callable[[str], bool]:
-    """A function that tells whether a line is `count` numbers separated by white space."""
-
-    def fits(text: str) -> bool:
-        cells = text.split()
-        return len(cells) == count and all(map(is_number, cells))
-
-    return fits
 
 
 def _rate(line: Line, separator: str | None, field: str, most: float, to_bytes_per_us: float) -> Rate:

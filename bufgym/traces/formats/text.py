@@ -1,9 +1,8 @@
 """Text files, written completely or not at all, and read with bounds: plain or gzip'd.
 
 Every reader gets its lines from here, so that a directory, a truncated download, a binary file or a compression bomb
-ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of text after decompression, 10**7 lines
-(Mahimahi, which is read in blocks, has no limit for lines of bare numbers), 4096 characters a line, and 16 MiB for
-JSON, which is held as a whole.
+ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of text after decompression, 10**7 lines,
+4096 characters a line, and for what is held as a whole 16 MiB of JSON and 128 MiB of Mahimahi's numbers.
 """
 
 from __future__ import annotations
@@ -33,13 +32,10 @@ _ZIP_MAGIC = b"PK\x03\x04"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 # int() and float() accept more than a data file should hold: "1_000", "infinity", digits of other scripts.
 _WHOLE = re.compile(r"[0-9]+")
-_NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
+NUMBER: Final = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+"""Pattern of a plain finite decimal number."""
+_NUMBER = re.compile(NUMBER)
 _MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
-
-
-def is_number(text: str) -> bool:
-    """Whether `text` is a plain finite decimal number."""
-    return _NUMBER.fullmatch(text) is not None
 
 
 def split_cells(text: str) -> list[str]:
@@ -121,17 +117,13 @@ def open_text(path: StrPath) -> Iterator[TextFile]:
 
 
 class TextFile:
-    """An open text file. Use one of `lines`, `first`, `text` and `read`; all of them respect the module's limits."""
+    """An open text file. Use one of `lines`, `first`, `text` and `whole`; all of them respect the module's limits."""
 
     def __init__(self, path: StrPath, stream: IO[bytes]) -> None:
         """Take the file's name, for error messages, and its bytes after decompression."""
         self.path = path
         self._stream = stream
         self._read_bytes = 0
-
-    def read(self, count: int, line: int) -> bytes:
-        """Up to `count` bytes, empty at the end; `line` is the line number for error messages."""
-        return self._take(count, line, whole_line=False)
 
     def lines(self) -> Iterator[Line]:
         """The lines that are not blank, numbered from 1, without surrounding white space.
@@ -141,7 +133,7 @@ class TextFile:
                 lines, blank ones included.
         """
         for number, raw in self._raw_lines():
-            line = parsed_line(self.path, number, raw)
+            line = _parsed_line(self.path, number, raw)
             if len(raw) > MAX_LINE_CHARACTERS and not raw.endswith(b"\n"):
                 raise _too_long(line)
             if line.text:
@@ -156,16 +148,21 @@ class TextFile:
             bracket = raw.lstrip()[:1]
             if bracket in (b"[", b"{"):
                 return Line(self.path, number, bracket.decode())
-            line = parsed_line(self.path, number, raw)
+            line = _parsed_line(self.path, number, raw)
             if line.text:
                 return line
         return None
 
-    def text(self, most: int = MAX_JSON_BYTES) -> str:
+    def whole(self, most: int) -> bytes:
         """All of it, at most `most` bytes."""
         content = self._take(most + 1, 1, whole_line=False)
         if len(content) > most:
-            raise fault(self.path, f"more than {most} bytes of JSON: must be at most")
+            raise fault(self.path, f"more than {most} bytes: must be at most")
+        return content
+
+    def text(self) -> str:
+        """All of it, at most MAX_JSON_BYTES."""
+        content = self.whole(MAX_JSON_BYTES)
         try:
             return content.decode("utf-8")
         except UnicodeDecodeError as error:
@@ -201,7 +198,7 @@ class TextFile:
         return data
 
 
-def parsed_line(path: StrPath, number: int, raw: bytes) -> Line:
+def _parsed_line(path: StrPath, number: int, raw: bytes) -> Line:
     """A line of bytes as text."""
     try:
         line = Line(path, number, raw.decode("utf-8").strip())

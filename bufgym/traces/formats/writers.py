@@ -1,13 +1,13 @@
 """Bandwidth traces into files, and how much a copy differs from its original.
 
 `write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms, so any other trace loses something.
-`difference` compares the trace with its copy.
+`difference` says how much.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 
@@ -18,10 +18,8 @@ from bufgym.traces.formats.tables import CSV_HEADER
 from bufgym.traces.formats.text import write_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array, Trace
 
-# Lines of at most 11 digits, as many as fit into the reader's 4 GiB.
-MAX_PACKETS: Final = 3 * 10**8
-
-_CHUNK_PACKETS: Final = 10**6
+# Lines of at most 11 digits, as many as fit into the reader's 128 MiB.
+MAX_PACKETS: Final = 10**7
 
 
 def write_csv(trace: Trace, path: StrPath) -> None:
@@ -51,65 +49,42 @@ def write_mahimahi(trace: Trace, path: StrPath) -> None:
     then. A trace that came from Mahimahi is preserved exactly (its packets of ms 0 as packets of ms 1).
 
     Raises:
-        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**7 s, 3 * 10**8
+        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**7 s, 10**7
             packets).
     """
     packets = trace.total_bytes // PACKET_BYTES
     if packets > MAX_PACKETS or trace.duration_us > MAX_DURATION_S * US_PER_S:
         rule = f"the trace must last at most {MAX_DURATION_S} s and hold at most {MAX_PACKETS} packets"
         raise fault(path, f"cannot be written: {rule}")
-    write_text(path, _stamps(trace, packets))
+    write_text(path, (f"{stamp}\n" for stamp in _stamps(trace, packets)))
 
 
 WRITERS: Final[dict[str, Callable[[Trace, StrPath], None]]] = {"csv": write_csv, "mahimahi": write_mahimahi}
 
 
-class Difference(NamedTuple):
-    """How a copy of a trace differs from the trace.
-
-    Attributes:
-        duration_us: how much longer the copy lasts, microseconds.
-        total_bytes: how many more bytes the copy carries in all.
-        largest_bytes: the greatest difference between the cumulative bytes of both at any one time, >= 0.
-    """
-
-    duration_us: int
-    total_bytes: int
-    largest_bytes: float
-
-    def __str__(self) -> str:
-        if not any(self):
-            return "nothing lost"
-        parts = [f"total {self.total_bytes:+d} bytes", f"at most {self.largest_bytes:.6g} bytes off at any time"]
-        if self.duration_us:
-            parts.append(f"duration {self.duration_us / 1000:+g} ms")
-        return ", ".join(parts)
-
-
-def difference(trace: Trace, copy: Trace) -> Difference:
-    """How far `copy` is from `trace`, up to the end of the shorter one.
+def difference(trace: Trace, copy: Trace) -> str:
+    """How far `copy` is from `trace` in all, and at any one time up to the end of the shorter one, in words.
 
     Between knots both are straight lines, so they are farthest apart at a knot of one of them.
     """
-    end_us = min(trace.duration_us, copy.duration_us)
-    largest = 0.0
+    largest_bytes = 0.0
     for times in (trace.time_us, copy.time_us):
-        inside = times[times <= end_us]
+        inside = times[times <= min(trace.duration_us, copy.duration_us)]
         original, copied = (np.interp(inside, link.time_us, link.cumulative_bytes) for link in (trace, copy))
-        largest = max(largest, float(np.abs(original - copied).max()))
-    return Difference(copy.duration_us - trace.duration_us, copy.total_bytes - trace.total_bytes, largest)
+        largest_bytes = max(largest_bytes, float(np.abs(original - copied).max()))
+    bytes_more, us_more = copy.total_bytes - trace.total_bytes, copy.duration_us - trace.duration_us
+    if not (largest_bytes or bytes_more or us_more):
+        return "nothing lost"
+    lost = f"total {bytes_more:+d} bytes, at most {largest_bytes:.6g} bytes off at any time"
+    return f"{lost}, duration {us_more / 1000:+g} ms" if us_more else lost
 
 
-def _stamps(trace: Trace, packets: int) -> Iterator[str]:
-    """The lines of all packets that are through by the end, and one more if the last is through before the end."""
-    end_ms, last_ms = -(-trace.duration_us // 1000), 0
-    for first in range(1, packets + 1, _CHUNK_PACKETS):
-        due = np.arange(first, min(first + _CHUNK_PACKETS, packets + 1), dtype=np.int64) * PACKET_BYTES
-        stamps_ms = -(-_transmitted_us(trace, due) // 1000)
-        last_ms = int(stamps_ms[-1])
-        yield "".join(f"{stamp}\n" for stamp in stamps_ms.tolist())
-    if last_ms < end_ms:
-        yield f"{end_ms}\n"
+def _stamps(trace: Trace, packets: int) -> list[int]:
+    """The ms of all packets that are through by the end, and of one more if the last is through before the end."""
+    end_ms = -(-trace.duration_us // 1000)
+    due = np.arange(1, packets + 1, dtype=np.int64) * PACKET_BYTES
+    stamps_ms: list[int] = (-(-_transmitted_us(trace, due) // 1000)).tolist()
+    return stamps_ms if packets and stamps_ms[-1] == end_ms else [*stamps_ms, end_ms]
 
 
 def _transmitted_us(trace: Trace, due: Int64Array) -> Int64Array:

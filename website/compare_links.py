@@ -9,22 +9,74 @@ table of the Kolmogorov-Smirnov statistic would.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from bufgym.traces.fit.fit import fit_links
-from bufgym.traces.fit.statistics import STATISTICS, Rows
+from bufgym.traces.fit import (
+    LOW_BYTES_PER_S,
+    Rows,
+    autocorrelation,
+    centred,
+    fit_links,
+    outage_gaps,
+    outage_lengths,
+    shoulder_of,
+)
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import LinkParameters
 from bufgym.traces.trace import Float64Array
 
 SETS: Final = 199
 KS_DISTANCE: Final = "KS distance"
+_KBPS: Final = 1e-3
 # Beyond the seeds that a fit uses for its trials.
 _FIRST_SEED: Final = 1_000_000
+
+
+def _quantile(q: float) -> Callable[[Rows], float]:
+    return lambda rows: float(np.quantile(np.concatenate(rows), q)) * _KBPS
+
+
+def _correlation(lag_s: int) -> Callable[[Rows], float]:
+    return lambda rows: float(autocorrelation(rows, (lag_s,))[0][0])
+
+
+def _spread_of_means(rows: Rows) -> float:
+    means = np.array([row.mean() for row in rows]) * _KBPS
+    return float(means.std(ddof=1)) if len(rows) > 1 else float("nan")
+
+
+def _of_any(values: Float64Array, statistic: Callable[[Float64Array], float]) -> float:
+    """The statistic, NaN of no values."""
+    return float(statistic(values)) if values.size else float("nan")
+
+
+STATISTICS: Final[Mapping[str, Callable[[Rows], float]]] = {
+    "mean, KB/s": lambda rows: float(np.concatenate(rows).mean()) * _KBPS,
+    "standard deviation, KB/s": lambda rows: float(np.concatenate(rows).std()) * _KBPS,
+    "standard deviation of the recordings' means, KB/s": _spread_of_means,
+    "5 % quantile, KB/s": _quantile(0.05),
+    "25 % quantile, KB/s": _quantile(0.25),
+    "median, KB/s": _quantile(0.5),
+    "75 % quantile, KB/s": _quantile(0.75),
+    "95 % quantile, KB/s": _quantile(0.95),
+    "autocorrelation at 1 s": _correlation(1),
+    "autocorrelation at 5 s": _correlation(5),
+    "autocorrelation at 30 s": _correlation(30),
+    "autocorrelation at 5 s within a recording": lambda rows: _correlation(5)(centred(rows)),
+    "autocorrelation at 30 s within a recording": lambda rows: _correlation(30)(centred(rows)),
+    "seconds under 500 KB/s, %": lambda rows: 100 * float((np.concatenate(rows) < LOW_BYTES_PER_S).mean()),
+    "outages an hour": lambda rows: 3600 * len(outage_lengths(rows)) / sum(map(len, rows)),
+    "rate within 5 s of an outage, % of the others'": lambda rows: 100 * shoulder_of(rows),
+    "mean outage, s": lambda rows: _of_any(outage_lengths(rows), np.mean),
+    "longest outage, s": lambda rows: _of_any(outage_lengths(rows), np.max),
+    "mean spacing of outages, s": lambda rows: _of_any(outage_gaps(rows), np.mean),
+    "median spacing of outages, s": lambda rows: _of_any(outage_gaps(rows), np.median),
+}
+"""Name -> statistic of the recordings of one mode; NaN if undefined."""
 
 
 @dataclass(frozen=True)

@@ -25,27 +25,23 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.fit.statistics import (
-    LOW_BYTES_PER_S,
-    Rows,
-    autocorrelation,
-    beside_outages,
-    centred,
-    outage_gaps,
-    outage_lengths,
-    shoulder_of,
-    spells,
-)
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.links import read_trace
 from bufgym.traces.generate.markov import link_rates
-from bufgym.traces.generate.parameters import LOW_QUANTILES, PROBABILITIES, LinkParameters, OutageParameters
+from bufgym.traces.generate.parameters import LOW_QUANTILES, PROBABILITIES, SHOULDER_S, LinkParameters, OutageParameters
 from bufgym.traces.trace import US_PER_S, Float64Array
+
+Rows: TypeAlias = Sequence[Float64Array]
+"""A row for each recording: float64[n], the rate of each second in bytes/s."""
+
+# 4 Mbit/s: the limit that the tables of the recordings use.
+LOW_BYTES_PER_S: Final = 500_000.0
 
 LAGS_S: Final = (1, 2, 3, 5, 10, 20, 30, 60)
 # Fewer outages than this say too little about their lengths and clusters.
@@ -249,3 +245,54 @@ def _posterior(lengths_s: Float64Array, share: float, short_s: float, long_s: fl
 
 def _three_digits(value: float) -> float:
     return float(f"{value:.3g}")
+
+
+# --- statistics of recordings ----------------------------------------------------------------------------------------
+
+
+def centred(rows: Rows) -> list[Float64Array]:
+    """Each row minus its own mean."""
+    return [row - row.mean() for row in rows]
+
+
+def autocorrelation(rows: Rows, lags: Sequence[int]) -> tuple[Float64Array, Float64Array]:
+    """Correlation at each lag about the mean of all rows, and the number of pairs it comes from."""
+    pooled = np.concatenate(rows)
+    mean, variance = float(pooled.mean()), float(pooled.var())
+    correlations, pairs = [], []
+    for lag in lags:
+        products = np.concatenate([(row[lag:] - mean) * (row[:-lag] - mean) for row in rows])
+        pairs.append(float(products.size))
+        correlations.append(float(products.mean()) / variance if products.size and variance > 0 else 0.0)
+    return np.array(correlations), np.array(pairs)
+
+
+def spells(row: Float64Array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """First seconds of the outages, the runs of seconds below LOW_BYTES_PER_S, and the seconds after their last."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], (row < LOW_BYTES_PER_S).astype(np.int8), [0]))))
+    return edges[::2], edges[1::2]
+
+
+def outage_lengths(rows: Rows) -> Float64Array:
+    """Lengths of the outages, s."""
+    return np.concatenate([ends - starts for starts, ends in map(spells, rows)]).astype(np.float64)
+
+
+def outage_gaps(rows: Rows) -> Float64Array:
+    """Times from the end of one outage to the start of the next, s."""
+    return np.concatenate([starts[1:] - ends[:-1] for starts, ends in map(spells, rows)]).astype(np.float64)
+
+
+def beside_outages(row: Float64Array) -> npt.NDArray[np.bool_]:
+    """Seconds, bool[n], that are within SHOULDER_S of an outage but not in one."""
+    near = np.zeros(row.size, np.bool_)
+    for start, end in zip(*spells(row), strict=True):
+        near[max(0, start - SHOULDER_S) : end + SHOULDER_S] = True
+    return near & (row >= LOW_BYTES_PER_S)
+
+
+def shoulder_of(rows: Rows) -> float:
+    """Mean rate beside outages over the mean rate of other seconds outside outages, at most 1; 1 without any."""
+    near = np.concatenate([row[beside_outages(row)] for row in rows])
+    far = np.concatenate([row[~beside_outages(row) & (row >= LOW_BYTES_PER_S)] for row in rows])
+    return min(1.0, round(float(near.mean() / far.mean()), 2)) if near.size and far.size else 1.0

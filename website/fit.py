@@ -1,10 +1,14 @@
-"""The page that compares recordings with generated links, mode by mode, and its pictures."""
+"""The page that compares recordings with generated links, mode by mode, and its pictures.
+
+``python -m website.fit LINKS.json PAGE.md FILE ...`` or ``... --suite A,B --data DIR``, with what `bufgym trace fit`
+fitted to these recordings.
+"""
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +16,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
-from bufgym.traces.fit.compare import KS_DISTANCE, SETS, HeldOut, Row, compare, generated_sets, held_out
-from bufgym.traces.fit.statistics import Rows, autocorrelation, outage_gaps, outage_lengths
-from bufgym.traces.formats.faults import os_errors
+from bufgym.cli.trace_fit import recordings_of
+from bufgym.traces.fit import Rows, autocorrelation, outage_gaps, outage_lengths
 from bufgym.traces.formats.text import write_text
-from bufgym.traces.generate.parameters import SHOULDER_S, LinkParameters
+from bufgym.traces.generate.parameters import SHOULDER_S, LinkParameters, read_links
 from bufgym.traces.trace import Float64Array
+from website.compare_links import KS_DISTANCE, SETS, HeldOut, Row, compare, generated_sets, held_out
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +39,7 @@ _INTRODUCTION: Final = """\
 Made by `{command}`; do not edit.
 
 The generator is `bufgym/traces/generate/markov.py`. Its parameters are in `{file}` beside it, and
-`bufgym/traces/fit/fit.py` fits them.
+`bufgym/traces/fit.py` fits them.
 
 How to read the tables:
 
@@ -64,6 +67,7 @@ def write_page(
     recordings: Mapping[str, Rows],
     page: Path,
     command: str,
+    file: str,
     sets: int = SETS,
     most_held_out: int | None = None,
 ) -> None:
@@ -74,17 +78,15 @@ def write_page(
         recordings: mode -> what it was fitted to.
         page: the file to write.
         command: what the page names as its origin.
+        file: name of the file of the links.
         sets: generated sets for each comparison.
         most_held_out: recordings of a mode that are held out at most, a fit each; by default all.
     """
     compared = {mode: compare(links[mode], rows, sets) for mode, rows in recordings.items()}
     plain = {mode: compare(_without_memory(links[mode]), rows, sets) for mode, rows in recordings.items()}
     unseen = {mode: held_out(mode, rows, sets, most_held_out) for mode, rows in recordings.items()}
-    with os_errors(page, "written"):
-        (page.parent / "figures").mkdir(parents=True, exist_ok=True)
-        pictures = {mode: _picture(mode, links[mode], rows, page.parent) for mode, rows in recordings.items()}
-    written = re.search(r"-o (\S+)", command)
-    file = "links.json" if written is None else written[1]
+    (page.parent / "figures").mkdir(parents=True, exist_ok=True)
+    pictures = {mode: _picture(mode, links[mode], rows, page.parent) for mode, rows in recordings.items()}
     introduction = _INTRODUCTION.format(command=command, file=file, sets=sets, level=_LEVEL)
     parts = [introduction, _summary(links, compared, plain, unseen)]
     parts += [_section(mode, links[mode], rows, pictures[mode]) for mode, rows in compared.items()]
@@ -242,7 +244,25 @@ def _survival(axis: Axes, values: Float64Array, colour: str) -> None:
     axis.loglog(distinct[drawn], share[drawn], colour)
 
 
-def check_page(path: Path) -> None:
-    """Raise BufgymError if `path` is not the name of a page."""
-    if path.suffix != ".md":
-        raise BufgymError(f"--page {path}: must end in .md")
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the page that the command line asks for."""
+    parser = argparse.ArgumentParser(prog="python -m website.fit", description="Compare links with recordings.")
+    parser.add_argument("links", type=Path, metavar="LINKS.json")
+    parser.add_argument("page", type=Path, metavar="PAGE.md")
+    parser.add_argument("files", nargs="*", metavar="FILE", help="recordings that the links were fitted to")
+    parser.add_argument("--suite", metavar="A,B", help="or the suites whose training links they were fitted to")
+    parser.add_argument("--data", metavar="DIR", help="the folder of recordings that the suites need")
+    parser.add_argument("--sets", type=int, default=SETS, help="generated sets for each comparison (%(default)s)")
+    parser.add_argument("--held-out", type=int, metavar="N", help="most recordings of a mode held out, a fit each")
+    options = parser.parse_args(arguments)
+    rows, words = recordings_of(options.files, None, options.suite, options.data)
+    command = f"python -m website.fit {options.links.name} {options.page.name} {words}"
+    if options.held_out is not None:
+        command += f" --held-out {options.held_out}"
+    links = read_links(options.links)
+    write_page(links, rows, options.page, command, options.links.name, options.sets, options.held_out)
+    print(f"wrote {options.page}")
+
+
+if __name__ == "__main__":
+    main()
