@@ -122,22 +122,24 @@ def from_poses(
     file: str,
     /,
     *,
-    format: Literal["tum", "euroc"] | None = None,
+    format: Literal["tum", "euroc", "kitti"] | None = None,
+    times: str | None = None,
     measured: MotionOptions = MotionOptions(),
     bridge_gaps: bool = False,
     out: Annotated[Path | None, Parameter(alias="-o")] = None,
 ) -> None:
-    """Take camera motion from a trajectory: TUM or EuRoC.
+    """Take camera motion from a trajectory: TUM, EuRoC or KITTI.
 
     Args:
         file: The trajectory, plain or gzip'd.
         format: Its format (default: recognised by its first line).
+        times: KITTI's times (default: NAME_times.txt beside NAME.txt).
         bridge_gaps: Write it in spite of gaps.
         out: Write the motion to this CSV file (t_s,motion).
     """
     from bufgym.traces import read_motion, write_motion_csv
 
-    motion = read_motion(file, measured.settings(), format=format)
+    motion = read_motion(file, measured.settings(), format=format, times=times)
     seconds = motion.duration_us / 1e6
     print(f"{printable(motion.name)}\n  source  {printable(motion.source)}")
     print(f"  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")

@@ -254,7 +254,7 @@ def test_a_broken_part_is_named_and_made_anew(tmp_path: Path, small: Sweep, form
         ({"specs": ("decimate:every=2", "decimate:every=2.0")}, "'decimate:every=2' is given more than once"),
         ({"seeds": 0}, "seeds = 0: must lie between 1 and 1000"),
         ({"capacities": (2, 2)}, r"capacities = \[2, 2\]: .* no two alike"),
-        ({"suite": "lte-belgium-v1"}, r"needs a folder of recordings \(--data DIR\)"),
+        ({"suite": "mahimahi-v1"}, r"needs a folder of recordings \(--data DIR\)"),
         ({"jobs": 0}, "jobs = 0:"),
         ({"backend": "sloky"}, "backend = 'sloky': must be one of loky"),
     ],

@@ -1,5 +1,6 @@
 """The suites: every split builds, splits share nothing, and no embedded suite changes unnoticed."""
 
+import gzip
 import hashlib
 import re
 from pathlib import Path
@@ -129,3 +130,12 @@ def test_what_is_unknown_or_missing_is_named(tmp_path: Path) -> None:
             suites.get(name).settings("test")
         with pytest.raises(BufgymError, match=str(tmp_path / "nowhere")):
             suites.get(name).settings("test", tmp_path / "nowhere")
+    (tmp_path / "mahimahi").mkdir()
+    for k in range(5):
+        with gzip.open(tmp_path / f"mahimahi/link-{k}.down.gz", "wt") as file:
+            file.write("1\n2\n1000\n")
+    with pytest.raises(BufgymError, match=r"tum_rgbd/freiburg1_rpy\.groundtruth\.txt\.gz: no such file"):
+        suites.get("mahimahi-v1").settings("test", tmp_path)
+    (tmp_path / "mahimahi/link-4.down.gz").unlink()
+    with pytest.raises(BufgymError, match=r"holds 4 recordings; this suite needs at least 5"):
+        suites.get("mahimahi-v1").settings("test", tmp_path)

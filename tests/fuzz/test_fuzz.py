@@ -57,7 +57,9 @@ def poses(folder: Path) -> Kind:
     tum = "".join(f"{k / 10} {k} 0 0 0 0 0 1\n" for k in range(30))
     euroc = "#timestamp [ns],x\n" + "".join(f"{k * 10**8},{k},0,0,1,0,0,0\n" for k in range(30))
     motion = "t_s,motion\n" + "".join(f"{k / 10},{k / 7}\n" for k in range(30))
-    texts = {"p.txt": tum, "e.csv": euroc, "m.csv": motion}
+    kitti = "".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(3))
+    (folder / "k_times.txt").write_text("0\n0.1\n0.2\n")
+    texts = {"p.txt": tum, "e.csv": euroc, "m.csv": motion, "k.txt": kitti}
     return [(name, text.encode()) for name, text in texts.items()], lambda path, uniform: read_motion(path)
 
 

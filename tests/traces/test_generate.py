@@ -173,7 +173,7 @@ def test_the_calls_that_are_stated_make_the_shipped_files_byte_for_byte(tmp_path
     assert made == {path.name: path.read_bytes() for path in (ROOT / "traces").glob("*.csv")}
     assert set(shipped_calls()) == set(traces.shipped()) == {name.removesuffix(".csv") for name in made}
     for name, call in shipped_calls().items():
-        generated = eval(call, {"synthetic_lte": synthetic_lte, "drive_motion": drive_motion})
+        generated: Any = eval(call, {"synthetic_lte": synthetic_lte, "drive_motion": drive_motion})
         if name.startswith("drive-"):
             assert load_motion(name).coordinate.tolist() == generated.coordinate.tolist()
         else:

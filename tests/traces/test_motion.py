@@ -27,15 +27,18 @@ EUROC = f"""#timestamp [ns] p_RS_R_x [m] p_RS_R_y [m] p_RS_R_z [m] q_RS_w [] q_R
 EUROC_CSV = "#timestamp, p_RS_R_x [m], ..., b_a_RS_S_z [m s^-2]\n" + "".join(
     line.replace(".0000000000", "").replace(" ", ",") + ",1,2,3,4,5,6,7,8,9\n" for line in EUROC.split("\n")[1:4]
 )
+KITTI = "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 0 0 0 1 0\n"
+KITTI_TIMES = "0.000000e+00\n1.000000e+00\n2.000000e+00\n"
 REPEATED = TUM.replace("101 1", "101 9 9 9 0 0 0 1\n101 1")
 """Of two poses with one time the last counts."""
 UPRIGHT = [0.0, 0, 0, 1]
-PATHS = [("tum", TUM), ("tum", REPEATED), ("euroc", EUROC), ("euroc", EUROC_CSV)]
+PATHS = [("tum", TUM), ("tum", REPEATED), ("euroc", EUROC), ("euroc", EUROC_CSV), ("kitti", KITTI)]
 
 
 @pytest.mark.parametrize(("format", "text"), PATHS)
 def test_one_path_in_each_format(tmp_path: Path, format: str, text: str) -> None:
     path = written(tmp_path, text, "path.txt")
+    written(tmp_path, KITTI_TIMES, "path_times.txt")
     assert detect_pose_format(path) == format
     motion = read_motion(path)
     assert motion.time_us.tolist() == [0, 1_000_000, 2_000_000]
@@ -61,7 +64,28 @@ def test_times_in_ns_are_exact_and_a_file_written_is_read_back(tmp_path: Path) -
         write_motion_csv(motion, tmp_path)
 
 
+def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
+    path = written(tmp_path, KITTI, "00.txt")
+    with pytest.raises(TraceError, match=r"holds KITTI matrices, which carry no time: .*no 00_times.txt beside"):
+        read_motion(path)
+    times = written(tmp_path, KITTI_TIMES, "times.txt")
+    assert read_motion(path, times=times).total == pytest.approx(2.0)
+    for text, says in (
+        ("0\n1\n", r"00.txt, line 3: must have a time, but .*times.txt has no more"),
+        (KITTI_TIMES + "3\n", "holds more times than .*00.txt has poses"),
+        ("0\n2\n1\n", r"00.txt, line 3: time in s = 1: must not be before the line above"),
+    ):
+        times.write_text(text)
+        with pytest.raises(TraceError, match=says):
+            read_motion(path, times=times)
+    with pytest.raises(BufgymError, match="format = 'bvh': must be one of tum, euroc, kitti"):
+        read_motion(path, format="bvh")
+    with pytest.raises(BufgymError, match=r"times = .*: goes with KITTI matrices only"):
+        read_motion(written(tmp_path, TUM, "path.txt"), times=times)
+
+
 def test_broken_files(tmp_path: Path) -> None:
+    written(tmp_path, KITTI_TIMES, "path_times.txt")
     for text, says in (
         ("0 0 0 0 0 0 0 1\n", "holds 1 samples: must hold at least 2"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 0\n", "line 2: norm of the quaternion = 0: must be 1 within 1 %"),
@@ -69,13 +93,14 @@ def test_broken_files(tmp_path: Path) -> None:
         ("0 0 0 0 0 0 0 1\n2e7 0 0 0 0 0 0 1\n", "line 2: time in s = 2e7: must be at most 10000000 s after"),
         ("t_s,motion\n0,0\n1,2\n2,1.5\n", "line 4: motion = 1.5: must not be below the line above"),
         ("#timestamp [ns] ...\n1 0 0 0 1 0 0\n", r"line 2: '1 0 0 0 1 0 0': must have 8 columns \(or the 17 of"),
+        ("1 0 0 0 0 1 0 0 0 0 2 0\n", "must be a rotation within 1 %"),
+        # A reflection: orthogonal, but no rotation.
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "must be a rotation within 1 %"),
         # Nanoseconds without EuRoC's header could be anybody's: not guessed.
         ("1403636579763555584 0 0 0 0 0 0 1\n", "line 1: time in s = 1403636579763555584: must be from 0 to"),
     ):
         with pytest.raises(TraceError, match=says):
             read_motion(written(tmp_path, text, "path.txt"))
-    with pytest.raises(BufgymError, match="format = 'bvh': must be one of tum, euroc"):
-        read_motion(written(tmp_path, TUM, "path.txt"), format="bvh")
 
 
 def about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -159,3 +184,11 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
     computed = quaternions(np.array([matrix]))[0]
     assert rotations(expected[None])[0] == pytest.approx(np.array(matrix))
     assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
+
+
+def test_real_kitti(shared_data: Path) -> None:
+    """Sequence 00 is 3.7 km long, 4541 poses in 470.6 s; its times come from the file beside."""
+    motion = read_motion(shared_data / "kitti" / "KITTI_00_gt.txt.gz", MotionSettings(fov_deg=1e9, scene_scale_m=1))
+    assert motion.total == pytest.approx(3724, abs=1) and (motion.time_us.size, motion.gaps) == (4541, ())
+    assert motion.duration_us / 1e6 == pytest.approx(470.6, abs=0.1)
+    assert "times from KITTI_00_gt_times.txt.gz" in motion.source

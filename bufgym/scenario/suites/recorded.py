@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TypeVar
 
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario.suites.suite import Build, Setting, Suite
-from bufgym.scenario.suites.synthetic import TRACES, both_sizes
+from bufgym.scenario.suites.synthetic import SIZE_BYTES, TRACES, both_sizes, both_values
 from bufgym.traces import Motion, read_motion, read_trace
 from bufgym.traces.formats.speed_tests import runs_of
 
@@ -43,6 +44,26 @@ def _belgium(split: str, data: Path | None) -> dict[str, Setting]:
     assert data is not None
     traces = [read_trace(_there(data / f"belgium_4g/csv/report_{name}.csv")) for name in _BELGIUM[split].split()]
     return both_sizes(traces, _tum(split, data))
+
+
+_MOST_TRACES = 12
+"""Most recordings in a split; a larger folder gives evenly spaced ones, in the order of their names."""
+
+
+def _every_fifth(pattern: str, size_bytes: int) -> Build:
+    """All files of a pattern, by name: of every five, three are for training, one validates and one tests."""
+
+    def build(split: str, data: Path | None) -> dict[str, Setting]:
+        assert data is not None
+        names = sorted(path for path in data.glob(pattern) if not path.name.startswith(("README", "LICENSE", "copy")))
+        rests = {"train": (0, 1, 2), "validation": (3,), "test": (4,)}[split]
+        chosen = [path for k, path in enumerate(names) if k % 5 in rests]
+        if not chosen:
+            raise BufgymError(f"{data / pattern}: holds {len(names)} recordings; this suite needs at least 5")
+        step = max(1, math.ceil(len(chosen) / _MOST_TRACES))
+        return both_values([read_trace(path) for path in chosen[::step]], _tum(split, data), size_bytes)
+
+    return build
 
 
 def _by_name(pattern: str, belongs: Callable[[str, str], bool]) -> Build:
@@ -106,5 +127,18 @@ SUITES = tuple(
         ("uplink-5g-v1", "over 5G uplinks of a drive, split by day", _uplink_5g, "uplink_5g/*.out.gz"),
         ("uplink-wifi-v1", "over WiFi uplinks in a shipyard, split by place", _uplink_wifi, "uplink_wifi/*.json.gz"),
         ("uplink-mmwave-v1", "over 5G mmWave uplinks, split by place", _uplink_mmwave, "uplink_mmwave/*.list.gz"),
+        ("lumos5g-v1", "over Lumos5G's 4G traces", _every_fifth("lumos5g/4G/*", SIZE_BYTES), "lumos5g/4G/*"),
+        (
+            "norway-hsdpa-v1",
+            "of 8 kB frames over the Norway HSDPA logs",
+            _every_fifth("norway_hsdpa/cooked/*", 8_000),
+            "norway_hsdpa/cooked/*",
+        ),
+        (
+            "mahimahi-v1",
+            "of 30 kB frames over Mahimahi's cellular traces",
+            _every_fifth("mahimahi/*.gz", 30_000),
+            "mahimahi/*.gz",
+        ),
     )
 )

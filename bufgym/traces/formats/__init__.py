@@ -4,7 +4,7 @@
 |---|---|
 | `links` | bandwidth traces in any format: `read_trace`, by the readers in `mahimahi`, `tables` and `logs` |
 | `writers` | bandwidth traces as CSV or Mahimahi |
-| `trajectories`, `motions` | camera poses (TUM, EuRoC), and the motion that they make |
+| `trajectories`, `motions` | camera poses (TUM, EuRoC, KITTI), and the motion that they make |
 | `workloads` | messages as CSV |
 | `bags`, `bag_poses`, `recordings` | robots' recordings, and the workloads that they make |
 

@@ -16,8 +16,10 @@ MOTION_HEADER: Final = "t_s,motion"
 MAX_COORDINATE: Final = 1e9
 
 
-def read_motion(path: StrPath, settings: MotionSettings | None = None, *, format: str | None = None) -> Motion:
-    """Read a trajectory (TUM, EuRoC) or a `t_s,motion` CSV, plain or gzip'd, recognised by the first line.
+def read_motion(
+    path: StrPath, settings: MotionSettings | None = None, *, format: str | None = None, times: StrPath | None = None
+) -> Motion:
+    """Read a trajectory (TUM, EuRoC, KITTI) or a `t_s,motion` CSV, plain or gzip'd, recognised by the first line.
 
     The first time becomes 0. A CSV holds finished coordinates, which are used as they are, minus the first. Stretches
     without a pose are bridged and listed in `Motion.gaps`.
@@ -26,15 +28,16 @@ def read_motion(path: StrPath, settings: MotionSettings | None = None, *, format
         path: the file.
         settings: how the motion of a trajectory is measured, by default `MotionSettings()`.
         format: of a trajectory, see `trajectories.read_poses`.
+        times: of a trajectory, likewise.
     """
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
     if first is None:
         raise fault(path, "is empty: must hold a trajectory or a motion recording")
-    if format is None and is_header(first.text, MOTION_HEADER):
+    if format is None and times is None and is_header(first.text, MOTION_HEADER):
         time_us, values = read_rows(path, _motion_row, skip=first.number)
         return Motion(trace_name(path), time_us, values[:, 0] - values[0, 0], f"{path} ({MOTION_HEADER})")
-    poses = read_poses(path, format=format)
+    poses = read_poses(path, format=format, times=times)
     source = f"{path} (trajectory, format {poses.format})"
     return motion_from_poses(poses, settings, name=trace_name(path), source=source)
 
