@@ -158,7 +158,7 @@ def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
         (f"{W} --topics /lidar", "no topic '/lidar'; it has: /camera, /odom"),
         (f"{W} --odom /odom", "odom = '/odom': needs a recording, which this is not"),
         (f"{W} --bridge-gaps", "--bridge-gaps needs --odom"),
-        (f"{W} --scenario interruption", "cannot go with --scenario"),
+        (f"{W} --interruption", "cannot go with --interruption"),
         (f"{W} --motion drive-0", "workload 'w' has an x of its own"),
         ("--drops d.csv", "--drops needs --workload"),
         ("--fov-deg 70", "--fov-deg needs --motion, or --workload with --odom"),

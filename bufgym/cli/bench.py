@@ -20,7 +20,7 @@ from bufgym.cli.options import (
     loaded,
     refuse,
 )
-from bufgym.cli.scenarios import OwnOptions, ScenarioOptions, StreamOptions, WorkloadOptions
+from bufgym.cli.scenarios import InterruptionOptions, OwnOptions, ScenarioOptions, StreamOptions, WorkloadOptions
 from bufgym.cli.suite import run_suite
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
@@ -45,6 +45,7 @@ def bench(
     who: WhoOptions = WhoOptions(),
     stream: StreamOptions = StreamOptions(),
     workload: WorkloadOptions = WorkloadOptions(),
+    interruption: InterruptionOptions = InterruptionOptions(),
     own: OwnOptions = OwnOptions(),
     buffer: BufferOptions = BufferOptions(),
     out: OutOptions = OutOptions(),
@@ -56,7 +57,7 @@ def bench(
         drops: With --workload: write each message that each policy dropped to this CSV file.
     """
     load_policies(who.policy_file)
-    scenario = ScenarioOptions(stream, workload, own)
+    scenario = ScenarioOptions(stream, workload, interruption, own)
     if suite.suite is not None:
         frozen = scenario.given() | given(buffer) | ({} if drops is None else {"drops": drops})
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")

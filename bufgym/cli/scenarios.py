@@ -1,4 +1,4 @@
-"""Scenario that options describe: a stream over traces, a recording, or one by name."""
+"""Scenario that options describe: a stream over traces, a recording, one interruption, or one of the user's own."""
 
 from __future__ import annotations
 
@@ -61,13 +61,28 @@ class WorkloadOptions(RecordingOptions):
     """MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; alone, played once from the start of each trace."""
 
 
-@Parameter(name="*", group=Group.create_ordered("A scenario by name instead, also of your own"))
+@Parameter(name="*", group=Group.create_ordered("One interruption of unknown length T instead"))
+@dataclass(frozen=True)
+class InterruptionOptions:
+    interruption: bool = False
+    """This scenario, and regret against its oracle."""
+    law: str | None = None
+    """Of T: fixed (t-max), uniform, log-uniform, geometric (default: log-uniform)."""
+    t_min: Count | None = None
+    """Shortest, messages (default: 1)."""
+    t_max: Count | None = None
+    """Longest, messages (default: 400)."""
+    t_mean: Positive | None = None
+    """Mean of the geometric law (default: 100)."""
+
+
+@Parameter(name="*", group=Group.create_ordered("A scenario of your own instead"))
 @dataclass(frozen=True)
 class OwnOptions:
     scenario_file: str | None = None
     """A Python file that registers it; its code is run."""
     scenario: str | None = None
-    """Which; also any other in 'bufgym list scenarios', as in interruption:law=fixed,t_max=12, or module:function."""
+    """Which; also any other in 'bufgym list scenarios', or module:function."""
 
 
 @dataclass(frozen=True)
@@ -76,19 +91,25 @@ class ScenarioOptions:
 
     stream: StreamOptions
     workload: WorkloadOptions
+    interruption: InterruptionOptions
     own: OwnOptions
 
     def given(self) -> dict[str, Any]:
         """Those that the user gave."""
-        return given(self.stream) | given(self.workload) | given(self.own)
+        return given(self.interruption) | given(self.stream) | given(self.workload) | given(self.own)
 
     def scenario(self, seeds: int | None) -> tuple[Scenario, str]:
         """Make the scenario, and a few lines about it; ``seeds`` is None where the user gave none."""
-        stream, workload = self.stream, self.workload
+        stream, workload, law = self.stream, self.workload, given(self.interruption)
         if given(self.own):
             described = {name: value for name, value in self.given().items() if name not in vars(self.own)}
-            refuse(described, "cannot go with --scenario or --scenario-file: the scenario has its own")
+            refuse(described, "cannot go with a scenario of your own, which says it itself")
             return _own(self.own, seeds or 10)
+        if law.pop("interruption", False):
+            uplinks = {name: v for name, v in given(stream).items() if name not in ("fps", "bytes", "value")}
+            refuse(uplinks | given(workload), "cannot go with --interruption")
+            return _interruption(stream, law, seeds or 10)
+        refuse(law, "needs --interruption")
         if workload.workload is not None:
             return _recording(workload.workload, stream, workload, seeds)
         refuse(given(workload, "topics", "odom", "bridge_gaps"), "needs --workload")
@@ -118,8 +139,7 @@ def _own(options: OwnOptions, seeds: int) -> tuple[Scenario, str]:
     found = scenarios.get(name)
     if found.topics:
         raise BufgymError(f"scenario {name}: has several topics; bufgym bench runs those of one queue")
-    known = scenarios.SCENARIOS.get(name.partition(":")[0])
-    what = type(found).__name__ if known is None else known[1]
+    what = scenarios.SCENARIOS[name][1] if name in scenarios.SCENARIOS else type(found).__name__
     traces = len(by_trace(found))
     met = "" if traces == 1 else f"{traces} traces x "
     return found, "\n".join(
@@ -130,6 +150,16 @@ def _own(options: OwnOptions, seeds: int) -> tuple[Scenario, str]:
             SCORE,
         ]
     )
+
+
+def _interruption(stream: StreamOptions, settings: dict[str, Any], seeds: int) -> tuple[Scenario, str]:
+    from bufgym.scenario import Interruption
+
+    settings = settings | _parameters(stream, "fps", "bytes")
+    made = Interruption(**settings, value=_value(stream, by_motion=False))
+    length = f"T = {made.t_max}" if made.law == "fixed" else f"T {made.law} on {made.t_min}..{made.t_max}"
+    about = f"One interruption of T messages, {length}; V = {made.value.name} over frame indices."
+    return made, f"{about}\nMeans over {seeds} seeds. {SCORE}"
 
 
 def _uplink(stream: StreamOptions, measured: MotionOptions, seeds: int) -> tuple[Scenario, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
@@ -81,38 +80,21 @@ def checked(scenario: Any, name: str) -> Scenario:
     return cast(Scenario, scenario)
 
 
-def _parameters(spec: str, text: str) -> dict[str, Any]:
-    """The parameters that ``text`` names, separated by commas."""
-    parameters: dict[str, Any] = {}
-    for part in filter(None, text.split(",")):
-        name, equals, value = part.partition("=")
-        if not equals:
-            raise BufgymError(f"scenario {spec!r}: {part!r}: must be PARAMETER=VALUE")
-        parameters[name] = value
-        for number in (float, int):
-            with contextlib.suppress(ValueError):
-                parameters[name] = number(value)
-    return parameters
-
-
 def get(spec: str | Scenario, **overrides: Any) -> Scenario:
     """The scenario of that name, or ``spec`` itself, with changed parameters; BufgymError for unknown ones.
 
-    A name may bring parameters that are numbers or words: ``"interruption:law=fixed,t_max=12"``.
     A name that ends in .toml names a client's configuration (``read_client``). ``module:function`` is imported (see
     ``bufgym.ground.modules``); it is a scenario or makes one without arguments.
     """
-    name, _, parameters = spec.partition(":") if isinstance(spec, str) else ("", "", "")
     if isinstance(spec, str) and spec.endswith(".toml"):
         spec = read_client(spec)
-    elif isinstance(spec, str) and modules.is_named(spec) and name not in SCENARIOS:
+    elif isinstance(spec, str) and modules.is_named(spec):
         found = modules.find(spec)
         spec = checked(found() if callable(found) else found, spec)
     elif isinstance(spec, str):
-        if name not in SCENARIOS:
-            raise unknown("scenario", name, SCENARIOS, ", and module:function for one's own")
-        overrides = {**_parameters(spec, parameters), **overrides}
-        spec = _named(name)
+        if spec not in SCENARIOS:
+            raise unknown("scenario", spec, SCENARIOS, ", and module:function for one's own")
+        spec = _named(spec)
     else:
         spec = checked(spec, type(spec).__name__)
     if not overrides:

@@ -180,7 +180,7 @@ def test_bench_with_a_file_and_with_modules(module: str, capsys: pytest.CaptureF
     shown = capsys.readouterr().out
     assert "over corridor-1, corridor-2" in shown and f"V = {module}:doorways" in shown
     for more, message in (
-        (["--fps", "10"], "--fps cannot go with --scenario or --scenario-file"),
+        (["--fps", "10"], "--fps cannot go with a scenario of your own"),
         (["--suite", "lte-v1"], "--scenario-file cannot go with --suite"),
         (["--scenario", "ten"], "unknown scenario 'ten'"),
     ):
