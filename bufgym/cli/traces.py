@@ -50,6 +50,28 @@ def info(files: Files, /, *, format: Format = None, column: Column = None) -> in
     return 2 if failed else 0
 
 
+# --- validate --------------------------------------------------------------------------------------------------------
+
+
+def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+    """Read each file and say whether it is sound; exit code 1 if not all."""
+    from bufgym import traces
+
+    failed = 0
+    for name in files:
+        try:
+            trace = traces.load(name, format, column=column)
+        except TraceError as error:
+            failed += 1
+            print(f"error  {error}")
+        else:
+            about = traces.describe(trace)
+            print(f"OK     {printable(trace.source)}: {about['duration_s']:.1f} s, mean {about['mean_KBps']:.1f} KB/s")
+    if len(files) > 1:
+        print(f"{len(files) - failed} of {len(files)} files are sound")
+    return 1 if failed else 0
+
+
 # --- convert ---------------------------------------------------------------------------------------------------------
 
 
