@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from cli_cases import Capsys, fails, shown
 
+from agents import tune
 from bufgym.benchmark import leaderboard, tuned
 from bufgym.cli import main
 from bufgym.ground.errors import BufgymError, printable
@@ -94,7 +95,7 @@ def test_a_leaderboard_that_was_tampered_with(tmp_path: Path, data: Any, rule: s
 
 def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tuned, "FILE", tmp_path / "tuned.json")
-    tuned.write("lte-v1", {"decimate": {"setting": "decimate:every=2"}})
+    tune.keep("lte-v1", [], split="validation", again="")
     before = tuned.FILE.read_bytes()
 
     def half(path: Path, text: str, **_: object) -> None:
@@ -103,7 +104,7 @@ def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(Path, "write_text", half)
     with pytest.raises(OSError, match="No space"):
-        tuned.write("lte-v1", {"decimate": {"setting": "decimate:every=3"}})
+        tune.keep("lte-v1", [], split="validation", again="")
     assert tuned.FILE.read_bytes() == before and list(tmp_path.iterdir()) == [tuned.FILE]
 
 
