@@ -21,7 +21,7 @@ from bufgym.benchmark.perf import (
     NATIVE,
     SEED,
     TOPICS,
-    Figure,
+    Measurement,
     Sizes,
     best_s,
     measure,
@@ -50,7 +50,7 @@ def _peer(package: str, n: int) -> Any:
     return importlib.import_module("pufferlib.ocean.cartpole.cartpole").Cartpole(num_envs=n)
 
 
-def measure_peers(sizes: Sizes, figures: Sequence[Figure]) -> tuple[list[Figure], list[str]]:
+def measure_peers(sizes: Sizes, figures: Sequence[Measurement]) -> tuple[list[Measurement], list[str]]:
     """(speeds of the PEERS and ratios of the native batches among ``figures`` to them; packages not here, and why)."""
     ours = [figure for figure in figures if figure.name in [f"native batch, {id}" for id in ENVIRONMENTS]]
     actions = np.random.default_rng(SEED).integers(2, size=(sizes.steps, sizes.batch)).astype(np.int32)
@@ -64,9 +64,9 @@ def measure_peers(sizes: Sizes, figures: Sequence[Figure]) -> tuple[list[Figure]
         rate = actions.size / best_s(sizes.repeats, envs.reset, partial(play, envs, actions))
         envs.close()
         call += f", {package} {version(package)}, n = {sizes.batch}, random actions, resets in the time"
-        found.append(Figure(f"CartPole, {package}", rate, "steps/s", None, f"steps a second of {call}"))
+        found.append(Measurement(f"CartPole, {package}", rate, "steps/s", None, f"steps a second of {call}"))
         ratios = [(f"{figure.name} / {package}", figure.value / rate) for figure in ours]
-        found += [Figure(name, ratio, "times", None, "the ratio of these two") for name, ratio in ratios]
+        found += [Measurement(name, ratio, "times", None, "the ratio of these two") for name, ratio in ratios]
     return found, absent
 
 

@@ -37,7 +37,7 @@ NATIVE = "vector_entry_point"
 SEED = 1
 
 
-class Figure(NamedTuple):
+class Measurement(NamedTuple):
     """One measured figure. ``value`` and ``target`` are in ``unit``; ``definition`` says how it was measured."""
 
     name: str
@@ -106,39 +106,39 @@ def _rate(env: Any, steps: int, repeats: int, single: bool = False) -> float:
     return decisions / best
 
 
-def measure(sizes: Sizes | None = None) -> list[Figure]:
+def measure(sizes: Sizes | None = None) -> list[Measurement]:
     """Speed of the batches, of the single environments and of rollouts."""
     sizes = sizes or Sizes()
     compile_here()
     return [*_batches(sizes), *_singles(sizes), *_rollouts(sizes)]
 
 
-def _batches(sizes: Sizes) -> Iterator[Figure]:
-    def figure(of: str, id: str, mode: str, steps: int, capacity: int, goal: float | None, what: str) -> Figure:
+def _batches(sizes: Sizes) -> Iterator[Measurement]:
+    def figure(of: str, id: str, mode: str, steps: int, capacity: int, goal: float | None, what: str) -> Measurement:
         vector = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=capacity)
         definition = f"{what} a second of gym.make_vec(vectorization_mode='{mode}'), n = {sizes.batch}, L = {capacity}"
         definition += ", all observation fields, resets in the time"
-        return Figure(f"{of}, {id}", _rate(vector, steps, sizes.repeats), "steps/s", goal, definition)
+        return Measurement(f"{of}, {id}", _rate(vector, steps, sizes.repeats), "steps/s", goal, definition)
 
     for id, goal in ENVIRONMENTS.items():
         native = figure("native batch", id, NATIVE, sizes.steps, sizes.capacity, goal, "decisions")
         sync = figure("SyncVectorEnv", id, "sync", sizes.sync_steps, sizes.capacity, None, "decisions")
         yield from (native, sync)
         ratio = native.value / sync.value
-        yield Figure(f"native / SyncVectorEnv, {id}", ratio, "times", 50.0, "the ratio of these two")
+        yield Measurement(f"native / SyncVectorEnv, {id}", ratio, "times", 50.0, "the ratio of these two")
     of, what = f"native batch of {len(scenarios.get('topics').topics)} topics", "decisions and choices of what to send"
     yield figure(of, TOPICS, NATIVE, sizes.steps, sizes.topic_slots, 5e6, what)
 
 
-def _singles(sizes: Sizes) -> Iterator[Figure]:
+def _singles(sizes: Sizes) -> Iterator[Measurement]:
     definition = f"calls of Env.step a second, without wrappers, L = {sizes.capacity}, all observation fields, "
     definition += "resets in the time"
     for id in ENVIRONMENTS:
         rate = _rate(gym.make(id, capacity=sizes.capacity).unwrapped, sizes.single_steps, sizes.repeats, single=True)
-        yield Figure(f"single environment, {id}", rate, "steps/s", 3e5, definition)
+        yield Measurement(f"single environment, {id}", rate, "steps/s", 3e5, definition)
 
 
-def _rollouts(sizes: Sizes) -> Iterator[Figure]:
+def _rollouts(sizes: Sizes) -> Iterator[Measurement]:
     scenario = scenarios.get("lte")
     episodes = [draw(scenario, seed) for seed in range(sizes.episodes)]
     arrivals = sum(len(episode.arrivals) for episode in episodes)
@@ -151,10 +151,10 @@ def _rollouts(sizes: Sizes) -> Iterator[Figure]:
         load()
         run()  # compiled, or loaded from disk, before the clock starts
         rate = arrivals / best_s(sizes.repeats, load, run)
-        yield Figure(f"rollout, {name}", rate, "arrivals/s", 4e7, definition)
+        yield Measurement(f"rollout, {name}", rate, "arrivals/s", 4e7, definition)
 
 
-def report(figures: Sequence[Figure], repeats: int) -> str:
+def report(figures: Sequence[Measurement], repeats: int) -> str:
     """Figures beside their targets, then their definitions."""
     measured = [
         [f.name, f"{_human(f.value)} {f.unit}", f"{_human(f.target)} {f.unit}" if f.target else ""] for f in figures
@@ -174,7 +174,7 @@ def _human(number: float) -> str:
     return f"{number:.3g}"
 
 
-def write_json(figures: Sequence[Figure], sizes: Sizes, path: Path) -> None:
+def write_json(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> None:
     """Write figures, sizes, and the versions and machine they were measured on."""
     document = {
         "versions": {name: version(name) for name in ("bufgym", "numpy", "numba", "gymnasium")},

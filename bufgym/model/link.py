@@ -113,7 +113,7 @@ class _Place:
     senders: int = 0
 
 
-class Knots:
+class KnotStore:
     """The knots of several traces in two flat arrays, which kernels read; each trace is stored once.
 
     A trace stays stored while a sender uses it, and afterwards until its room is needed; the trace left first goes

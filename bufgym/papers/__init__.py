@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, cast
 
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.papers.figure import Figure, report, save_picture, statements
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 
 __all__ = ["FIGURES", "NEEDS_DATA", "TAKES_DATA", "figure", "run", "run_live"]
 
@@ -71,7 +71,7 @@ def run(name: str, out: Path | None = None, **options: Any) -> str:
     return "\n".join([*report(name, reproduction, rows), *_saved(reproduction, rows, out, name)])
 
 
-def _saved(reproduction: Figure, rows: Rows, out: Path | None, stem: str) -> Iterator[str]:
+def _saved(reproduction: Figure, rows: FigureRows, out: Path | None, stem: str) -> Iterator[str]:
     """Save the numbers and the picture in ``out``, unless it is None; yield lines that say where."""
     if out is None:
         return

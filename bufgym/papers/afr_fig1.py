@@ -14,7 +14,7 @@ import numpy as np
 
 from bufgym import policies, sim
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 from bufgym.scenario import Interruption
 
 POLICIES = {"drop-oldest": "Drop Oldest", "random": "Random", "afr": "AFR"}
@@ -32,12 +32,12 @@ class Reproduction(Figure):
     RULES = {"last_T": whole(2)}
     SIZE_INCHES = (10.0, 4.2)
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         """Return a row for each policy and message: the arrival at which the message was dropped, or None."""
         interruption = Interruption(law="fixed", t_max=self.last_T)
         rng = np.random.Generator(np.random.PCG64(self.seed))
         episode = interruption.episode(self.last_T).with_uniforms(rng)
-        rows = Rows()
+        rows = FigureRows()
         for policy in POLICIES:
             senders = sim.run(policies.get(policy), [episode], self.capacity, interruption.value)
             dropped_us = np.asarray(senders.batch.log[0])["dropped_us"]
@@ -46,14 +46,14 @@ class Reproduction(Figure):
                 rows.append({"policy": policy, "message": message, "dropped_at": dropped_at})
         return rows
 
-    def received(self, rows: Rows, policy: str) -> list[int]:
+    def received(self, rows: FigureRows, policy: str) -> list[int]:
         """List the numbers of the messages received, including 0 and T + 1."""
         return [row["message"] for row in rows.where(policy=policy, dropped_at=None)]
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         return [f"{label:12} {' '.join(map(str, self.received(rows, p)))}" for p, label in POLICIES.items()]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         longest = {policy: int(np.diff(self.received(rows, policy)).max()) for policy in POLICIES}
         return {
             "order": longest["afr"] <= longest["random"] <= longest["drop-oldest"],
@@ -63,7 +63,7 @@ class Reproduction(Figure):
             "ideal_gap": (self.last_T + 1) / (min(self.capacity, self.last_T) + 1),
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         panels = figure.subplots(1, len(POLICIES), sharey=True)
         end = self.last_T + 1
         for axes, (policy, label) in zip(panels, POLICIES.items(), strict=True):

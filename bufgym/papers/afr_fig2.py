@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.papers.figure import COLOURS, Figure, legend_below
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 
 VIEW_ANGLE = math.radians(60)
 """The camera's field of view."""
@@ -95,15 +95,15 @@ class GeometryFigure(Figure):
             ),
         }
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         """Return a row for each motion and distance d with V from the views and V from the formula."""
-        return Rows(
+        return FigureRows(
             {"motion": name, "d": d, "V": float(v), "formula": motion.formula(d)}
             for name, motion in self.motions().items()
             for d, v in enumerate(motion.table())
         )
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         # ``tabulated`` refuses a V that breaks one of Eq. 3-6.
         values = [qoi.tabulated(range(MESSAGES + 1), rows.column("V", motion=name).tolist()) for name in self.motions()]
         difference = float(abs(rows.column("V") - rows.column("formula")).max())
@@ -118,7 +118,7 @@ class Reproduction(GeometryFigure):
     shown: int = 4
     """Number of messages drawn."""
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         panels = figure.subplots(1, 3)
         for axes, (name, motion) in zip(panels, self.motions().items(), strict=True):
             for k in range(self.shown):

@@ -7,7 +7,7 @@ from typing import Any
 
 from bufgym.papers.afr_fig2 import MESSAGES, GeometryFigure
 from bufgym.papers.figure import COLOURS, finish
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 
 
 @dataclass(frozen=True)
@@ -16,10 +16,10 @@ class Reproduction(GeometryFigure):
 
     SIZE_INCHES = (7.0, 4.2)
 
-    def tables(self, rows: Rows) -> list[str]:
-        return Rows(row for row in rows if row["d"] in (0, 1, 2, 4, 8, 16)).pivot("d", "motion", "V", ".4f")
+    def tables(self, rows: FigureRows) -> list[str]:
+        return FigureRows(row for row in rows if row["d"] in (0, 1, 2, 4, 8, 16)).pivot("d", "motion", "V", ".4f")
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         axes = figure.add_subplot()
         for (name, motion), colour in zip(self.motions().items(), ("afr", "random", "drop-oldest"), strict=True):
             d = rows.column("d", motion=name)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bufgym import policies, sim
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
-from bufgym.papers.rows import Rows, table
+from bufgym.papers.rows import FigureRows, table
 from bufgym.policies.afr import C, P, R
 from bufgym.scenario import Interruption
 
@@ -72,11 +72,11 @@ class Reproduction(Figure):
 
     SIZE_INCHES = (7.5, 5.3)
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         kept = (step for step in steps() if step.T >= PAPER_L)
-        return Rows(step._asdict() | {"kept": " ".join(map(str, step.kept))} for step in kept)
+        return FigureRows(step._asdict() | {"kept": " ".join(map(str, step.kept))} for step in kept)
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines: list[list[object]] = [["T", "drops", "paper", "r", "c", "p", "kept"]]
         for row in rows:
             T, dropped = row["T"], row["dropped"]
@@ -84,11 +84,11 @@ class Reproduction(Figure):
             lines.append([T, dropped or "-", PAPER_DROPS.get(T, "-"), row["r"], row["c"], row["p"], row["kept"] + note])
         return table(lines, left=7)
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         same = [row["dropped"] == PAPER_DROPS[row["T"]] for row in rows if row["T"] in PAPER_DROPS]
         return {"drops": all(same), "same": sum(same), "compared": len(same)}
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         axes = figure.add_subplot()
         for row in rows:
             kept = [int(seq) for seq in row["kept"].split()]

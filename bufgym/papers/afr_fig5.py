@@ -21,7 +21,7 @@ from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import Rows, listed
+from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario import Episode, Interruption
 
 PAPER_L = 8
@@ -84,7 +84,7 @@ class Reproduction(Figure):
 
     RULES = {"runs": whole(2)}
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         v = qoi.exponential(0.618)
         interruption = Interruption(law="fixed", t_max=self.last_T, value=v)
         rng = np.random.Generator(np.random.PCG64(self.seed))
@@ -92,7 +92,7 @@ class Reproduction(Figure):
         episodes = [interruption.episode(T) for T in lengths]
         samples = [gained_at_random(interruption, T, PAPER_L, self.runs, rng) for T in lengths]
         afr, drop_oldest = (gained(policy, episodes, PAPER_L, v) for policy in ("afr", "drop-oldest"))
-        return Rows(
+        return FigureRows(
             {
                 "T": T,
                 "oracle-ideal": oracle.ideal(PAPER_L, T, v),
@@ -105,12 +105,12 @@ class Reproduction(Figure):
             for T in lengths
         )
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         shown = sorted({1, 8, 9, 17, 18, 25, 35, 36, 50, 71, 72, self.last_T} & set(rows.distinct("T")))
         numbers = {name: (name, ".4f") for name in CURVES} | {"sd random": ("random_sd", ".4f")}
-        return Rows(rows[T - 1] for T in shown).listing({"T": ("T", "")} | numbers, left=0)
+        return FigureRows(rows[T - 1] for T in shown).listing({"T": ("T", "")} | numbers, left=0)
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         afr_mean, oldest_mean = (mean_score(policy, PAPER_L, *MEAN_OVER) for policy in ("afr", "drop-oldest"))
         printed = [row for row in rows if row["T"] in PAPER_PEAKS]
         peaks = equal_lengths(rows)
@@ -133,7 +133,7 @@ class Reproduction(Figure):
             "oldest_mean": oldest_mean,
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         axes = figure.add_subplot()
         lengths, random, spread = (rows.column(name) for name in ("T", "random", "random_sd"))
         axes.fill_between(lengths, random - spread, random + spread, color=COLOURS["random"], alpha=0.2, linewidth=0)
@@ -153,6 +153,6 @@ class Reproduction(Figure):
         axes.legend(loc="lower right", frameon=False, ncols=2)
 
 
-def equal_lengths(rows: Rows) -> list[int]:
+def equal_lengths(rows: FigureRows) -> list[int]:
     """Find the T above L at which AFR equals oracle-ideal."""
     return [r["T"] for r in rows if r["T"] > PAPER_L and r["oracle-ideal"] - r["afr"] <= EQUAL * r["oracle-ideal"]]

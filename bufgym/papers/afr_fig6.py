@@ -13,7 +13,7 @@ import numpy as np
 
 from bufgym.papers.afr_evaluation import LinkFigure
 from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.rows import Rows, listed
+from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario.suites import RATE_HZ
 
 PAPER_LOW = [21, 23]
@@ -30,10 +30,10 @@ class Reproduction(LinkFigure):
 
     SIZE_INCHES = (7.5, 5.2)
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         lengths_us, rates = self.link.samples()
         ends_s = np.cumsum(lengths_us) / 1e6
-        return Rows(
+        return FigureRows(
             {
                 "second": k,
                 "start_s": round(float(end_s - length_us / 1e6), 6),
@@ -50,14 +50,14 @@ class Reproduction(LinkFigure):
         """Bytes/s."""
         return RATE_HZ * self.size_bytes
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         return [
             f"Second {row['second']}: {row['bytes_per_s'] / 1e3:.1f} KB/s, from {row['start_s']:.2f} to "
             f"{row['end_s']:.2f} s of the trace."
             for row in rows.where(under_500KBps=True, streamed=True)
         ]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         rates = rows.column("bytes_per_s", streamed=True)
         best, best_of_all = float(rates.max()), float(rows.column("bytes_per_s").max())
         low_seconds = [row["second"] for row in rows.where(under_500KBps=True, streamed=True)]
@@ -82,7 +82,7 @@ class Reproduction(LinkFigure):
             "carried": float(np.average(rates, weights=self.streamed[0])) / self.demand,
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         panels = figure.subplots(2, 1, height_ratios=[2, 1])
         rates, edges = rows.column("bytes_per_s") / 1e6, np.append(rows.column("start_s"), rows[-1]["end_s"])
         for axes, until_s in zip(panels, (min(self.show_s, edges[-1]), edges[-1]), strict=True):

@@ -17,7 +17,7 @@ from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, ti
 from bufgym.papers.figure import heat_table
 from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, FrameFigure, FrameRun, spearman
 from bufgym.papers.perception import mapping
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 
 RESAMPLES = 2000
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
@@ -28,7 +28,7 @@ SLICE = 30_000
 """Number of points drawn of a map."""
 
 
-def change(rows: Rows, column: str, policy: str, other: str) -> Interval:
+def change(rows: FigureRows, column: str, policy: str, other: str) -> Interval:
     """Divide the column's mean under ``policy`` by its mean under ``other`` and subtract 1.
 
     The interval comes from a paired bootstrap over offsets: a drawn offset brings all its runs of both policies.
@@ -49,10 +49,10 @@ def spelled(interval: Interval) -> str:
 class Reproduction(FrameFigure):
     """Map error of each policy at each L on each recording."""
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         return self.play("map", "track")
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines: list[str] = []
         labels: dict[Any, str] = {name: style[0] for name, style in POLICIES.items()}
         for recording in rows.distinct("recording"):
@@ -62,7 +62,7 @@ class Reproduction(FrameFigure):
                 lines += [*shown.pivot("policy", "L", "rmse_mm", ".2f", labels), ""]
         return lines[:-1]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         main = self.recordings[-1]
         facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets, "moves": "not run"}
         for other, paper in PAPER.items():
@@ -85,7 +85,7 @@ class Reproduction(FrameFigure):
             facts["moves"] = self.where_it_moves(rows.where(recording=main))
         return facts
 
-    def where_it_moves(self, rows: Rows) -> str:
+    def where_it_moves(self, rows: FigureRows) -> str:
         """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""
         moved, won = [], []
         x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
@@ -95,7 +95,7 @@ class Reproduction(FrameFigure):
             won.append(rows.mean("rmse_mm", k=k, policy="afr") / rows.mean("rmse_mm", k=k, policy="drop-oldest") - 1)
         return f"{spearman(np.array(moved), np.array(won)):+.2f}"
 
-    def size_inches(self, rows: Rows) -> tuple[float, float]:
+    def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return 13.0, 0.9 + 0.28 * len(self.policies) + 4.6 * len(self.recordings)
 
     @property
@@ -103,7 +103,7 @@ class Reproduction(FrameFigure):
         """Policies whose maps are drawn."""
         return [name for name in SHOWN if name in self.policies] or [self.policies[0]]
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         heights = [0.9 + 0.28 * len(self.policies), *[4.6] * len(self.recordings)]
         above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
         panels = above.subplots(1, 2 * len(self.recordings), squeeze=False, sharey=True)[0]
@@ -121,7 +121,7 @@ class Reproduction(FrameFigure):
         for part, recording in zip(below, self.recordings, strict=True):
             self._maps(part, recording)
 
-    def _errors(self, rows: Rows) -> NDArray[np.float64]:
+    def _errors(self, rows: FigureRows) -> NDArray[np.float64]:
         """Errors in mm, [policies, L and their mean]."""
         by_L = [[rows.mean("rmse_mm", policy=policy, L=L) for L in self.capacities] for policy in self.policies]
         return np.column_stack([by_L, np.mean(by_L, axis=1)])

@@ -15,7 +15,7 @@ import numpy as np
 
 from bufgym.papers.figure import finish, heat_table
 from bufgym.papers.frame_runs import POLICIES, FrameFigure
-from bufgym.papers.rows import Rows, table
+from bufgym.papers.rows import FigureRows, table
 
 THIRD = 1 / 3
 """Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
@@ -27,10 +27,10 @@ COLUMNS = 4
 class Reproduction(FrameFigure):
     """Tracking failures under each policy at each L on each recording."""
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         return self.play("track")
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines: list[str] = []
         for recording in rows.distinct("recording"):
             shown = rows.where(recording=recording)
@@ -45,7 +45,7 @@ class Reproduction(FrameFigure):
             lines += [f"{recording}, runs of {self.offsets} in which tracking breaks, by L:", *table(cells), ""]
         return lines[:-1]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         broken = {
             name: {policy: failures(rows, recording=name, policy=policy) for policy in self.policies}
             for name in self.recordings
@@ -72,7 +72,7 @@ class Reproduction(FrameFigure):
             facts["oldest"] = everywhere(lambda counts: 0.4 <= counts["drop-oldest"] / runs <= 0.6)
             facts["oldest_rate"], facts["afr_rate"] = each(".0%", ("drop-oldest",), runs), each(".0%", ("afr",), runs)
             facts["third_count"] = each(".0f", ("afr", "drop-oldest"))
-            large = Rows(row for row in rows if row["L"] > 10)
+            large = FigureRows(row for row in rows if row["L"] > 10)
             facts["large_count"] = failures(large, policy="afr")
             facts |= dict.fromkeys(("afr", "third", "large"))
             if everywhere(lambda counts: counts["drop-oldest"] > 0):  # else AFR has nothing to improve
@@ -81,17 +81,17 @@ class Reproduction(FrameFigure):
                 facts["large"] = failures(large, policy="afr") == 0 if large else None
         return facts
 
-    def size_inches(self, rows: Rows) -> tuple[float, float]:
+    def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return 13.0, (0.4 + 1.7 * math.ceil(len(self.policies) / COLUMNS)) * len(self.recordings)
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         parts = figure.subfigures(len(self.recordings), 2, squeeze=False, width_ratios=[1, 1.7])
         for (left, right), recording in zip(parts, self.recordings, strict=True):
             shown = rows.where(recording=recording)
             self._counts(left.subplots(), recording, shown)
             self._broken(right, recording, shown)
 
-    def _counts(self, axes: Any, recording: str, shown: Rows) -> None:
+    def _counts(self, axes: Any, recording: str, shown: FigureRows) -> None:
         """Draw a table of how many runs break for each policy and L."""
         counts = np.array([[failures(shown, policy=policy, L=L) for L in self.capacities] for policy in self.policies])
         labels = [POLICIES[policy][0] for policy in self.policies]
@@ -103,7 +103,7 @@ class Reproduction(FrameFigure):
         axes.set_title(f"{recording}: runs of {self.offsets} in which tracking breaks", loc="left", fontsize=10)
         axes.set_xlabel("queue size L")
 
-    def _broken(self, part: Any, recording: str, shown: Rows) -> None:
+    def _broken(self, part: Any, recording: str, shown: FigureRows) -> None:
         """Draw the camera's path from above for each policy, and where tracking broke along it."""
         places = self.stage(recording).whole.poses[:, :3, 3]
         across, along = np.argsort(np.ptp(places, axis=0))[:0:-1]
@@ -123,6 +123,6 @@ class Reproduction(FrameFigure):
         part.suptitle(f"{recording}: where, all L (the way begins at the triangle)", x=0.02, ha="left", fontsize=10)
 
 
-def failures(rows: Rows, **where: object) -> int:
+def failures(rows: FigureRows, **where: object) -> int:
     """Count the runs in which tracking broke."""
     return sum(bool(row["failed"]) for row in rows.where(**where))

@@ -24,7 +24,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT, compile_for, records
 from bufgym.model.buffer import ACCEPT, MESSAGE, Buffer
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import Rows, listed
+from bufgym.papers.rows import FigureRows, listed
 from bufgym.policies.registry import Policy, signatures
 from bufgym.scenario import Interruption
 
@@ -140,9 +140,9 @@ class Reproduction(Figure):
 
     RULES = {"images": whole(0)}
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         buffer, arrivals = full_queue(self.capacity, 400)
-        rows = Rows()
+        rows = FigureRows()
         for policy in map(policies.get, policies.names(for_topics=False)):
             # Only built-in policies, because a user's policy names no source.
             if policy.compile and policy.source and policy.privileged is None:
@@ -155,11 +155,11 @@ class Reproduction(Figure):
             rows.append({"policy": IMAGES, "inside_us": None, **called, "paper": PAPER[IMAGES]})
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         called = {"called": ("called_median_us", ".2f"), "p99": ("called_p99_us", ".2f"), "paper": ("paper", "")}
         return rows.listing({"policy": ("policy", ""), "inside": ("inside_us", ".4f")} | called)
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         fast = [row for row in rows if row["paper"].startswith("<")]
         inside = [f"{row['policy']} {_yes(row['inside_us'] < LIMIT_COMPILED_US)}" for row in fast]
         called = [f"{row['policy']} {_yes(row['called_median_us'] < LIMIT_PYTHON_US)}" for row in fast]
@@ -175,10 +175,10 @@ class Reproduction(Figure):
             "called": listed(called),
         }
 
-    def size_inches(self, rows: Rows) -> tuple[float, float]:
+    def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return 7.0, 0.34 * len(rows) + 2.2
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         axes, at = figure.add_subplot(), np.arange(len(rows))
         inside, median, p99 = (rows.column(f"{name}_us") for name in ("inside", "called_median", "called_p99"))
         axes.plot(inside, at, "o", color=COLOURS["afr"], label=f"inside a {HOW}")

@@ -19,7 +19,7 @@ from bufgym import policies, sim
 from bufgym.benchmark.run import draw
 from bufgym.papers.afr_evaluation import FRAME_BYTES, LinkFigure
 from bufgym.papers.figure import COLOURS, finish
-from bufgym.papers.rows import Row, Rows, listed, table
+from bufgym.papers.rows import FigureRows, Row, listed, table
 from bufgym.scenario import Uplink
 from bufgym.scenario.suites import CAPACITIES, RATE_HZ, time_value
 
@@ -44,9 +44,9 @@ class Reproduction(LinkFigure):
 
     SIZE_INCHES = (9.0, 3.8)
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         """Return a row for each size, policy, L and run."""
-        rows = Rows()
+        rows = FigureRows()
         for size_kb in sorted({self.size_bytes / 1000, *self.sweep_kb}):
             uplink = Uplink(
                 traces=(self.link,),
@@ -71,17 +71,17 @@ class Reproduction(LinkFigure):
                 rows.append(row)
         return rows
 
-    def recalculations(self, rows: Rows, size_kb: float) -> tuple[float, float]:
+    def recalculations(self, rows: FigureRows, size_kb: float) -> tuple[float, float]:
         """Return the fewest and the most recalculations over L; each is a mean over runs."""
         counts = [rows.mean("dropped", size_kb=size_kb, policy="orbbuf", L=L) for L in self.capacities]
         return min(counts), max(counts)
 
-    def rates_hz(self, rows: Rows, size_kb: float) -> list[float]:
+    def rates_hz(self, rows: FigureRows, size_kb: float) -> list[float]:
         """Frames kept in each of the two seconds at the smallest L by `afr` and `afr-paper`, mean over runs."""
         shown = rows.where(size_kb=size_kb, L=min(self.capacities))
         return [shown.mean(f"kept_in_second_{s}", policy=p) for p in ("afr", "afr-paper") for s in SECONDS]
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         heads = [f"{policy}, second {s}" for policy in ("afr", "afr-paper") for s in SECONDS]
         lines = [["kB", "recalculations", *heads]]
         for size_kb in rows.distinct("size_kb"):
@@ -91,7 +91,7 @@ class Reproduction(LinkFigure):
             )
         return ["ORBBuf's evictions over all L; frames that AFR keeps of each second at the smallest L:", *table(lines)]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         sizes = rows.distinct("size_kb")
         counts = {kb: self.recalculations(rows, kb) for kb in sizes}
         rates = {kb: self.rates_hz(rows, kb) for kb in sizes}
@@ -113,7 +113,7 @@ class Reproduction(LinkFigure):
             "least_L": min(self.capacities),
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         left, right = figure.subplots(1, 2)
         sizes = rows.distinct("size_kb")
         fewest, most = np.array([self.recalculations(rows, kb) for kb in sizes]).T

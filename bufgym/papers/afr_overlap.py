@@ -23,7 +23,7 @@ from bufgym.papers.afr_theorems import gaps_of
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import FrameFigure
 from bufgym.papers.perception.views import overlap_information
-from bufgym.papers.rows import Row, Rows
+from bufgym.papers.rows import FigureRows, Row
 
 NOISE = 0.05
 """Violation of a rule that still counts as keeping it, because depth has noise and edges."""
@@ -43,8 +43,8 @@ class Reproduction(FrameFigure):
 
     SIZE_INCHES = (11.0, 3.8)
 
-    def simulate(self) -> Rows:
-        rows = Rows()
+    def simulate(self) -> FigureRows:
+        rows = FigureRows()
         for recording in self.recordings:
             seen = self.stage(recording).seen
             v = 1.0 - seen.astype(np.float64)
@@ -58,7 +58,7 @@ class Reproduction(FrameFigure):
                         rows.append({"recording": recording, "by": by, "d": float(d)} | rules | gained)
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines: list[str] = []
         heads = ("mean V", "10 %", "90 %", "Eq. 5 broken", "Eq. 6 broken", "by")
         columns = {"d": ("d", "g")} | {head: (name, ".3f") for head, name in zip(heads, _RULES, strict=True)}
@@ -68,9 +68,9 @@ class Reproduction(FrameFigure):
             lines += [f"{recording}, d in {unit}:", *shown.listing(columns), ""]
         return lines[:-1]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         by_frames = rows.where(by="frames")
-        played = Rows(row for row in by_frames if row["behind"] is not None)
+        played = FigureRows(row for row in by_frames if row["behind"] is not None)
         facts: dict[str, Any] = {"about": self.about(), "noise": NOISE}
         for rule in ("broken_5", "broken_6"):
             facts[rule] = "; ".join(
@@ -97,7 +97,7 @@ class Reproduction(FrameFigure):
             facts |= {"behind": "not played", "of_best": "not played"}
         return facts
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         colours = dict(zip(self.recordings, (COLOURS["afr"], COLOURS["drop-oldest"]), strict=False))
         left, middle, right = figure.subplots(1, 3)
         for recording, colour in colours.items():
@@ -106,7 +106,9 @@ class Reproduction(FrameFigure):
                 d = shown.column("d")
                 axes.fill_between(d, shown.column("V_low"), shown.column("V_high"), color=colour, alpha=0.2)
                 axes.plot(d, shown.column("V"), "o-", color=colour, markersize=4, label=recording)
-            played = Rows(row for row in rows.where(recording=recording, by="frames") if row["behind"] is not None)
+            played = FigureRows(
+                row for row in rows.where(recording=recording, by="frames") if row["behind"] is not None
+            )
             for name, line in (("afr", "-"), ("oldest", "--")):
                 label = f"{recording}, {'AFR' if name == 'afr' else 'Drop Oldest'}"
                 right.plot(played.column("d"), played.column(f"{name}_of_best"), line, color=colour, label=label)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import POLICIES, FrameFigure, spearman_over
-from bufgym.papers.rows import Row, Rows, listed, table
+from bufgym.papers.rows import FigureRows, Row, listed, table
 
 MEASURES = {
     "H_time": "time",
@@ -43,13 +43,13 @@ class Reproduction(FrameFigure):
     """Correlation of each measure of information with each measure of the task, on each recording."""
 
     @cached_property
-    def runs(self) -> Rows:
+    def runs(self) -> FigureRows:
         """Runs of Fig. 7 and 8."""
         return self.play("map", "track")
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         """Return a row for each recording, measure and task; the runs themselves are saved with Fig. 7 and 8."""
-        rows = Rows()
+        rows = FigureRows()
         for recording in self.recordings:
             shown = self.runs.where(recording=recording)
             offset = np.array(shown.column("k"), np.int64)
@@ -64,7 +64,7 @@ class Reproduction(FrameFigure):
                 rows.append({"recording": recording, **names, **interval, "runs": len(a)})
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines: list[str] = []
         for recording, scope in rows.distinct("recording", "scope"):
             shown = rows.where(recording=recording, scope=scope)
@@ -84,7 +84,7 @@ class Reproduction(FrameFigure):
             lines += [f"{recording}, mean of all runs (of failures: their part):", *table([heads, *cells]), ""]
         return lines[:-1]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         best, reached = {}, []
         for recording in self.recordings:
             for task in ("map error", "tracking failure"):
@@ -106,10 +106,10 @@ class Reproduction(FrameFigure):
             "ranking": "; ".join(f"{task} on {where}: {text}" for (where, task), text in best.items()) or "unknown",
         }
 
-    def size_inches(self, rows: Rows) -> tuple[float, float]:
+    def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return 11.0, 3.7 * len(self.recordings) + 0.4
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         colours = (COLOURS["other"], COLOURS["afr"], COLOURS["random"], COLOURS["orange"], COLOURS["pink"])
         pairs = rows.distinct("recording", "scope")
         panels = figure.subplots(len(self.recordings), 2, squeeze=False, sharey=True)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from bufgym import policies, sim
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import Row, Rows
+from bufgym.papers.rows import FigureRows, Row
 from bufgym.scenario import Interruption
 from bufgym.sim import metrics
 
@@ -86,10 +86,10 @@ class Reproduction(Figure):
 
     RULES = {"last_T": whole(2)}
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         """Return a row for each L: comparisons, violations by statement, and AFR's worst ratio to oracle-ideal."""
         lengths = range(1, self.last_T + 1)
-        rows = Rows()
+        rows = FigureRows()
         for L in range(1, self.max_capacity + 1):
             row: Row = {"L": L, "paper_bound": bound(L), "sharper_bound": sharper_bound(L), "worst": 1.0, "at_T": 0}
             row |= dict.fromkeys(("comparisons", *VIOLATIONS), 0)
@@ -113,12 +113,12 @@ class Reproduction(Figure):
             rows.append(row)
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         bounds = {"paper's bound": ("paper_bound", ".4f"), "sharper bound": ("sharper_bound", ".4f")}
         worst = {"worst of every V and T": ("worst", ".4f"), "at T": ("at_T", "")}
         return rows.listing({"L": ("L", "")} | bounds | worst, left=0)
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         counts = {name: int(rows.column(name).sum()) for name in VIOLATIONS}
         return {
             "theorem-1": counts["above_oracle"] == counts["oracle_above_ideal"] == 0,
@@ -134,7 +134,7 @@ class Reproduction(Figure):
             "bound_8": bound(min(8, self.max_capacity)),
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         axes = figure.add_subplot()
         looks = {
             "worst": ("o", "afr", "AFR, worst of every V and T"),

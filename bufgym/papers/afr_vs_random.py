@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from bufgym.papers.afr_theorems import extremes, gaps_of
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import Row, Rows
+from bufgym.papers.rows import FigureRows, Row
 
 ROUNDING = 1e-9
 """Relative tolerance; the expectations are sums of some ten thousand products."""
@@ -95,9 +95,9 @@ class Reproduction(Figure):
     RULES = {"max_capacity": whole(DRAWN_L), "last_T": whole(COUNTEREXAMPLE[1])}
     SIZE_INCHES = (10.0, 4.4)
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         """Return a row for each L: how often E[Random] is above AFR, and the highest and lowest ratio of the two."""
-        rows = Rows()
+        rows = FigureRows()
         for L in range(1, self.max_capacity + 1):
             random = expected_extremes(L, self.last_T)
             row: Row = {"L": L, "cases": 0, "violations": 0, "highest_ratio": 0.0, "at_T": 0, "at_D": 0}
@@ -117,15 +117,15 @@ class Reproduction(Figure):
             rows.append(row)
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         counts = {"L": ("L", ""), "cases": ("cases", ""), "E[Random] above AFR": ("violations", "")}
         highest = {"highest E[Random] / AFR": ("highest_ratio", ".6f"), "at T": ("at_T", ""), "at D": ("at_D", "")}
         return rows.listing(counts | highest, left=0)
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         L, T, D = COUNTEREXAMPLE
         (gaps,) = gaps_of("afr", L, [T])
-        beyond_1 = Rows(row for row in rows if row["L"] > 1)
+        beyond_1 = FigureRows(row for row in rows if row["L"] > 1)
         violations = int(beyond_1.column("violations").sum())
         random = float(expected_extremes(L, T)[T, D - 1])
         afr = int(extremes(gaps)[D - 1])
@@ -140,7 +140,7 @@ class Reproduction(Figure):
             "counter_random": random,
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         left, right = figure.subplots(1, 2)
         random = expected_extremes(DRAWN_L, self.last_T)
         lengths = range(1, self.last_T + 1)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from bufgym.ground.errors import BufgymError, install
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 from bufgym.scenario.checks import above_0
 
 COLOURS = {
@@ -102,22 +102,22 @@ class Figure(ABC):
                 rule(option.name, getattr(self, option.name))
 
     @abstractmethod
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         """The figure's numbers, written as CSV."""
 
     @abstractmethod
-    def claims(self, rows: Rows) -> Mapping[str, Any]:
+    def claims(self, rows: FigureRows) -> Mapping[str, Any]:
         """Map each claim to True, False or None if it was not tested; also give the numbers that the texts quote."""
 
     @abstractmethod
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         """Draw ``rows`` into an empty matplotlib figure."""
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         """Lines of text between the heading and the claims."""
         return []
 
-    def size_inches(self, rows: Rows) -> tuple[float, float]:
+    def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         """(width, height) of the picture."""
         return self.SIZE_INCHES
 
@@ -132,12 +132,12 @@ def statements() -> dict[str, dict[str, Any]]:
     return texts
 
 
-def facts_of(figure: Figure, rows: Rows) -> dict[str, Any]:
+def facts_of(figure: Figure, rows: FigureRows) -> dict[str, Any]:
     """Collect what the texts may quote: the figure's options and the results of its claims."""
     return {option.name: getattr(figure, option.name) for option in fields(figure)} | dict(figure.claims(rows))
 
 
-def report(name: str, figure: Figure, rows: Rows) -> list[str]:
+def report(name: str, figure: Figure, rows: FigureRows) -> list[str]:
     """Lines of text: our numbers beside the paper's, and which of its claims hold."""
     facts, texts = facts_of(figure, rows), statements()[name]
     lines = [*_filled(f"{texts['title']}. {texts.get('setup', '')}", facts), "", *figure.tables(rows), ""]
@@ -167,7 +167,7 @@ def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
 # --- pictures --------------------------------------------------------------------------------------------------------
 
 
-def save_picture(reproduction: Figure, rows: Rows, path: Path) -> Path:
+def save_picture(reproduction: Figure, rows: FigureRows, path: Path) -> Path:
     """Draw and write the PNG; return its path. An error that names the extra where matplotlib is absent."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg

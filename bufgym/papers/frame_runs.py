@@ -32,7 +32,7 @@ from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views
 from bufgym.papers.perception.stage import IMAGES, OFFSETS, Stage
-from bufgym.papers.rows import Row, Rows
+from bufgym.papers.rows import FigureRows, Row
 from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
 from bufgym.traces import Trace
 
@@ -130,12 +130,12 @@ class FrameFigure(Figure):
         (row,) = self.done(self.task("kept", setting))
         return cast(tuple[int, ...], row["kept"])
 
-    def play(self, *kinds: Kind) -> Rows:
+    def play(self, *kinds: Kind) -> FigureRows:
         """Return a row for each run: its frame count, its information by each V and its results of these tasks."""
         settings = self.settings()
         self.done(*(self.task("kept", setting) for setting in settings))
         parts = [self.done(*(self.task(kind, setting) for setting in settings)) for kind in kinds]
-        rows = Rows()
+        rows = FigureRows()
         for setting, *found in zip(settings, *parts, strict=True):
             row: Row = setting._asdict() | {"received": len(self.kept(setting))} | self.information(setting)
             rows.append(functools.reduce(operator.or_, found, row))

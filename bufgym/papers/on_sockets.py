@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.model.qoi import Value
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 from bufgym.policies import Policy
 from bufgym.robot.sender import Leaves
 from bufgym.robot.validate import play
@@ -42,7 +42,7 @@ def received_s(
     return times_s
 
 
-def apart(simulated: Rows, live: Rows) -> Iterator[str]:
+def apart(simulated: FigureRows, live: FigureRows) -> Iterator[str]:
     """How the rows differ, column by column."""
     for name in simulated[0]:
         if name.endswith(UNITS) and any(one[name] != other[name] for one, other in zip(simulated, live, strict=True)):

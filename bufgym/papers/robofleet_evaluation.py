@@ -24,7 +24,7 @@ from bufgym import policies, sim
 from bufgym.benchmark.run import draw
 from bufgym.model.topics import Topic
 from bufgym.papers.figure import COLOURS, Figure, at_least_0, whole
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 from bufgym.scenario import Client, Stream
 from bufgym.traces import Trace
 
@@ -256,7 +256,7 @@ def p95(numbers: NDArray[np.float64]) -> float:
     return float(np.percentile(numbers, 95)) if len(numbers) else np.nan
 
 
-def curves(axes: Any, rows: Rows, x: str, y: str, names: Sequence[str], **styles: Any) -> None:
+def curves(axes: Any, rows: FigureRows, x: str, y: str, names: Sequence[str], **styles: Any) -> None:
     """Draw the mean of column ``y`` against column ``x``, one line per sender; ``styles`` apply to every line."""
     for k, name in enumerate(names):
         means = {at: rows.mean(y, **{x: at}, sender=name) for at in rows.where(sender=name).distinct(x)}

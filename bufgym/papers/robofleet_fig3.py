@@ -14,7 +14,7 @@ from typing import Any
 
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.robofleet_evaluation import MBIT, SHORT, CloudFigure, cloud_bytes, curves, p95, stream
-from bufgym.papers.rows import Rows, listed
+from bufgym.papers.rows import FigureRows, listed
 from bufgym.traces.generate import steady
 
 SENDERS = ("robofleet", "no-drop", "no-drop-released", "rosbridge", "ros-native")
@@ -44,9 +44,9 @@ class Reproduction(CloudFigure):
         """Clouds per second that the link carries."""
         return self.mbit_per_s * MBIT / cloud_bytes(self.points)[1]
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         size, link = cloud_bytes(self.points)[1], steady(self.mbit_per_s * MBIT)
-        rows = Rows()
+        rows = FigureRows()
         for rate, name, seed in product(sorted(self.rates_hz), SENDERS, range(self.runs)):
             sent = self.send(name, (stream("PointCloud2", rate, points=self.points),), link, self.duration_s, seed)
             latency_s = sent.received.latency_s
@@ -66,7 +66,7 @@ class Reproduction(CloudFigure):
             )
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         return [
             "Mean latency, ms:",
             *rows.pivot("publish_hz", "sender", "latency_ms", ".1f", SHORT),
@@ -75,7 +75,7 @@ class Reproduction(CloudFigure):
             *rows.pivot("publish_hz", "sender", "received_hz", ".1f", SHORT),
         ]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         low, high = min(self.rates_hz), max(self.rates_hz)
         at_high = rows.where(publish_hz=high)
         high_ms = {name: at_high.mean("latency_ms", sender=name) for name in SENDERS}
@@ -115,7 +115,7 @@ class Reproduction(CloudFigure):
             "last_s": at_high.mean("last_latency_ms", sender="no-drop") / 1e3,
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         latency, received = figure.subplots(1, 2)
         high = max(self.rates_hz)
         panels = ((latency, "latency_ms", "Latency"), (received, "received_hz", "Throughput"))

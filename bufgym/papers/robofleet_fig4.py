@@ -21,7 +21,7 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.figure import COLOURS, at_least_0, finish, legend_below
 from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, SHORT, CloudFigure, Sent, played_once, stream
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")
@@ -68,8 +68,8 @@ class Reproduction(CloudFigure):
         streams = (stream(kind, RATES_HZ[kind], points=self.points),)
         return away_s, self.send(name, streams, link, away_s + outage_s + watched_s, seed)
 
-    def simulate(self) -> Rows:
-        rows = Rows()
+    def simulate(self) -> FigureRows:
+        rows = FigureRows()
         for kind, mbit, dropout_s, seed, name in product(
             self.kinds, self.links_mbit_per_s, self.dropouts_s, range(self.runs), SENDERS
         ):
@@ -78,7 +78,7 @@ class Reproduction(CloudFigure):
             rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, FACTOR)})
         return rows
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         cells = by_cell(rows)
         ratios = {key: ratio(cell) for key, cell in cells.items()}
         about = [key for key, r in ratios.items() if ABOUT[0] <= r <= ABOUT[1]]
@@ -101,9 +101,9 @@ class Reproduction(CloudFigure):
             "about": "; ".join(f"{kind} at {mbit:g} Mbit/s {shown}" for (kind, mbit), shown in lengths.items()),
         }
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines = ["Recovery of rosbridge to Robofleet's, by the length of the dropout in s:"]
-        cells = Rows(
+        cells = FigureRows(
             {"topic": f"{kind}, {mbit:g} Mbit/s", "dropout_s": dropout_s, "ratio": ratio(cell)}
             for (kind, mbit, dropout_s), cell in by_cell(rows).items()
         )
@@ -112,7 +112,7 @@ class Reproduction(CloudFigure):
             lines += [kind, *rows.where(message=kind).pivot("sender", "dropout_s", "recovery_s", ".3f", SHORT)]
         return lines
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         left, right = figure.subplots(1, 2)
         shown_s = min(self.dropouts_s, key=lambda s: abs(s - 10))
         kind, mbit = self.kinds[0], max(self.links_mbit_per_s)
@@ -165,7 +165,7 @@ def ratio(cell: Sequence[float]) -> float:
     return cell[1] / cell[0] if cell[0] > 0 and math.isfinite(cell[0]) else math.nan
 
 
-def by_cell(rows: Rows) -> Cells:
+def by_cell(rows: FigureRows) -> Cells:
     """Average the recovery of each of ``SENDERS`` for each message kind, link and dropout."""
     return {
         (kind, mbit, dropout): tuple(

@@ -18,7 +18,7 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.figure import COLOURS, at_least_0, finish, legend_below
 from bufgym.papers.robofleet_evaluation import JITTER, MBIT, SHORT, CloudFigure, cloud_bytes, curves, stream
-from bufgym.papers.rows import Rows, average
+from bufgym.papers.rows import FigureRows, average
 from bufgym.traces.generate import ramp
 
 SENDERS = ("robofleet", "no-drop", "rosbridge", "ros-native")
@@ -55,10 +55,10 @@ class Reproduction(CloudFigure):
         """Capacity of the link, Mbit/s."""
         return self.from_mbit_per_s + (self.to_mbit_per_s - self.from_mbit_per_s) * min(at_s / self.fall_s, 1)
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         link = ramp(self.from_mbit_per_s * MBIT, self.to_mbit_per_s * MBIT, self.fall_s)
         streams = (stream("PointCloud2", self.rate_hz, points=self.points),)
-        rows = Rows()
+        rows = FigureRows()
         for name, seed in product(SENDERS, range(self.runs)):
             received = self.send(name, streams, link, self.until_s, seed, watched_s=math.ceil(self.until_s)).received
             for second in range(math.ceil(self.until_s)):
@@ -77,9 +77,9 @@ class Reproduction(CloudFigure):
                 )
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         links = [{**row, "sender": "link", "received": row["link_mbit_per_s"]} for row in rows.where(run=0)]
-        received = Rows([*rows, *links]).pivot("second", "sender", "received", ".1f", SHORT | {"link": "Mbit/s"})
+        received = FigureRows([*rows, *links]).pivot("second", "sender", "received", ".1f", SHORT | {"link": "Mbit/s"})
         return [
             "Received in each second, and the link's Mbit/s in its middle:",
             *received,
@@ -88,7 +88,7 @@ class Reproduction(CloudFigure):
             *rows.pivot("second", "sender", "mean_latency_s", ".3f", SHORT),
         ]
 
-    def broken(self, rows: Rows, name: str) -> int | None:
+    def broken(self, rows: FigureRows, name: str) -> int | None:
         """Find the second in which this program breaks; None if it never does."""
         size = dict(zip(("ros-native", "robofleet", "rosbridge"), cloud_bytes(self.points), strict=True))
         for second in rows.distinct("second"):
@@ -99,7 +99,7 @@ class Reproduction(CloudFigure):
                 return int(second)
         return None
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         ros, size, _ = cloud_bytes(self.points)
         last_s = size / (self.to_mbit_per_s * MBIT)
         # A message sent is at most one period old, plus jitter, because a newer one would have overwritten it.
@@ -133,9 +133,9 @@ class Reproduction(CloudFigure):
             "native_share": share["ros-native"],
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         latency, rate = figure.subplots(2, 1, sharex=True)
-        middles = Rows(row | {"second": row["second"] + 0.5} for row in rows)
+        middles = FigureRows(row | {"second": row["second"] + 0.5} for row in rows)
         for axes, name in ((latency, "mean_latency_s"), (rate, "received")):
             curves(axes, middles, "second", name, SENDERS[::-1], markersize=4.5)
             axes.axvline(self.fall_s, color=COLOURS["other"], linewidth=1)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bufgym.papers.figure import COLOURS, finish, legend_below, several, whole
 from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, ClientFigure, Sent, cloud_bytes, p95, stream
-from bufgym.papers.rows import Rows, average, listed
+from bufgym.papers.rows import FigureRows, average, listed
 from bufgym.traces.generate import steady
 
 CONSTANT = 1.05
@@ -44,10 +44,10 @@ class Reproduction(ClientFigure):
     LIVE = {"points": (4_000,), "max_consumers": 4, "queue_sizes": (10,), "duration_s": 6.0, "runs": 1, "live": 1.0}
     RULES = {"points": several(whole(1, 10**7)), "max_consumers": whole(2, 100)}
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         link = steady(self.mbit_per_s * MBIT)
         senders = [("robofleet", 1), ("rosbridge", 1), *(("ros-native", queue) for queue in self.queue_sizes)]
-        rows = Rows()
+        rows = FigureRows()
         for points, n, (name, queue), seed in product(
             self.points, range(1, self.max_consumers + 1), senders, range(self.runs)
         ):
@@ -73,7 +73,7 @@ class Reproduction(ClientFigure):
         """Number of copies of such a cloud, as ROS binary, that the link carries."""
         return self.mbit_per_s * MBIT / (self.rate_hz * cloud_bytes(points)[0])
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines: list[str] = []
         for points in self.points:
             ros, flatbuffer, _ = cloud_bytes(points)
@@ -89,12 +89,12 @@ class Reproduction(ClientFigure):
             ]
         return lines[:-1]
 
-    def latencies_s(self, rows: Rows, points: int, line: str) -> list[float]:
+    def latencies_s(self, rows: FigureRows, points: int, line: str) -> list[float]:
         """Mean latency for each number of consumers, s."""
         shown = rows.where(points=points, line=line)
         return [shown.mean("mean_latency_s", consumers=n) for n in range(1, self.max_consumers + 1)]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         growth, linear, slopes = {}, [], []
         for points in self.points:
             first, *_, last = self.latencies_s(rows, points, "Robofleet")
@@ -123,10 +123,10 @@ class Reproduction(ClientFigure):
             "slopes": "; ".join(slopes),
         }
 
-    def size_inches(self, rows: Rows) -> tuple[float, float]:
+    def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return max(5.6, 4.4 * len(self.points) + 0.4), 4.2  # at least the legend's width
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         panels = figure.subplots(1, len(self.points), squeeze=False)[0]
         consumers = range(1, self.max_consumers + 1)
         for axes, points in zip(panels, self.points, strict=True):

@@ -29,7 +29,7 @@ from bufgym.papers.robofleet_evaluation import (
     played_once,
     stream,
 )
-from bufgym.papers.rows import Row, Rows
+from bufgym.papers.rows import FigureRows, Row
 from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")
@@ -90,18 +90,18 @@ class Reproduction(ClientFigure):
         streams = [stream(kind, hz, **(rules | changed.get(kind, {}))) for kind, (hz, rules) in TOPICS.items()]
         return self.send(name, streams, link, self.zone_s[1] + self.after_s, seed)
 
-    def simulate(self) -> Rows:
+    def simulate(self) -> FigureRows:
         first, *others = self.image_priorities
         cases = [(bad, name, first) for bad in self.bad_mbit_per_s for name in SENDERS]
         cases += [(self.shown, "robofleet", priority) for priority in others]
-        rows = Rows()
+        rows = FigureRows()
         for (bad, name, priority), seed in product(cases, range(self.runs)):
             sent = self.run(bad, name, priority, seed)
             key = {"bad_mbit_per_s": bad, "sender": name, "image_priority": priority, "run": seed}
             rows += [{**key, "topic": kind, **_entry(sent.on(k), self.zone_s)} for k, kind in enumerate(TOPICS)]
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         looked = {"median_in_zone_ms": "median latency, ms", "p95_in_zone_ms": "95 %, ms", "lost_in_zone": "dropped"}
         lines: list[str] = []
         for bad, priority in rows.distinct("bad_mbit_per_s", "image_priority"):
@@ -111,7 +111,7 @@ class Reproduction(ClientFigure):
                 lines += [*shown.pivot("sender", "topic", column, ",.0f", SHORT), ""]
         return lines[:-1]
 
-    def affected(self, rows: Rows, name: str) -> list[float]:
+    def affected(self, rows: FigureRows, name: str) -> list[float]:
         """List for each zone how long after it the last topic is still affected, s, mean over runs."""
         first = rows.where(sender=name, image_priority=self.image_priorities[0])
         return [
@@ -119,7 +119,7 @@ class Reproduction(ClientFigure):
             for bad in self.bad_mbit_per_s
         ]
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         first = rows.where(image_priority=self.image_priorities[0], bad_mbit_per_s=self.shown)
         lost = sum(row["lost"] for row in rows.where(sender="robofleet", topic="PoseStamped"))
         medians = (
@@ -154,7 +154,7 @@ class Reproduction(ClientFigure):
             "medians": ", ".join(medians),
         }
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         panels = figure.subplots(len(SENDERS), 1, sharex=True, sharey=True)
         for axes, name in zip(panels, SENDERS, strict=True):
             sent = self.run(self.shown, name, self.image_priorities[0], 0)

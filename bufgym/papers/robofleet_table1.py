@@ -17,7 +17,7 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.encodings import ENCODINGS, KINDS, Content, content, encode
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import Rows, table
+from bufgym.papers.rows import FigureRows, table
 
 PAPER = {
     "LaserScan": (7_260, 7_328, 28_000),
@@ -60,8 +60,8 @@ class Reproduction(Figure):
             messages.setdefault(kind, content(kind, **parameters))
         return messages
 
-    def simulate(self) -> Rows:
-        rows = Rows()
+    def simulate(self) -> FigureRows:
+        rows = FigureRows()
         for (kind, message), encoding in itertools.product(self.messages.items(), ENCODINGS):
             bytes_, paper = len(encode(kind, message, encoding)), of_paper(kind, encoding)
             ratio = None if paper is None else f"{bytes_ / paper:.4f}"
@@ -70,7 +70,7 @@ class Reproduction(Figure):
             )
         return rows
 
-    def tables(self, rows: Rows) -> list[str]:
+    def tables(self, rows: FigureRows) -> list[str]:
         lines = [["", "", *ENCODINGS]]
         for kind in rows.distinct("message"):
             labels = {"ours": "bytes", "paper": "paper_bytes", "ratio": "ours_to_paper"}
@@ -80,7 +80,7 @@ class Reproduction(Figure):
                 lines.append([kind if label == "ours" else "", label, *texts])
         return table(lines, left=2)
 
-    def claims(self, rows: Rows) -> dict[str, Any]:
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
         sizes = sizes_of(rows)
         listed = {
             name: ", ".join(f"{sizes[kind][encoding]:,}" for kind in PAPER)
@@ -104,7 +104,7 @@ class Reproduction(Figure):
         }
         return equal | listed | contents | {"others": ", ".join(kind for kind in sizes if kind not in PAPER)}
 
-    def draw(self, rows: Rows, figure: Any) -> None:
+    def draw(self, rows: FigureRows, figure: Any) -> None:
         sizes = sizes_of(rows)
         axes = figure.add_subplot()
         width, ticks = 0.8 / len(SHOWN), np.arange(len(sizes))
@@ -124,7 +124,7 @@ class Reproduction(Figure):
         legend_below(figure, 3)
 
 
-def sizes_of(rows: Rows) -> dict[str, dict[str, int]]:
+def sizes_of(rows: FigureRows) -> dict[str, dict[str, int]]:
     """Map kind and encoding to bytes."""
     sizes: dict[str, dict[str, int]] = {}
     for row in rows:

@@ -1,4 +1,4 @@
-"""Rows of a figure's numbers: queries, and tables of text."""
+"""FigureRows of a figure's numbers: queries, and tables of text."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Row = dict[str, Any]
 """Column -> text, number or None."""
 
 
-class Rows(list[Row]):
-    """Rows with the same columns. In each method ``where`` selects rows whose columns have these values."""
+class FigureRows(list[Row]):
+    """FigureRows with the same columns. In each method ``where`` selects rows whose columns have these values."""
 
-    def where(self, **values: object) -> Rows:
-        return Rows(row for row in self if all(row[name] == value for name, value in values.items()))
+    def where(self, **values: object) -> FigureRows:
+        return FigureRows(row for row in self if all(row[name] == value for name, value in values.items()))
 
     def column(self, name: str, **where: object) -> NDArray[np.float64]:
         """Return one column, float64[rows]."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
-from bufgym.model.link import Knots
+from bufgym.model.link import KnotStore
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy
@@ -67,7 +67,7 @@ class Senders:
         self.episodes: list[Episode | None] = [None] * n
         self.begun = np.zeros(n, np.int64)
         self._uniforms: list[np.random.Generator | None] = [None] * n
-        self._knots = Knots()
+        self._knots = KnotStore()
         self.batch = new_batch(n, self.capacity, max_messages, len(self.topic_table), values)
         self._rules = self.topic_table.view(np.int64)
         self._unlogged = np.tile(FRESH, max_messages)

@@ -147,7 +147,7 @@ class Batch(NamedTuple):
     order: NDArray[np.int64]
     """int64[n, messages]: sequence numbers in the order in which the socket dequeued them."""
     knot_us: NDArray[np.int64]
-    """int64[knots]: times of the knots of every trace, us (see ``bufgym.model.link.Knots``)."""
+    """int64[knots]: times of the knots of every trace, us (see ``bufgym.model.link.KnotStore``)."""
     knot_bytes: NDArray[np.int64]
     """int64[knots]: bytes that the trace has carried by then."""
     v: NDArray[np.float64]

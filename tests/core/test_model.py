@@ -13,7 +13,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import records
 from bufgym.model import link, qoi
 from bufgym.model.buffer import MESSAGE, arrival_gain, evict, gaps, loss, motion_gaps, push, row_width
-from bufgym.model.link import FOREVER, Knots, Link, position_at, segment, time_of
+from bufgym.model.link import FOREVER, KnotStore, Link, position_at, segment, time_of
 
 pytestmark = pytest.mark.kernels
 
@@ -77,7 +77,7 @@ KNOTS = [(0, 0), (10_000, 1_000), (20_000, 1_000), (30_000, 4_000)]
 
 
 def carrying(knots, after):
-    store = Knots()
+    store = KnotStore()
     store.place(trace([(0, 0), (7, 9)], "stop"), 0)  # so that this trace does not begin at knot 0
     first, last, code = store.place(trace(knots, after), 1)
     where = (store.us, store.bytes, first, last, code, first)
@@ -142,7 +142,7 @@ def test_nothing_is_lost_to_rounding():
 
 
 def test_traces_are_stored_once():
-    store, a, b = Knots(), trace(KNOTS, "loop"), trace([(0, 0), (5, 5)], "hold")
+    store, a, b = KnotStore(), trace(KNOTS, "loop"), trace([(0, 0), (5, 5)], "hold")
     assert store.place(a, 0) == (0, 3, 0)
     assert store.place(b, 1) == (4, 5, 1)
     assert store.place(a, 1) == (0, 3, 0)
@@ -153,7 +153,7 @@ def test_traces_are_stored_once():
 def test_traces_that_nobody_follows_make_room(monkeypatch):
     """Room for 8 knots: a new trace for each episode takes the place of one that was left, never of one followed."""
     monkeypatch.setattr(link, "KEPT_KNOTS", 8)
-    store, a = Knots(), trace(KNOTS, "loop")
+    store, a = KnotStore(), trace(KNOTS, "loop")
     store.place(a, 0)
     for k in range(1, 100):
         new = trace([(0, 0), (5, k)], "hold")

@@ -9,7 +9,7 @@ import pytest
 from bufgym.papers import afr_fig7, afr_fig8, afr_overlap, frame_tasks
 from bufgym.papers.frame_runs import spearman, spearman_over
 from bufgym.papers.frame_tasks import FrameTask, carry_out
-from bufgym.papers.rows import Rows
+from bufgym.papers.rows import FigureRows
 from bufgym.traces import Trace
 
 LINK = Trace.constant(1e6, 10.0, name="link")
@@ -42,14 +42,14 @@ def test_spearman() -> None:
     assert spearman_over(a, -a, group, "falls") == pytest.approx((-1, -1, -1))
     # AFR is 10 % below at every place of the fade, however much these differ: the interval has no width.
     pairs = [("drop-oldest", 10.0), ("afr", 9.0)]
-    rows = Rows({"k": k, "L": 5, "policy": p, "rmse_mm": mm * (1 + k)} for k in range(4) for p, mm in pairs)
+    rows = FigureRows({"k": k, "L": 5, "policy": p, "rmse_mm": mm * (1 + k)} for k in range(4) for p, mm in pairs)
     assert afr_fig7.spelled(afr_fig7.change(rows, "rmse_mm", "afr", "drop-oldest")) == "-10.0% [-10.0%, -10.0%]"
 
 
 def fig8_claims(broken: dict[tuple[str, str, int], int], data: Path | None, *capacities: int) -> dict[str, Any]:
     """Claims where of ten runs so many fail: by recording, policy and L; none where nothing is said."""
     policies = ("drop-oldest", "afr")
-    rows = Rows(
+    rows = FigureRows(
         {"recording": r, "k": k, "L": L, "policy": p, "failed": k < broken.get((r, p, L), 0), "failed_at": None}
         for r in ("room", "7-scenes")[: 1 + (data is not None)]
         for p in policies

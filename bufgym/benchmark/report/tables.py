@@ -19,7 +19,7 @@ NOTHING_SCORED = (
 )
 
 
-class Place(NamedTuple):
+class Ranked(NamedTuple):
     """One line of a ranking."""
 
     rank: int | None  # 1 for the best; None for a policy that is not ranked
@@ -28,14 +28,14 @@ class Place(NamedTuple):
     reason: str  # why it is not ranked; empty if it is
 
 
-def ranking(run: SuiteRun, summary: Summary, standings: Sequence[Standing] | None = None) -> list[Place]:
+def ranking(run: SuiteRun, summary: Summary, standings: Sequence[Standing] | None = None) -> list[Ranked]:
     """Ranked policies best first, then the others with the manifest's reasons; by default over all cells."""
-    places: list[Place] = []
+    places: list[Ranked] = []
     for standing in summary.overall if standings is None else standings:
         known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
         reason = "" if standing.ranked else run.manifest["unranked"][standing.policy]
         values = [pair(standing, quantity) for quantity in summary.quantities]
-        places.append(Place(len(places) + 1 if known else None, standing.policy, values, reason))
+        places.append(Ranked(len(places) + 1 if known else None, standing.policy, values, reason))
     return places
 
 
@@ -97,7 +97,7 @@ def intro(run: SuiteRun) -> list[str]:
     return lines
 
 
-def _texts(place: Place) -> list[str]:
+def _texts(place: Ranked) -> list[str]:
     return [" ".join(filter(None, texts)) for texts in place.values]
 
 

@@ -97,7 +97,7 @@ def _unzip(archive: Path, folder: Path, check: Check) -> None:
 
 
 def _untar(archive: Path, folder: Path, check: Check) -> None:
-    with gzip.open(archive) as stream, tarfile.open(fileobj=_Bounded(archive, stream)) as packed:
+    with gzip.open(archive) as stream, tarfile.open(fileobj=_BoundedArchive(archive, stream)) as packed:
         packed.extraction_filter = getattr(tarfile, "data_filter", None)  # not in the oldest Pythons
         for member in packed:
             check(member.name, member.size, member.isreg() or member.isdir())
@@ -107,7 +107,7 @@ def _untar(archive: Path, folder: Path, check: Check) -> None:
 _UNPACKERS: Final[dict[str, Callable[[Path, Path, Check], None]]] = {".tar.gz": _untar, ".tgz": _untar, ".zip": _unzip}
 
 
-class _Bounded(io.RawIOBase):
+class _BoundedArchive(io.RawIOBase):
     """The decompressed bytes of a tar file, a limited number at once."""
 
     def __init__(self, archive: Path, inner: gzip.GzipFile) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from bufgym.ground.files import read_utf8, unpacked_limit
-from bufgym.traces.formats.bag_poses import Channel
+from bufgym.traces.formats.bag_poses import BagTopic
 
 # A chunk of a recording has some MB, a robot some hundred topics; more is a mistake, or a bomb.
 MAX_CHUNK_BYTES: Final = 2**28
@@ -31,11 +31,11 @@ MAX_METADATA_BYTES: Final = 2**23
 _RECORD: Final = struct.Struct("<BQ")
 """An MCAP record's kind and length."""
 _MESSAGE: Final = struct.Struct("<HIQQ")
-"""Channel, sequence number, when it was logged and when it was published, ns."""
+"""BagTopic, sequence number, when it was logged and when it was published, ns."""
 _STORAGE: Final = re.compile(r"\s*(storage_identifier|compression_format|compression_mode):(.*)")
 _PIECE_BYTES: Final = 2**20
 
-Message = tuple[Channel, int, bytes]
+Message = tuple[BagTopic, int, bytes]
 """Its channel, when it was logged in ns, and its serialised form."""
 
 
@@ -87,14 +87,14 @@ def _mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
     from mcap.stream_reader import StreamReader
 
     schemas: dict[int, str] = {}
-    channels: dict[int, Channel] = {}
+    channels: dict[int, BagTopic] = {}
 
     def declared(record: Any) -> None:
         if isinstance(record, records.Schema):
             schemas[record.id] = record.name
         elif isinstance(record, records.Channel):
             types[record.topic] = _type(schemas.get(record.schema_id, ""))
-            channels[record.id] = Channel(record.topic, types[record.topic], record.message_encoding)
+            channels[record.id] = BagTopic(record.topic, types[record.topic], record.message_encoding)
 
     with _Bounded(path) as file:
         unpacked = _Unpacked(file.size)
@@ -241,14 +241,14 @@ def _sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
         kinds = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
         if base.execute(kinds).fetchone() != (2,):
             raise ValueError("no table of messages and topics")
-        channels: dict[int, Channel] = {}
+        channels: dict[int, BagTopic] = {}
         for number, topic, type, encoding in base.execute("SELECT id, name, type, serialization_format FROM topics"):
             if encoding != "cdr" or not isinstance(topic, str) or not isinstance(type, str):
                 raise ValueError(f"topic {topic!r} of type {type!r} in {encoding!r}: must be text, in cdr")
             if len(channels) > MAX_TOPICS:
                 break  # who reads on says so
             types[topic] = type
-            channels[number] = Channel(topic, type, "cdr")
+            channels[number] = BagTopic(topic, type, "cdr")
         for number, logged_ns, data in base.execute("SELECT topic_id, timestamp, data FROM messages"):
             if not isinstance(logged_ns, int) or not isinstance(data, bytes):
                 raise ValueError("a message's time must be a whole number, and its data bytes")
@@ -266,10 +266,10 @@ def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
         unpacked = _Unpacked(path.stat().st_size)
         for place, chunk in reader.chunks.items():
             reader.chunks[place] = chunk._replace(decompressor=_limited(chunk.decompressor, unpacked))
-        channels: dict[int, Channel] = {}
+        channels: dict[int, BagTopic] = {}
         for connection in reader.connections:
             types[connection.topic] = connection.msgtype
-            channels[connection.id] = Channel(connection.topic, connection.msgtype, "ros1")
+            channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1")
         for connection, logged_ns, data in reader.messages(list(reader.connections)):
             yield channels[connection.id], logged_ns, data
 

@@ -24,7 +24,7 @@ _LISTED_FRAMES: Final = 8
 
 
 @dataclass(frozen=True)
-class Channel:
+class BagTopic:
     """What the messages of one topic are."""
 
     topic: str
@@ -57,7 +57,7 @@ class PoseCollector:
         self._poses: dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]] = {}
         self._stores: dict[str, Any] = {}
 
-    def add(self, channel: Channel, time_ns: int, data: bytes) -> None:
+    def add(self, channel: BagTopic, time_ns: int, data: bytes) -> None:
         """Keep the poses of a message that was logged at `time_ns`."""
         message = self._decoded(channel, data)
         if channel.type in _POSE_TYPES:
@@ -91,7 +91,7 @@ class PoseCollector:
         values = np.array(list(by_us.values()))
         return from_ns, Poses(np.array(list(by_us), np.int64), values[:, :3], unit(values[:, 3:]), self.topic)
 
-    def _decoded(self, channel: Channel, data: bytes) -> Any:
+    def _decoded(self, channel: BagTopic, data: bytes) -> Any:
         if not carries_poses(channel.type):
             rule = f"must be one of {', '.join(_POSE_TYPES)}, {', '.join(_TF_TYPES)}"
             raise BufgymError(f"{self.path}: {self.topic} carries {channel.type or 'no known type'}: {rule}")
