@@ -6,7 +6,7 @@ import functools
 import json
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from bufgym.relay import wire
 from bufgym.relay.audit import Audit
@@ -18,9 +18,6 @@ from bufgym.relay.rules import Permissions
 from bufgym.relay.store import Mailbox, Settled, Store
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError
-
-if TYPE_CHECKING:
-    from bufgym.relay.peers import Peers
 
 OWN: Final = "relay"
 """The relay's name as a sender, and the prefix of its topics."""
@@ -83,6 +80,16 @@ class Member(Protocol):
         """Close it."""
 
 
+class Others(Protocol):
+    """The other relays that share topics with this one, see ``peers``."""
+
+    async def hold(self, sender: Mailbox, message: wire.Message) -> bool | None:
+        """Give a no_drop message to them; return whether they may have it, None if nobody answers."""
+
+    async def close(self) -> None:
+        """End the connection to them."""
+
+
 class Own(Protocol):
     """A receiver inside the relay, such as the recorder or the Foxglove server."""
 
@@ -111,7 +118,7 @@ class Hub:
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
-        self.peers: Peers | None = None
+        self.peers: Others | None = None
         """The other relays, if it shares topics with any."""
 
     # --- who is here --------------------------------------------------------------------------------------------------

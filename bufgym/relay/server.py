@@ -179,8 +179,8 @@ class Server:
         if self.config.nats is not None:
             from bufgym.relay.peers import Peers  # not at start-up: few need it
 
-            self.hub.peers = Peers(self.hub, self.config.nats)
-            await self.hub.peers.start()
+            self.hub.peers = peers = Peers(self.hub, self.config.nats)
+            await peers.start()
         if self.config.foxglove is not None:
             from bufgym.relay.foxglove import Window  # not at start-up: few need it
 
