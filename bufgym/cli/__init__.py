@@ -37,7 +37,6 @@ COMMANDS: dict[str, Any] = {
             "info": "cli.traces:info",
             "plot": "cli.traces:plot",
             "validate": "cli.traces:validate",
-            "validate": "cli.traces:validate",
             "convert": "cli.traces:convert",
             "from-bag": "cli.trace_bags:from_bag",
             "from-poses": "cli.trace_bags:from_poses",
