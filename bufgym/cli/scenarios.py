@@ -15,15 +15,15 @@ from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, printable
 
 if TYPE_CHECKING:
-    from bufgym.model.qoi import Value
     from bufgym.scenario import Scenario, Uplink
-    from bufgym.traces import Motion, Trace
+    from bufgym.traces import Motion
 
 SCORE = "Score: 0 is Drop Oldest, 1 the clairvoyant; regret = 1 - QoI / the clairvoyant's."
 """Legend of the table's first columns."""
 
-_PARAMETERS = {"fps": "rate_hz", "bytes": "size_bytes", "seconds": "duration_s"}
-"""Options whose scenario parameter has another name. Options not given take the scenario's defaults."""
+_PARAMETERS = {"trace": "traces", "fps": "rate_hz", "bytes": "size_bytes", "seconds": "duration_s"}
+"""Options whose scenario parameter has another name. Options not given take the scenario's defaults, and text is read
+there."""
 
 _MESSAGES = ("fps", "bytes", "size_cv", "seconds", "jitter")
 """Options of a made stream, which a recording has itself."""
@@ -155,26 +155,21 @@ def _own(options: OwnOptions, seeds: int) -> tuple[Scenario, str]:
 def _interruption(stream: StreamOptions, settings: dict[str, Any], seeds: int) -> tuple[Scenario, str]:
     from bufgym.scenario import Interruption
 
-    settings = settings | _parameters(stream, "fps", "bytes")
-    made = Interruption(**settings, value=_value(stream, by_motion=False))
+    made = Interruption(**settings, **_parameters(stream, "fps", "bytes", "value"))
     length = f"T = {made.t_max}" if made.law == "fixed" else f"T {made.law} on {made.t_min}..{made.t_max}"
     about = f"One interruption of T messages, {length}; V = {made.value.name} over frame indices."
     return made, f"{about}\nMeans over {seeds} seeds. {SCORE}"
 
 
 def _uplink(stream: StreamOptions, measured: MotionOptions, seeds: int) -> tuple[Scenario, str]:
-    from bufgym import scenario, traces
-    from bufgym.scenario import Uplink
+    from bufgym.model import qoi
 
-    settings = _parameters(stream, *_MESSAGES)
-    motions = stream.motion
-    if motions is None:
-        motions = [name for name in traces.shipped() if name.startswith("drive-")]
-    if stream.value is not None or motions == ["none"]:
-        settings["value"] = _value(stream, by_motion=False)
-    links, scale = _links(stream), (stream.scale or 1.0,)
-    uplink = scenario.get("lte", traces=links, motion=_motions(motions, measured), scale=scale, **settings)
-    assert isinstance(uplink, Uplink)
+    settings = _parameters(stream)
+    if stream.motion is not None:
+        settings["motion"] = _motions(stream.motion, measured)
+    if stream.motion == ["none"]:
+        settings = {"value": qoi.exponential(), **settings}
+    uplink = _over_lte(**settings)
     recorded = _some([_with_gaps(motion) for motion in uplink.motion])
     x = f"the camera's motion, in fields of view, from {recorded}" if uplink.motion else "the frame index"
     traces_met = f"{len(uplink.traces)} {'trace' if len(uplink.traces) == 1 else 'traces'}"
@@ -192,7 +187,7 @@ def _recording(
     file: str, stream: StreamOptions, recording: RecordingOptions, seeds: int | None
 ) -> tuple[Scenario, str]:
     """Make a workload as recorded; with --seeds it starts at random places of each trace."""
-    from bufgym.scenario import Uplink
+    from bufgym.model import qoi
     from bufgym.traces import read_workload
 
     refuse(given(stream, *_MESSAGES), "cannot go with --workload: a recording has its own")
@@ -201,14 +196,9 @@ def _recording(
     if recording.odom is None and not motions:
         refuse(given(recording, *MOTION), "needs --odom or --motion")
     by_motion = bool(motions) or workload.x is not None
-    uplink = Uplink(
-        traces=_links(stream),
-        motion=motions,
-        scale=(stream.scale or 1.0,),
-        random_offset=seeds is not None,
-        value=_value(stream, by_motion),
-        workload=workload,
-    )
+    value = stream.value or (qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential())
+    settings = _parameters(stream, "trace", "scale")
+    uplink = _over_lte(motion=motions, random_offset=seeds is not None, value=value, workload=workload, **settings)
     source = f"from {_some([_with_gaps(motion) for motion in motions])}" if motions else "as recorded"
     places = "from the trace's start" if seeds is None else f"{seeds} random places each"
     shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
@@ -220,13 +210,13 @@ def _recording(
     return uplink, "\n".join([*about, SCORE])
 
 
-def _value(options: StreamOptions, by_motion: bool) -> Value:
-    """Choose V by the options, or the default over a recording's motion or over frame indices."""
-    from bufgym.model import qoi
+def _over_lte(**settings: Any) -> Uplink:
+    """Change the uplink over the shipped links."""
+    from bufgym.scenario import Uplink, get
 
-    if options.value is not None:
-        return qoi.load(options.value)
-    return qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential()
+    uplink = get("lte", **settings)
+    assert isinstance(uplink, Uplink)
+    return uplink
 
 
 def _over(uplink: Uplink) -> str:
@@ -239,16 +229,6 @@ def _measured(uplink: Uplink, x: str) -> list[str]:
         f"QoI = 1 + sum of V(step in x) over the messages received; V = {uplink.value.name}.",
         f"x is {x}.",
     ]
-
-
-def _links(options: StreamOptions) -> tuple[Trace, ...]:
-    from bufgym import traces
-    from bufgym.scenario.checks import links
-
-    names = options.trace
-    if names is None:
-        names = [name for name in traces.shipped() if name.startswith("lte-")]
-    return tuple(trace for name in names for trace in links(name))
 
 
 def _motions(names: Sequence[str], measured: MotionOptions) -> tuple[Motion, ...]:

@@ -92,7 +92,7 @@ def _own_client(
     config: str, options: ClientOptions, send: SendOptions, specs: list[str], who: WhoOptions, out: OutOptions
 ) -> list[dict[str, Any]]:
     """Run the client of a configuration file and print its summary; the rows."""
-    from bufgym import policies, traces
+    from bufgym import policies
     from bufgym.benchmark.rows import write_rows
     from bufgym.benchmark.run import run
     from bufgym.benchmark.summary import plain
@@ -103,17 +103,9 @@ def _own_client(
     task, file = TASKS["topics"], out.file()
     if out.out is not None and file is None:
         raise BufgymError(f"{out.out}: with --config rows are written to .csv or .parquet files")
-    shipped = traces.shipped()
-    links = options.trace or [name for name in shipped if name.startswith("lte-")]
-    motions = options.motion or [name for name in shipped if name.startswith("drive-")]
-    client = read_client(
-        config,
-        traces=tuple(traces.load(name) for name in links),
-        motion=() if motions == ["none"] else tuple(traces.load_motion(name) for name in motions),
-        scale=options.scale or 1.0,
-    )
-    # Outside the file's own block, whose error would name the file.
-    client = replace(client, **given(send))
+    links: dict[str, Any] = {} if options.trace is None else {"traces": options.trace}
+    # What the user typed does not go through ``read_client``, whose errors name the file.
+    client = replace(read_client(config), **links, **given(options, "motion", "scale"), **given(send))
     chosen = [policies.get(spec) for spec in (specs if task.baseline in specs else [*specs, task.baseline])]
     seeds, label = who.seeds or SEEDS, Path(config).stem
     rows = run(chosen, client, who.capacity or (CAPACITY,), seeds, label=label, progress=True)

@@ -190,6 +190,5 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         return {agent: self.rows.info(i, terms[i], terminated) for i, agent in enumerate(self.possible_agents)}
 
 
-def parallel_env(**arguments: Any) -> FleetEnv:
-    """``FleetEnv`` under the name that PettingZoo's tools expect."""
-    return FleetEnv(**arguments)
+parallel_env = FleetEnv
+"""The name that PettingZoo's tools expect."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -129,8 +129,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[L + 2]: the actions valid now, under the name that sb3-contrib looks for."""
-        mask: NDArray[np.bool_] = self.rows.output.action_mask[0].astype(np.bool_)
-        return mask
+        return cast(NDArray[np.bool_], self.rows.action_masks()[0])
 
     def render(self) -> Any:
         """Kept and dropped messages as a timeline against the link's capacity: text, or uint8[400, 800, 3]."""

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from bufgym.ground.errors import BufgymError, install
+from bufgym.model.checks import above_0
 from bufgym.papers.rows import FigureRows
-from bufgym.scenario.checks import above_0
 
 COLOURS = {
     "afr": "#0072b2",

@@ -74,9 +74,9 @@ class SlotScorer(nn.Module):
         self.latent_dim_pi, self.latent_dim_vf = slots + 1, width
         self.occupied = features.slot_fields.index("occupied") if "occupied" in features.slot_fields else None
         self.masked = masked and self.occupied is not None
-        self.score = _perceptron(inputs, width, 1)
+        self.score = _perceptron(inputs, width)
         """Slot -> logit of dropping it; the last slot is the newcomer, so its logit is for rejecting."""
-        self.accept = _perceptron(inputs, width, 1, bias=accept_bias)
+        self.accept = _perceptron(inputs, width, accept_bias)
         """The newcomer's features -> logit of accepting it."""
         self.worth = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
         self.critic = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU())
@@ -114,9 +114,9 @@ class SlotScorer(nn.Module):
         return latent
 
 
-def _perceptron(inputs: int, width: int, outputs: int, bias: float = 0.0) -> nn.Sequential:
-    """Make two hidden layers, and outputs that begin close to ``bias``."""
-    last = nn.Linear(width, outputs)
+def _perceptron(inputs: int, width: int, bias: float = 0.0) -> nn.Sequential:
+    """Make two hidden layers, and an output that begins close to ``bias``."""
+    last = nn.Linear(width, 1)
     nn.init.uniform_(last.weight, -0.1 / width**0.5, 0.1 / width**0.5)
     nn.init.constant_(last.bias, bias)
     return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), last)

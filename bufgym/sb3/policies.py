@@ -38,14 +38,13 @@ from bufgym.sb3.export import read_policy, weights_of
 from bufgym.sb3.networks import SlotScorer
 
 
-def as_policy(
-    model: BaseAlgorithm | BasePolicy | StrPath, name: str = "", *, fields: Sequence[str] | None = None
-) -> Policy:
+def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Policy:
     """Make a bufgym policy of a trained model; it takes the model's most likely or most valued action.
 
     A network that scores slots with masks (``SlotPolicy`` under MaskablePPO) runs compiled and serves every L. Any
     other network runs in torch, one decision at a time, and serves the L it was trained for. Algorithms that take
-    action masks get them. For others, an invalid action does the same as in the environment.
+    action masks get them. For others, an invalid action does the same as in the environment. An observation "flat" or
+    "slots" must be of every field; a "dict" names its fields.
 
         policy = as_policy("model.zip", "mine")
         bufgym.benchmark.run.run([policy, policies.get("afr")], scenario, capacities=[8], seeds=10)
@@ -54,8 +53,6 @@ def as_policy(
         model: the model, its ``policy``, or the path of a saved one. A zip holds pickles, and reading it can run any
             code: read your own alone.
         name: the policy's name; by default that of the file or class.
-        fields: fields of a "flat" or "slots" observation, in the environment's own order; by default every field. A
-            "dict" names its fields.
 
     Raises:
         BufgymError: no such file, or a model that was not trained on a bufgym environment.
@@ -68,7 +65,7 @@ def as_policy(
         raise BufgymError(f"model {name}: has a recurrent network, whose state a policy cannot keep")
     about = f"A trained {type(agent).__name__}."
     masked = takes_masks(agent) and getattr(network, "masked", True)
-    decisions = _Decisions(name, agent, masked, fields)
+    decisions = _Decisions(name, agent, masked)
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
         return slot_policy(name, weights_of(network), about)
     if not decisions.for_topics:
@@ -84,7 +81,7 @@ def takes_masks(agent: Any) -> bool:
 class _Decisions:
     """Decisions of a model from a robot's view, one at a time."""
 
-    def __init__(self, name: str, agent: Any, masked: bool, fields: Sequence[str] | None) -> None:
+    def __init__(self, name: str, agent: Any, masked: bool) -> None:
         self.name, self.agent, self.masked = name, agent, masked
         space, actions = agent.observation_space, agent.action_space
         self.capacity = int(getattr(actions, "n", 0)) - 2
@@ -93,7 +90,7 @@ class _Decisions:
         form = "dict" if isinstance(space, spaces.Dict) else "flat"
         if form == "dict" and {"slots", "context"} & set(space):
             form = "slots"
-        names, numbers = list(space) if form == "dict" else fields, spaces.flatdim(space)
+        names, numbers = list(space) if form == "dict" else None, spaces.flatdim(space)
         all_fields = SLOT_FIELDS + TOPIC_SLOT_FIELDS, CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS
         if names is None:
             self.for_topics = numbers == ObservationForm(form, *all_fields, self.capacity).numbers

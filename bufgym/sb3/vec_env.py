@@ -35,7 +35,6 @@ def make_vec_env(
     seed: int | None = None,
     *,
     monitor_dir: str | None = None,
-    info_keywords: Sequence[str] = (),
     **settings: Any,
 ) -> VecEnv:
     """Make ``n_envs`` rows of a native batch for stable-baselines3.
@@ -46,7 +45,6 @@ def make_vec_env(
         seed: row i starts from seed + i at the first reset.
         monitor_dir: folder that gets one file, ``0.monitor.csv``, with the episodes of all rows; ``load_results`` reads
             it.
-        info_keywords: entries of an episode's last info that the file and ``episode`` get besides.
         settings: of the environment.
     """
     if "num_envs" in settings:
@@ -59,8 +57,8 @@ def make_vec_env(
     results = None
     if monitor_dir is not None:
         header: dict[str, Any] = {"t_start": time.time(), "env_id": env_id}
-        results = ResultsWriter(str(Path(monitor_dir) / "0"), header, tuple(info_keywords))
-    batch = GymVecEnv(envs, results=results, info_keywords=info_keywords)
+        results = ResultsWriter(str(Path(monitor_dir) / "0"), header)
+    batch = GymVecEnv(envs, results=results)
     if seed is not None:
         batch.seed(seed)
         batch.action_space.seed(seed)
@@ -80,21 +78,13 @@ class GymVecEnv(VecEnv):
 
     At an episode's end ``info`` has all the environment's final entries, ``terminal_observation``,
     ``TimeLimit.truncated`` and ``episode``. As with stable-baselines3's ``Monitor``, ``episode`` is {r: sum of rewards,
-    l: steps, t: seconds since this object was made} plus the ``info_keywords`` of the last info; it also goes to
-    ``results`` if given. Infos of other steps are empty unless ``step_infos``, as n dicts cost more than a compiled
-    step of n environments.
+    l: steps, t: seconds since this object was made}; it also goes to ``results`` if given. Infos of other steps are
+    empty, as n dicts cost more than a compiled step of n environments.
 
     ``env_method(name)`` calls the batch's method once and returns its rows, so ``action_masks`` costs one call.
     """
 
-    def __init__(
-        self,
-        envs: VectorEnv[Any, Any, Any],
-        *,
-        step_infos: bool = False,
-        results: ResultsWriter | None = None,
-        info_keywords: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, envs: VectorEnv[Any, Any, Any], *, results: ResultsWriter | None = None) -> None:
         mode = envs.metadata.get("autoreset_mode")
         if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
             raise BufgymError(
@@ -102,9 +92,7 @@ class GymVecEnv(VecEnv):
                 "gym.make_vec(..., autoreset_mode=AutoresetMode.SAME_STEP)"
             )
         self.envs = envs
-        self.step_infos = step_infos
         self.results = results
-        self.info_keywords = tuple(info_keywords)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         self._vector_options: dict[str, Any] | None = None
         self._actions: NDArray[Any] = np.zeros(0)
@@ -131,31 +119,24 @@ class GymVecEnv(VecEnv):
         done = np.logical_or(terminated, truncated)
         self._returns += rewards
         self._lengths += 1
-        infos: list[dict[str, Any]] = (
-            [_row(info, i) for i in range(self.num_envs)] if self.step_infos else [{} for _ in range(self.num_envs)]
-        )
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done).tolist():
-            last = _row(info.get("final_info", {}), i)
-            infos[i] = last | {
-                "terminal_observation": _final_observation(info["final_obs"], i),
+            infos[i] = _row(info.get("final_info", {}), i) | {
+                "terminal_observation": info["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                "episode": self._episode(i, last),
+                "episode": self._episode(i),
             }
         self._returns[done] = 0.0
         self._lengths[done] = 0
         return observation, np.asarray(rewards, np.float32), done, infos
 
-    def _episode(self, i: int, last: Mapping[str, Any]) -> dict[str, Any]:
-        """Entries of ``Monitor`` for the episode that environment ``i`` has ended with the info ``last``."""
+    def _episode(self, i: int) -> dict[str, Any]:
+        """Entries of ``Monitor`` for the episode that environment ``i`` has ended."""
         episode = {
             "r": float(self._returns[i]),
             "l": int(self._lengths[i]),
             "t": time.perf_counter() - self._born,
         }
-        for name in self.info_keywords:
-            if name not in last:
-                raise BufgymError(f"info_keywords: {name!r} is not in an episode's last info: {', '.join(last)}")
-            episode[name] = last[name]
         if self.results is not None:
             self.results.write_row({**episode, "r": round(episode["r"], 6), "t": round(episode["t"], 6)})
         return episode
@@ -232,8 +213,3 @@ def _row(info: Mapping[str, Any], i: int) -> dict[str, Any]:
             entry = column[i]
             own[key] = entry.item() if isinstance(entry, np.generic) else entry
     return own
-
-
-def _final_observation(final: Any, i: int) -> Any:
-    """Environment ``i``'s last observation from ``final_obs``, an array per environment or a batched dict."""
-    return _row(final, i) if isinstance(final, Mapping) else final[i]

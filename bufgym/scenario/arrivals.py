@@ -34,16 +34,7 @@ _LARGEST = sys.float_info.max
 def messages(
     arrival_us: NDArray[np.int64], size_bytes: NDArray[np.int64] | int, x: NDArray[np.float64] | None = None
 ) -> NDArray[Any]:
-    """MESSAGE[n] from columns; x defaults to the frame index. Times and x must not decrease, sizes be >= 1 byte."""
-    arrivals = unchecked_messages(arrival_us, size_bytes, x)
-    check_messages(arrivals)
-    return arrivals
-
-
-def unchecked_messages(
-    arrival_us: NDArray[np.int64], size_bytes: NDArray[np.int64] | int, x: NDArray[np.float64] | None
-) -> NDArray[Any]:
-    """Make ``messages`` from columns that an ``Episode`` checks before anything else is done with them."""
+    """MESSAGE[n] from columns; x defaults to the frame index. An ``Episode`` checks them: ``_RULES``."""
     arrivals = records(len(arrival_us), MESSAGE)
     arrivals["seq"] = np.arange(len(arrival_us))
     arrivals["arrival_us"], arrivals["size_bytes"] = arrival_us, size_bytes

@@ -11,8 +11,7 @@ from bufgym import traces
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.checks import above_0 as above_0  # papers check their parameters with it too
-from bufgym.model.checks import between
+from bufgym.model.checks import above_0, between
 from bufgym.model.qoi import Value
 from bufgym.traces import Motion, Trace
 from bufgym.traces.trace import MAX_DURATION_S

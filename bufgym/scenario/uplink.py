@@ -16,7 +16,7 @@ from bufgym.model.checks import whole
 from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.scenario.arrivals import read_only, unchecked_messages
+from bufgym.scenario.arrivals import messages, read_only
 from bufgym.scenario.checks import as_tuple, check_stream, check_value, recordings, up_to
 from bufgym.scenario.draws import beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
@@ -141,7 +141,7 @@ class Uplink:
             skip(rng, jitter_draws)
         arrival_us = (periods * period_us).astype(np.int64)
         arrival_us -= arrival_us[0]
-        return unchecked_messages(arrival_us, size, None)
+        return messages(arrival_us, size)
 
     def drawn_sizes(self, rng: np.random.Generator, robot: int = 0) -> NDArray[np.int64]:
         """int64[n] bytes of the messages of one stream, or of a fleet's robot; ``rng`` stays where it is."""
@@ -152,7 +152,7 @@ class Uplink:
 
 def _replayed(workload: Workload) -> NDArray[Any]:
     """MESSAGE[n] of a recording."""
-    arrivals = unchecked_messages(workload.arrival_us, workload.size_bytes, workload.x)
+    arrivals = messages(workload.arrival_us, workload.size_bytes, workload.x)
     arrivals["topic"] = workload.topic
     return arrivals
 

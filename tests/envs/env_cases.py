@@ -48,6 +48,6 @@ def valid_action(mask: np.ndarray, rng: np.random.Generator) -> int:
     return int(rng.choice(np.flatnonzero(mask)))
 
 
-def text(env: SenderEnv, width: int = 100) -> list[str]:
+def text(env: SenderEnv) -> list[str]:
     """The frame without colours, line by line."""
-    return re.sub(r"\x1b\[[0-9;]*m", "", render.ansi(env.rows.senders, 0, width)).splitlines()
+    return re.sub(r"\x1b\[[0-9;]*m", "", render.ansi(env.rows.senders, 0)).splitlines()

@@ -84,15 +84,15 @@ def test_image_shows_each_state_in_its_colour() -> None:
     assert tuple(image[2, 2]) == (255, 255, 255)
 
 
-@pytest.mark.parametrize(("capacity", "width"), [(1, 200), (20, 1), (40, 60), (300, 200)])
-def test_lines_keep_to_the_width(capacity: int, width: int) -> None:
+@pytest.mark.parametrize("capacity", [1, 20, 40, 300])
+def test_lines_keep_to_the_width(capacity: int) -> None:
     n = 100
     env = SenderEnv(Interruption(law="fixed", t_max=n + 5), capacity)
     env.reset(seed=0)
     for k in range(n):
         env.step(capacity + 1 if k % 3 else capacity)
-    lines = text(env, width)
-    assert max(map(len, lines[1:4])) <= max(60, width)
+    lines = text(env)
+    assert max(map(len, lines[1:4])) <= 100
     assert lines[3].endswith("?")
     check(render.rgb_array(env.rows.senders, 0), "rgb_array")
 

@@ -127,10 +127,6 @@ def test_while_the_kernel_is_compiled_elsewhere_the_steps_are_the_same(
     assert played(env_id, 5) == compiled
 
 
-def test_an_id_may_name_its_module() -> None:
-    assert gym.make("bufgym:bufgym/Uplink-v0", capacity=3).action_space == gym.spaces.Discrete(5)
-
-
 def test_fields_choose_what_is_observed() -> None:
     env, everything = make(fields=["service_ratio", "loss"]), make()
     few, all_of_it = env.reset(seed=3)[0], everything.reset(seed=3)[0]
@@ -161,15 +157,6 @@ def test_rewards_worked_by_hand() -> None:
         np.testing.assert_allclose(rewarded, expected, atol=1e-15)
         assert info["qoi"] == pytest.approx(1 + v1 + 2 * v2)
         assert (info["arrived"], info["delivered"], info["dropped"], info["invalid"]) == (6, 4, 2, 0)
-
-
-@kernels
-def test_rejecting_all_and_weighted_rewards() -> None:
-    """T = 3, all rejected: 0 and 4 are delivered, V(4) comes with the last step, weighted 2 and 0.5."""
-    env = SenderEnv(Interruption(law="fixed", t_max=3), 2, reward={"delivered": 2.0, "retained": 0.5})
-    env.reset(seed=0)
-    rewarded = [env.step(2)[1] for _ in range(3)]
-    assert rewarded == [0, 0, pytest.approx(2.5 * (1 - 0.618**4))]
 
 
 @kernels

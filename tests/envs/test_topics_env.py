@@ -247,7 +247,7 @@ def test_pictures_of_any_size(topics: int, capacity: int) -> None:
     env.reset(seed=0)
     for k in range(9):
         env.step(capacity + 1 if waiting(env) == ARRIVAL_WAITS else k % 2 * capacity)
-        assert max(map(len, text(env, 60)[1 : topics + 3])) <= 60
+        assert max(map(len, text(env)[1 : topics + 3])) <= 100
     frame = env.render()
     assert (frame.shape, frame.dtype) == ((400, 800, 3), np.uint8)
     shown = {tuple(pixel) for pixel in frame.reshape(-1, 3).tolist()}

@@ -281,15 +281,6 @@ def test_arrays_handed_out_are_never_written_again(mode: str, form: str) -> None
             assert_same(a, b)
 
 
-def test_arrays_that_nobody_holds_are_used_again() -> None:
-    envs = vector("fading")
-    envs.reset(seed=0)
-    for _ in range(60):
-        step = envs.step(np.full(N, L))
-    assert len(envs._outputs._made) <= 4
-    assert step[1].shape == (N,)
-
-
 def test_gymnasiums_wrappers_understand_the_infos() -> None:
     envs: Any = DictInfoToList(RecordEpisodeStatistics(FlattenObservation(vector("interruption"))))
     envs.reset(seed=0)

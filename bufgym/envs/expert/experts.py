@@ -65,15 +65,9 @@ def policy(env: Any, name: str | Policy) -> PolicyExpert:
     return PolicyExpert(env, policies.get(name))
 
 
-def online(env: Any, *, objective: str = "ratio", max_states: int = 50_000_000) -> PolicyExpert:
-    """Make an expert of the best policy that does not know T, for ``bufgym/Interruption-v0`` with few slots or short T.
-
-    The arguments are those for ``oracle.online_optimum``.
-    """
+def online(env: Any) -> PolicyExpert:
+    """Make an expert of ``oracle.online_optimum``, which does not know T, for few slots or short interruptions."""
     rows = rows_of(env)
     if not isinstance(rows.scenario, Interruption):
         raise BufgymError(f"expert.online: known for bufgym/Interruption-v0, not for {type(rows.scenario).__name__}")
-    best = online_optimum(
-        rows.capacity, law(rows.scenario), rows.scenario.value, objective=objective, max_states=max_states
-    )
-    return PolicyExpert(env, best.policy())
+    return PolicyExpert(env, online_optimum(rows.capacity, law(rows.scenario), rows.scenario.value).policy())

@@ -63,11 +63,17 @@ class Clairvoyant:
 
     def regrets(self) -> NDArray[np.float64]:
         """float64[n, L + 2]: the part of H that each action gives up for good, 0 for the best; NaN as in ``values``."""
-        return regrets(self.values())
+        values = self.values()
+        most = np.where(np.isnan(values), -np.inf, values).max(axis=1, keepdims=True)
+        return np.asarray(most - values)
 
     def actions(self) -> NDArray[np.int64]:
         """int64[n]: a best action (ties: accept, then reject, then the oldest slot), L where no decision is due."""
-        return best(self.values())
+        values, L = self.values(), self.rows.capacity
+        order = np.array([L + 1, L, *range(L)])
+        known = np.where(np.isnan(values), -np.inf, values)[:, order]
+        chosen = order[np.argmax(known >= known.max(axis=1, keepdims=True) - _TIE, axis=1)]
+        return np.asarray(np.where(np.isnan(values).all(axis=1), L, chosen), np.int64)
 
     def _load(self, i: int) -> None:
         """Compute the steps of row ``i``'s episode."""
@@ -113,23 +119,3 @@ class Clairvoyant:
             self._span[i] = place.start, place.stop
             self._end = place.stop
         self._ahead = old._replace(latest=pool[0], gain=pool[1], follow=pool[2])
-
-
-def regrets(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """See ``Clairvoyant.regrets``."""
-    most = np.where(np.isnan(values), -np.inf, values).max(axis=1, keepdims=True)
-    return np.asarray(most - values)
-
-
-def best(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """See ``Clairvoyant.actions``."""
-    L = values.shape[1] - 2
-    order = np.array([L + 1, L, *range(L)])
-    known = np.where(np.isnan(values), -np.inf, values)[:, order]
-    chosen = order[np.argmax(known >= known.max(axis=1, keepdims=True) - _TIE, axis=1)]
-    return np.asarray(np.where(np.isnan(values).all(axis=1), L, chosen), np.int64)
-
-
-def clairvoyant(env: Any) -> Clairvoyant:
-    """The expert that knows the whole episode, for one queue and messages of equal size."""
-    return Clairvoyant(env)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
-from bufgym.envs.expert.hindsight import Clairvoyant, regrets
+from bufgym.envs.expert.hindsight import Clairvoyant
 from bufgym.envs.expert.player import Player
 from bufgym.ground.errors import BufgymError
 
@@ -83,8 +83,7 @@ def record(
         seen[every, length], masks[every, length], taken[every, length] = output.flat, mask, actions
         numbers[every, length, 1] = output.qoi
         if judge is not None:
-            given_away = regrets(judge.values())[every, actions]
-            numbers[every, length, 2] = np.nan_to_num(given_away)
+            numbers[every, length, 2] = np.nan_to_num(judge.regrets()[every, actions])
         rows.step(actions)
         numbers[every, length, 0] = rows.rewards()
         length[left > 0] += 1

@@ -17,8 +17,6 @@ DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
 """States of a message."""
 STATES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
 
-LETTERS = string.ascii_letters
-
 
 class Scene(NamedTuple):
     """The content of a picture of one sender.
@@ -66,7 +64,7 @@ class Scene(NamedTuple):
 
 def letter(topic: int) -> str:
     """A letter for a topic, used where its name has no room."""
-    return LETTERS[topic % len(LETTERS)]
+    return string.ascii_letters[topic % 52]
 
 
 def scene_of(senders: Senders, i: int) -> Scene:

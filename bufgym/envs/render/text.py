@@ -20,20 +20,20 @@ _COLOURS = (_GREEN, _BLUE, _YELLOW, _RED, _MAGENTA)
 _LEVELS = "_▁▂▃▄▅▆▇█"
 _LABEL, _TOPIC_LABEL = 10, 16
 """Columns of a line's label, and of a label that is a topic's name."""
-_NARROWEST = 60
-"""Fewest columns that hold the counts."""
+_WIDTH = 100
+"""Columns of the picture."""
 
 
-def ansi(senders: Senders, i: int, width: int = 100) -> str:
-    """Sender ``i`` as lines of text: counts, link capacity, messages, queue, legend; ``width`` is at least 60 columns.
+def ansi(senders: Senders, i: int) -> str:
+    """Sender ``i`` as lines of text: counts, link capacity, messages, queue, legend.
 
     One column of capacity and messages is one arrival: its mark below, and above it the link's mean capacity until the
     next arrival. The latest arrivals are shown, as many as fit. With several topics each has a line of messages, and
     the queue is a row of their letters.
     """
     scene = scene_of(senders, i)
-    width, label = max(width, _NARROWEST), _TOPIC_LABEL if scene.topics else _LABEL
-    latest = slice(max(0, len(scene.states) - (width - label)), None)
+    label = _TOPIC_LABEL if scene.topics else _LABEL
+    latest = slice(max(0, len(scene.states) - (_WIDTH - label)), None)
     counts = scene.counts
     legend = "  ".join(f"{_painted([_mark(state)])} {name}" for state, name in enumerate(STATES)) + "  _ empty"
     lines = [
@@ -42,7 +42,7 @@ def ansi(senders: Senders, i: int, width: int = 100) -> str:
         f"{counts['dropped']} dropped; H = {scene.qoi:.2f}",
         "capacity".ljust(label) + _capacity_line(senders, i, scene, latest),
         *_message_lines(scene, latest, label),
-        "queue".ljust(label) + (_topic_queue_line if scene.topics else _queue_line)(scene, width - label),
+        "queue".ljust(label) + (_topic_queue_line if scene.topics else _queue_line)(scene, _WIDTH - label),
         " " * _LABEL + legend + (f"  {scene.question}" if scene.topics else f"  {_painted([(_RED, '9')])} missing"),
     ]
     if scene.demand > 0:

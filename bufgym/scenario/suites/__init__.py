@@ -14,13 +14,11 @@ from __future__ import annotations
 from bufgym.ground.errors import unknown
 from bufgym.scenario.suites import recorded, shared_uplinks, stress, synthetic
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
-from bufgym.scenario.suites.synthetic import EPISODE_S, RATE_HZ, SIZE_BYTES, motion_value, time_value
+from bufgym.scenario.suites.synthetic import RATE_HZ, motion_value, time_value
 
 __all__ = [
     "CAPACITIES",
-    "EPISODE_S",
     "RATE_HZ",
-    "SIZE_BYTES",
     "SPLITS",
     "SUITES",
     "Setting",
