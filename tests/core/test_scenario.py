@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from bufgym import policies, scenario
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import LAWS, SCENARIOS, Interruption, Streams, Uplink, messages
+from bufgym.scenario.arrivals import check_messages
 from bufgym.scenario.draws import place
 from bufgym.sim import run
 from bufgym.traces import Motion
@@ -161,10 +162,19 @@ def test_other_rates_jitters_and_sizes_meet_the_same_motion_and_link(changes, mo
         (lambda: uplink(duration_s=1e9, rate_hz=1e-6), "duration_s = 1000000000.0: must be at most 10000000"),
         (lambda: uplink(rate_hz=1e-300), "rate_hz = 1e-300: must be at most 100000, and at least 1e-07"),
         (lambda: uplink(propagation_us=-5), "propagation_us = -5: must be a whole number from 0 to 10000000000000"),
-        (lambda: messages(np.array([]), 5), "at least one message"),
-        (lambda: messages(np.array([0, 2, 1]), 5), "message 2: arrival_us = 1: times must be >= 0, must not decrease"),
-        (lambda: messages(np.array([0, 1]), np.array([5, 0])), "message 1: size_bytes = 0: must be at least 1 byte"),
-        (lambda: messages(np.arange(2), 5, np.array([1.0, 0.5])), "message 1: x = 0.5: must be a finite number"),
+        (lambda: check_messages(messages(np.array([]), 5)), "at least one message"),
+        (
+            lambda: check_messages(messages(np.array([0, 2, 1]), 5)),
+            "message 2: arrival_us = 1: times must be >= 0, must not decrease",
+        ),
+        (
+            lambda: check_messages(messages(np.array([0, 1]), np.array([5, 0]))),
+            "message 1: size_bytes = 0: must be at least 1 byte",
+        ),
+        (
+            lambda: check_messages(messages(np.arange(2), 5, np.array([1.0, 0.5]))),
+            "message 1: x = 0.5: must be a finite number",
+        ),
         (lambda: scenario.get("moon"), "unknown scenario 'moon'; known: interruption, lte"),
         (lambda: scenario.get("interruption", speed=3), "Interruption: no parameter 'speed'; it has: "),
         (lambda: Streams.seeded(-1), "seed = -1"),

@@ -1,8 +1,8 @@
 """How fast relays are, and their page.
 
-python tests/relay/measure.py load --robots 20 --viewers 5 --seconds 60 [--slow]
-python tests/relay/measure.py idle --connections 1000
-python tests/relay/measure.py page --robots 20 --seconds 10   # frames that the page drops; needs Playwright, Chromium
+python -m website.relay_load load --robots 20 --viewers 5 --seconds 60 [--slow]
+python -m website.relay_load idle --connections 1000
+python -m website.relay_load page --robots 20 --seconds 10   # frames that the page drops; needs Playwright, Chromium
 
 A relay has a process of its own; all else shares another. Robots send messages that are made beforehand.
 ``page --robots 0`` says what the machine drops of an empty page.
@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-# This is no test: pytest does it for those.
-sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
+REPO = Path(__file__).resolve().parent.parent
+# It shares robots with the examples, and a relay's settings with the tests.
+sys.path[:0] = [str(REPO / "tests"), str(REPO / "tests" / "relay"), str(REPO / "examples")]
 
 from loop_cases import beside
 from made_up_robot import ODOMETRY, SCAN, cast, jpeg, odometry, picture, pose_at, scan
@@ -189,7 +189,7 @@ async def traced(port: int, robots: int, seconds: float) -> Any:
     """The events of Chromium's trace of the page."""
     from playwright.async_api import async_playwright
 
-    words = {"executable_path": shutil.which("chromium"), "args": ["--no-sandbox", "--disable-gpu"]}
+    words: dict[str, Any] = {"executable_path": shutil.which("chromium"), "args": ["--no-sandbox", "--disable-gpu"]}
     async with async_playwright() as play, await play.chromium.launch(**words) as browser:
         page = await browser.new_page(viewport={"width": 1360, "height": 800})
         began_s = time.monotonic()
