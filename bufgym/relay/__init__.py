@@ -1,8 +1,8 @@
 """A relay for fleets: robots and viewers connect to it, and publish and subscribe by topic as its rules allow.
 
 Robofleet [sikand2021robofleet] is a client on each robot, one server and a web page. This package is the server, built
-on bufgym's queues. ``Server`` serves what a ``Config`` allows. ``Client``, ``Session`` and ``Robot`` connect to it, and
-``wire`` defines the protocol on its WebSockets.
+on bufgym's queues. ``Server`` serves what a ``Config`` allows. ``RobotClient``, ``Session`` and ``Robot`` connect to
+it, and ``wire`` defines the protocol on its WebSockets.
 """
 
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ with needs("msgspec", "relay", "bufgym.relay"):  # the other libraries of the ex
 
 if TYPE_CHECKING:
     from bufgym.relay.bag import BagSource
-    from bufgym.relay.client import Client
+    from bufgym.relay.client import RobotClient
     from bufgym.relay.config import Config, Foxglove, Limits, Nats, Rotation, Rule, StoreLimits, Tls, Tokens, load
     from bufgym.relay.policies import compiled
     from bufgym.relay.robot import Robot, Source
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BagSource",
-    "Client",
     "Config",
     "Foxglove",
     "Limits",
@@ -33,6 +32,7 @@ __all__ = [
     "Nats",
     "RefusedError",
     "Robot",
+    "RobotClient",
     "Rotation",
     "Rule",
     "Server",
@@ -55,7 +55,7 @@ __getattr__ = on_demand(
     **dict.fromkeys(("Server", "serve_forever"), "server"),
     **dict.fromkeys(("Session", "security", "token"), "session"),
     **dict.fromkeys(("Message", "RefusedError"), "wire"),
-    Client="client",
+    RobotClient="client",
     BagSource="bag",
     compiled="policies",
 )

@@ -1,6 +1,6 @@
 """A relay's client for robots and other Python programs: publishes through a policy's queue, and subscribes.
 
-    client = Client("ws://relay.example:7420", "robot-3", topics=(Topic("/robots/robot-3/camera"),), policy="afr")
+    client = RobotClient("ws://relay.example:7420", "robot-3", topics=(Topic("/robots/robot-3/camera"),), policy="afr")
     client.subscribe("^/robots/robot-3/command$", on_command, durable=True)
     running = asyncio.create_task(client.run())  # connects, and again whenever the connection breaks
     client.publish("/robots/robot-3/camera", jpeg, encoding="jpeg")  # never blocks; the policy decides what goes
@@ -45,7 +45,7 @@ class _Away:
     written: bool = False
 
 
-class Client(Session):
+class RobotClient(Session):
     """A session with a queue. See the module's text."""
 
     def __init__(

@@ -34,11 +34,11 @@ Seconds = Annotated[float, Meta(gt=0, le=1e12)]
 Port = Annotated[int, Meta(ge=0, le=65_535)]
 
 
-class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of the configuration; ``load`` checks the types and ranges of its fields."""
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A section of the configuration; ``load`` checks the types and ranges of its fields."""
 
 
-class Rule(Table, frozen=True, kw_only=True):
+class Rule(Section, frozen=True, kw_only=True):
     """Robofleet's rule: an identity, send or receive, and a pattern that matches whole topics."""
 
     address: str = ""
@@ -78,7 +78,7 @@ class Rule(Table, frozen=True, kw_only=True):
         return next((part for part in ("recorder", "foxglove", "nats") if getattr(self, part)), "")
 
 
-class Limits(Table, frozen=True):
+class Limits(Section, frozen=True):
     """Limits of one identity over all its connections, unless a field says otherwise."""
 
     message_bytes: Count = 2**23
@@ -97,7 +97,7 @@ class Limits(Table, frozen=True):
     """Time from the connection to its hello."""
 
 
-class StoreLimits(Table, frozen=True):
+class StoreLimits(Section, frozen=True):
     """Limits of the store, which holds no_drop messages until their receivers have acked them."""
 
     messages: Count = 1_000
@@ -110,7 +110,7 @@ class StoreLimits(Table, frozen=True):
     """n_T, no_drop messages on their way to or from a client and not acked, at most."""
 
 
-class Tls(Table, frozen=True):
+class Tls(Section, frozen=True):
     """Certificates, PEM files."""
 
     certificate: Text
@@ -119,7 +119,7 @@ class Tls(Table, frozen=True):
     """Authority that signs clients' certificates; if empty, clients are not asked for certificates."""
 
 
-class Tokens(Table, frozen=True):
+class Tokens(Section, frozen=True):
     """JSON web tokens, as an OpenID provider issues them."""
 
     issuer: Text
@@ -136,7 +136,7 @@ class Tokens(Table, frozen=True):
             raise BufgymError(f"tokens: algorithms = {list(self.algorithms)}: must be of {', '.join(ALGORITHMS)}")
 
 
-class Nats(Table, frozen=True):
+class Nats(Section, frozen=True):
     """A NATS server with JetStream, over which relays share messages (extra ``mesh``)."""
 
     url: Annotated[str, Meta(pattern="^(nats|tls)://[^/ ]+$")]
@@ -149,21 +149,21 @@ class Nats(Table, frozen=True):
     """PEM file of the authority that signs the server's certificate; empty for the system's."""
 
 
-class Foxglove(Table, frozen=True):
+class Foxglove(Section, frozen=True):
     """Address for Foxglove and Lichtblick (extra ``foxglove``); they see what rules with ``foxglove`` allow."""
 
     host: Text = "127.0.0.1"
     port: Port = 8765
 
 
-class Rotation(Table, frozen=True):
+class Rotation(Section, frozen=True):
     """Rotation of a log: a full file is followed by the next, and the oldest is deleted."""
 
     bytes: Annotated[int, Meta(ge=1_000, le=2**40)] = 2**26
     files: Annotated[int, Meta(ge=1, le=10**6)] = 16
 
 
-class Config(Table, frozen=True, kw_only=True):
+class Config(Section, frozen=True, kw_only=True):
     """The whole configuration."""
 
     host: Text = "127.0.0.1"

@@ -19,7 +19,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.relay import ros_messages, wire
-from bufgym.relay.client import Client
+from bufgym.relay.client import RobotClient
 from bufgym.relay.monitor import Monitor
 from bufgym.robot.odometry import Odometry
 from bufgym.robot.tasks import Tasks, until_one_ends
@@ -67,7 +67,7 @@ class Robot:
         policies: Sequence[str] = POLICIES,
         **session: Any,
     ) -> None:
-        """Arguments as for ``Client``; a command may choose one of ``policies``."""
+        """Arguments as for ``RobotClient``; a command may choose one of ``policies``."""
         if not name or "/" in name:
             raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
         self.name = name
@@ -83,7 +83,7 @@ class Robot:
         self._location: dict[str, float] | None = None
         self._began_s = time.monotonic()
         self._pings = Tasks()
-        self.client = Client(
+        self.client = RobotClient(
             url,
             name,
             topics=topics,

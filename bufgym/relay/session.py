@@ -1,6 +1,6 @@
 """A session at a relay: keeps a connection, subscribes, and sends commands that arrive exactly once.
 
-This is all that a viewer needs. ``client.Client`` adds a queue for a robot's messages.
+This is all that a viewer needs. ``client.RobotClient`` adds a queue for a robot's messages.
 """
 
 from __future__ import annotations

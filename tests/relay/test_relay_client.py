@@ -14,7 +14,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.relay import session
-from bufgym.relay.client import Client
+from bufgym.relay.client import RobotClient
 from bufgym.relay.session import Session, security, token
 from bufgym.relay.unanswered import Unanswered
 from bufgym.relay.wire import Message, RefusedError
@@ -126,7 +126,7 @@ async def test_a_queue_over_a_break_and_a_change_of_policy(corner: Corner) -> No
     records: list[tuple[int, str]] = []
     topic = corner.topic("camera")
     async with links(corner, 1) as ((link, url),):
-        robot = Client(
+        robot = RobotClient(
             url,
             "a",
             topics=(Topic(topic),),
@@ -180,4 +180,4 @@ def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(BufgymError, match=r"subscription '\[': no regular expression"):
         Session("ws://a:1", "a").subscribe("[", print)
     with pytest.raises(BufgymError, match="topic '/b': this client publishes nothing"):
-        Client("ws://a:1", "a").publish("/b", b"")
+        RobotClient("ws://a:1", "a").publish("/b", b"")
