@@ -72,7 +72,7 @@ def best(
     """Find the best plan; return its messages in order and its gain, H - 1."""
     n = len(c)
     problem, guide = new_problem(c, size, limit, limit, x, v, ends, GRID), np.empty(n, np.int64)
-    find_future(problem, None)
+    find_future(problem)
     _, low = guided(problem, guide)
     high = most(problem)
     labels = no_labels(n)

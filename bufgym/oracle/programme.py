@@ -19,6 +19,9 @@ NEVER = -1
 MAX_CELLS = 1 << 23
 """Most entries of ``future``, 8 bytes each; longer episodes take a coarser grid."""
 
+BLOCK = 32
+"""Grid positions that share the range of successors to look at."""
+
 
 class Problem(NamedTuple):
     """One episode as the kernels read it; arrays over messages.
@@ -57,12 +60,14 @@ class Room(NamedTuple):
         max_bytes: B, bytes.
         until: float64[2, steps], sum of the prices of all arrivals before this grid position; of a message, of a byte.
         before: float64[2, messages + 1], the same sum over the arrivals before each message.
+        begun: float64[messages, steps], like ``future``, if the message begins there after waiting; less its price.
     """
 
     capacity: int
     max_bytes: int
     until: NDArray[np.float64]
     before: NDArray[np.float64]
+    begun: NDArray[np.float64]
 
 
 def new_problem(
@@ -113,8 +118,8 @@ def waiting_cost(p: Problem, room: Room, j: int, step: int) -> float:
 
 
 @kernel
-def find_future(p: Problem, room: Room | None) -> None:
-    """Fill ``future`` (zeros so far) from the last message back; waiting costs the prices of ``room``, if any."""
+def find_future(p: Problem) -> None:
+    """Fill ``future`` (zeros so far) from the last message back, where waiting costs nothing."""
     n, steps = p.future.shape
     for i in range(n - 1, -1, -1):
         step_i, reach = p.c[i] // p.grid, p.c[i] + p.limit[i] + p.size[i]
@@ -137,5 +142,74 @@ def find_future(p: Problem, room: Room | None) -> None:
             last = min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid - step_i
             shift = step_i + p.size[j] // p.grid - p.c[j] // p.grid
             for k in range(max(low, split), min(top, last + 1)):
-                w = added if room is None else added - waiting_cost(p, room, j, step_i + k)
-                p.future[i, k] = max(p.future[i, k], w + p.future[j, k + shift])
+                p.future[i, k] = max(p.future[i, k], added + p.future[j, k + shift])
+
+
+@kernel
+def find_priced_future(p: Problem, room: Room, last: NDArray[np.int64], best: NDArray[np.float64]) -> None:
+    """Fill ``future`` and ``room.begun`` from the last message back; ``last`` and ``best`` are work space, [positions].
+
+    At each grid position ``last`` has the best successor of the message looked at before.
+    """
+    n, steps = p.future.shape
+    last[:] = n - 1
+    for i in range(n - 1, -1, -1):
+        if p.limit[i] < 0 or p.c[i] + p.size[i] > p.ends:
+            continue
+        at, length = p.c[i] // p.grid, p.size[i] // p.grid
+        stop = min(at + steps, (p.c[i] + p.limit[i] + p.size[i]) // p.grid + 1)
+        best[at + length : stop] = -np.inf
+        for left in range(at + length, stop, BLOCK):
+            right = min(stop, left + BLOCK)
+            furthest = i
+            for step in range(left, right):
+                furthest = max(furthest, last[step])
+            for j in range(i + 1, furthest + 1):
+                low = max(left, p.idle[j] // p.grid)
+                if p.between[j] > i and p.idle[j] >= right * p.grid:
+                    break  # ``between`` could be sent before every further message, too
+                if low < right and p.limit[j] >= 0 and p.c[j] + p.size[j] <= p.ends:
+                    offer(p, room, i, j, low, right, last, best)
+        future = p.future[i, length : stop - at]
+        for k in range(len(future)):
+            future[k] = max(0.0, best[at + length + k])
+        # After i and no other message ``between`` may end earlier than ``idle``.
+        j = i + 1
+        while j < n and p.between[j] <= i:
+            if p.between[j] == i and p.limit[j] >= 0 and p.c[j] + p.size[j] <= p.ends:
+                w = value(p.v, p.x[j] - p.x[i]) + p.future[j, (p.c[j] + p.size[j]) // p.grid - p.c[j] // p.grid]
+                for k in range(length, min(stop, p.idle[j] // p.grid) - at):
+                    p.future[i, k] = max(p.future[i, k], w)
+            j += 1
+        for step in range(-(-p.c[i] // p.grid), min(p.c[i] + p.limit[i], p.ends - p.size[i]) // p.grid + 1):
+            room.begun[i, step - at] = p.future[i, step - at + length] - waiting_cost(p, room, i, step)
+
+
+@kernel
+def offer(
+    p: Problem,
+    room: Room,
+    i: int,
+    j: int,
+    low: int,
+    right: int,
+    last: NDArray[np.int64],
+    best: NDArray[np.float64],
+) -> None:
+    """Raise ``best`` to what j after i gains at grid positions ``low`` to ``right``, and note j in ``last``."""
+    added, at = value(p.v, p.x[j] - p.x[i]), p.c[j] // p.grid
+    # Ends before c_j: the link is idle, and j begins when it arrives.
+    split = max(low, min(right, -(-p.c[j] // p.grid)))
+    w = added + p.future[j, (p.c[j] + p.size[j]) // p.grid - at]
+    for step in range(low, split):
+        if w > best[step]:
+            best[step], last[step] = w, j
+    # Later ends: j waits and begins there.
+    right = min(right, min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid + 1)
+    if split < right:
+        begun, bests, lasts = room.begun[j, split - at : right - at], best[split:right], last[split:right]
+        for k in range(len(begun)):
+            w = added + begun[k]
+            better = w > bests[k]
+            bests[k] = w if better else bests[k]
+            lasts[k] = j if better else lasts[k]

@@ -26,7 +26,7 @@ from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
 from bufgym.oracle import beam
-from bufgym.oracle.programme import Problem, Room, find_future, new_problem, waiting_cost
+from bufgym.oracle.programme import Problem, Room, find_priced_future, new_problem
 
 ROUNDS = 40
 """Most price updates."""
@@ -98,9 +98,8 @@ def _priced(p: Problem, prices: NDArray[np.float64], capacity: int, max_bytes: i
     before = np.concatenate([np.zeros((2, 1)), np.cumsum(prices, axis=1)], axis=1)
     positions = np.arange(int(p.c[-1]) // p.grid + p.future.shape[1] + 1) * p.grid
     until = np.ascontiguousarray(before[:, np.searchsorted(p.c, positions, side="left")])
-    room = Room(capacity, max_bytes, until, before)
-    p.future[:] = 0.0
-    find_future(p, room)
+    room = Room(capacity, max_bytes, until, before, np.empty_like(p.future))
+    find_priced_future(p, room, np.empty(len(positions), np.int64), np.empty(len(positions)))
     return room
 
 
@@ -126,7 +125,7 @@ def follow(p: Problem, room: Room, message: NDArray[np.int64], begin: NDArray[np
                 w = p.future[j, (p.c[j] + p.size[j]) // p.grid - p.c[j] // p.grid]
             elif step <= min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid:
                 begins = step * p.grid
-                w = p.future[j, step + p.size[j] // p.grid - p.c[j] // p.grid] - waiting_cost(p, room, j, step)
+                w = room.begun[j, step - p.c[j] // p.grid]
             else:
                 continue
             if i >= 0:
