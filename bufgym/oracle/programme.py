@@ -149,7 +149,10 @@ def find_future(p: Problem) -> None:
 def find_priced_future(p: Problem, room: Room, last: NDArray[np.int64], best: NDArray[np.float64]) -> None:
     """Fill ``future`` and ``room.begun`` from the last message back; ``last`` and ``best`` are work space, [positions].
 
-    At each grid position ``last`` has the best successor of the message looked at before.
+    What j gains if i ends at a grid position is V(x_j - x_i) plus a number that does not depend on i. V is concave: the
+    further back i lies, the less a later j is ahead of an earlier one. So once j is beaten by an earlier message at a
+    position, it stays beaten there for all i further back. ``last`` has the best j found so far at each position, the
+    last that need be looked at.
     """
     n, steps = p.future.shape
     last[:] = n - 1
@@ -157,46 +160,37 @@ def find_priced_future(p: Problem, room: Room, last: NDArray[np.int64], best: ND
         if p.limit[i] < 0 or p.c[i] + p.size[i] > p.ends:
             continue
         at, length = p.c[i] // p.grid, p.size[i] // p.grid
-        stop = min(at + steps, (p.c[i] + p.limit[i] + p.size[i]) // p.grid + 1)
-        best[at + length : stop] = -np.inf
-        for left in range(at + length, stop, BLOCK):
-            right = min(stop, left + BLOCK)
-            furthest = i
+        first, stop = at + length, min(at + steps, (p.c[i] + p.limit[i] + p.size[i]) // p.grid + 1)
+        best[first:stop] = -np.inf
+        for left in range(first, stop, BLOCK):
+            right, furthest = min(stop, left + BLOCK), i
             for step in range(left, right):
                 furthest = max(furthest, last[step])
             for j in range(i + 1, furthest + 1):
-                low = max(left, p.idle[j] // p.grid)
                 if p.between[j] > i and p.idle[j] >= right * p.grid:
                     break  # ``between`` could be sent before every further message, too
-                if low < right and p.limit[j] >= 0 and p.c[j] + p.size[j] <= p.ends:
-                    offer(p, room, i, j, low, right, last, best)
-        future = p.future[i, length : stop - at]
-        for k in range(len(future)):
-            future[k] = max(0.0, best[at + length + k])
-        # After i and no other message ``between`` may end earlier than ``idle``.
-        j = i + 1
-        while j < n and p.between[j] <= i:
+                offer(p, room, i, j, max(left, p.idle[j] // p.grid), right, last, best)
+        # Between i and these j nothing else could be sent, so i may also end earlier than ``idle``; for no other i.
+        for j in range(i + 1, n):
+            if p.between[j] > i:
+                break
             if p.between[j] == i and p.limit[j] >= 0 and p.c[j] + p.size[j] <= p.ends:
                 w = value(p.v, p.x[j] - p.x[i]) + p.future[j, (p.c[j] + p.size[j]) // p.grid - p.c[j] // p.grid]
-                for k in range(length, min(stop, p.idle[j] // p.grid) - at):
-                    p.future[i, k] = max(p.future[i, k], w)
-            j += 1
+                for step in range(first, min(stop, p.idle[j] // p.grid)):
+                    best[step] = max(best[step], w)
+        for step in range(first, stop):
+            p.future[i, step - at] = max(0.0, best[step])
         for step in range(-(-p.c[i] // p.grid), min(p.c[i] + p.limit[i], p.ends - p.size[i]) // p.grid + 1):
             room.begun[i, step - at] = p.future[i, step - at + length] - waiting_cost(p, room, i, step)
 
 
 @kernel
 def offer(
-    p: Problem,
-    room: Room,
-    i: int,
-    j: int,
-    low: int,
-    right: int,
-    last: NDArray[np.int64],
-    best: NDArray[np.float64],
+    p: Problem, room: Room, i: int, j: int, low: int, right: int, last: NDArray[np.int64], best: NDArray[np.float64]
 ) -> None:
     """Raise ``best`` to what j after i gains at grid positions ``low`` to ``right``, and note j in ``last``."""
+    if low >= right or p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
+        return
     added, at = value(p.v, p.x[j] - p.x[i]), p.c[j] // p.grid
     # Ends before c_j: the link is idle, and j begins when it arrives.
     split = max(low, min(right, -(-p.c[j] // p.grid)))
@@ -204,12 +198,11 @@ def offer(
     for step in range(low, split):
         if w > best[step]:
             best[step], last[step] = w, j
-    # Later ends: j waits and begins there.
-    right = min(right, min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid + 1)
-    if split < right:
-        begun, bests, lasts = room.begun[j, split - at : right - at], best[split:right], last[split:right]
-        for k in range(len(begun)):
-            w = added + begun[k]
-            better = w > bests[k]
-            bests[k] = w if better else bests[k]
-            lasts[k] = j if better else lasts[k]
+    # Later ends: j waits and begins there. Without a branch, the loop runs over several positions at once.
+    right = max(split, min(right, min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid + 1))
+    begun, bests, lasts = room.begun[j, split - at : right - at], best[split:right], last[split:right]
+    for k in range(len(begun)):
+        w = added + begun[k]
+        better = w > bests[k]
+        bests[k] = w if better else bests[k]
+        lasts[k] = j if better else lasts[k]

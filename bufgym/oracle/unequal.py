@@ -10,6 +10,7 @@ is an upper bound of the best plan's gain, as a plan that keeps to L loses nothi
 depends only on the byte at which it begins, as j waits during the arrivals j, j + 1, ... before that byte. So the
 ``programme`` finds the maximum. Under a byte limit B waiting bytes have prices too. As in ``labels``, leaving a message
 out while the link is idle is never worth it. This is used only if the message finds room whichever messages wait.
+On a coarser grid messages end no later than in truth, so the maximum does not fall and the bound holds on every grid.
 
 The plan comes from a beam search (``beam``) that the programme guides. Prices follow the subgradient (Held, Wolfe and
 Crowder, Mathematical Programming 6, 1974). They rise where the programme's own plan queues too much and fall where it

@@ -2,14 +2,21 @@
 
 from functools import cache
 
+import naive_oracle
 import numpy as np
 import pytest
-from cases import VALUES
+from cases import VALUES, trace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym.oracle import unequal
-from bufgym.oracle.programme import new_problem
+from bufgym import policies
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.oracle import clairvoyant, unequal
+from bufgym.oracle.programme import Room, new_problem, waiting_cost
+from bufgym.scenario import Episode, messages
+from bufgym.sim import run
+from bufgym.sim.metrics import outcome
 
 pytestmark = pytest.mark.kernels
 MESSAGE = st.tuples(st.integers(0, 30), st.integers(1, 12), st.integers(-1, 25), st.integers(0, 3), st.integers(0, 3))
@@ -57,3 +64,55 @@ def test_the_best_plan_under_prices_is_that_of_a_search(messages, ends, v):
     for k in range(len(c)):
         waiting = [size[j] for j, at in zip(ways, begin[:length], strict=True) if j <= k and c[k] < at]
         assert queued[:, k].tolist() == [len(waiting), sum(waiting)]
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_no_plan_beats_the_bound_and_the_plan_found_keeps_to_its_room(seed):
+    """Against a search of all decisions: short queues, by messages and by bytes, links that rest, scenes that stand."""
+    rng = np.random.default_rng(seed)
+    n, L, max_bytes = int(rng.integers(5, 9)), int(rng.integers(1, 4)), (None, 9_000, 14_000)[seed % 3]
+    v = (qoi.exponential(0.4), qoi.saturating(2.5), qoi.tabulated([0, 1, 3], [0, 0.6, 1]))[seed // 3 % 3]
+    us, size = np.cumsum(rng.choice([0, 300, 900, 2_000], n)), rng.integers(1, 8, n) * 1_201
+    x = np.cumsum(rng.choice([0, 0.25, 1, 2.5], n))
+    knots = [(0, 0), (4_000, int(rng.integers(2, 9)) * 1_500), (5_000 + 2_000 * (seed % 2), 12_000), (14_000, 24_000)]
+    after = ("loop", "hold", "stop")[seed // 9 % 3]
+    episode = Episode(messages(us, size, x), Link(trace(knots, after)))
+    twins = [{"seq": k, "us": int(us[k]), "bytes": int(size[k]), "x": float(x[k]), "uniform": 0.0} for k in range(n)]
+    best = naive_oracle.best(naive_oracle.Link(knots, after, 0), twins, L, v, max_bytes, "arrival", 0, n)
+    plan = clairvoyant(episode, L, v, max_bytes=max_bytes)
+    result = outcome(run(policies.get("clairvoyant"), [episode], L, v, max_bytes=max_bytes), 0)
+    assert result.invalid == 0 and result.delivered == plan.kept.sum()
+    assert result.qoi == pytest.approx(v.information(x[plan.kept]), abs=1e-9)
+    assert result.qoi <= best + 1e-9 <= plan.qoi + 2e-9
+
+
+def every_successor(p, room: Room, i: int, step: int) -> float:
+    """The most that a plan under prices gains after message i that ends at this grid position: by trying them all."""
+    most = 0.0
+    for j in range(i + 1, len(p.c)):
+        arrives = -(-p.c[j] // p.grid)
+        begins, at = max(step, arrives), p.c[j] // p.grid
+        if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
+            continue
+        if step < arrives:
+            ends, cost = (p.c[j] + p.size[j]) // p.grid, 0.0
+        elif begins <= min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid:
+            ends, cost = begins + p.size[j] // p.grid, waiting_cost(p, room, j, begins)
+        else:
+            continue
+        most = max(most, qoi.value(p.v, p.x[j] - p.x[i]) - cost + p.future[j, ends - at])
+    return most
+
+
+@given(st.integers(0, 2**32), VALUES)
+def test_nothing_is_lost_by_looking_only_at_successors_that_can_still_be_best(seed, v):
+    rng = np.random.default_rng(seed)
+    n, grid = 24, int(rng.integers(2, 6))
+    size, limit = rng.integers(1, 60, n), rng.choice([-1, 0, 30, 90, 150], n)
+    c, x = np.cumsum(rng.integers(0, 25, n)), np.cumsum(rng.choice([0.0, 0.125, 0.5, 2.0], n))
+    p = new_problem(c, size, limit, np.full(n, -(10**6)), x, v.array, int(c[-1]) + 80, int(size.mean()) // grid + 1)
+    room = unequal._priced(p, rng.choice([0.0, 0.0, 0.02, 0.2], (2, n)) * [[1.0], [0.02]], n, 10**6)
+    for i in np.flatnonzero((limit >= 0) & (c + size <= p.ends)):
+        for step in range((c[i] + size[i]) // p.grid, min(c[i] + limit[i] + size[i], p.ends) // p.grid + 1):
+            found = p.future[i, step - c[i] // p.grid]
+            assert found == pytest.approx(every_successor(p, room, i, step), abs=1e-12)
