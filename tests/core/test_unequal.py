@@ -116,3 +116,17 @@ def test_nothing_is_lost_by_looking_only_at_successors_that_can_still_be_best(se
         for step in range((c[i] + size[i]) // p.grid, min(c[i] + limit[i] + size[i], p.ends) // p.grid + 1):
             found = p.future[i, step - c[i] // p.grid]
             assert found == pytest.approx(every_successor(p, room, i, step), abs=1e-12)
+
+
+@given(st.integers(0, 2**32), VALUES)
+def test_leaving_messages_out_while_the_link_is_idle_is_never_worth_it(seed, v):
+    """Where waiting costs nothing, plans that never do so gain as much as all plans."""
+    rng = np.random.default_rng(seed)
+    n, x = 16, np.cumsum(rng.choice([0.0, 0.125, 0.5, 2.0], 16))
+    c, size, limit = np.cumsum(rng.integers(0, 70, n)), rng.integers(1, 40, n), rng.choice([-1, 0, 20, 60], n)
+    totals = []
+    for certain in (limit, np.full(n, -(10**6))):
+        p = new_problem(c, size, limit, certain, x, v.array, int(c[-1]) + 30, 10**6)
+        room = unequal._priced(p, np.zeros((2, n)), n, 10**6)
+        totals.append(unequal.follow(p, room, np.empty(n, np.int64), np.empty(n, np.int64))[1])
+    assert totals[0] == pytest.approx(totals[1], abs=1e-12)
