@@ -90,9 +90,7 @@ def offer(p: Problem, room: Room, states: States, j: int, i: int, w: int) -> Non
     """Add "message j after state ``w`` of message i" if j finds room and is among the best; i = -1 for none."""
     e = states.end[i, w] if i >= 0 else 0
     s = max(e, p.c[j])
-    if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends:
-        return
-    if i >= 0 and (ends_too_early(p, i, e, j) or not has_room(p, room, states, i, w, j)):
+    if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends or (i >= 0 and ends_too_early(p, i, e, j)):
         return
     added = value(p.v, p.x[j] - p.x[i]) if i >= 0 else 0.0
     net = added + (states.net[i, w] if i >= 0 else 0.0)
@@ -106,6 +104,8 @@ def offer(p: Problem, room: Room, states: States, j: int, i: int, w: int) -> Non
     for other in range(k):
         if states.end[j, other] == end and states.net[j, other] == net:
             return  # equal in rank, end and gain
+    if i >= 0 and not has_room(p, room, states, i, w, j):
+        return
     k = min(k, width - 1)
     states.used[j] = k + 1
     while k > 0 and states.promise[j, k - 1] < promise:
