@@ -104,7 +104,7 @@ def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
     """Three messages of 10 bytes arrive at bytes 0, 1 and 2 of the link."""
     c, size, far = np.arange(3), np.full(3, 10), np.full(3, 100)
     p = programme.new_problem(c, size, far, np.zeros(3, np.int64), np.arange(3.0), V.array, 2**62, 1)
-    room = programme.Room(capacity, max_bytes, np.zeros((2, 200)), np.zeros((2, 4)))
+    room = programme.Room(capacity, max_bytes, np.zeros((2, 200)), np.zeros((2, 4)), p.future)
     work = np.empty(3, np.int64)
     length, gain = beam.search(p, room, beam.new_states(3, width), work)
     assert work[:length][::-1].tolist() == plan
