@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -90,6 +90,12 @@ def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Arrays:
                     raise BufgymError(f"{_place(policy, cell, run)}: {what}")
             table.qoi[policy, cell] = np.array([[runs[s, e]["qoi"] for e in best] for s in trained], np.float64)
     return table
+
+
+def check_met(policy: str, met: Collection[str]) -> None:
+    """Raise an error for the name of a policy that met no episodes; an empty name is none."""
+    if policy and policy not in met:
+        raise BufgymError(f"no row of {policy}, with which the others are to be compared")
 
 
 def _clairvoyant(row: Mapping[str, Any]) -> float:
