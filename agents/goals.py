@@ -34,6 +34,7 @@ from bufgym.benchmark.bootstrap import (
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep
+from bufgym.benchmark.table import decimal
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import BASELINE, EveryLength, law, online_optimum
@@ -107,13 +108,12 @@ def section(results: SuiteResults) -> list[str]:
     columns = [AGENTS, *results.seeds, best]
     cells = dict.fromkeys((cell.scenario, cell.capacity) for cell in results.scores.cells)
     groups = {str(L): results.shares(columns, capacity=L) for L in sorted({L for _, L in cells})}
-    groups[f"all, {results.scores.counted} of {len(cells)} cells"] = {
-        name: standings[name]["share"] for name in columns
-    }
+    counted = f"all, {results.scores.counted} of {len(cells)} cells"
+    groups[counted] = {name: standings[name]["share"] for name in columns}
     rows = []
     for name, found in groups.items():
-        alone = [written(found[column]._replace(low=math.nan, high=math.nan), ".2f") for column in columns[1:]]
-        rows.append([name, written(found[AGENTS], ".2f"), *(text.removesuffix(" [–]") for text in alone)])
+        alone = [decimal(found[column].value, 2) for column in columns[1:]]
+        rows.append([name, written(found[AGENTS], ".2f"), *alone])
     labels = dict.fromkeys(label for label, _ in cells)
     scenarios = [f"{label} {written(results.shares([AGENTS], scenario=label)[AGENTS], '.2f')}" for label in labels]
     shown = ", ".join(f"{name} {written(standings[name]['score'], '.3f')}" for name in (AGENTS, best, AFR))
@@ -169,8 +169,8 @@ def exact(agents: Sequence[Policy]) -> list[str]:
     return [
         "## interruption-v1, exactly",
         "",
-        "The figure is the regret over AFR's in this cell. It is exact over the law of the test split's T, as one run holds all "
-        "lengths. The mean over the seeds comes first, then their range.",
+        "The figure is the regret over AFR's in this cell. It is exact over the law of the test split's T, as one "
+        "run holds all lengths. The mean over the seeds comes first, then their range.",
         "",
         *table(["V", *(f"L = {L}" for L in suite.capacities)], rows),
         "",
@@ -178,8 +178,8 @@ def exact(agents: Sequence[Policy]) -> list[str]:
 
 
 FIGURE = (
-    "The figure is the share of AFR's regret: the sum of the regrets over the cells (scenario, L), divided by the sum of "
-    "AFR's, a ratio of sums. Cells where Drop Oldest's regret is under 1 % do not count. The 95 % interval is over "
+    "The figure is the share of AFR's regret: the sum of the regrets over the cells (scenario, L), divided by the sum "
+    "of AFR's, a ratio of sums. Cells where Drop Oldest's regret is under 1 % do not count. The 95 % interval is over "
     "training seeds and links, which are drawn jointly for all cells."
 )
 
