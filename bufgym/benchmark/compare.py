@@ -144,7 +144,7 @@ def compare(
         if settings:
             raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
         chosen = _with(chosen, rival, tasks.TASKS[suites.get(on).kind])
-        return _on_suite(chosen, tuple(dict.fromkeys(files)), on, capacities, seeds, progress, named)
+        return _on_suite(chosen, files, on, capacities, seeds, progress, named)
     if isinstance(on, str) and on.isidentifier() and on not in scenario.SCENARIOS:
         close = difflib.get_close_matches(on, [*scenario.SCENARIOS, *suites.SUITES], 1)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join([*scenario.SCENARIOS, *suites.SUITES])}"
@@ -168,9 +168,11 @@ def compare(
             shown = shown._replace(notes=[table.SCORE, *shown.notes])
     texts = [shown.plain(), shown.markdown(), shown.html()]
     if named and task.kind == "queue":
-        paired = _paired(task.summary([*rows, *floor], table.unranked(rows), named))
-        more = paired.plain(), paired.markdown(), paired.html()
-        texts = ["\n\n".join(both) for both in zip(texts, more, strict=True)]
+        found = task.summary([*rows, *floor], table.unranked(rows), named)
+        paired = [quantity for quantity in found.quantities if quantity.key in ("share", "against")]
+        notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
+        more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
+        texts = ["\n\n".join(both) for both in zip(texts, (more.plain(), more.markdown(), more.html()), strict=True)]
     return Comparison(rows, about or label or repr(stream), *texts)
 
 
@@ -181,26 +183,8 @@ def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> l
     return [*chosen, *({policy.name: policy for policy in more if policy.name not in known}.values())]
 
 
-def _paired(summed: summary.Summary) -> table.Table:
-    """Make the table of the share of AFR's regret and of its difference to another policy's, over all capacities."""
-    shown = [quantity for quantity in summed.quantities if quantity.key in ("share", "against")]
-    lines = [
-        [standing.policy, *(" ".join(filter(None, summary.pair(standing, quantity))) for quantity in shown)]
-        for standing in summed.overall
-    ]
-    notes = [f"{quantity.title}: {quantity.about}." for quantity in shown]
-    notes.append("Brackets: 95 % intervals over links, or over episodes where there is one link or none.")
-    return table.Table(["policy", *(quantity.title for quantity in shown)], [("", lines)], notes)
-
-
 def _on_suite(
-    chosen: Sequence[Policy],
-    files: tuple[str, ...],
-    name: str,
-    capacities: Sequence[int],
-    seeds: Any,
-    progress: bool,
-    against: str,
+    chosen: Sequence[Policy], files: list[str], name: str, capacities: Any, seeds: Any, progress: bool, against: str
 ) -> Comparison:
     """``compare`` on the test split of a suite. Its processes know policies by name, or load them from ``files``."""
     registered = {*policies.names(), *policies.names(named_only=True)}
@@ -213,7 +197,7 @@ def _on_suite(
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
     names = tuple(policy.name for policy in chosen)
-    sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=files)
+    sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=tuple(dict.fromkeys(files)))
     # Other processes can't know what a user's own code registered in this one.
     own = any(not policy.on_arrival.__module__.startswith("bufgym.") for policy in chosen) and not files
     with tempfile.TemporaryDirectory() as folder:

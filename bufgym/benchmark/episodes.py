@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -54,7 +54,7 @@ def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Ru
     return groups
 
 
-def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Arrays:
+def read(rows: Sequence[Mapping[str, Any]], baseline: str, against: str = "") -> Arrays:
     """Make arrays of the rows, checked as ``score.scores`` says."""
     groups = _by_run(rows)
     cells = sorted({cell for _, cell in groups})
@@ -67,6 +67,8 @@ def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Arrays:
     training_seeds = {
         policy: sorted(numbers, key=lambda s: -1 if s is None else s) for policy, numbers in seeds.items()
     }
+    if against and against not in seeds:
+        raise BufgymError(f"no row of {against}, with which the others are to be compared")
     for cell in cells:
         if (baseline, cell) not in groups:
             raise BufgymError(f"{cell[0]}, L = {cell[1]}: no row of the baseline {baseline!r}")
@@ -90,12 +92,6 @@ def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Arrays:
                     raise BufgymError(f"{_place(policy, cell, run)}: {what}")
             table.qoi[policy, cell] = np.array([[runs[s, e]["qoi"] for e in best] for s in trained], np.float64)
     return table
-
-
-def check_met(policy: str, met: Collection[str]) -> None:
-    """Raise an error for the name of a policy that met no episodes; an empty name is none."""
-    if policy and policy not in met:
-        raise BufgymError(f"no row of {policy}, with which the others are to be compared")
 
 
 def _clairvoyant(row: Mapping[str, Any]) -> float:

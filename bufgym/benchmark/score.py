@@ -131,8 +131,7 @@ def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = (), ag
         BufgymError: there are no rows, rows are incomplete or duplicate, a cell lacks the baseline, or policies met
             different episodes or disagree on the clairvoyant; or ``against`` has no rows.
     """
-    table = episodes.read(rows, BASELINE)
-    episodes.check_met(against, table.training_seeds)
+    table = episodes.read(rows, BASELINE, against)
     drawn = links_drawn(table.episodes, RESAMPLES, SEED)
     base = _resampled(table, BASELINE)
     samples = {cell: _Sample.of(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}

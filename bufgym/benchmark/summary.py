@@ -127,8 +127,7 @@ def summarise(
     """
     # ``read`` makes sure that all met the same episodes, and orders them.
     rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
-    table = episodes.read(rows, baseline)
-    episodes.check_met(against, table.training_seeds)
+    table = episodes.read(rows, baseline, against)
     drawn = links_drawn(table.episodes, RESAMPLES, SEED)
     cells = list(dict.fromkeys((scenario, capacity) for scenario, capacity, *_ in runs))
 
@@ -198,9 +197,15 @@ def table_of(summary: Summary, abouts: Mapping[str, str] | None = None) -> Table
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", summary.overall))
 
+    return table_over(blocks, summary.quantities)
+
+
+def table_over(blocks: Sequence[tuple[str, Sequence[Standing]]], quantities: Sequence[Quantity]) -> Table:
+    """Make a table of these quantities with a block for each title and its standings."""
+
     def line(standing: Standing) -> list[str]:
-        pairs = [(pair(standing, quantity), quantity.interval) for quantity in summary.quantities]
+        pairs = [(pair(standing, quantity), quantity.interval) for quantity in quantities]
         return [standing.policy, *(" ".join(filter(None, texts if both else texts[:1])) for texts, both in pairs)]
 
-    head = ["policy", *(quantity.title for quantity in summary.quantities)]
+    head = ["policy", *(quantity.title for quantity in quantities)]
     return Table(head, [(name, [line(standing) for standing in standings]) for name, standings in blocks])

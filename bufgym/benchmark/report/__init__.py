@@ -57,9 +57,8 @@ def best_rule(summary: Summary) -> str:
     """The first ranked policy that was not learned; empty if all were."""
     for standing in summary.overall:
         with suppress(BufgymError):  # a run's agent that is not registered
-            known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
-            if known and not policies.get(standing.policy).weights:
-                return standing.policy
+            if standing.ranked and not policies.get(standing.policy).weights:
+                return "" if math.isnan(standing[summary.rank_by].value) else standing.policy
     return ""
 
 
