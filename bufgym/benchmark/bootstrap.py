@@ -71,7 +71,8 @@ def links_drawn(
         place = {link: k for k, link in enumerate(sorted(set(links)))}
         n = len(place)
         draws.setdefault(n, times_drawn(n, resamples, stream(seed, f"{n} links")))
-        counts[scenario] = draws[n][:, [place[link] for link in links]]
+        # In the order of ``times_drawn``, so that sums over row 0 round as they do there.
+        counts[scenario] = np.ascontiguousarray(draws[n][:, [place[link] for link in links]])
     return counts
 
 
