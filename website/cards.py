@@ -114,7 +114,10 @@ def board(name: str) -> list[tuple[str, str, str]]:
 def _board(name: str) -> list[str]:
     rows = board(name)
     return (
-        ["As it comes ([leaderboard](leaderboard.md)):", table(("suite", "regret / AFR's", "score"), rows)]
+        [
+            "As it comes, over the discriminative cells ([leaderboard](leaderboard.md)):",
+            table(("suite", "regret / AFR's", "score"), rows),
+        ]
         if rows
         else []
     )
@@ -124,7 +127,10 @@ def _scores(card: Card) -> list[str]:
     rows = scores(card)
     if not rows:
         return []
-    return ["All training seeds:", table(("suite", "regret / AFR's", "score", "AFR's score"), rows)]
+    return [
+        "All training seeds, over the cells that their page counts:",
+        table(("suite", "regret / AFR's", "score", "AFR's score"), rows),
+    ]
 
 
 def _text(card: Card) -> str:
