@@ -15,15 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym.benchmark import episodes
-from bufgym.benchmark.bootstrap import (
-    RESAMPLES,
-    SEED,
-    UNKNOWN,
-    Interval,
-    links_drawn,
-    percentile_interval,
-    written,
-)
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
 from bufgym.benchmark.table import Rows, Table, signed
