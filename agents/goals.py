@@ -2,27 +2,39 @@
 
 ``python -m agents.goals runs/NAME --suites lte-v1,outage-v1 --out docs/agents.md`` (``--data DIR`` for recordings).
 
-The figure is the regret over AFR's: the sum of an agent's regrets over the cells (scenario, L) of one L, or over all,
-divided by AFR's. Intervals are percentile bootstraps: first training seeds are drawn, then the episodes of each cell,
-the same ones for the agent and for AFR.
+The figure is the share of AFR's regret over the discriminative cells (scenario, L) of one L, or over all of them: a
+ratio of sums, see ``bufgym.benchmark.score``. So are the intervals: training seeds are drawn, and links, one draw for
+all cells, the agents and AFR.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agents.evaluation import EvaluationSet, Numbers
+from agents.evaluation import EvaluationSet
 from agents.page import columns_of, command, publish, table, written
 from agents.runs import MODEL, read_settings
 from bufgym import policies
-from bufgym.benchmark.bootstrap import Interval
-from bufgym.benchmark.score import regret, scores
+from bufgym.benchmark import episodes
+from bufgym.benchmark.bootstrap import (
+    RESAMPLES,
+    SEED,
+    Interval,
+    links_drawn,
+    percentile_interval,
+    stream,
+    times_drawn,
+)
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep
+from bufgym.benchmark.table import decimal
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import BASELINE, EveryLength, law, online_optimum
@@ -30,64 +42,40 @@ from bufgym.policies import Policy, registry
 from bufgym.scenario import Interruption
 from bufgym.scenario.suites import get as suite_of
 
-RESAMPLES = 500
-RESAMPLES_OF_MANY = 200
-"""Resamples with more than ``MANY`` cells, whose mean varies less."""
-MANY = 30
 AFR = "afr"
 AGENTS = "agents"
-NEGLIGIBLE = 1e-9
-"""Sum of AFR's regrets below which a ratio says nothing."""
 
 
 @dataclass(frozen=True)
 class SuiteResults:
-    """H of every policy in every cell of one suite, episode by episode."""
+    """Rows of one suite's test split."""
 
     suite: str
     """Its name."""
-    cells: list[tuple[str, int]]
-    """(scenario, L)"""
-    best: list[Numbers]
-    """The clairvoyant's H, float64[episodes] of each cell."""
-    fixed: dict[str, list[Numbers]]
-    """H of each fixed policy, likewise."""
-    agents: list[list[Numbers]]
-    """H of each training seed, likewise."""
-    scores: dict[str, Interval]
-    """Scores of the agents together (AGENTS) and of every fixed policy: 0 is Drop Oldest, 1 the clairvoyant."""
+    rows: list[Row]
+    """Of every ranked fixed policy, of all agents as the training seeds of one policy AGENTS, and of each agent alone
+    as the policies ``seeds``."""
+    seeds: list[str]
+    """A name for each agent."""
+    scores: Scores
+    """Of all rows."""
 
-    def ratio(self, seeds_qoi: Sequence[list[Numbers]], cells: Sequence[int], rng: np.random.Generator) -> Interval:
-        """Regret over AFR's in these cells; ``seeds_qoi`` has H by training seed, as ``agents``."""
+    def shares(self, names: Collection[str], **where: Any) -> dict[str, Interval]:
+        """The share of AFR's regret of these policies in the cells whose "scenario" or "capacity" is as given."""
+        names = {*names, AFR, BASELINE}
+        rows = [row for row in self.rows if row["policy"] in names and where.items() <= row.items()]
+        return {standing.policy: standing["share"] for standing in scores(rows).standings}
 
-        def resampled(seeds: Sequence[int], picks: Sequence[NDArray[np.int64] | slice]) -> float:
-            agents = afr = 0.0
-            for cell, pick in zip(cells, picks, strict=True):
-                best = self.best[cell][pick].sum()
-                agents += float(np.mean([float(regret(seeds_qoi[s][cell][pick].sum(), best)) for s in seeds]))
-                afr += float(regret(self.fixed[AFR][cell][pick].sum(), best))
-            return agents / afr if afr > NEGLIGIBLE else float("nan")
-
-        count = len(seeds_qoi)
-        ratios = []
-        for _ in range(RESAMPLES_OF_MANY if len(cells) > MANY else RESAMPLES):
-            picks = [rng.integers(len(self.best[cell]), size=len(self.best[cell])) for cell in cells]
-            ratios.append(resampled(rng.integers(count, size=count).tolist(), picks))
-        low, high = np.nanpercentile(ratios, [2.5, 97.5])
-        return Interval(resampled(range(count), [slice(None)] * len(cells)), float(low), float(high))
-
-    def behind(self, rival: str, rng: np.random.Generator) -> list[str]:
+    def behind(self, rival: str) -> list[str]:
         """Cells where the agents' mean H lies below the rival's by more than its interval."""
+        table = episodes.read([row for row in self.rows if row["policy"] in (AGENTS, rival, BASELINE)], BASELINE)
+        drawn, trained = links_drawn(table.episodes), len(self.seeds)
+        seeds = times_drawn(trained, RESAMPLES, stream(SEED, f"training of {AGENTS}")) / trained
         lines = []
-        for cell, (label, L) in enumerate(self.cells):
-            gain = np.array([agent[cell] for agent in self.agents]) - self.fixed[rival][cell]
-            seeds, episodes = gain.shape
-            means = [
-                gain[rng.integers(seeds, size=seeds)][:, rng.integers(episodes, size=episodes)].mean()
-                for _ in range(RESAMPLES)
-            ]
-            if np.percentile(means, 97.5) < 0:
-                share = -gain.mean() / self.best[cell].mean()
+        for label, L in table.cells:
+            gain, weights = table.qoi[AGENTS, (label, L)] - table.qoi[rival, (label, L)], drawn[label]
+            if percentile_interval((weights * (seeds @ gain)).sum(axis=1) / weights.sum(axis=1)).high < 0:
+                share = -gain.mean() / table.best[label, L].mean()
                 lines.append(f"- {label}, L = {L}: H is below {rival}'s by {share:.2%} of the clairvoyant's")
         return lines
 
@@ -101,22 +89,12 @@ def measure(
     ranked = [name for name in fixed if registry.get(name).ranked]
     sweep = Sweep(suite, tuple(ranked), "test", suite_of(suite).capacities, seeds, data)
     evaluation = EvaluationSet(sweep, folder / "goals" / suite)
-    cells = [(cell.label, cell.capacity) for cell in evaluation.cells]
-    rows = [evaluation.benchmark_rows(evaluation.run(agent), AGENTS, seed) for seed, agent in enumerate(agents)]
-    result = scores([{**row, "training_seed": None} for row in evaluation.rows] + [row for own in rows for row in own])
-    indices = [[i for i, row in enumerate(rows[0]) if (row["scenario"], row["capacity"]) == cell] for cell in cells]
-
-    def split(numbers: Numbers) -> list[Numbers]:
-        return [numbers[own] for own in indices]
-
-    return SuiteResults(
-        suite,
-        cells,
-        split(evaluation.fixed(AFR, "clairvoyant")),
-        {name: split(evaluation.fixed(name)) for name in ranked},
-        [split(np.array([row["qoi"] for row in own], np.float64)) for own in rows],
-        {standing.policy: standing["score"] for standing in result.standings},
-    )
+    rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
+    names = [f"seed {seed}" for seed in range(len(agents))]
+    for seed, agent in enumerate(agents):
+        own = evaluation.benchmark_rows(evaluation.run(agent), AGENTS, seed)
+        rows += [*own, *({**row, "policy": names[seed]} for row in own)]
+    return SuiteResults(suite, rows, names, scores(rows))
 
 
 # --- the page --------------------------------------------------------------------------------------------------------
@@ -124,27 +102,27 @@ def measure(
 
 def section(results: SuiteResults) -> list[str]:
     """Markdown of one suite."""
-    rng = np.random.default_rng(0)
-    every = list(range(len(results.cells)))
-    fixed = {name: results.ratio([h], every, rng).value for name, h in results.fixed.items() if name != AFR}
-    best = min(fixed, key=lambda name: fixed[name])
-    groups = {str(L): [i for i in every if results.cells[i][1] == L] for L in sorted({L for _, L in results.cells})}
+    standings = {standing.policy: standing for standing in results.scores.standings}
+    fixed = {name: one["share"].value for name, one in standings.items() if name not in (AFR, AGENTS, *results.seeds)}
+    best = min(fixed, key=lambda name: (math.isnan(fixed[name]), fixed[name]))
+    columns = [AGENTS, *results.seeds, best]
+    cells = dict.fromkeys((cell.scenario, cell.capacity) for cell in results.scores.cells)
+    groups = {str(L): results.shares(columns, capacity=L) for L in sorted({L for _, L in cells})}
+    counted = f"all, {results.scores.counted} of {len(cells)} cells"
+    groups[counted] = {name: standings[name]["share"] for name in columns}
     rows = []
-    for name, cells in [*groups.items(), ("all", every)]:
-        seeds = [f"{results.ratio([agent], cells, rng).value:.2f}" for agent in results.agents]
-        rival = results.ratio([results.fixed[best]], cells, rng).value
-        rows.append([name, written(results.ratio(results.agents, cells, rng), ".2f"), *seeds, f"{rival:.2f}"])
-    head = ["L", "all seeds", *(f"seed {s}" for s in range(len(results.agents))), best]
-    scenarios = []
-    for label in dict.fromkeys(label for label, _ in results.cells):
-        cells = [i for i in every if results.cells[i][0] == label]
-        scenarios.append(f"{label} {results.ratio(results.agents, cells, rng).value:.2f}")
-    shown = ", ".join(f"{name} {written(results.scores[name], '.3f')}" for name in (AGENTS, best, AFR))
+    for name, found in groups.items():
+        alone = [decimal(found[column].value, 2) for column in columns[1:]]
+        rows.append([name, written(found[AGENTS], ".2f"), *alone])
+    labels = dict.fromkeys(label for label, _ in cells)
+    scenarios = [f"{label} {written(results.shares([AGENTS], scenario=label)[AGENTS], '.2f')}" for label in labels]
+    shown = ", ".join(f"{name} {written(standings[name]['score'], '.3f')}" for name in (AGENTS, best, AFR))
     rivals = dict.fromkeys([AFR, BASELINE, best])
-    behind = [line for rival in rivals for line in results.behind(rival, rng)]
+    behind = [line for rival in rivals for line in results.behind(rival)]
     below = f"the agents' mean H is below {' or '.join(rivals)} by more than the interval"
     return [
-        *(f"## {results.suite}", "", *table(head, rows), "", f"The ratio by scenario is: {', '.join(scenarios)}.", ""),
+        *(f"## {results.suite}", "", *table(["L", "all seeds", *columns[1:]], rows), ""),
+        *(f"The share by scenario is: {', '.join(scenarios)}.", ""),
         *(f"The scores are: {shown}. The score of {BASELINE} is 0 and the clairvoyant's is 1.", ""),
         *([f"In these cells {below}:"] if behind else [f"In no cell {below}."]),
         *("", *behind, ""),
@@ -191,12 +169,19 @@ def exact(agents: Sequence[Policy]) -> list[str]:
     return [
         "## interruption-v1, exactly",
         "",
-        "The figure is the regret over AFR's. It is exact over the law of the test split's T, as one run holds all "
-        "lengths. The mean over the seeds comes first, then their range.",
+        "The figure is the regret over AFR's in this cell. It is exact over the law of the test split's T, as one "
+        "run holds all lengths. The mean over the seeds comes first, then their range.",
         "",
         *table(["V", *(f"L = {L}" for L in suite.capacities)], rows),
         "",
     ]
+
+
+FIGURE = (
+    "The figure is the share of AFR's regret: the sum of the regrets over the cells (scenario, L), divided by the sum "
+    "of AFR's, a ratio of sums. Cells where Drop Oldest's regret is under 1 % do not count. The 95 % interval is over "
+    "training seeds and links, which are drawn jointly for all cells."
+)
 
 
 def main(
@@ -226,7 +211,7 @@ def main(
         lines += [f"Made by `{read_settings(run)['command']}`. The seeds stopped after {decisions} decisions.", ""]
     folder = " --data DIR" if data else ""
     lines += [f"This page is made by `python -m agents.goals runs/{run.name} --suites {suites}{folder}`.", ""]
-    lines += ["The figure is the regret over AFR's. Its 95 % interval is over training seeds and episodes.", ""]
+    lines += [FIGURE, ""]
     for suite in suites.split(","):
         lines += section(measure(suite, agents, run, data, seeds))
         if suite == "interruption-v1":

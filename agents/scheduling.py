@@ -29,8 +29,8 @@ Without training, run `bufgym topics --suite topics-v1`.
 
 The figures are means over the {settings} settings of the test split, with {episodes} episodes each. QoI is the weighted
 sum of each topic's H. It is compared with `robofleet`, as published, on the same episodes, with paired 95 % intervals
-over episodes. Age is the age of information at the server. "First" are the topics of priority 20, and "others" are the
-rest.
+over links. QoI / robofleet's and age / robofleet's are means of the settings' ratios, not ratios of sums. Age is the
+age of information at the server. "First" are the topics of priority 20, and "others" are the rest.
 
 | policy | QoI / robofleet's | no_drop lost | age, first / robofleet's | age, first, s | age, others, s | late |
 |---|---|---:|---|---:|---:|---:|

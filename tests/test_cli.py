@@ -119,6 +119,17 @@ def test_bench_writes_rows_and_a_table(trace: str, tmp_path: Path, capsys: Capsy
     assert sorted(path.name for path in out.iterdir()) == ["rows.csv", "table.md"]
 
 
+def test_bench_against_a_policy(capsys: Capsys) -> None:
+    """On a suite and elsewhere; the policy and AFR run too."""
+    for where in (["--suite", "interruption-v1", "--jobs", "1"], ["--scenario", "interruption"]):
+        text = shown(
+            ["bench", *where, "--policies", "min-gap", "--against", "target-gap", "--capacity", "4", "--seeds", "3"],
+            capsys,
+        )
+        assert "regret / afr's, minus target-gap's" in text and "afr " in text and "drop-oldest" in text
+    fails(["bench", "--policies", "afr", "--against", "no-such"], "no-such", capsys)
+
+
 def test_bench_writes_parquet_where_it_can(trace: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pyarrow")
     command = ["bench", "--trace", trace, *QUICK, "--policies", "afr", "--out", str(tmp_path)]

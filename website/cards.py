@@ -92,7 +92,7 @@ def scores(card: Card) -> list[tuple[str, str, str, str]]:
     """(suite, regret over AFR's, score of the agents, AFR's score), each with its interval over all training seeds."""
     rows = []
     for part in re.split(r"^## ", _text(card), flags=re.MULTILINE)[1:]:
-        regret = re.search(r"^\| all \| ([^|]+) \|", part, re.MULTILINE)
+        regret = re.search(r"^\| all[^|]* \| ([^|]+) \|", part, re.MULTILINE)
         score = re.search(r"^The scores are: agents ([\d.]+ \[[^\]]+\]).* afr ([\d.]+ \[[^\]]+\])", part, re.MULTILINE)
         if regret and score:
             rows.append((part.split("\n")[0], regret[1], score[1], score[2]))
@@ -100,7 +100,7 @@ def scores(card: Card) -> list[tuple[str, str, str, str]]:
 
 
 def board(name: str) -> list[tuple[str, str, str]]:
-    """(suite, regret over AFR's, score) of the agent as it comes with bufgym, from the leaderboard."""
+    """(suite, share of AFR's regret, score) of the agent as it comes with bufgym, from the leaderboard."""
     entries = leaderboard.read(DOCS / "leaderboard.csv")
     rows = []
     for entry in entries.values():
@@ -114,7 +114,10 @@ def board(name: str) -> list[tuple[str, str, str]]:
 def _board(name: str) -> list[str]:
     rows = board(name)
     return (
-        ["As it comes ([leaderboard](leaderboard.md)):", table(("suite", "regret / AFR's", "score"), rows)]
+        [
+            "As it comes, over the discriminative cells ([leaderboard](leaderboard.md)):",
+            table(("suite", "regret / AFR's", "score"), rows),
+        ]
         if rows
         else []
     )
@@ -124,7 +127,10 @@ def _scores(card: Card) -> list[str]:
     rows = scores(card)
     if not rows:
         return []
-    return ["All training seeds:", table(("suite", "regret / AFR's", "score", "AFR's score"), rows)]
+    return [
+        "All training seeds, over the cells that their page counts:",
+        table(("suite", "regret / AFR's", "score", "AFR's score"), rows),
+    ]
 
 
 def _text(card: Card) -> str:

@@ -114,6 +114,7 @@ def compare(
     seeds: int | Sequence[int] | None = None,
     progress: bool = True,
     about: str = "",
+    against: PolicyLike | None = None,
     **settings: Any,
 ) -> Comparison:
     """Run each policy on the same episodes of a scenario or a suite.
@@ -125,6 +126,8 @@ def compare(
         seeds: so many episodes on each trace, or these; by default 10, or the suite's.
         progress: show a bar on stderr, where that is a terminal.
         about: lines that stand above the table and explain it; by default what ``on`` is.
+        against: a policy that every other is compared with, by the paired difference of their shares of AFR's regret
+            (of QoI over Robofleet's with topics, of the gain over AFR with a fleet). It and AFR run too.
         settings: of a queue, ``max_bytes`` and ``decide_at``; the others are parameters of a scenario that is named.
 
     Raises:
@@ -132,12 +135,16 @@ def compare(
     """
     several = [policies] if isinstance(policies, str | Path | Policy) or callable(policies) else policies
     chosen = [make_policy(policy) for policy in several]
-    files = tuple(os.fspath(p) for p in several if isinstance(p, Path) or (isinstance(p, str) and sources.is_source(p)))
+    rival = None if against is None else make_policy(against)
+    named = "" if rival is None else rival.name
+    words = (*several, against)
+    files = [os.fspath(p) for p in words if isinstance(p, Path) or (isinstance(p, str) and sources.is_source(p))]
     capacities = [capacity] if isinstance(capacity, int) else list(capacity or ())
     if isinstance(on, str) and on in suites.SUITES:
         if settings:
             raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
-        return _on_suite(chosen, files, on, capacities, seeds, progress)
+        chosen = _with(chosen, rival, tasks.TASKS[suites.get(on).kind])
+        return _on_suite(chosen, files, on, capacities, seeds, progress, named)
     if isinstance(on, str) and on.isidentifier() and on not in scenario.SCENARIOS:
         close = difflib.get_close_matches(on, [*scenario.SCENARIOS, *suites.SUITES], 1)
         hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join([*scenario.SCENARIOS, *suites.SUITES])}"
@@ -147,22 +154,37 @@ def compare(
     label = on if isinstance(on, str) else ""
     seeds, capacities = 10 if seeds is None else seeds, capacities or [8]
     task = tasks.of(stream)
+    chosen = _with(chosen, rival, task)
     alone = all(policy.name != task.baseline for policy in chosen)
     if task.kind != "queue":
         chosen = [*chosen, make_policy(task.baseline)] if alone else chosen
         rows = run(chosen, stream, capacities, seeds, label=label, progress=progress)
-        shown = summary.table_of(task.summary(rows, table.unranked(rows)))
+        shown = summary.table_of(task.summary(rows, table.unranked(rows), named))
     else:
         rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
-        floor = run([BASELINE], stream, capacities, seeds, label=label, bound=False, **queue) if alone else []
+        floor = run([BASELINE], stream, capacities, seeds, label=label, bound=named != "", **queue) if alone else []
         shown = table.of(rows, floor)
         if not about and "score" in shown.head:
             shown = shown._replace(notes=[table.SCORE, *shown.notes])
-    return Comparison(rows, about or label or repr(stream), shown.plain(), shown.markdown(), shown.html())
+    texts = [shown.plain(), shown.markdown(), shown.html()]
+    if named and task.kind == "queue":
+        found = task.summary([*rows, *floor], table.unranked(rows), named)
+        paired = [quantity for quantity in found.quantities if quantity.key in ("share", "against")]
+        notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
+        more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
+        texts = ["\n\n".join(both) for both in zip(texts, (more.plain(), more.markdown(), more.html()), strict=True)]
+    return Comparison(rows, about or label or repr(stream), *texts)
+
+
+def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
+    """The policies, then those that the comparison with ``rival`` needs."""
+    more = [] if rival is None else [rival, make_policy(task.reference)]
+    known = {policy.name for policy in chosen}
+    return [*chosen, *({policy.name: policy for policy in more if policy.name not in known}.values())]
 
 
 def _on_suite(
-    chosen: Sequence[Policy], files: tuple[str, ...], name: str, capacities: Sequence[int], seeds: Any, progress: bool
+    chosen: Sequence[Policy], files: list[str], name: str, capacities: Any, seeds: Any, progress: bool, against: str
 ) -> Comparison:
     """``compare`` on the test split of a suite. Its processes know policies by name, or load them from ``files``."""
     registered = {*policies.names(), *policies.names(named_only=True)}
@@ -175,10 +197,11 @@ def _on_suite(
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
     names = tuple(policy.name for policy in chosen)
-    sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=files)
+    sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=tuple(dict.fromkeys(files)))
     # Other processes can't know what a user's own code registered in this one.
     own = any(not policy.on_arrival.__module__.startswith("bufgym.") for policy in chosen) and not files
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
-        return Comparison(rows, f"suite {name}", report.plain(out), report.markdown(out), report.html(out))
+        shown = [form(out, against) for form in (report.plain, report.markdown, report.html)]
+        return Comparison(rows, f"suite {name}", *shown)

@@ -54,7 +54,7 @@ def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Ru
     return groups
 
 
-def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Arrays:
+def read(rows: Sequence[Mapping[str, Any]], baseline: str, against: str = "") -> Arrays:
     """Make arrays of the rows, checked as ``score.scores`` says."""
     groups = _by_run(rows)
     cells = sorted({cell for _, cell in groups})
@@ -67,6 +67,8 @@ def read(rows: Sequence[Mapping[str, Any]], baseline: str) -> Arrays:
     training_seeds = {
         policy: sorted(numbers, key=lambda s: -1 if s is None else s) for policy, numbers in seeds.items()
     }
+    if against and against not in seeds:
+        raise BufgymError(f"no row of {against}, with which the others are to be compared")
     for cell in cells:
         if (baseline, cell) not in groups:
             raise BufgymError(f"{cell[0]}, L = {cell[1]}: no row of the baseline {baseline!r}")

@@ -177,7 +177,7 @@ def markdown(board: Sequence[Entry]) -> str:
         "# Leaderboard",
         "",
         "Made by `bufgym leaderboard`. `bufgym validate SUITE/POLICY` checks a row. Brackets hold 95 % bootstrap",
-        "intervals over test episodes.",
+        "intervals over the test links, which are drawn jointly for all cells.",
     ]
     for suite in dict.fromkeys(entry.suite for entry in board):
         group = [entry for entry in board if entry.suite == suite]

@@ -3,11 +3,18 @@
 A *cell* is a scenario with a capacity, and an *episode* of it is a trace with a seed. Every policy meets the same
 episodes at every capacity of the scenario, so policies are compared episode by episode.
 
-Every interval is a paired percentile bootstrap over episodes (Efron and Tibshirani 1993, chapter 13). The episodes of a
-scenario are drawn with replacement, with the same draw for all its capacities and all policies, and the statistic is
-computed again. For a policy trained several times, training seeds are drawn first. The draws depend only on the seed
-and the names, so neither the order of the rows nor the other policies change an interval. An interval describes fresh
-episodes on the same traces, not other traces.
+Every interval is a paired percentile bootstrap over links (Efron and Tibshirani 1993, chapter 13). Links, which are
+traces, are drawn with replacement, each with all its seeds, and the statistic is computed again. One draw serves all
+capacities, all policies and the scenarios on the same links, see ``bootstrap.links_drawn``. For a policy trained
+several times, training seeds are drawn too. The draws depend only on the seed and the links, so neither the order of
+the rows nor the other policies change an interval. An interval describes fresh links; where a scenario has one link or
+none, fresh episodes.
+
+Two aggregates compare regrets over several cells. They differ, so each has one name everywhere:
+
+* *share of AFR's regret*: (sum over the cells of the policy's regret) / (sum over the cells of AFR's regret), a ratio
+  of sums. The cells are the discriminative ones unless a page names others.
+* *mean ratio*: the mean over the cells of (the policy's regret / the other's regret in this cell).
 
 Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS 2021) and their library rliable.
 """
@@ -27,6 +34,7 @@ from bufgym.benchmark.bootstrap import (
     RESAMPLES,
     SEED,
     Interval,
+    links_drawn,
     percentile_interval,
     ratio,
     stream,
@@ -40,6 +48,9 @@ REFERENCE = "afr"
 
 DISCRIMINATIVE = 0.01
 """A cell is discriminative, and counts, where the baseline's regret is at least this."""
+
+NEGLIGIBLE = 1e-9
+"""Mean regret up to which a ratio to it says nothing."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +92,8 @@ class Scores:
       without possible gain have no score and are left out. In a resample a pair is weighted by its number of draws.
     * ``improvement``: paired probability of improvement over ``REFERENCE``, mean over the discriminative cells: the
       share of episodes with H above the reference's, plus half the share with the same H.
+    * ``share``: share of ``REFERENCE``'s regret, a ratio of sums; NaN where the reference loses nothing.
+    * ``against``: ``share`` minus that of the policy ``against``, paired; only where one is named.
     """
 
     standings: list[Standing]  # ranked policies first, best score first
@@ -105,26 +118,28 @@ def regret(h: Numbers, best: Numbers) -> Numbers:
     return 1 - ratio(h, best, best > 0)
 
 
-def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = ()) -> Scores:
+def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = (), against: str = "") -> Scores:
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Args:
         rows: from ``bufgym.benchmark.run``. Rows of a trained agent may have a "training_seed"; the H of an episode is
             then the mean over training seeds.
         unranked: policies that are shown but not ranked, such as an unbounded queue or the clairvoyant.
+        against: the policy that every other is compared with by its share of ``REFERENCE``'s regret.
 
     Raises:
         BufgymError: there are no rows, rows are incomplete or duplicate, a cell lacks the baseline, or policies met
-            different episodes or disagree on the clairvoyant.
+            different episodes or disagree on the clairvoyant; or ``against`` has no rows.
     """
-    table = episodes.read(rows, BASELINE)
-    drawn = {name: times_drawn(len(e), RESAMPLES, stream(SEED, name)) for name, e in table.episodes.items()}
+    table = episodes.read(rows, BASELINE, against)
+    drawn = links_drawn(table.episodes, RESAMPLES, SEED)
     base = _resampled(table, BASELINE)
     samples = {cell: _Sample.of(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
     discriminative = [cell for cell in table.cells if samples[cell].discriminative]
     compared = _resampled(table, REFERENCE) if REFERENCE in table.training_seeds else {}
     interval = percentile_interval
-    cell_scores, standings = [], []
+    cell_scores: list[CellScore] = []
+    overall: dict[str, dict[str, Numbers]] = {}
     for policy in table.training_seeds:
         by_cell = {
             cell: _statistics(h, compared.get(cell), samples[cell]) for cell, h in _resampled(table, policy).items()
@@ -139,9 +154,12 @@ def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = ()) ->
                     *(samples[cell].discriminative, table.exact[cell]),
                 )
             )
-        overall = _overall([by_cell[cell] for cell in discriminative], [samples[cell] for cell in discriminative])
-        values = {key: interval(numbers) for key, numbers in overall.items()}
-        standings.append(Standing(policy, policy not in unranked, values))
+        overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
+    _compare(overall, against)
+    standings = [
+        Standing(policy, policy not in unranked, {key: interval(numbers) for key, numbers in values.items()})
+        for policy, values in overall.items()
+    ]
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
     standings.sort(key=lambda s: (not s.ranked, math.isnan(s["score"].value), -s["score"].value, s.policy))
     return Scores(standings, cell_scores)
@@ -195,7 +213,7 @@ class _Statistics(NamedTuple):
 def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statistics:
     sums = sample.sums(h)
     total, base, best = sums.sum(axis=1), sample.base.sum(axis=1), sample.best.sum(axis=1)
-    episodes = sample.weights.shape[1]
+    episodes = sample.weights.sum(axis=1)
     difference = improvement = np.full(len(total), np.nan)
     if h_ref is not None:
         minus = h - h_ref
@@ -214,6 +232,15 @@ def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> dict[s
     weights = np.hstack([np.add.reduceat(sample.weights, sample.starts, axis=1) for sample in samples])
     means = {name: np.mean([getattr(c, name) for c in cells], axis=0) for name in ("score", "regret", "improvement")}
     return {**means, "iqm": _interquartile_means(values, weights / weights[0])}
+
+
+def _compare(overall: Mapping[str, dict[str, Numbers]], against: str) -> None:
+    """Add the share of the reference's regret to the statistics of each policy, and how it differs from another's."""
+    for values in overall.values():
+        lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
+        values["share"] = ratio(values["regret"], lost, lost > NEGLIGIBLE)
+    for values in overall.values() if against else ():
+        values["against"] = values["share"] - overall[against]["share"]
 
 
 def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:

@@ -1,8 +1,8 @@
 """Summary of a benchmark's rows: quantities with intervals for each policy, by cell and over all cells.
 
 A *cell* is a scenario with a capacity. Within a cell a statistic is computed over episodes; over all cells it is the
-mean of the cells' values. Every interval is the paired bootstrap over episodes that ``score`` describes: one draw
-serves all policies and all capacities of a scenario.
+mean of the cells' values, so a ratio over all cells is a mean of ratios, not a ratio of sums. Every interval is the
+paired bootstrap over links that ``score`` describes: one draw serves all policies and all cells.
 """
 
 from __future__ import annotations
@@ -15,19 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym.benchmark import episodes
-from bufgym.benchmark.bootstrap import (
-    RESAMPLES,
-    SEED,
-    UNKNOWN,
-    Interval,
-    percentile_interval,
-    stream,
-    times_drawn,
-    written,
-)
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
-from bufgym.benchmark.table import Rows, Table
+from bufgym.benchmark.table import Rows, Table, signed
 from bufgym.ground.errors import BufgymError
 
 
@@ -70,6 +61,12 @@ class Summary:
         return {standing.policy: standing for standing in self.overall}
 
 
+def difference(title: str, against: str) -> Quantity:
+    """Make the quantity of the paired difference of another, ``title``, to that of the policy ``against``."""
+    about = f"paired difference of {title}: both met the same episodes, and a draw of links serves both"
+    return Quantity("against", f"{title}, minus {against}'s", signed, about, versus=against)
+
+
 KEY = ("scenario", "capacity", "policy", "trace", "seed")
 Run = tuple[str, int, str, str, int]
 """Values of the columns ``KEY``."""
@@ -103,6 +100,7 @@ def summarise(
     rank_by: str,
     baseline: str,
     unranked: Collection[str] = (),
+    against: str = "",
 ) -> Summary:
     """Compare every policy with ``baseline``, by cell and over all cells.
 
@@ -113,14 +111,16 @@ def summarise(
         rank_by: the key of the quantity that orders the policies.
         baseline: the policy that the others are measured against.
         unranked: policies that come last, such as an unbounded queue.
+        against: the policy that every other is compared with by ``rank_by``, see ``difference``.
 
     Raises:
-        BufgymError: there are no runs, a cell lacks the baseline, or policies met different episodes.
+        BufgymError: there are no runs, a cell lacks the baseline, policies met different episodes, or ``against`` has
+            no runs.
     """
     # ``read`` makes sure that all met the same episodes, and orders them.
     rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
-    table = episodes.read(rows, baseline)
-    drawn = {name: times_drawn(len(e), RESAMPLES, stream(SEED, name)) for name, e in table.episodes.items()}
+    table = episodes.read(rows, baseline, against)
+    drawn = links_drawn(table.episodes, RESAMPLES, SEED)
     cells = list(dict.fromkeys((scenario, capacity) for scenario, capacity, *_ in runs))
 
     def numbers_of(policy: str, cell: Cell) -> Numbers:
@@ -132,6 +132,14 @@ def summarise(
         }
         for policy in table.training_seeds
     }
+
+    if against:
+        (ranking,) = (quantity for quantity in quantities if quantity.key == rank_by)
+        quantities = (*quantities, difference(ranking.title, against))
+        other = {cell: numbers[rank_by] for cell, numbers in by_policy[against].items()}
+        for by_cell in by_policy.values():
+            for cell, numbers in by_cell.items():
+                numbers["against"] = numbers[rank_by] - other[cell]
 
     def standings(over: Sequence[Cell]) -> list[Standing]:
         # Resamples of a single episode are all equal, so there is no interval.
@@ -146,8 +154,7 @@ def summarise(
             entries.append(Standing(policy, policy not in unranked, values))
         return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
 
-    by_cell = {cell: standings([cell]) for cell in cells}
-    return Summary(quantities, rank_by, standings(cells), by_cell, baseline)
+    return Summary(quantities, rank_by, standings(cells), {cell: standings([cell]) for cell in cells}, baseline)
 
 
 # --- as text ---------------------------------------------------------------------------------------------------------
@@ -182,9 +189,15 @@ def table_of(summary: Summary, abouts: Mapping[str, str] | None = None) -> Table
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", summary.overall))
 
+    return table_over(blocks, summary.quantities)
+
+
+def table_over(blocks: Sequence[tuple[str, Sequence[Standing]]], quantities: Sequence[Quantity]) -> Table:
+    """Make a table of these quantities with a block for each title and its standings."""
+
     def line(standing: Standing) -> list[str]:
-        pairs = [(pair(standing, quantity), quantity.interval) for quantity in summary.quantities]
+        pairs = [(pair(standing, quantity), quantity.interval) for quantity in quantities]
         return [standing.policy, *(" ".join(filter(None, texts if both else texts[:1])) for texts, both in pairs)]
 
-    head = ["policy", *(quantity.title for quantity in summary.quantities)]
+    head = ["policy", *(quantity.title for quantity in quantities)]
     return Table(head, [(name, [line(standing) for standing in standings]) for name, standings in blocks])

@@ -30,6 +30,11 @@ def score(number: float) -> str:
     return decimal(number, 3)
 
 
+def signed(number: float) -> str:
+    """Format a difference as +0.713, or NaN as a dash."""
+    return ("+" if number >= 0 else "") + score(number)
+
+
 def percent(number: float) -> str:
     """Format with three digits: 12.3 %, 1.23 %, 0.123 %."""
     size = float(f"{abs(number * 100):.3g}")  # rounded first: 9.999 % is 10.0 %

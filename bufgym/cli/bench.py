@@ -11,6 +11,7 @@ from cyclopts import Group, Parameter
 
 from bufgym.cli.options import (
     RESULTS,
+    WHO,
     Count,
     OutOptions,
     SuiteOptions,
@@ -49,11 +50,13 @@ def bench(
     own: OwnOptions = OwnOptions(),
     buffer: BufferOptions = BufferOptions(),
     out: OutOptions = OutOptions(),
+    against: Annotated[str | None, Parameter(group=WHO)] = None,
     drops: Annotated[str | None, Parameter(group=RESULTS)] = None,
 ) -> None:
     """Run policies side by side on the same episodes.
 
     Args:
+        against: Compare every policy with this one, by the paired difference of their shares of AFR's regret.
         drops: With --workload: write each message that each policy dropped to this CSV file.
     """
     load_policies(who.policy_file)
@@ -61,18 +64,23 @@ def bench(
     if suite.suite is not None:
         frozen = scenario.given() | given(buffer) | ({} if drops is None else {"drops": drops})
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
-        run_suite("bench", suite, who, out)
+        run_suite("bench", suite, who, out, against=against or "")
         return
     refuse(given(suite), "needs --suite")
     if out.file() is not None:
         raise BufgymError(f"--out {out.out}: without --suite it must be a folder")
     if drops is not None and workload.workload is None:
         raise BufgymError("--drops needs --workload")
-    _bench(scenario, who, buffer, out, drops)
+    _bench(scenario, who, buffer, out, drops, against)
 
 
 def _bench(
-    options: ScenarioOptions, who: WhoOptions, buffer: BufferOptions, out: OutOptions, drops: str | None
+    options: ScenarioOptions,
+    who: WhoOptions,
+    buffer: BufferOptions,
+    out: OutOptions,
+    drops: str | None,
+    against: str | None,
 ) -> None:
     """Run the scenario that the options describe."""
     from bufgym import policies
@@ -97,7 +105,7 @@ def _bench(
             )
     capacity, seeds = list(who.capacity or (8,)), who.seeds or (1 if recorded else 10)
     settings: dict[str, Any] = {"max_bytes": buffer.max_bytes, "decide_at": decide_at}
-    done = compare(chosen, stream, capacity=capacity, seeds=seeds, about=about, **settings)
+    done = compare(chosen, stream, capacity=capacity, seeds=seeds, about=about, against=against, **settings)
     bounds = _bound_notes(done.rows, stream, decide_at) if recorded else []
     print("\n".join([str(done), *bounds]))
     if recorded:

@@ -88,7 +88,10 @@ class SuiteOptions:
     """Head of the Ray or Dask cluster (default: one on this machine)."""
 
 
-@Parameter(name="*", group=Group.create_ordered("Who runs"))
+WHO = Group.create_ordered("Who runs")
+
+
+@Parameter(name="*", group=WHO)
 @dataclass(frozen=True)
 class WhoOptions:
     policies: list[str] | None = None

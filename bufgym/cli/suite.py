@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bufgym.cli.options import OutOptions, SuiteOptions, WhoOptions, command_line, load_policies, loaded
+from bufgym.cli.options import OutOptions, SuiteOptions, WhoOptions, command_line, load_policies, loaded, one_policy
 from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ def run_suite(
     *,
     default: str = "",
     kind: str | None = None,
+    against: str = "",
 ) -> list[Row]:
     """Run a suite, print its summary and return its rows.
 
@@ -33,7 +34,9 @@ def run_suite(
         changes: parameters of the suite's scenarios that are not as they are.
         default: suite where the options name none.
         kind: kind of task; a suite of another kind is an error.
+        against: policy that every other is compared with; it and the task's reference run too.
     """
+    from bufgym import policies
     from bufgym.benchmark import report
     from bufgym.benchmark.rows import write_rows
     from bufgym.benchmark.sweep import Sweep, run_sweep
@@ -44,10 +47,17 @@ def run_suite(
     if kind not in (None, suite.kind):
         raise BufgymError(f"suite {suite.name} is not one of {kind}: bufgym bench --suite {suite.name}")
     task = TASKS[suite.kind]
-    specs, sources = loaded(who.policies)
+    named, sources = loaded(who.policies)
+    specs = named or task.default_policies(suite.name)
+    if against:
+        rival = one_policy(against)
+        sources = tuple(dict.fromkeys([*sources, *loaded([against])[1]]))
+        against = policies.get(rival).name
+        known = {policies.get(spec).name for spec in specs}
+        specs = [*specs, *(name for name in dict.fromkeys((against, task.reference)) if name not in known)]
     sweep = Sweep(
         suite.name,
-        tuple(specs or task.default_policies(suite.name)),
+        tuple(specs),
         options.split or "test",
         who.capacity or (),
         who.seeds,
@@ -63,6 +73,7 @@ def run_suite(
         policies=tuple(who.policies or ()) or None,
         capacity=who.capacity,
         seeds=who.seeds,
+        against=against or None,
         **changes,
         policy_file=who.policy_file,
         data=options.data,
@@ -83,7 +94,7 @@ def run_suite(
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(*["the same command resumes it"] * (folder == Path(out.out or ""))) from None
-        print(report.plain(folder))
+        print(report.plain(folder, against))
     if file is not None:
         print(f"\n{len(rows)} rows in {write_rows(rows, file, task.layout)}")
     elif out.out is not None:

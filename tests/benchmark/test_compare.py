@@ -12,6 +12,7 @@ from bufgym.benchmark.run import run
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import REJECT, registry
+from bufgym.scenario import FleetScenario
 
 
 def stubborn(buffer, arrival, memory):
@@ -33,6 +34,28 @@ def test_a_scenario_by_name_or_made_and_policies_of_each_kind() -> None:
     page = done._repr_html_()
     assert page.startswith("<p>interruption</p>\n<table>") and page.count("<tr>") == 5 and ">stubborn</td>" in page
     assert "score: 0 is Drop Oldest" in done.table() and "<p>score: 0 is Drop Oldest" in page
+
+
+def test_the_paired_difference_to_a_policy() -> None:
+    """It, AFR and Drop Oldest run too; the difference is that of the two shares of AFR's regret."""
+    options: dict[str, Any] = {"capacity": [4, 8], "seeds": 20, "progress": False}
+    done = bufgym.compare("min-gap", "interruption", against="decimate:every=2", **options)
+    assert {row["policy"] for row in done.rows} == {"min-gap", "decimate:every=2", "afr"}
+    lines = [line.split() for line in done.table().split("\n\n")[-1].splitlines()]
+    assert " ".join(lines[0]) == "policy regret / afr's regret / afr's, minus decimate:every=2's"
+    shares = {line[0]: line[1:] for line in lines[1:5]}
+    assert set(shares) == {"min-gap", "decimate:every=2", "afr", "drop-oldest"} and shares["afr"][0] == "–"
+    assert shares["decimate:every=2"][-1] == "–"
+    less = float(shares["min-gap"][0]) - float(shares["decimate:every=2"][0])
+    assert float(shares["min-gap"][3].replace("−", "-")) == pytest.approx(less, abs=0.0011)
+    assert "| min-gap |" in done.table("markdown").split("\n\n")[-2] and done.html.count("<table>") == 2
+    assert "ratio of sums" in done.table()
+    suite = bufgym.compare("afr", "interruption-v1", against="afr", capacity=4, seeds=3, progress=False)
+    assert "minus afr's" in suite.table()
+    fleet = bufgym.compare(
+        "min-gap", FleetScenario(robots=2, uplink=scenario.get("lte", duration_s=5.0)), against="afr", seeds=1
+    )
+    assert "minus afr's" in fleet.table()
 
 
 def test_a_suite_by_name() -> None:

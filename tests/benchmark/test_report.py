@@ -38,15 +38,28 @@ def test_the_ranking_in_markdown(folder: Path) -> None:
     """All episodes are alike, so every interval is a point. (95 - 80) / (100 - 80) = 0.75, and so on."""
     lines = report.markdown(folder).splitlines()
     assert lines[:3] == ["```", MANIFEST["command"], "```"]
-    at = lines.index("| # | policy | score | IQM | regret, at most | better than afr |")
-    zero, one = "0.000 [0.000, 0.000]", "1.000 [1.000, 1.000]"
+    versus = "regret / afr's | better than afr | regret / afr's, minus afr's"
+    at = lines.index(f"| # | policy | score | IQM | regret, at most | {versus} |")
+    zero, half, one = "0.000 [0.000, 0.000]", "0.500 [0.500, 0.500]", "1.000 [1.000, 1.000]"
+
+    def plus(n: int) -> str:
+        return f"+{n}.000 [+{n}.000, +{n}.000]"
+
+    def minus(number: str) -> str:
+        return re.sub(r"(\d\.)", "−\\1", number)
+
     assert [line.strip("| ").split(" | ") for line in lines[at + 2 : at + 7]] == [
-        ["1", "&lt;b&gt;", *["0.750 [0.750, 0.750]"] * 2, "5.00 % [5.00, 5.00]", one],
-        ["2", "afr", *["0.500 [0.500, 0.500]"] * 2, "10.0 % [10.0, 10.0]", "–"],
-        ["3", "drop-oldest", *[zero] * 2, "20.0 % [20.0, 20.0]", zero],
-        ["4", "random", *["−1.000 [−1.000, −1.000]"] * 2, "40.0 % [40.0, 40.0]", zero],
-        ["–", "clairvoyant (it knows the future)", *[one] * 2, "0.000 % [0.000, 0.000]", one],
+        ["1", "&lt;b&gt;", *["0.750 [0.750, 0.750]"] * 2, "5.00 % [5.00, 5.00]", half, one, minus(half)],
+        ["2", "afr", *[half] * 2, "10.0 % [10.0, 10.0]", "–", "–", "–"],
+        ["3", "drop-oldest", *[zero] * 2, "20.0 % [20.0, 20.0]", "2.000 [2.000, 2.000]", zero, plus(1)],
+        ["4", "random", *[minus(one)] * 2, "40.0 % [40.0, 40.0]", "4.000 [4.000, 4.000]", zero, plus(3)],
+        ["–", "clairvoyant (it knows the future)", *[one] * 2, "0.000 % [0.000, 0.000]", zero, one, minus(one)],
     ]
+    # By default the others are compared with the best rule: a policy that is not registered is none.
+    assert "minus random's" in report.plain(folder, "random") and "minus" not in report.plain(folder)
+    assert "minus afr&#39;s" in report.write(folder).read_text(encoding="utf-8")
+    with pytest.raises(BufgymError, match="no row of min-gap, with which the others"):
+        report.plain(folder, "min-gap")
 
 
 def test_cells_are_marked_where_they_are_not_discriminative_or_the_bound_is_not_exact(folder: Path) -> None:

@@ -12,7 +12,7 @@ from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import Quantity, Run, Summary, by_run, summarise
-from bufgym.benchmark.table import decimal, percent, score
+from bufgym.benchmark.table import decimal, percent, score, signed
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import TIE
@@ -32,7 +32,7 @@ ROWS: Layout = {
 class FleetTask(Task):
     """Robots that share one uplink, the same policy on each.
 
-    Robots are not independent, so intervals resample episodes, never robots.
+    Robots are not independent, so intervals resample links, never robots.
     """
 
     kind = "fleet"
@@ -44,7 +44,7 @@ class FleetTask(Task):
     listed = ("gain", "above", "worst")
     no_plan = "a link of its own, which no robot in a cell has"
     legend = (
-        "Team QoI: mean of H over the robots. Intervals: 95 %, over episodes, as the robots of one share a link.",
+        "Team QoI: mean of H over the robots. Intervals: 95 %, resampling links, as the robots of one share it.",
         "Robots above, below: with a larger or smaller H than the same robot under AFR. Fairness: Jain's index of H.",
     )
 
@@ -74,9 +74,6 @@ class FleetTask(Task):
     def quantities(self) -> tuple[Quantity, ...]:
         afr = self.baseline
 
-        def gained(number: float) -> str:
-            return f"{'+' if number >= 0 else ''}{score(number)}"
-
         def four_digits(number: float) -> str:
             return decimal(number, 4)
 
@@ -86,15 +83,15 @@ class FleetTask(Task):
         jain = "Jain's index of the robots' H, (sum H)^2 / (N sum H^2): 1 if all are equal, 1/N if one has everything"
         return (
             Quantity("team", "team QoI", score, "mean over the robots of H, mean over episodes", interval=False),
-            Quantity("gain", f"gain over {afr}", gained, f"team QoI minus {afr}'s team QoI", versus=afr, drawn=True),
+            Quantity("gain", f"gain over {afr}", signed, f"team QoI minus {afr}'s team QoI", versus=afr, drawn=True),
             Quantity("above", f"robots above {afr}'s", percent, above, versus=afr, drawn=True),
             Quantity("below", "below", percent, below, interval=False, versus=afr),
             Quantity("worst", "worst robot", score, "the least H of a robot, mean over episodes", interval=False),
             Quantity("fairness", "fairness", four_digits, f"{jain} (Jain, Chiu and Hawe 1984)", interval=False),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
-        options: Any = {"rank_by": "gain", "baseline": self.baseline, "unranked": unranked}
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+        options: Any = {"rank_by": "gain", "baseline": self.baseline, "unranked": unranked, "against": against}
         return summarise(_runs(rows), _statistics, self.quantities(), **options)
 
     def describe(self, scenarios: Sequence[FleetScenario], episodes: int) -> str:
@@ -127,4 +124,4 @@ def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Num
         # If no robot got anything, all are equal.
         "fairness": np.where(square > 0, ratio(np.square(ours.sum(1)), square, square > 0), 1.0),
     }
-    return {name: weights @ numbers / len(ours) for name, numbers in by_episode.items()}
+    return {name: weights @ numbers / weights.sum(1) for name, numbers in by_episode.items()}

@@ -10,7 +10,7 @@ import numpy as np
 
 from bufgym.benchmark.rows import RUNS, Row
 from bufgym.benchmark.score import REFERENCE, scores
-from bufgym.benchmark.summary import Quantity, Summary
+from bufgym.benchmark.summary import Quantity, Summary, difference
 from bufgym.benchmark.table import REGRET_AT_MOST, percent, score
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
@@ -25,6 +25,9 @@ from bufgym.scenario.suites import Setting
 from bufgym.sim import NEVER, Senders, run
 from bufgym.sim.metrics import outcome
 from bufgym.sim.senders import padded
+
+SHARE = f"regret / {REFERENCE}'s"
+"""Title of the share of AFR's regret, see ``score``."""
 
 
 def best(
@@ -108,17 +111,19 @@ class QueueTask(Task):
     def quantities(self) -> tuple[Quantity, ...]:
         means = "It is the mean over the discriminative cells"
         scale = f"0 is Drop Oldest and 1 the clairvoyant, which no policy can pass. {means}"
+        share = f"sum over the discriminative cells of the regrets, divided by that of {REFERENCE}: a ratio of sums"
         above = f"share of episodes with a larger H than under {REFERENCE}. Equal episodes count one half"
         return (
             Quantity("score", "score", score, scale, drawn=True),
             Quantity("iqm", "IQM", score, "interquartile mean of the scores on each discriminative cell and trace"),
             Quantity("regret", "regret", percent, f"share of the clairvoyant's H that was lost. {means}"),
+            Quantity("share", SHARE, score, share, versus=REFERENCE),
             Quantity("improvement", f"better than {REFERENCE}", score, above, versus=REFERENCE, drawn=True),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
-        scored = scores(rows, unranked)
-        quantities = self.quantities()
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+        scored = scores(rows, unranked, against)
+        quantities = (*self.quantities(), *([difference(SHARE, against)] if against else []))
         if not scored.exact:
             quantities = tuple(q._replace(title=REGRET_AT_MOST) if q.key == "regret" else q for q in quantities)
         return Summary(quantities, "score", scored.standings, {}, self.baseline, scored)

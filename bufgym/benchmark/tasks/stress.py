@@ -56,9 +56,9 @@ class StressTask(QueueTask):
     def quantities(self) -> tuple[Quantity, ...]:
         return (*_ratios(), *super().quantities())
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
         """Rank by the worst cell, smallest ratio first; the notes name that cell."""
-        summary = QueueTask().summary(rows, unranked)
+        summary = QueueTask().summary(rows, unranked, against)
         assert summary.scores is not None
         found = ratios(summary.scores)
 

@@ -63,12 +63,13 @@ class Task(ABC):
         """Quantities that its summary shows."""
 
     @abstractmethod
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
         """Compare every policy with the baseline.
 
         Args:
             rows: rows of ``run``.
             unranked: policies that are shown but not ranked.
+            against: policy that every other is compared with in a further quantity, "against"; empty for none.
         """
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:

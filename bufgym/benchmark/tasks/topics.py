@@ -56,7 +56,7 @@ class TopicsTask(Task):
     listed = ("relative", "lost", "age_relative")
     no_plan = "a queue of its own, which no topic of a client has"
     legend = (
-        "QoI: sum over topics of weight x H, mean over episodes; [low, high]: 95 % intervals, resampling episodes.",
+        "QoI: sum over topics of weight x H, mean over episodes; [low, high]: 95 % intervals, resampling links.",
         "no_drop lost: messages, all episodes together. Age: of information, at the server, mean over topics and time.",
         "Late: of what was delivered on topics with a deadline. Delivered a second: until the last arrival or receipt.",
         "The QoI of an unbounded queue counts messages that arrive long after the others.",
@@ -82,7 +82,7 @@ class TopicsTask(Task):
     def quantities(self, first: str = "first") -> tuple[Quantity, ...]:
         """List the quantities; ``first`` names the topics of the highest priority."""
 
-        paired = "Both are sums over the episodes that both met"
+        paired = "Both are sums over the episodes that both met; over several settings it is the mean of these ratios"
         first_age = "mean age of information at the server of the topics with the highest priority, s"
         relative_age = f"age of the topics with the highest priority, divided by their age under {BASELINE}. {paired}"
         others_age = "mean age of information of all other topics, s"
@@ -100,12 +100,12 @@ class TopicsTask(Task):
             Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = ()) -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
         runs = by_run(rows, "topic", "weighted_qoi")
         priorities = {max(row["priority"] for row in run.values()) for run in runs.values()}
         first = f"priority {priorities.pop():g}" if len(priorities) == 1 else "first"
         numbers = {key: _numbers(list(run.values())) for key, run in runs.items()}
-        options: Any = {"rank_by": "relative", "baseline": self.baseline, "unranked": unranked}
+        options: Any = {"rank_by": "relative", "baseline": self.baseline, "unranked": unranked, "against": against}
         return summarise(numbers, _statistics, self.quantities(first), **options)
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
