@@ -1,10 +1,12 @@
 """Built-in fields outside the tables, computed if an environment's ``fields`` or a learned policy names them.
 
-They describe the link's rate as the robot's own socket shows it, and each slot's gaps counted in messages.
+They describe the link's rate as the robot's own socket shows it, bytes beside what the link carries, and each slot's
+gaps counted in messages or per byte.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.ground.modules import first_line
-from bufgym.model.buffer import Buffer
+from bufgym.model.buffer import Buffer, gaps
 from bufgym.model.observe.own import OWN_FIELDS, Function, OwnField
 from bufgym.model.observe.queue import squash
 
@@ -84,6 +86,36 @@ def time_to_free(buffer: Buffer, arrival: Any) -> float:
 
 
 @kernel
+def carried(buffer: Buffer) -> float:
+    """A million times the bytes that the link carries in an arrival period, at the rate over 2 s."""
+    return float(buffer.long_rate_bytes_per_s * max(buffer.period_us, 1.0))
+
+
+@_field("context", "link", "g/(g+r), r = bytes that the link carries in an arrival period")
+def newcomer_bytes(buffer: Buffer, arrival: Any) -> float:
+    "the newcomer's bytes; the link's rate is that over 2 s: 0.5 = just keeps up, 1 = nothing carried yet"
+    return squash(1e6 * arrival.size_bytes, carried(buffer))
+
+
+@_field("context", "queue", "standard deviation, at most 1")
+def size_spread(buffer: Buffer, arrival: Any) -> float:
+    "spread of the natural logarithm of bytes, over the queued messages and the newcomer: 0 = all alike"
+    n, newcomer = len(buffer.slots) + 1, math.log(max(arrival.size_bytes, 1))
+    total, squares = 0.0, 0.0
+    for k in range(n - 1):
+        off = math.log(max(buffer.slots[k].size_bytes, 1)) - newcomer
+        total += off
+        squares += off * off
+    return math.sqrt(min(max((squares - total * total / n) / n, 0.0), 1.0))
+
+
+@_field("context", "link", "g/(g+r), r = rate over 2 s")
+def load(buffer: Buffer, arrival: Any) -> float:
+    "the bytes that arrive, kept or not, a running mean over about 8 arrivals: more than 0.5 = the link falls behind"
+    return squash(1e6 * buffer.arrival_bytes, carried(buffer))
+
+
+@kernel
 def observe_on_board(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
     """Write every value of ``ON_BOARD_FIELDS`` into ``context`` (float[fields])."""
     context[0] = rate_short(buffer, arrival)
@@ -91,9 +123,12 @@ def observe_on_board(buffer: Buffer, arrival: Any, context: NDArray[np.floating[
     context[2] = rate_long(buffer, arrival)
     context[3] = rate_trend(buffer, arrival)
     context[4] = time_to_free(buffer, arrival)
+    context[5] = newcomer_bytes(buffer, arrival)
+    context[6] = size_spread(buffer, arrival)
+    context[7] = load(buffer, arrival)
 
 
-# --- gaps in messages ------------------------------------------------------------------------------------------------
+# --- each slot -------------------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -130,13 +165,48 @@ def index_merged(buffer: Buffer, arrival: Any, k: int) -> float:
 
 
 @kernel
+def bytes_of(buffer: Buffer, arrival: Any, k: int) -> int:
+    """Bytes of slot ``k``; the newcomer is ``len(buffer.slots)``."""
+    return int(arrival.size_bytes if k == len(buffer.slots) else buffer.slots[k].size_bytes)
+
+
+@kernel
+def merged_per_byte(buffer: Buffer, arrival: Any, k: int) -> float:
+    """The motion gap left if slot ``k`` is dropped, for each of its bytes."""
+    return float(max(gaps(buffer, arrival, True, k)[4], 0.0) / max(bytes_of(buffer, arrival, k), 1))
+
+
+@kernel
+def mean_per_byte(buffer: Buffer, arrival: Any) -> float:
+    """The mean of ``merged_per_byte`` over the queued messages and the newcomer."""
+    total = 0.0
+    for k in range(len(buffer.slots) + 1):
+        total += merged_per_byte(buffer, arrival, k)
+    return total / (len(buffer.slots) + 1)
+
+
+@_field("slot", "link", "g/(g+r), r = bytes that the link carries in an arrival period")
+def bytes_in_period(buffer: Buffer, arrival: Any, k: int) -> float:
+    "its bytes; the link's rate is that over 2 s"
+    return squash(1e6 * bytes_of(buffer, arrival, k), carried(buffer))
+
+
+@_field("slot", "motion", "g/(g+r), r = mean of the queue")
+def gap_per_byte(buffer: Buffer, arrival: Any, k: int) -> float:
+    "motion gap left if it is dropped, for each of its bytes"
+    return squash(merged_per_byte(buffer, arrival, k), mean_per_byte(buffer, arrival))
+
+
+@kernel
 def observe_on_board_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
     """Write every value of ``ON_BOARD_SLOT_FIELDS`` into ``rows`` (float[fields, L + 1]); the newcomer is last."""
     s, last = len(buffer.slots), buffer.capacity
-    even = even_index_gap(buffer, arrival)
+    even, link, per_byte = even_index_gap(buffer, arrival), carried(buffer), mean_per_byte(buffer, arrival)
     for k in range(s + 1):
         before, merged = index_gaps(buffer, arrival, k)
         column = k if k < s else last
         rows[0, column] = squash(before, even)
         rows[1, column] = squash(merged, 2 * even)
+        rows[2, column] = squash(1e6 * bytes_of(buffer, arrival, k), link)
+        rows[3, column] = squash(merged_per_byte(buffer, arrival, k), per_byte)
     rows[:, s:last] = 0.0
