@@ -34,18 +34,18 @@ from numpy.typing import NDArray
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import changed, check_name, constants, is_number, named_settings
-from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS, Field, RewardTerm
-
-Function = Callable[..., float]
+from bufgym.model.observe.declare import Field, Function
+from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS, RewardTerm
 
 
 @dataclass(frozen=True)
 class OwnField(Field):
-    """An observed quantity that a function computes."""
+    """A field observed where it is named.
+
+    Its ``function`` is (buffer, arrival) -> number for the context, (buffer, arrival, k) -> number for a slot.
+    """
 
     _: KW_ONLY
-    function: Function
-    """(buffer, arrival) -> number for a context field, (buffer, arrival, k) -> number for a slot field."""
     compile: bool = False
     """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
 
