@@ -3,9 +3,8 @@
 ``@field`` and ``@reward_term`` add your own.
 """
 
-from bufgym.model.observe import terms as _terms  # noqa: F401  (registers the terms that are computed where named)
 from bufgym.model.observe.declare import Field
-from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS, RewardTerm
+from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, RewardTerm
 from bufgym.model.observe.on_board import (
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
@@ -21,9 +20,9 @@ from bufgym.model.observe.own import (
     own_field,
     own_term,
     reward_term,
-    terms_for,
 )
 from bufgym.model.observe.queue import CONTEXT_FIELDS, SLOT_FIELDS, observe_context, observe_slots
+from bufgym.model.observe.terms import TOPIC_REWARD_TERMS, terms_for
 from bufgym.model.observe.topics import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_SLOT_FIELDS,

@@ -43,8 +43,3 @@ REWARD_TERMS = (
 )
 """``retained`` is ``delivered`` shaped by a potential, the QoI held and not yet delivered (Ng, Harada and Russell
 1999). It shows at once what a decision costs or gains, and telescopes to the same total."""
-TOPIC_REWARD_TERMS = (
-    RewardTerm("age", "s^2", "minus the weighted mean age of information at the server, integrated over time"),
-    RewardTerm("late", "messages", "minus the weight of each message that reaches the server after its deadline"),
-)
-"""Further terms with several topics; weights are fractions of their sum over the topics."""
