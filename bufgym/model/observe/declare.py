@@ -44,26 +44,20 @@ class Field:
     _: KW_ONLY
     function: Function
     """Computes it. With a ``reference`` or a ``mean`` it gives the length g, of which g / (g + r) is observed."""
-    reference: Function | None = None
-    """Computes r, which may differ from slot to slot; takes what ``function`` takes."""
-    mean: Function | None = None
-    """Computes r, one for the whole queue."""
+    reference: str = ""
+    """r as an expression of the function's arguments; it may differ from slot to slot."""
+    mean: str = ""
+    """The same for an r of the whole queue."""
 
 
 def declare(
-    table: list[Field],
-    per: str,
-    group: str,
-    unit: str,
-    reference: Function | None = None,
-    mean: Function | None = None,
+    table: list[Field], per: str, group: str, unit: str, reference: str = "", mean: str = ""
 ) -> Callable[[Function], Function]:
     """Add the decorated function to ``table`` as the field of its name; it comes back as a kernel."""
 
     def add(function: Function) -> Function:
-        name, made = function.__name__, kernel(function)
-        meaning = first_line(function)
-        table.append(Field(name, per, group, unit, meaning, function=made, reference=reference, mean=mean))
+        name, text, made = function.__name__, first_line(function), kernel(function)
+        table.append(Field(name, per, group, unit, text, function=made, reference=reference, mean=mean))
         return made
 
     return add
@@ -86,11 +80,10 @@ def writer(
     """
     lines = [f"def write({arguments}):"]
     for i, field in enumerate(fields, first):
-        scale, line = field.reference or field.mean, scaled if field.reference else mean if field.mean else plain
+        line = scaled if field.reference else mean if field.mean else plain
         line = plain if line is None else line
         if line:
-            names = {"f": field.function.__name__, "r": scale.__name__ if scale else ""}
-            lines.append("    " + line.format(i=i, **names))
+            lines.append("    " + line.format(i=i, f=field.function.__name__, r=field.reference or field.mean))
     made: dict[str, Any] = {}
     exec("\n".join(lines), module, made)
     return kernel(made["write"])

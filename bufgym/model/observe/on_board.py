@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from bufgym.ground.kernel import kernel
 from bufgym.ground.modules import first_line
 from bufgym.model.buffer import Buffer, gaps
-from bufgym.model.observe.declare import Field, Function, declare, divide_row, squash, writer  # noqa: F401
+from bufgym.model.observe.declare import Field, Function, declare, divide_row, squash, writer  # noqa: F401 (in generated lines)
 from bufgym.model.observe.own import OWN_FIELDS, OwnField
 
 ON_BOARD_FIELDS: list[OwnField] = []
 """Context fields, in the order in which ``observe_on_board`` writes them."""
 ON_BOARD_SLOT_FIELDS: list[OwnField] = []
 """Slot fields, in the order in which ``observe_on_board_slots`` writes them."""
-
-
 _LENGTHS: list[Field] = []
 """The slot fields before they are divided by their means."""
 
@@ -48,7 +46,7 @@ def _slot(group: str, unit: str, mean: Function) -> Callable[[Function], Functio
     """
 
     def add(function: Function) -> Function:
-        length = declare(_LENGTHS, "slot", group, unit, mean=mean)(function)
+        length = declare(_LENGTHS, "slot", group, unit, mean=f"{mean.__name__}(buffer, arrival)")(function)
 
         def squashed(buffer: Buffer, arrival: Any, k: int) -> float:
             return squash(length(buffer, arrival, k), mean(buffer, arrival))
@@ -220,7 +218,7 @@ observe_on_board = writer(globals(), ON_BOARD_FIELDS, "buffer, arrival, context"
 """Write every value of ``ON_BOARD_FIELDS`` into ``context`` (float[fields])."""
 _OF_SLOT, _LENGTH = "buffer, arrival, k, column, rows", "rows[{i}, column] = {f}(buffer, arrival, k)"
 _write = writer(globals(), _LENGTHS, _OF_SLOT, _LENGTH)
-_divide = writer(globals(), _LENGTHS, "buffer, arrival, rows", "divide_row(rows[{i}], {r}(buffer, arrival))")
+_divide = writer(globals(), _LENGTHS, "buffer, arrival, rows", "divide_row(rows[{i}], {r})")
 
 
 @kernel

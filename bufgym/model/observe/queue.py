@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps_among
-from bufgym.model.observe.declare import TINY, Field, declare, kept, squash, squash_row, writer  # noqa: F401
+from bufgym.model.observe.declare import TINY, Field, declare, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
 from bufgym.model.qoi import merging_loss, value
 
 # Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
@@ -27,62 +27,35 @@ _CONTEXT: list[Field] = []
 
 
 class Slot(NamedTuple):
-    """A queued message or the newcomer, beside its neighbours."""
+    """A queued message or the newcomer, beside its neighbours.
+
+    Fields:
+        rank: (k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer.
+        back_us: time since the message kept before it, us.
+        merged_us: time gap left if it is dropped, us.
+        back_x: motion since the message before it.
+        merged_x: motion gap left if it is dropped.
+        lost: V lost if it alone is dropped.
+        loss: the same as a part of H: weighted with several topics.
+        size_bytes: its bytes.
+        even_us: the even time spacing, us.
+        even_x: the even motion spacing.
+        even_lost: V lost by merging two even gaps.
+        mean_bytes: mean bytes of the queued messages and the newcomer.
+    """
 
     rank: float
-    """(k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer."""
     back_us: float
-    """Time since the message kept before it, us."""
     merged_us: float
-    """Time gap left if it is dropped, us."""
     back_x: float
-    """Motion since the message before it."""
     merged_x: float
-    """Motion gap left if it is dropped."""
     lost: float
-    """V lost if it alone is dropped."""
     loss: float
-    """The same as a part of H: weighted with several topics."""
     size_bytes: int
-    """Its bytes."""
     even_us: float
-    """The even time spacing, us."""
     even_x: float
-    """The even motion spacing."""
     even_lost: float
-    """V lost by merging two even gaps."""
     mean_bytes: float
-    """Mean bytes of the queued messages and the newcomer."""
-
-
-@kernel
-def _even_us(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    return slot.even_us
-
-
-@kernel
-def _two_even_us(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    return 2 * slot.even_us
-
-
-@kernel
-def _even_x(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    return slot.even_x
-
-
-@kernel
-def _two_even_x(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    return 2 * slot.even_x
-
-
-@kernel
-def _even_lost(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    return slot.even_lost
-
-
-@kernel
-def _mean_bytes(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    return slot.mean_bytes
 
 
 @declare(_SLOTS, "slot", "queue", "flag")
@@ -97,25 +70,25 @@ def rank(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     return slot.rank
 
 
-@declare(_SLOTS, "slot", "time", "g/(g+r), r = even time spacing", reference=_even_us)
+@declare(_SLOTS, "slot", "time", "g/(g+r), r = even time spacing", reference="slot.even_us")
 def time_before(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     "time since the message kept before it"
     return slot.back_us
 
 
-@declare(_SLOTS, "slot", "time", "g/(g+r), r = 2 x even time spacing", reference=_two_even_us)
+@declare(_SLOTS, "slot", "time", "g/(g+r), r = 2 x even time spacing", reference="2 * slot.even_us")
 def time_merged(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     "time gap left if it is dropped"
     return slot.merged_us
 
 
-@declare(_SLOTS, "slot", "motion", "g/(g+r), r = even motion spacing", reference=_even_x)
+@declare(_SLOTS, "slot", "motion", "g/(g+r), r = even motion spacing", reference="slot.even_x")
 def motion_before(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     "motion since the message before it"
     return slot.back_x
 
 
-@declare(_SLOTS, "slot", "motion", "g/(g+r), r = 2 x even motion spacing", reference=_two_even_x)
+@declare(_SLOTS, "slot", "motion", "g/(g+r), r = 2 x even motion spacing", reference="2 * slot.even_x")
 def motion_merged(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     "motion gap left if it is dropped"
     return slot.merged_x
@@ -127,13 +100,13 @@ def loss(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     return slot.loss
 
 
-@declare(_SLOTS, "slot", "queue", "g/(g+r), r = mean queued size", mean=_mean_bytes)
+@declare(_SLOTS, "slot", "queue", "g/(g+r), r = mean queued size", mean="slot.mean_bytes")
 def size(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     "its bytes"
     return slot.size_bytes
 
 
-@declare(_SLOTS, "slot", "value", "l/(l+r), r = that of an even gap", reference=_even_lost)
+@declare(_SLOTS, "slot", "value", "l/(l+r), r = that of an even gap", reference="slot.even_lost")
 def relative_loss(buffer: Buffer, arrival: Any, slot: Slot) -> float:
     "the same loss, free of V's scale"
     return slot.lost
@@ -142,9 +115,9 @@ def relative_loss(buffer: Buffer, arrival: Any, slot: Slot) -> float:
 SLOT_FIELDS = tuple(_SLOTS)
 _LENGTH, _SQUASHED = (
     "rows[{i}, column] = {f}(buffer, arrival, slot)",
-    "squash_row(rows[{i}], {r}(buffer, arrival, slot))",
+    "squash_row(rows[{i}], {r})",
 )
-_RATIO = "rows[{i}, column] = squash({f}(buffer, arrival, slot), {r}(buffer, arrival, slot))"
+_RATIO = "rows[{i}, column] = squash({f}(buffer, arrival, slot), {r})"
 _OF_SLOT, _OF_ROWS = "buffer, arrival, slot, column, rows", "buffer, arrival, slot, rows"
 _write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH)
 _squash_rows = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", _SQUASHED, _SQUASHED)
@@ -198,22 +171,25 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
 
 
 class Newcomer(NamedTuple):
-    """The newcomer beside what came before it; all 0 where the socket asks."""
+    """The newcomer beside what came before it; all 0 where the socket asks.
+
+    Fields:
+        gap_us: time since the previous arrival, us.
+        gap_x: motion since then.
+        even_us: the even time spacing, us.
+        even_x: the even motion spacing.
+        even_gain: V of it.
+        even_value: the same as a part of H: weighted with several topics.
+        even_lost: V lost by merging two even gaps.
+    """
 
     gap_us: float
-    """Time since the previous arrival, us."""
     gap_x: float
-    """Motion since then."""
     even_us: float
-    """The even time spacing, us."""
     even_x: float
-    """The even motion spacing."""
     even_gain: float
-    """V of it."""
     even_value: float
-    """The same as a part of H: weighted with several topics."""
     even_lost: float
-    """V lost by merging two even gaps."""
 
 
 @declare(_CONTEXT, "context", "queue", "fraction of L")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first
-from bufgym.model.observe.declare import TINY, Field, declare, kept, squash, squash_row, writer  # noqa: F401
+from bufgym.model.observe.declare import TINY, Field, declare, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
 from bufgym.model.observe.queue import (
     CONTEXT_FIELDS,
     ROUNDING,
@@ -30,31 +30,29 @@ _CONTEXT: list[Field] = []
 
 
 class OfTopic(NamedTuple):
-    """A message among those of all topics."""
+    """A message among those of all topics.
+
+    Fields:
+        k: its slot.
+        topic: TOPIC: its topic's settings and past.
+        own: whether its topic is the newcomer's.
+        age_us: time since its arrival, us.
+        priority: the highest priority.
+        weight: the largest weight.
+        gain: what its delivery adds to H, in units of that weight.
+        per_byte: the same for each byte of it.
+        mean_per_byte: the mean of that over the queue.
+    """
 
     k: int
-    """Its slot."""
     topic: Any
-    """TOPIC: its topic's settings and past."""
     own: bool
-    """Whether its topic is the newcomer's."""
     age_us: int
-    """Time since its arrival, us."""
     priority: float
-    """The highest priority."""
     weight: float
-    """The largest weight."""
     gain: float
-    """What its delivery adds to H, in units of that weight."""
     per_byte: float
-    """The same for each byte of it."""
     mean_per_byte: float
-    """The mean of that over the queue."""
-
-
-@kernel
-def _mean_per_byte(buffer: Buffer, slot: OfTopic) -> float:
-    return slot.mean_per_byte
 
 
 @declare(_SLOTS, "slot", "topic", "fraction of the highest")
@@ -118,7 +116,7 @@ def gain(buffer: Buffer, slot: OfTopic) -> float:
     return slot.gain
 
 
-@declare(_SLOTS, "slot", "topic", "g/(g+r), r = mean of the queue", mean=_mean_per_byte)
+@declare(_SLOTS, "slot", "topic", "g/(g+r), r = mean of the queue", mean="slot.mean_per_byte")
 def gain_per_byte(buffer: Buffer, slot: OfTopic) -> float:
     "the same for each byte of it"
     return slot.per_byte
@@ -138,7 +136,7 @@ def in_flight(buffer: Buffer, arriving: bool) -> float:
 
 TOPIC_SLOT_FIELDS, TOPIC_CONTEXT_FIELDS = tuple(_SLOTS), tuple(_CONTEXT)
 _FIRST, _FIRST_CONTEXT = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
-_LENGTH, _SQUASHED = "rows[{i}, column] = {f}(buffer, slot)", "squash_row(rows[{i}], {r}(buffer, slot))"
+_LENGTH, _SQUASHED = "rows[{i}, column] = {f}(buffer, slot)", "squash_row(rows[{i}], {r})"
 _write = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, column, rows", _LENGTH, first=_FIRST)
 _squash_means = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, rows", "", mean=_SQUASHED, first=_FIRST)
 _LINE = "context[{i}] = {f}(buffer, arriving)"
