@@ -124,6 +124,8 @@ class Buffer(NamedTuple):
     """Time since a message was last dequeued, us."""
     period_us: float
     """Running mean of the time between arrivals, us."""
+    arrival_bytes: float
+    """Running mean of the bytes of an arrival, kept or not; the newcomer counts."""
     departures: int
     """Messages dequeued since the previous arrival."""
     service_ratio: float

@@ -99,5 +99,6 @@ class Weights(ScorerWeights):
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
     """Make the policy of these weights; it works for every L."""
-    reads_rate = not set(CONTEXT_NAMES[TABLE:]).isdisjoint(weights.fields)
+    on_link = {field.name for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.group == "link"}
+    reads_rate = not on_link.isdisjoint(weights.fields)
     return weights.policy(name, on_arrival, source=source, about=summary, reads_rate=reads_rate)

@@ -20,7 +20,7 @@ from bufgym.sim.state import (
     place_of,
 )
 
-# Weights of the running means: about the last 8 arrivals for the period, 16 for the service ratio.
+# Weights of the running means: about the last 8 arrivals for the period and the bytes, 16 for the service ratio.
 _PERIOD_WEIGHT, _SERVICE_WEIGHT = 1 / 8, 1 / 16
 # Sending time over which the link's rate is averaged, us.
 _SHORT_US, _MEDIUM_US, _LONG_US = 100_000, 500_000, 2_000_000
@@ -41,11 +41,13 @@ def arrive(batch: Batch, i: int) -> int:
         if sender.next == 1:
             sender.period_us = float(gap_us)
         sender.period_us += _PERIOD_WEIGHT * (gap_us - sender.period_us)
+        sender.arrival_bytes += _PERIOD_WEIGHT * (arrival.size_bytes - sender.arrival_bytes)
         sender.service_ratio += _SERVICE_WEIGHT * (sender.departures - sender.service_ratio)
         if sender.measures == 1:
             measure_rate(batch, i)
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
+        sender.arrival_bytes = float(arrival.size_bytes)
     if batch.several is not None and sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
         at(batch.log, i, sender.next).limited = 1
         decision = REJECT

@@ -96,6 +96,7 @@ SENDER = np.dtype(
         ("last_dequeue_us", np.int64),  # when the socket last dequeued a message
         ("departures", np.int64),  # messages dequeued since the previous arrival
         ("period_us", np.float64),  # running mean of the time between arrivals
+        ("arrival_bytes", np.float64),  # running mean of the bytes of an arrival
         ("service_ratio", np.float64),  # running mean of departures per arrival
         ("left_bytes", np.int64),  # in the socket when the present arrival came
         ("sent_bytes", np.int64),  # bytes that had left the socket by then

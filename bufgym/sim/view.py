@@ -65,6 +65,7 @@ def view(batch: Batch, i: int) -> Buffer:
         left_fraction,
         sender.now_us - sender.last_dequeue_us,
         sender.period_us,
+        sender.arrival_bytes,
         sender.departures,
         sender.service_ratio,
         sender.drained_bytes,

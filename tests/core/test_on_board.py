@@ -122,9 +122,9 @@ def test_gaps_in_messages_by_hand():
     assert [seq for seq, _ in seen] == [0, 0, 0, 0, 0, 0]
     even = 5 / 3
     before, merged = np.array([1, 3, 1]), np.array([4, 4, 2])
-    np.testing.assert_allclose(seen[5][1], [before / (before + even), merged / (merged + 2 * even)])
+    np.testing.assert_allclose(seen[5][1][:2], [before / (before + even), merged / (merged + 2 * even)])
     # Message 1 was asked for before anything but 0: one message since, and the next is one more.
-    np.testing.assert_allclose(seen[1][1][:, [0, 2]], [[0, 1 / (1 + 1 / 3)], [0, 2 / (2 + 2 / 3)]])
+    np.testing.assert_allclose(seen[1][1][:2, [0, 2]], [[0, 1 / (1 + 1 / 3)], [0, 2 / (2 + 2 / 3)]])
 
 
 @given(cases())
@@ -138,7 +138,7 @@ def test_a_coordinate_that_counts_messages_has_the_same_gaps(case):
             slots = np.zeros((len(OTHERS), buffer.capacity + 1))
             observe_slots(buffer, arrival, slots)
             of_x = [slots[OTHERS.index(name)] for name in ("motion_before", "motion_merged")]
-            np.testing.assert_allclose(rows_of(buffer, arrival), of_x, rtol=1e-6)
+            np.testing.assert_allclose(rows_of(buffer, arrival)[:2], of_x, rtol=1e-6)
         return ANYTHING.on_arrival(buffer, arrival, memory)
 
     case.run(policies.Policy("compared", on_arrival), V)

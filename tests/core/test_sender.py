@@ -88,15 +88,17 @@ def test_what_the_policy_sees():
 def test_running_means_by_hand():
     # Arrivals at 0, 8, 10 and 10 ms. The first gap, 8 ms, is the period; then 8 + (2 - 8) / 8, 7.25 + (0 - 7.25) / 8.
     # Message 0 is dequeued before 1, then 1 before 2, and none before 3; each weighs a sixteenth in the service ratio.
+    # An eighth of the way to each newcomer's bytes: 1000, + 7000 / 8, - 1874 / 8, - 1639.75 / 8.
     views = []
 
     def note(buffer, arrival, memory):
-        views.append((buffer.period_us / MS, buffer.service_ratio))
+        views.append((buffer.period_us / MS, buffer.service_ratio, buffer.arrival_bytes))
         return ACCEPT
 
     line([0, 8, 10, 10], sizes=[1_000, 8_000, 1, 1], capacity=3).run(Policy("note", note))
     ratio = 1 / 16 + (1 - 1 / 16) / 16
-    assert views == [(0, 0), (8, 1 / 16), (7.25, ratio), (7.25 * 7 / 8, ratio * 15 / 16)]
+    assert [view[:2] for view in views] == [(0, 0), (8, 1 / 16), (7.25, ratio), (7.25 * 7 / 8, ratio * 15 / 16)]
+    assert [view[2] for view in views] == [1_000, 1_875, 1_640.75, 1_435.78125]
 
 
 def take_all(buffer, arrival, memory):

@@ -3,19 +3,8 @@
 ``@field`` and ``@reward_term`` add your own.
 """
 
-from bufgym.model.observe import terms as _terms  # noqa: F401  (registers the terms that are computed where named)
-from bufgym.model.observe.fields import (
-    CONTEXT_FIELDS,
-    FIELDS,
-    REWARD_TERMS,
-    SLOT_FIELDS,
-    TOPIC_CONTEXT_FIELDS,
-    TOPIC_FIELDS,
-    TOPIC_REWARD_TERMS,
-    TOPIC_SLOT_FIELDS,
-    Field,
-    RewardTerm,
-)
+from bufgym.model.observe.declare import Field
+from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, RewardTerm
 from bufgym.model.observe.on_board import (
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
@@ -31,10 +20,15 @@ from bufgym.model.observe.own import (
     own_field,
     own_term,
     reward_term,
-    terms_for,
 )
-from bufgym.model.observe.queue import observe_context, observe_slots
-from bufgym.model.observe.topics import observe_topic_context, observe_topic_slots
+from bufgym.model.observe.queue import CONTEXT_FIELDS, SLOT_FIELDS, observe_context, observe_slots
+from bufgym.model.observe.terms import TOPIC_REWARD_TERMS, terms_for
+from bufgym.model.observe.topics import (
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_SLOT_FIELDS,
+    observe_topic_context,
+    observe_topic_slots,
+)
 
 __all__ = [
     "CONTEXT_FIELDS",

@@ -34,18 +34,18 @@ from numpy.typing import NDArray
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import changed, check_name, constants, is_number, named_settings
-from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS, Field, RewardTerm
-
-Function = Callable[..., float]
+from bufgym.model.observe.declare import Field, Function
+from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, RewardTerm
 
 
 @dataclass(frozen=True)
 class OwnField(Field):
-    """An observed quantity that a function computes."""
+    """A field observed where it is named.
+
+    Its ``function`` is (buffer, arrival) -> number for the context, (buffer, arrival, k) -> number for a slot.
+    """
 
     _: KW_ONLY
-    function: Function
-    """(buffer, arrival) -> number for a context field, (buffer, arrival, k) -> number for a slot field."""
     compile: bool = False
     """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
 
@@ -62,7 +62,8 @@ class OwnTerm(RewardTerm):
     memory: Mapping[str, float] = entry(default_factory=dict)
     """Names and initial values of its memory, float64[entries], at an episode's begin."""
     one_queue: bool = False
-    """Whether it is for one queue only: with several topics the term is missing, or a built-in one of that name."""
+    """Whether the function is for one queue only. With several topics the term is missing, or among
+    ``TOPIC_REWARD_TERMS``."""
     compile: bool = False
     """As in ``OwnField``."""
 
@@ -165,11 +166,6 @@ def own_term(text: str) -> OwnTerm | None:
     if term is None or not settings:
         return term
     return replace(term, name=text, parameters=changed(f"reward term {name}", term.parameters, settings))
-
-
-def terms_for(several_topics: bool) -> tuple[RewardTerm, ...]:
-    """The terms that every environment computes, named or not."""
-    return REWARD_TERMS + (TOPIC_REWARD_TERMS if several_topics else ())
 
 
 def _found(text: str, entries: Mapping[str, Entry], what: str) -> Entry | None:

@@ -1,13 +1,16 @@
-"""Built-in reward terms outside the tables, computed where an environment's ``reward`` names one.
+"""Built-in reward terms outside the table, computed where an environment's ``reward`` names one.
 
-Each is a cost, hence negative: a weight > 0 rewards less of it. Steps are ``bufgym.envs.own.Step``.
+Each is a cost, hence negative: a weight > 0 rewards less of it. Steps are ``bufgym.envs.own.Step``. ``age`` and
+``late`` mean the same with one queue and with several topics. There every environment has them, and the transition
+counts them for each topic; one queue has the weight 1 and a deadline of its own.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from bufgym.model.observe.own import reward_term
+from bufgym.model.observe.fields import REWARD_TERMS, RewardTerm
+from bufgym.model.observe.own import OWN_TERMS, reward_term
 
 
 @reward_term("delay", unit="s", compile=True)
@@ -30,7 +33,7 @@ def energy(step: Any, memory: Any) -> float:
 
 @reward_term("late", unit="messages", parameters={"deadline_s": 1.0}, one_queue=True, compile=True)
 def late(step: Any, memory: Any) -> float:
-    "minus each message that reaches the server later than deadline_s (1 s) after its arrival"
+    "minus the weight of each message that reaches the server after its deadline; one queue: deadline_s, by default 1 s"
     count = 0
     for seq in step.delivered:
         delay_us = step.log[seq].transmitted_us + step.propagation_us - step.messages[seq].arrival_us
@@ -39,9 +42,9 @@ def late(step: Any, memory: Any) -> float:
     return -float(count)
 
 
-@reward_term("age", unit="s", memory={"newest_us": -1.0, "until_us": 0.0}, one_queue=True, compile=True)
+@reward_term("age", unit="s^2", memory={"newest_us": -1.0, "until_us": 0.0}, one_queue=True, compile=True)
 def age(step: Any, memory: Any) -> float:
-    "minus the age of information at the server, integrated over time (s^2), from the first arrival to the last"
+    "minus the weighted mean age of information at the server, integrated over time from the first arrival to the last"
     if len(step.messages) == 0:
         return 0.0
     if memory[0] < 0:  # before the first receipt, the first arrival counts
@@ -59,3 +62,12 @@ def age(step: Any, memory: Any) -> float:
         if k < len(step.delivered):
             memory[0] = max(memory[0], step.messages[step.delivered[k]].arrival_us)
     return -area
+
+
+TOPIC_REWARD_TERMS: tuple[RewardTerm, ...] = (OWN_TERMS["age"], OWN_TERMS["late"])
+"""Terms that environments with several topics compute besides; weights are fractions of their sum over the topics."""
+
+
+def terms_for(several_topics: bool) -> tuple[RewardTerm, ...]:
+    """The terms that every environment computes, named or not."""
+    return REWARD_TERMS + (TOPIC_REWARD_TERMS if several_topics else ())

@@ -2,19 +2,145 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first
-from bufgym.model.observe import fields
-from bufgym.model.observe.queue import ROUNDING, TINY, observe_link, squash, squash_row
+from bufgym.model.observe.declare import TINY, Field, declare, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
+from bufgym.model.observe.queue import (
+    CONTEXT_FIELDS,
+    ROUNDING,
+    SLOT_FIELDS,
+    Newcomer,
+    Slot,
+    squash_means,
+    write_by_slot,
+    write_context,
+)
 from bufgym.model.qoi import merging_loss, value
 from bufgym.model.topics import NO_DEADLINE_US
 
 _SECOND_US = 1_000_000
+
+_SLOTS: list[Field] = []
+_CONTEXT: list[Field] = []
+
+
+class OfTopic(NamedTuple):
+    """A message among those of all topics.
+
+    Fields:
+        k: its slot.
+        topic: TOPIC: its topic's settings and past.
+        own: whether its topic is the newcomer's.
+        age_us: time since its arrival, us.
+        priority: the highest priority.
+        weight: the largest weight.
+        gain: what its delivery adds to H, in units of that weight.
+        per_byte: the same for each byte of it.
+        mean_per_byte: the mean of that over the queue.
+    """
+
+    k: int
+    topic: Any
+    own: bool
+    age_us: int
+    priority: float
+    weight: float
+    gain: float
+    per_byte: float
+    mean_per_byte: float
+
+
+@declare(_SLOTS, "slot", "topic", "fraction of the highest")
+def priority(buffer: Buffer, slot: OfTopic) -> float:
+    "priority of its topic"
+    return float(slot.topic.priority / slot.priority)
+
+
+@declare(_SLOTS, "slot", "topic", "fraction of the largest")
+def weight(buffer: Buffer, slot: OfTopic) -> float:
+    "weight of its topic in the sum of H"
+    return float(slot.topic.weight / slot.weight)
+
+
+@declare(_SLOTS, "slot", "topic", "flag")
+def no_drop(buffer: Buffer, slot: OfTopic) -> float:
+    "1 where it may not be dropped"
+    return float(slot.topic.no_drop)
+
+
+@declare(_SLOTS, "slot", "topic", "flag")
+def oldest(buffer: Buffer, slot: OfTopic) -> float:
+    "1 where it is the oldest of its topic, the only one that may be sent"
+    return 1.0 if slot.k < len(buffer.slots) and is_first(buffer, slot.k) else 0.0
+
+
+@declare(_SLOTS, "slot", "topic", "flag")
+def own(buffer: Buffer, slot: OfTopic) -> float:
+    "1 where its topic is the newcomer's; 0 when the socket asks"
+    return 1.0 if slot.own else 0.0
+
+
+@declare(_SLOTS, "slot", "topic", "g/(g+r), r = 1 s")
+def waited(buffer: Buffer, slot: OfTopic) -> float:
+    "time since its arrival"
+    return squash(slot.age_us, _SECOND_US)
+
+
+@declare(_SLOTS, "slot", "topic", "g/(g+r), r = 1 s")
+def silence(buffer: Buffer, slot: OfTopic) -> float:
+    "time since the arrival of its topic's message dequeued last"
+    known_us = slot.topic.dequeued_arrival_us if slot.topic.dequeued > 0 else 0
+    return squash(max(buffer.now_us - known_us, 0), _SECOND_US)
+
+
+@declare(_SLOTS, "slot", "topic", "g/(g+r), r = its deadline")
+def lateness(buffer: Buffer, slot: OfTopic) -> float:
+    "time since its arrival; 0 without a deadline"
+    return squash(slot.age_us, slot.topic.deadline_us) if slot.topic.deadline_us < NO_DEADLINE_US else 0.0
+
+
+@declare(_SLOTS, "slot", "topic", "fraction of L")
+def queued(buffer: Buffer, slot: OfTopic) -> float:
+    "messages of its topic in the buffer"
+    return float(slot.topic.queued / buffer.capacity)
+
+
+@declare(_SLOTS, "slot", "topic", "QoI, weighted")
+def gain(buffer: Buffer, slot: OfTopic) -> float:
+    "what its delivery adds to H"
+    return slot.gain
+
+
+@declare(_SLOTS, "slot", "topic", "g/(g+r), r = mean of the queue", mean="slot.mean_per_byte")
+def gain_per_byte(buffer: Buffer, slot: OfTopic) -> float:
+    "the same for each byte of it"
+    return slot.per_byte
+
+
+@declare(_CONTEXT, "context", "topic", "flag")
+def socket_asks(buffer: Buffer, arriving: bool) -> float:
+    "1 where the socket asks what to send, 0 at an arrival"
+    return 0.0 if arriving else 1.0
+
+
+@declare(_CONTEXT, "context", "topic", "n/(n+r), r = n_T")
+def in_flight(buffer: Buffer, arriving: bool) -> float:
+    "messages sent and not yet acknowledged"
+    return squash(buffer.in_flight, buffer.window)
+
+
+TOPIC_SLOT_FIELDS, TOPIC_CONTEXT_FIELDS = tuple(_SLOTS), tuple(_CONTEXT)
+_FIRST, _FIRST_CONTEXT = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
+_LENGTH, _SQUASHED = "rows[{i}, column] = {f}(buffer, slot)", "squash_row(rows[{i}], {r})"
+_write = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, column, rows", _LENGTH, first=_FIRST)
+_squash_means = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, rows", "", mean=_SQUASHED, first=_FIRST)
+_LINE = "context[{i}] = {f}(buffer, arriving)"
+_write_context = writer(globals(), TOPIC_CONTEXT_FIELDS, "buffer, arriving, context", _LINE, first=_FIRST_CONTEXT)
 
 
 @kernel
@@ -40,7 +166,8 @@ def even_gaps(topic: Any, last_us: int, last_x: float) -> tuple[float, float]:
 def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDArray[np.floating[Any]]) -> None:
     """Write every SLOT_FIELDS and TOPIC_SLOT_FIELDS value into ``rows``, float[fields, L + 1].
 
-    Empty slots are 0. The newcomer is last; if the socket asks (not ``arriving``) its column is empty too.
+    Empty slots are 0. The newcomer is last; if the socket asks (not ``arriving``) its column is empty too. A gap and a
+    gain are rounded as the rows are before others are made of them.
     """
     s, capacity = len(buffer.slots), buffer.capacity
     priority, weight = largest(buffer)
@@ -56,57 +183,43 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
             if topic.queued == 0 and topic.dequeued == 0:  # nothing of the topic was kept before it
                 back_us, back_x = 0, 0.0
             gain = arrival_gain(buffer, arrival)
-        age_us, known_us = buffer.now_us - message.arrival_us, topic.dequeued_arrival_us if topic.dequeued > 0 else 0
-        rows[fields.OCCUPIED, column] = 1.0
-        rows[fields.RANK, column] = (k + 1) / (s + 1)
         own = arriving and message.topic == arrival.topic
         last_us, last_x = (arrival.arrival_us, arrival.x) if own else (topic.previous_us, topic.previous_x)
         even_us, even_x = even_gaps(topic, last_us, last_x)
-        # Rounded as the rows are.
-        rows[fields.TIME_BEFORE, column], rows[fields.MOTION_BEFORE, column] = back_us, back_x
-        before_us, before_x = float(rows[fields.TIME_BEFORE, column]), float(rows[fields.MOTION_BEFORE, column])
+        before_us, before_x = kept(back_us, rows), kept(back_x, rows)
         v = buffer.v[topic.v_start :]
         lost = max(merging_loss(v, before_x, value(v, before_x), on_x, value(v, on_x)), 0.0)
         even_gain = value(v, even_x)
-        even_loss = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
-        rows[fields.TIME_BEFORE, column] = squash(before_us, even_us)
-        rows[fields.TIME_MERGED, column] = squash(before_us + on_us, 2 * even_us)
-        rows[fields.MOTION_BEFORE, column] = squash(before_x, even_x)
-        rows[fields.MOTION_MERGED, column] = squash(before_x + on_x, 2 * even_x)
-        rows[fields.LOSS, column] = lost * topic.weight / weight
-        rows[fields.RELATIVE_LOSS, column] = squash(lost, even_loss)
-        rows[fields.SIZE, column] = message.size_bytes
-        rows[fields.PRIORITY, column] = topic.priority / priority
-        rows[fields.WEIGHT, column] = topic.weight / weight
-        rows[fields.NO_DROP, column] = topic.no_drop
-        rows[fields.OLDEST, column] = 1.0 if k < s and is_first(buffer, k) else 0.0
-        rows[fields.OWN, column] = 1.0 if own else 0.0
-        rows[fields.WAITED, column] = squash(age_us, _SECOND_US)
-        rows[fields.SILENCE, column] = squash(max(buffer.now_us - known_us, 0), _SECOND_US)
-        rows[fields.LATENESS, column] = squash(age_us, topic.deadline_us) if topic.deadline_us < NO_DEADLINE_US else 0.0
-        rows[fields.QUEUED, column] = topic.queued / capacity
-        rows[fields.GAIN, column] = gain / weight
-        rows[fields.GAIN_PER_BYTE, column] = float(rows[fields.GAIN, column]) / message.size_bytes
+        even_lost = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
         size_sum += message.size_bytes
-        gain_sum += float(rows[fields.GAIN_PER_BYTE, column])
-    squash_row(rows[fields.SIZE], size_sum / max(count, 1))
-    squash_row(rows[fields.GAIN_PER_BYTE], gain_sum / max(count, 1))
+        slot = Slot(
+            (k + 1) / (s + 1), before_us, before_us + on_us, before_x, before_x + on_x,
+            lost, lost * topic.weight / weight, message.size_bytes, even_us, even_x, even_lost, size_sum / (k + 1),
+        )  # fmt: skip
+        write_by_slot(buffer, arrival, slot, column, rows)
+        gain = kept(gain / weight, rows)
+        per_byte = kept(gain / message.size_bytes, rows)
+        gain_sum += per_byte
+        age_us = buffer.now_us - message.arrival_us
+        of = OfTopic(k, topic, own, age_us, priority, weight, gain, per_byte, gain_sum / (k + 1))
+        _write(buffer, of, column, rows)
+        if k == count - 1:  # the means are complete
+            squash_means(buffer, arrival, slot, rows)
+            _squash_means(buffer, of, rows)
 
 
 @kernel
 def observe_topic_context(buffer: Buffer, arrival: Any, arriving: bool, context: NDArray[np.floating[Any]]) -> None:
     """Write every CONTEXT_FIELDS and TOPIC_CONTEXT_FIELDS value into ``context`` (float[fields])."""
-    observe_link(buffer, context)
-    context[fields.ARRIVAL_TIME_GAP], context[fields.ARRIVAL_MOTION_GAP] = 0.0, 0.0
-    context[fields.EVEN_VALUE], context[fields.BEND] = 0.0, 0.0
+    newcomer = Newcomer(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if arriving:
         topic = buffer.topics[arrival.topic]
         v = buffer.v[topic.v_start :]
         even_us, even_x = even_gaps(topic, arrival.arrival_us, arrival.x)
-        context[fields.ARRIVAL_TIME_GAP] = squash(arrival.arrival_us - buffer.previous_us, even_us)
-        context[fields.ARRIVAL_MOTION_GAP] = squash(arrival.x - buffer.previous_x, even_x)
+        gap_us, gap_x = float(arrival.arrival_us - buffer.previous_us), arrival.x - buffer.previous_x
         gain = value(v, even_x)
-        context[fields.EVEN_VALUE] = topic.weight * gain / largest(buffer)[1]
-        context[fields.BEND] = min(merging_loss(v, even_x, gain, even_x, gain) / max(gain, TINY), 1.0)
-    context[fields.SOCKET_ASKS] = 0.0 if arriving else 1.0
-    context[fields.IN_FLIGHT] = squash(buffer.in_flight, buffer.window)
+        lost = min(merging_loss(v, even_x, gain, even_x, gain), max(gain, TINY))
+        share = topic.weight * gain / largest(buffer)[1]
+        newcomer = Newcomer(gap_us, gap_x, even_us, even_x, gain, share, lost)
+    write_context(buffer, arrival, newcomer, context)
+    _write_context(buffer, arriving, context)

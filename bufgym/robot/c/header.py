@@ -15,7 +15,8 @@ from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, printable
 from bufgym.ground.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
-from bufgym.model.observe.queue import ROUNDING, TINY
+from bufgym.model.observe.declare import TINY
+from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
 from bufgym.policies import Policy, learned, target_gap, thinning
 from bufgym.policies.scoring import unpack

@@ -26,6 +26,21 @@ static inline double bufgym_even_gap(const struct bufgym_queue *q, const struct 
     return gain;
 }
 
+/* Standard deviation of the logarithm of bytes, of the queued messages and the newcomer; at most 1. */
+static inline double bufgym_deviation(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    const double newcomer = log((double)arrival->size_bytes), n = q->occupancy + 1;
+    double sum = 0.0, squares = 0.0;
+    int k;
+    for (k = 0; k < q->occupancy; k++) {
+        const double off = log((double)q->slots[k].size_bytes) - newcomer;
+        sum += off;
+        squares += off * off;
+    }
+    sum = (squares - sum * sum / n) / n;
+    return sqrt(sum < 0.0 ? 0.0 : sum < 1.0 ? sum : 1.0);
+}
+
 /* The fields of the context. */
 static inline void bufgym_observe_context(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
@@ -37,6 +52,7 @@ static inline void bufgym_observe_context(struct bufgym_queue *q, const struct b
     const double period_us = q->period_us > 1.0 ? q->period_us : 1.0;
     const double demand = 1e6 * mean_bytes / period_us;
     const double short_rate = 1e6 * q->short_rate, long_rate = 1e6 * q->long_rate, left = 1e6 * (double)q->left_bytes;
+    const double carried = long_rate * period_us;
     double even_loss;
 
     context[BUFGYM_OCCUPANCY] = (double)q->occupancy / L;
@@ -57,6 +73,9 @@ static inline void bufgym_observe_context(struct bufgym_queue *q, const struct b
     context[BUFGYM_RATE_LONG] = bufgym_squash(long_rate, demand);
     context[BUFGYM_RATE_TREND] = bufgym_squash(short_rate, long_rate);
     context[BUFGYM_TIME_TO_FREE] = q->busy > 0 && q->left_bytes > 0 ? left / (left + short_rate * period_us) : 0.0;
+    context[BUFGYM_NEWCOMER_BYTES] = bufgym_squash(1e6 * (double)arrival->size_bytes, carried);
+    context[BUFGYM_SIZE_SPREAD] = bufgym_deviation(q, arrival);
+    context[BUFGYM_LOAD] = bufgym_squash(1e6 * q->arrival_bytes, carried);
 }
 
 /* The fields of each candidate: empty slots are 0, the newcomer is the last. */
@@ -70,8 +89,9 @@ static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct buf
     const double step_us = (double)(arrival->arrival_us - q->previous_us), step_x = arrival->x - q->previous_x;
     int64_t before_us = q->dequeued_arrival_us;
     const double even_seq = (double)(arrival->seq - q->dequeued_seq) / (BUFGYM_CAPACITY + 1);
+    const double carried = 1e6 * q->long_rate * (q->period_us > 1.0 ? q->period_us : 1.0);
     int64_t before_seq = q->dequeued_seq;
-    double before_x = q->dequeued_x, newcomer_gain = 0.0, loss, even_loss;
+    double before_x = q->dequeued_x, newcomer_gain = 0.0, per_byte = 0.0, loss, even_loss;
     int k;
 
     if (s > 0)
@@ -94,6 +114,9 @@ static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct buf
         rows[BUFGYM_SIZE][k] = (double)slot->size_bytes;
         rows[BUFGYM_INDEX_BEFORE][k] = bufgym_squash((double)(slot->seq - before_seq), even_seq);
         rows[BUFGYM_INDEX_MERGED][k] = bufgym_squash((double)(after->seq - before_seq), 2 * even_seq);
+        rows[BUFGYM_BYTES_IN_PERIOD][k] = bufgym_squash(1e6 * (double)slot->size_bytes, carried);
+        rows[BUFGYM_GAP_PER_BYTE][k] = rows[BUFGYM_MOTION_MERGED][k] / (double)slot->size_bytes;
+        per_byte += rows[BUFGYM_GAP_PER_BYTE][k];
         before_seq = slot->seq;
         before_us = slot->arrival_us;
         before_x = slot->x;
@@ -110,6 +133,11 @@ static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct buf
     rows[BUFGYM_SIZE][last] = (double)arrival->size_bytes;
     rows[BUFGYM_INDEX_BEFORE][last] = bufgym_squash((double)(arrival->seq - before_seq), even_seq);
     rows[BUFGYM_INDEX_MERGED][last] = bufgym_squash((double)(arrival->seq - before_seq + 1), 2 * even_seq);
+    rows[BUFGYM_BYTES_IN_PERIOD][last] = bufgym_squash(1e6 * (double)arrival->size_bytes, carried);
+    rows[BUFGYM_GAP_PER_BYTE][last] = rows[BUFGYM_MOTION_MERGED][last] / (double)arrival->size_bytes;
+    per_byte = (per_byte + rows[BUFGYM_GAP_PER_BYTE][last]) / (s + 1);
+    for (k = 0; k <= last; k++)
+        rows[BUFGYM_GAP_PER_BYTE][k] = bufgym_squash(rows[BUFGYM_GAP_PER_BYTE][k], per_byte);
 
     bufgym_even_gap(q, arrival, &even_loss);
     bufgym_squash_row(rows[BUFGYM_TIME_BEFORE], even_us);

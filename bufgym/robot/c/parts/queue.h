@@ -50,8 +50,8 @@ struct bufgym_queue {
     int64_t previous_us; /* the arrival before, kept or not */
     double previous_x;
     int64_t departures; /* messages dequeued since then */
-    /* running means over about 8 arrivals: time between them, its square; over 16: departures per arrival */
-    double period_us, service_ratio;
+    /* running means over about 8 arrivals: time between them, their bytes; over 16: departures per arrival */
+    double period_us, arrival_bytes, service_ratio;
     /* the link's rate, bytes/us: running means over about 0.1 s, 0.5 s and 2 s of sending */
     double short_rate, medium_rate, long_rate;
     int64_t sent_bytes, sending_us;     /* all until the arrival before */
@@ -125,11 +125,13 @@ static inline void bufgym_note(struct bufgym_queue *q, const struct bufgym_messa
     if (q->arrived == 0) {
         q->previous_us = arrival->arrival_us;
         q->previous_x = arrival->x;
+        q->arrival_bytes = (double)arrival->size_bytes;
     } else {
         int64_t gap_us = arrival->arrival_us - q->previous_us;
         if (q->arrived == 1)
             q->period_us = (double)gap_us;
         q->period_us += 0.125 * ((double)gap_us - q->period_us);
+        q->arrival_bytes += 0.125 * ((double)arrival->size_bytes - q->arrival_bytes);
         q->service_ratio += 0.0625 * ((double)q->departures - q->service_ratio);
         bufgym_measure_rate(q);
     }
