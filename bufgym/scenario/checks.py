@@ -47,7 +47,7 @@ def check_stream(stream: Any) -> None:
 def check_sizes(stream: Any, moves: bool) -> None:
     """Check the parameter ``sizes`` of a stream, which moves or not; its ``size_cv`` must not be given too."""
     law, _, _ = parsed(stream.sizes)
-    if law != EQUAL and getattr(stream, "size_cv", 0.0):
+    if law != EQUAL and getattr(stream, "size_cv", None):
         raise BufgymError(f"sizes = {stream.sizes!r}, size_cv = {stream.size_cv}: must not both be given")
     if law == "motion" and not moves:
         raise BufgymError(f"sizes = {stream.sizes!r}: needs a motion recording")

@@ -18,7 +18,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages, read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
-from bufgym.scenario.draws import beside, place, place_link, shipped, sizes, skip
+from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
@@ -28,8 +28,8 @@ from bufgym.traces.workload import Workload
 _JITTER_HZ = 30.0
 """Reference rate. At any rate an episode leaves its stream where the jitter of so many messages a second does. So
 motion and all later draws are the same for every ``rate_hz``, ``jitter``, ``sizes`` and ``size_cv``."""
-_TIMES, _SIZES = 0, 1
-"""Numbers of the generators ``beside`` the stream: jitter at other rates, and sizes (of robot r: r more)."""
+_TIMES = 0
+"""Number of the generator ``beside`` the stream that draws the jitter of other rates."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Uplink:
         self, rng: np.random.Generator, robot: int = 0, arrival_us: NDArray[np.int64] | None = None
     ) -> NDArray[Any]:
         """MESSAGE[n] of the camera, or of a fleet's robot; at these times if they are given."""
-        own = beside(rng, _SIZES + robot) if self.size_cv or self.sizes != EQUAL else rng
+        own = beside(rng, SIZES + robot) if self.size_cv or self.sizes != EQUAL else rng
         arrivals = messages(self._times(rng) if arrival_us is None else arrival_us, int(self.size_bytes))
         moving = self._move(arrivals, rng)
         if self.sizes != EQUAL:
