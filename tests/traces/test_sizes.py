@@ -189,3 +189,20 @@ def test_fit_reads_tables_workloads_and_names(tmp_path, capsys) -> None:
     with pytest.raises(BufgymError, match="no topic has the 100 messages"):
         fits(workload)
     assert main(["trace", "fit", "--sizes"]) == 2 and "needs recordings" in capsys.readouterr().err
+
+
+def test_a_generated_workload_has_the_law_and_is_read_back(tmp_path, capsys) -> None:
+    for motion, law in (("drive-0", "motion"), ("none", "jpeg")):
+        file = tmp_path / f"{law}.csv"
+        words = ["--sizes", law, "--motion", motion, "--duration", "20", "--fps", "10", "--bytes", "5000"]
+        assert main(["trace", "generate", "workload", *words, "--out", str(file)]) in (0, None)
+        made = traces.read_workload(str(file))
+        assert len(made) == 200 and np.ptp(made.size_bytes) > 0 and (made.x is None) == (motion == "none")
+        assert f"200 messages, mean {made.size_bytes.mean():,.0f} bytes" in capsys.readouterr().out
+
+
+def test_a_topic_of_a_file_has_sizes(tmp_path) -> None:
+    file = tmp_path / "client.toml"
+    file.write_text('[[topic]]\nname = "a"\nrate_hz = 5\nsize_bytes = 100\nsizes = "gop:every=3,cv=0,noise=0"\n')
+    drawn_sizes = scenario.read_client(file, duration_s=6.0).draw(Streams.seeded(0)).arrivals["size_bytes"]
+    assert sorted(set(drawn_sizes.tolist())) == [50, 200]
