@@ -202,7 +202,7 @@ def test_a_users_mistake_is_shown_where_it_is(trace: str, tmp_path: Path, text: 
         ("--interruption --trace x.csv", "--trace cannot go with --interruption"),
         ("--out rows.csv", "rows.csv: without --suite it must be"),
         ("--nonsense", "--nonsense"),
-        ("--size 3", "--size. Did you mean --size-cv?"),
+        ("--size 3", "--size. Did you mean --sizes?"),
     ],
 )
 def test_bad_options_of_bench(options: str, naming: str, capsys: Capsys) -> None:

@@ -25,7 +25,7 @@ _PARAMETERS = {"trace": "traces", "fps": "rate_hz", "bytes": "size_bytes", "seco
 """Options whose scenario parameter has another name. Options not given take the scenario's defaults, and text is read
 there."""
 
-_MESSAGES = ("fps", "bytes", "size_cv", "seconds", "jitter")
+_MESSAGES = ("fps", "bytes", "size_cv", "sizes", "seconds", "jitter")
 """Options of a made stream, which a recording has itself."""
 
 
@@ -42,6 +42,8 @@ class StreamOptions:
     """Mean message size, bytes."""
     size_cv: Least0 | None = None
     """Coefficient of variation of the size; 0: all equal."""
+    sizes: str | None = None
+    """Law of the sizes: jpeg, gop, depth-colour, motion, recorded:NAME; with parameters jpeg:cv=0.3."""
     seconds: Positive | None = None
     """Length of an episode, s."""
     jitter: Least0 | None = None
@@ -106,7 +108,7 @@ class ScenarioOptions:
             refuse(described, "cannot go with a scenario of your own, which says it itself")
             return _own(self.own, seeds or 10)
         if law.pop("interruption", False):
-            uplinks = {name: v for name, v in given(stream).items() if name not in ("fps", "bytes", "value")}
+            uplinks = {name: v for name, v in given(stream).items() if name not in ("fps", "bytes", "sizes", "value")}
             refuse(uplinks | given(workload), "cannot go with --interruption")
             return _interruption(stream, law, seeds or 10)
         refuse(law, "needs --interruption")
@@ -155,7 +157,7 @@ def _own(options: OwnOptions, seeds: int) -> tuple[Scenario, str]:
 def _interruption(stream: StreamOptions, settings: dict[str, Any], seeds: int) -> tuple[Scenario, str]:
     from bufgym.scenario import Interruption
 
-    made = Interruption(**settings, **_parameters(stream, "fps", "bytes", "value"))
+    made = Interruption(**settings, **_parameters(stream, "fps", "bytes", "sizes", "value"))
     length = f"T = {made.t_max}" if made.law == "fixed" else f"T {made.law} on {made.t_min}..{made.t_max}"
     about = f"One interruption of T messages, {length}; V = {made.value.name} over frame indices."
     return made, f"{about}\nMeans over {seeds} seeds. {SCORE}"

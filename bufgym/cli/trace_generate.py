@@ -1,4 +1,4 @@
-"""``bufgym trace generate``: links and motions from a seed.
+"""``bufgym trace generate``: links, motions and workloads from a seed.
 
 A link's options are the parameters of the function that makes it, without their units.
 """
@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from bufgym import traces
-from bufgym.cli.options import Natural, Positive
+from bufgym.cli.options import Count, Natural, Positive
 from bufgym.traces import Trace
 
 
@@ -25,7 +25,7 @@ def _option(name: str) -> str:
 
 generate = App(
     name="generate",
-    help="Make a link or a motion from a seed, as CSV.",
+    help="Make a link, a motion or a workload from a seed, as CSV.",
     default_parameter=Parameter(name_transform=_option),
 )
 Out = Annotated[Path, Parameter(alias="-o", help="The CSV to write.")]
@@ -76,3 +76,34 @@ def drive(*, seed: Natural = 0, duration: Positive = 300.0, out: Out) -> None:
     motion = traces.drive_motion(seed, duration)
     traces.write_motion_csv(motion, out)
     print(f"wrote {out}: {motion.source}, {motion.total:.3f} views")
+
+
+@generate.command
+def workload(
+    *,
+    seed: Natural = 0,
+    duration: Positive = 300.0,
+    fps: Positive = 30.0,
+    bytes: Count = 230_000,
+    sizes: str = "equal",
+    motion: str = "drive-0",
+    out: Out,
+) -> None:
+    """The messages of a camera, for ``--workload`` of bench.
+
+    Args:
+        duration: Length, s.
+        fps: Messages a second.
+        bytes: Mean size of a message.
+        sizes: Law of the sizes: equal, jpeg, gop, depth-colour, motion, recorded:NAME; with parameters jpeg:cv=0.3.
+        motion: Recording that gives x from a random place on; 'none': without x.
+    """
+    from bufgym import scenario
+    from bufgym.scenario import Streams
+
+    uplink = scenario.get("lte", rate_hz=fps, size_bytes=bytes, sizes=sizes, motion=motion, duration_s=duration)
+    drawn = uplink.draw(Streams.seeded(seed)).arrivals
+    x = None if motion == "none" else drawn["x"]
+    made = traces.Workload("made", drawn["arrival_us"], drawn["size_bytes"], x=x)
+    traces.write_workload_csv(made, out)
+    print(f"wrote {out}: {len(made)} messages, mean {made.size_bytes.mean():,.0f} bytes")

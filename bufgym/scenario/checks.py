@@ -14,6 +14,7 @@ from bufgym.model import qoi
 from bufgym.model.checks import above_0, between
 from bufgym.model.qoi import Value
 from bufgym.traces import Motion, Trace
+from bufgym.traces.generate.sizes import EQUAL, parsed
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
@@ -41,6 +42,15 @@ def check_stream(stream: Any) -> None:
     up_to("size_bytes", stream.size_bytes, MAX_MESSAGE_BYTES)
     between("jitter", stream.jitter, 0, 1, "of a period")
     between("size_cv", stream.size_cv, 0, 10)
+
+
+def check_sizes(stream: Any, moves: bool) -> None:
+    """Check the parameter ``sizes`` of a stream, which moves or not; its ``size_cv`` must not be given too."""
+    law, _, _ = parsed(stream.sizes)
+    if law != EQUAL and getattr(stream, "size_cv", None):
+        raise BufgymError(f"sizes = {stream.sizes!r}, size_cv = {stream.size_cv}: must not both be given")
+    if law == "motion" and not moves:
+        raise BufgymError(f"sizes = {stream.sizes!r}: needs a motion recording")
 
 
 def check_value(scenario: object) -> None:

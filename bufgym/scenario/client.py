@@ -26,10 +26,11 @@ from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics
 from bufgym.scenario.arrivals import read_only
-from bufgym.scenario.checks import as_tuple, check_stream, check_value, recordings, up_to
-from bufgym.scenario.draws import place, place_link, shipped, sizes
+from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
+from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace
+from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
@@ -50,7 +51,9 @@ class Stream:
     jitter: float = 0.1
     """Largest shift of a message within its period, as a fraction of the period."""
     size_cv: float = 0.0
-    """Coefficient of variation of the log-normal sizes; 0 for equal sizes."""
+    """Coefficient of variation of independent log-normal sizes; 0 for equal sizes."""
+    sizes: str = EQUAL
+    """Law of the sizes (``bufgym.traces.generate.sizes``)."""
     moves: bool = False
     """Whether its x is the robot's motion; otherwise x is time, in periods of its rate limit or its own rate."""
     encodings: Mapping[str, int] = field(default_factory=dict)
@@ -61,6 +64,7 @@ class Stream:
             raise BufgymError(f"stream: {self.topic!r} is not a bufgym.model.topics.Topic")
         try:
             check_stream(self)
+            check_sizes(self, self.moves)
             whole("size_bytes", self.size_bytes)
             if not isinstance(self.moves, bool):
                 raise BufgymError(f"moves = {self.moves!r}: must be true or false")
@@ -105,6 +109,8 @@ class Client:
     """Time from a message's last byte on the link to its ack, us; None for twice the propagation delay."""
     consumers: int = 1
     """Receivers of each message."""
+    sizes: str = EQUAL
+    """Law of the sizes of all streams that move, such as cameras, in place of their own; equal for their own."""
     value: Value = field(default_factory=lambda: qoi.exponential(0.618))
     """V of topics that have none of their own."""
 
@@ -122,6 +128,7 @@ class Client:
         whole("round_trip_us", self.ack_delay_us, 0, MAX_TIME_US)
         whole("consumers", self.consumers, 1)
         check_value(self)
+        check_sizes(self, True)
         for stream in self.streams:
             if stream.moves and not self.motion:
                 raise BufgymError(f"topic {stream.topic.name!r}: moves, but the client has no motion recording")
@@ -178,13 +185,23 @@ class Client:
         phase = rng.random() if self.random_offset else 0.0
         time_us = ((np.arange(n) + phase + stream.jitter * rng.random(n)) * period_us).astype(np.int64)
         time_us.sort()
-        size = sizes(n, stream.size_bytes, stream.size_cv, rng)
+        size = self._sizes(number, stream, moving and Moving(moving[0], time_us + moving[1]), n, rng)
         if stream.moves and moving is not None:
             motion, start_us = moving
             x = np.asarray(motion.at(time_us + start_us), np.float64)
         else:
             x = np.asarray(time_us * (stream.unit_hz / 1e6), np.float64)
         return time_us, np.full(n, number, np.int64), size, x - x[0]
+
+    def _sizes(
+        self, number: int, stream: Stream, moving: Moving | None, n: int, rng: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """int64[n], bytes of one stream's messages; a law's own draws leave ``rng`` as it was without."""
+        own = self.sizes if stream.moves and self.sizes != EQUAL else stream.sizes
+        independent = sizes(n, stream.size_bytes, stream.size_cv, rng)
+        if own == EQUAL:
+            return independent
+        return drawn(own, n, stream.size_bytes, beside(rng, SIZES + number), moving)
 
     def _encoded_bytes(self, arrivals: NDArray[Any], encoding: str) -> NDArray[np.int64]:
         """int64[messages], the messages' bytes in another encoding, by the ratio of each topic."""
@@ -233,8 +250,8 @@ def client_over_lte() -> Client:
 
 
 _TOPIC_KEYS = {f.name for f in fields(Topic)} - {"value"}
-_STREAM_KEYS = {"rate_hz", "size_bytes", "jitter", "size_cv", "moves"}
-_CLIENT_KEYS = {"window", "propagation_us", "round_trip_us", "consumers", "duration_s"}
+_STREAM_KEYS = {"rate_hz", "size_bytes", "jitter", "size_cv", "sizes", "moves"}
+_CLIENT_KEYS = {"window", "propagation_us", "round_trip_us", "consumers", "duration_s", "sizes"}
 
 
 def read_client(path: str | Path, **parameters: Any) -> Client:

@@ -14,7 +14,7 @@ from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.scenario import registry
-from bufgym.scenario.arrivals import check_messages, messages, read_only, sealed
+from bufgym.scenario.arrivals import check_messages, read_only, sealed
 from bufgym.scenario.episode import Episode, Streams, check_link
 from bufgym.scenario.uplink import Uplink
 
@@ -113,10 +113,7 @@ class FleetScenario:
 
     def _beside(self, arrival_us: NDArray[np.int64], streams: Streams, robot: int) -> NDArray[Any]:
         """MESSAGE[n] of one more robot whose camera ticks at these times."""
-        sizes = self.uplink.drawn_sizes(streams.arrival, robot)
-        arrivals = messages(arrival_us, sizes)
-        self.uplink.move(arrivals, streams.arrival)
-        return read_only(arrivals)
+        return read_only(self.uplink.stream(streams.arrival, robot, arrival_us))
 
     @functools.cached_property
     def _cell(self) -> Uplink:

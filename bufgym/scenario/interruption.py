@@ -16,9 +16,11 @@ from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages, read_only
-from bufgym.scenario.checks import check_value, rate, up_to
+from bufgym.scenario.checks import check_sizes, check_value, rate, up_to
+from bufgym.scenario.draws import SIZES, beside
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
+from bufgym.traces.generate.sizes import EQUAL, drawn
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
 LAWS = ("fixed", "uniform", "log-uniform", "geometric")
@@ -45,7 +47,9 @@ class Interruption:
     rate_hz: float = 30.0
     """Messages a second."""
     size_bytes: int = 230_000
-    """Bytes of every message."""
+    """Mean bytes of a message."""
+    sizes: str = EQUAL
+    """Law of the sizes (``bufgym.traces.generate.sizes``), of mean ``size_bytes``."""
     value: Value = field(default_factory=qoi.exponential)
     """V for the QoI."""
     lengths: tuple[int, ...] = ()
@@ -73,6 +77,7 @@ class Interruption:
         if self.law == "geometric" and not self.t_mean >= self.t_min:
             raise BufgymError(f"t_mean = {self.t_mean}: must be at least t_min = {self.t_min}")
         check_value(self)
+        check_sizes(self, False)
         object.__setattr__(self, "lengths", tuple(whole("lengths", T) for T in self.lengths))
         shortest = self.t_max if self.law == "fixed" else self.t_min
         if self.lengths and not any(shortest <= T <= self.t_max for T in self._allowed):
@@ -110,19 +115,26 @@ class Interruption:
         return min(self.t_max, self.t_min - 1 + int(rng.geometric(1 / (self.t_mean - self.t_min + 1))))
 
     def episode(self, T: int) -> Episode:
-        """The interruption of exactly T messages, 1 <= T <= t_max."""
+        """The interruption of exactly T messages, 1 <= T <= t_max, all of ``size_bytes``."""
         if not 1 <= T <= self.t_max:
             raise BufgymError(f"T = {T}: must lie between 1 and t_max = {self.t_max}")
         if T not in self._episodes:
-            resumes_us = self.period_us * T + self.period_us // 2
-            trace = _blocked_then_open(self.period_us * (self.t_max + 1), self.max_messages * self.size_bytes)
-            link = Link(trace, offset_us=int(trace.time_us[1]) - resumes_us)
-            self._episodes[T] = Episode(self._table[: T + 2], link, 1, T)
+            self._episodes[T] = self._of(self._table[: T + 2], T, self.max_messages * self.size_bytes)
         return self._episodes[T]
+
+    def _of(self, arrivals: NDArray[Any], T: int, total_bytes: int) -> Episode:
+        resumes_us = self.period_us * T + self.period_us // 2
+        trace = _blocked_then_open(self.period_us * (self.t_max + 1), total_bytes)
+        return Episode(arrivals, Link(trace, offset_us=int(trace.time_us[1]) - resumes_us), 1, T)
 
     def draw(self, streams: Streams) -> Episode:
         """Draw one episode."""
-        return self.episode(self.draw_length(streams.link))
+        T = self.draw_length(streams.link)
+        if self.sizes == EQUAL:
+            return self.episode(T)
+        arrivals = self._table[: T + 2].copy()
+        arrivals["size_bytes"] = drawn(self.sizes, T + 2, self.size_bytes, beside(streams.arrival, SIZES))
+        return self._of(read_only(arrivals), T, int(arrivals["size_bytes"].sum()))
 
     @functools.cached_property
     def _episodes(self) -> dict[int, Episode]:

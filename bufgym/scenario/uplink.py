@@ -17,18 +17,19 @@ from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages, read_only
-from bufgym.scenario.checks import as_tuple, check_stream, check_value, recordings, up_to
-from bufgym.scenario.draws import beside, place, place_link, shipped, sizes, skip
+from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
+from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Motion, Trace, read_workload
+from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import Workload
 
 _JITTER_HZ = 30.0
 """Reference rate. At any rate an episode leaves its stream where the jitter of so many messages a second does. So
-motion and all later draws are the same for every ``rate_hz``, ``jitter`` and ``size_cv``."""
-_TIMES, _SIZES = 0, 1
-"""Numbers of the generators ``beside`` the stream: jitter at other rates, and sizes (of robot r: r more)."""
+motion and all later draws are the same for every ``rate_hz``, ``jitter``, ``sizes`` and ``size_cv``."""
+_TIMES = 0
+"""Number of the generator ``beside`` the stream that draws the jitter of other rates."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class Uplink:
     sizes.
 
     A ``workload``, a robot's recording, is played as it is. It replaces the stream that ``rate_hz``, ``jitter``,
-    ``size_bytes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it has one.
+    ``size_bytes``, ``sizes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it
+    has one.
 
     Text in place of an object is read as on the command line: ``traces="lte-synthetic-0"`` (a shipped name or a file,
     or a list of them), ``motion="drive-0"`` (or "none"), ``value="saturating:0.5"``, ``workload="drive.mcap"``.
@@ -58,7 +60,9 @@ class Uplink:
     size_bytes: int = 230_000
     """Mean bytes of a message."""
     size_cv: float = 0.0
-    """Coefficient of variation of the log-normal sizes; 0 for equal sizes."""
+    """Coefficient of variation of independent log-normal sizes; 0 for equal sizes."""
+    sizes: str = EQUAL
+    """Law of the sizes: equal, jpeg, gop, depth-colour, motion or recorded:NAME (``bufgym.traces.generate.sizes``)."""
     duration_s: float = 30.0
     """Length of an episode's arrivals, s."""
     scale: tuple[float, ...] = (1.0,)
@@ -85,6 +89,7 @@ class Uplink:
         if not self.scale or not all(math.isfinite(s) and s > 0 for s in self.scale):
             raise BufgymError(f"scale = {self.scale}: every factor must be a number > 0")
         check_stream(self)
+        check_sizes(self, bool(self.motion) or self.workload is not None)
         up_to("duration_s", self.duration_s, MAX_DURATION_S)
         whole("propagation_us", self.propagation_us, 0, MAX_TIME_US)
         if self.size_bytes < 1:
@@ -116,23 +121,41 @@ class Uplink:
 
     def draw(self, streams: Streams) -> Episode:
         """Draw one episode."""
-        arrivals = self._stream(streams.arrival) if self.workload is None else _replayed(self.workload)
-        self.move(arrivals, streams.arrival)
+        if self.workload is None:
+            arrivals = self.stream(streams.arrival)
+        else:
+            arrivals = _replayed(self.workload)
+            self._move(arrivals, streams.arrival)
         trace, offset_us = place_link(self._links, streams.link, self.random_offset, self.link_offset_s)
         return Episode(read_only(arrivals), Link(trace, offset_us, int(self.propagation_us)))
 
-    def move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> None:
-        """Give these messages the x of a recording, if there are any, from a random place on."""
-        if self.motion:
-            motion, start_us = place(self.motion, rng, self.random_offset)
-            x = motion.at(arrivals["arrival_us"] + start_us)
-            arrivals["x"] = x - x[0]
+    def stream(
+        self, rng: np.random.Generator, robot: int = 0, arrival_us: NDArray[np.int64] | None = None
+    ) -> NDArray[Any]:
+        """MESSAGE[n] of the camera, or of a fleet's robot; at these times if they are given."""
+        own = beside(rng, SIZES + robot) if self.size_cv or self.sizes != EQUAL else rng
+        arrivals = messages(self._times(rng) if arrival_us is None else arrival_us, int(self.size_bytes))
+        moving = self._move(arrivals, rng)
+        if self.sizes != EQUAL:
+            arrivals["size_bytes"] = drawn(self.sizes, len(arrivals), self.size_bytes, own, moving)
+        elif self.size_cv:
+            arrivals["size_bytes"] = sizes(len(arrivals), self.size_bytes, self.size_cv, own)
+        return arrivals
 
-    def _stream(self, rng: np.random.Generator) -> NDArray[Any]:
-        """MESSAGE[n] of the camera, x being the frame index."""
+    def _move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> Moving | None:
+        """Give these messages the x of a recording, if there are any, from a random place on."""
+        if not self.motion:
+            return None
+        motion, start_us = place(self.motion, rng, self.random_offset)
+        time_us = arrivals["arrival_us"] + start_us
+        x = motion.at(time_us)
+        arrivals["x"] = x - x[0]
+        return Moving(motion, time_us)
+
+    def _times(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        """int64[n], arrival times of the frames, us."""
         n, period_us = self.max_messages, 1e6 / self.rate_hz
         periods, jitter_draws = np.arange(n, dtype=np.float64), round(_JITTER_HZ * self.duration_s)
-        size = self.drawn_sizes(rng)
         if self.jitter and n == jitter_draws:
             periods += self.jitter * rng.random(n)
         else:
@@ -141,13 +164,7 @@ class Uplink:
             skip(rng, jitter_draws)
         arrival_us = (periods * period_us).astype(np.int64)
         arrival_us -= arrival_us[0]
-        return messages(arrival_us, size)
-
-    def drawn_sizes(self, rng: np.random.Generator, robot: int = 0) -> NDArray[np.int64]:
-        """int64[n] bytes of the messages of one stream, or of a fleet's robot; ``rng`` stays where it is."""
-        return sizes(
-            self.max_messages, self.size_bytes, self.size_cv, beside(rng, _SIZES + robot) if self.size_cv else rng
-        )
+        return arrival_us
 
 
 def _replayed(workload: Workload) -> NDArray[Any]:

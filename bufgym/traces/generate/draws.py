@@ -41,6 +41,16 @@ def nearly_normal(uniforms: Float64Array) -> Float64Array:
     return total - 6.0
 
 
+def ar1(shocks: list[float], memory: float) -> list[float]:
+    """An AR(1) process of variance 1 driven by `shocks`."""
+    share = math.sqrt(1 - memory**2)
+    value, values = shocks[0], []
+    for k, shock in enumerate(shocks):
+        value = memory * value + share * shock if k else shock
+        values.append(value)
+    return values
+
+
 def checked(name: str, value: float, least: float, most: float) -> float:
     """`value` if it is a number from `least` to `most`."""
     if not (is_finite(value) and least <= value <= most):

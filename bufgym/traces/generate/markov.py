@@ -31,7 +31,7 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.draws import NORMAL_UNIFORMS, checked, nearly_normal, second_stream, stream
+from bufgym.traces.generate.draws import NORMAL_UNIFORMS, ar1, checked, nearly_normal, second_stream, stream
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
 from bufgym.traces.trace import US_PER_S, Float64Array, Trace
 
@@ -100,20 +100,10 @@ def _scores(link: LinkParameters, random: np.random.Generator, count: int) -> Fl
     second = np.arange(count)
     redrawn = (uniforms[:, -1] < 1 / link.level_stay_s) | (second == 0)
     level = nearly_normal(uniforms[:, :NORMAL_UNIFORMS])[np.maximum.accumulate(np.where(redrawn, second, 0))]
-    fast = np.array(_ar1(nearly_normal(uniforms[:, NORMAL_UNIFORMS:-1]).tolist(), link.fast_memory))
+    fast = np.array(ar1(nearly_normal(uniforms[:, NORMAL_UNIFORMS:-1]).tolist(), link.fast_memory))
     fast_share = max(0.0, 1 - link.place_share - link.level_share)
     slow = math.sqrt(link.place_share) * place + math.sqrt(link.level_share) * level
     return np.asarray(slow + math.sqrt(fast_share) * fast, np.float64)
-
-
-def _ar1(shocks: list[float], memory: float) -> list[float]:
-    """An AR(1) process of variance 1 driven by `shocks`."""
-    share = math.sqrt(1 - memory**2)
-    value, values = shocks[0], []
-    for k, shock in enumerate(shocks):
-        value = memory * value + share * shock if k else shock
-        values.append(value)
-    return values
 
 
 def _outages(p: OutageParameters, random: np.random.Generator, count: int) -> Iterator[tuple[int, Float64Array]]:
