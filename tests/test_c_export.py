@@ -145,7 +145,7 @@ def test_with_a_window_several_messages_are_in_the_socket(tmp_path):
     [
         ("afr", "<= 2.0 / 3.0", "<= 0.2"),
         ("learned-motion", "bufgym_v[] = {\n    0.0, -0.48", "bufgym_v[] = {\n    0.0, -0.08"),
-        ("min-motion-gap", "gaps.before_x + gaps.after_x < smallest", "gaps.before_x < smallest"),
+        ("min-motion-gap", ": gaps.before_x + gaps.after_x;", ": gaps.before_x;"),
     ],
 )
 def test_parity_finds_another_number(name, number, other, tmp_path):

@@ -77,6 +77,11 @@ class Sweep:
             for label, setting in settings.items()
         }
 
+    def capacities_of(self, setting: Setting) -> tuple[int, ...]:
+        """L that a setting is met with: those asked for, or else its own or the suite's."""
+        own = self.capacities in ((), suites.get(self.suite).capacities)
+        return setting.capacities if own and setting.capacities else self.capacities
+
     def setting(self, label: str, trace: int) -> Setting:
         """Return one setting with its scenario on one trace alone."""
         setting = self.settings()[label]
@@ -141,7 +146,7 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
         sources.load(source, sweep.folder)
     setting = sweep.setting(shard.label, shard.trace)
     limits: dict[str, Any] = {} if setting.max_bytes is None else {"max_bytes": setting.max_bytes}
-    return run(sweep.policies, setting.scenario, sweep.capacities, shard.seeds, label=shard.label, **limits)
+    return run(sweep.policies, setting.scenario, sweep.capacities_of(setting), shard.seeds, label=shard.label, **limits)
 
 
 def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Row] | Exception]:
@@ -279,9 +284,9 @@ def _read(file: Path, shard: Shard) -> list[Row]:
         rows = read_rows(file, layout)
     except BufgymError as error:
         raise BufgymError(f"{error}; {again}") from None
-    scenario = sweep.settings()[shard.label].scenario
-    runs = len(sweep.specs) * len(sweep.capacities) * len(shard.seeds)
-    expected, columns = runs * sweep.task.rows_per_run(scenario), tuple(layout)
+    setting = sweep.settings()[shard.label]
+    runs = len(sweep.specs) * len(sweep.capacities_of(setting)) * len(shard.seeds)
+    expected, columns = runs * sweep.task.rows_per_run(setting.scenario), tuple(layout)
     if len(rows) != expected or any(tuple(row) != columns for row in rows):
         raise BufgymError(f"{file}: {len(rows)} rows where {expected} of {len(columns)} columns were written; {again}")
     return rows

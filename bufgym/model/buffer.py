@@ -201,6 +201,12 @@ def has_space(buffer: Buffer, arrival: Any) -> bool:
 
 
 @kernel
+def suffices(buffer: Buffer, arrival: Any, freed_bytes: int) -> bool:
+    """Whether the newcomer fits by bytes once so many have been freed."""
+    return bool(buffer.backlog_bytes - freed_bytes + arrival.size_bytes <= buffer.max_bytes)
+
+
+@kernel
 def fill(buffer: Buffer) -> float:
     """Fill level of the queue by messages or by bytes, whichever is higher; 1 when full."""
     return max(len(buffer.slots) / buffer.capacity, buffer.backlog_bytes / buffer.max_bytes)

@@ -14,6 +14,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     fragments,
     gaps,
     middleware,
+    price_dp,
     robofleet,
     sampling,
     schedulers,

@@ -54,9 +54,12 @@ def latest_only(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 @built_in("random", source="AFR paper [wang2022afr], Eq. 9")
 def random(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Random Drop: a full queue drops one of its messages or the newcomer, each as likely as the others."""
+    """Random Drop: a full queue drops one of its messages or the newcomer, each as likely as the others.
+
+    Under B further messages may have to go for a newcomer that stays.
+    """
     if has_space(buffer, arrival):
         return ACCEPT
     s = len(buffer.slots)
-    victim = int(uniform_draw(buffer, arrival) * (s + 1))
+    victim = int(uniform_draw(buffer, arrival) * (s if buffer.evictions > 0 else s + 1))
     return victim if victim < s else REJECT

@@ -9,7 +9,17 @@ from __future__ import annotations
 import numpy as np
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, gaps, has_space, loss, motion_gaps
+from bufgym.model.buffer import (
+    ACCEPT,
+    REJECT,
+    Buffer,
+    arrival_gain,
+    gaps,
+    has_space,
+    loss,
+    motion_gaps,
+    suffices,
+)
 from bufgym.model.qoi import value
 from bufgym.policies.registry import Arrival, Memory, built_in
 
@@ -22,20 +32,37 @@ def gap_left(buffer: Buffer, arrival: Arrival, victim: int) -> float:
 
 
 @kernel
-def smallest_gap(buffer: Buffer, arrival: Arrival, in_time: bool, slots: int, discount: float) -> int:
-    """What leaves the smallest merged gap, in time or motion, of the first ``slots`` and the oldest if several do.
+def discounted(buffer: Buffer, arrival: Arrival, in_time: bool, k: int, discount: float) -> float:
+    """The merged gap of slot k of s, in time or motion, less ``discount`` (1 - k / s) of it; slot s is the newcomer."""
+    s = len(buffer.slots)
+    before_us, after_us, before, after, _ = gaps(buffer, arrival, True, k)
+    left = float(before_us + after_us) if in_time else before + after
+    return left * (1 - discount * (1 - k / s)) if k < s else left
 
-    The newcomer, slot s, is REJECT. The gap of slot k of s is discounted by ``discount`` (1 - k / s).
+
+@kernel
+def smallest_gap(buffer: Buffer, arrival: Arrival, in_time: bool, slots: int, discount: float) -> int:
+    """What leaves the smallest ``discounted`` gap, of the first ``slots`` and the oldest if several do.
+
+    The newcomer, slot s, is REJECT. Under B it may take the place of several messages. So it goes itself, unless those
+    that leave no larger a gap make room for it. Once one of them has gone, the newcomer stays.
     """
     s, victim, smallest = len(buffer.slots), REJECT, np.inf
-    for k in range(slots):
-        before_us, after_us, before, after, _ = gaps(buffer, arrival, True, k)
-        left = float(before_us + after_us) if in_time else before + after
-        if k < s:
-            left *= 1 - discount * (1 - k / s)
+    asked = s if buffer.evictions > 0 else slots
+    for k in range(asked):
+        left = discounted(buffer, arrival, in_time, k, discount)
         if left < smallest:
             victim, smallest = k, left
-    return victim if victim < s else REJECT
+    if victim < 0 or victim == s:
+        return REJECT
+    if asked > s and not suffices(buffer, arrival, buffer.slots[victim].size_bytes):
+        own, freed_bytes = discounted(buffer, arrival, in_time, s, discount), 0
+        for k in range(s):
+            if discounted(buffer, arrival, in_time, k, discount) <= own:
+                freed_bytes += buffer.slots[k].size_bytes
+        if not suffices(buffer, arrival, freed_bytes):
+            return REJECT
+    return victim
 
 
 @built_in("min-gap", source="online checkpointing, smallest merged gap")

@@ -3,7 +3,8 @@
 One small network scores every candidate, a queued message or the newcomer. Its inputs are the features of the candidate
 and of the context (``model.observe``), so one set of weights serves every L; ``scoring`` has the formula. The *drop*
 network scores dropping the candidate. The *accept* network scores accepting the newcomer, where there is room. The
-policy takes the decision that scores highest; ties go to the oldest message.
+policy takes the decision that scores highest; ties go to the oldest message. Under a byte limit a newcomer that would
+take the place of several messages is dropped, unless those that score no less make room for it.
 
 The context c may also change the weights of the candidate's own features s, by the matrix ``mix`` M: the score of
 dropping it grows by c M s. So one agent can weigh a rank or a gap differently where V is straight and where it is flat.
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, suffices
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
     ON_BOARD_FIELDS,
@@ -64,11 +65,16 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
             break
     read_context(scorer, scratch)
     common = begin(scorer, DROP, scratch)
-    best, decision = -np.inf, REJECT
-    for k in range(s + 1):
-        dropped = score(scorer, DROP, common, k if k < s else L, scratch)
+    own, best, decision, freed_bytes = score(scorer, DROP, common, L, scratch), -np.inf, REJECT, 0
+    for k in range(s):
+        dropped = score(scorer, DROP, common, k, scratch)
+        if dropped >= own:
+            freed_bytes += buffer.slots[k].size_bytes
         if dropped > best:
-            best, decision = dropped, k if k < s else REJECT
+            best, decision = dropped, k
+    # Once a message has gone for the newcomer, that stays.
+    if buffer.evictions == 0 and (own > best or not suffices(buffer, arrival, freed_bytes)):
+        best, decision = own, REJECT
     if has_space(buffer, arrival):
         common = begin(scorer, KEEP, scratch)
         if score(scorer, KEEP, common, L, scratch) >= best:

@@ -1,14 +1,15 @@
 """The target gap: a distance between sent messages that suits the link, the queue and the messages to come.
 
-    m <- motion per time: since the message dequeued last, and over ``PACE_US``
-    r <- messages per time that the link sends: its rates over 0.1 s and 2 s, and over ``LINK_US``
+    m <- motion per time: since the message dequeued last, and over ``pace_s``
+    r <- messages per time that the link sends: its rates over 0.1 s and 2 s, and over ``link_s``
     g <- m T / (r T + L - s)
 
 In the next T the scene moves on by m T, the link sends r T messages and the queue takes L - s more. Their even gap is
 g. It is wide if the queue is full, or if the link sends few messages for the motion.
 
-    soon <- whether the socket is free before ``NEAR`` more arrivals
-    if there is room, and the queue is empty or the socket idle: accept
+    soon <- whether the socket is free before ``near`` more arrivals
+    if a queued message adds nothing: it goes
+    elif there is room, and the queue is empty or the socket idle: accept
     elif soon and the message behind the head lies nearer to g than the head: the head goes
     elif the queue is full: what leaves the smallest gap goes, older ones rather
     elif the smallest gap that can be left is at most g: it goes, though there is room
@@ -17,35 +18,67 @@ g. It is wide if the queue is full, or if the link sends few messages for the mo
 The head is thus checked once more when its turn comes, as the link's rate may have changed. Blackouts in mid-stream are
 no exception. On a steady link, where g is known, the even spacing is made behind the head (``thinning``).
 
+A message adds nothing if V is straight from its one neighbour to the other: V(a) + V(b) = V(a + b). A V that saturates
+is straight up to where it is flat.
+
 No target is set while the past does not predict the future. In bursts an empty queue would leave the link idle; one
 long pause counts as a burst for some seconds. Nor is there a target for queues of fewer than ``LEAST`` messages, before
-anything has been sent, or until the stream has run for as long as a full queue takes to be sent. Then the smallest gap
-goes, and ``thinning`` says whether it goes with room too.
+anything has been sent, or until the stream has run for a quarter of the time that a full queue takes to be sent, a
+short queue's for ``SHORT_RUN_US``. Then the smallest gap goes, and ``thinning`` says whether it goes with room too.
+
+A queue of up to ``SHORT_QUEUE`` messages holds too little to wait for a target. Its head gets a *last chance*:
+
+    f <- s / L
+    S, M <- times to send a message of mean size at the rates over 0.1 s and ``link_s``, at most ``SLOWEST`` arrivals
+    if the link is not steady and the socket is free before ``chance`` more arrivals:
+        if the head's neighbours lie no farther apart than the scene moves in
+           (early + early_full f) arrivals + (slow - slow_full f) S + mean_full f M: the head goes
+
+The numbers are the policy's parameters. ``python -m agents.tune target-gap`` looks for them on a suite's links.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, Buffer, has_space, motion_gaps, running_mean
 from bufgym.model.observe.on_board import mean_bytes
+from bufgym.model.qoi import EXPONENTIAL, SATURATING
 from bufgym.policies.gaps import gap_left, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, built_in
 from bufgym.policies.thinning import places, spare, steady
 
-HORIZON_US = 5e6
-"""T, us."""
-SHORT, LONG = 0.25, 0.25
-"""Weights of the link's rates over 0.1 s and 2 s in r; the rest is that of the rate over ``LINK_US``."""
-REST = 1 - SHORT - LONG
-LINK_US = 20e6
-PACED, PACE_US = 0.4, 15e6
-"""Weight in m of the mean motion over ``PACE_US``."""
-NEAR = 1.5
-"""Arrivals."""
-DISCOUNT = 0.165
-"""Discount on the gap at the head of the queue, compared with the tail's."""
+PARAMETERS = {
+    "horizon_s": 5.0,
+    "short": 0.25,
+    "long": 0.25,
+    "link_s": 20.0,
+    "paced": 0.4,
+    "pace_s": 15.0,
+    "near": 1.5,
+    "discount": 0.165,
+    "chance": 1.02,
+    "early": 1.0,
+    "early_full": 1.09,
+    "slow": 0.76,
+    "slow_full": 0.92,
+    "mean_full": 0.076,
+}
+"""T, s; weights of the link's rates over 0.1 s and 2 s in r, the rest being that over ``link_s``; weight in m of the
+mean motion over ``pace_s``; ``near``, in arrivals; discount on the gap at the head of the queue, compared with the
+tail's; and the numbers of the last chance."""
+HORIZON_S, SHORT, LONG, LINK_S, PACED, PACE_S, NEAR, DISCOUNT = range(8)
+CHANCE, EARLY, EARLY_FULL, SLOW, SLOW_FULL, MEAN_FULL = range(8, 14)
 LEAST = 4
 """Smallest L that follows the target."""
+SHORT_QUEUE, SHORT_RUN_US = 5, 10e6
+"""Largest L with a last chance for its head, and how long a stream must have run for it to follow the target, us."""
+SLOWEST = 16.0
+"""Most arrivals in S and M."""
 BURSTY, LATE = 1.5, 1 / 32
 """Arrivals are bursty if the mean square of the time between them exceeds ``BURSTY`` times the square of its mean. The
 ratio is 2 for a Poisson process and 10 for bursts of ten. The newest time has weight ``LATE`` in both means, so that
@@ -53,20 +86,23 @@ a whole burst does not look like an even stream."""
 WITHIN = 1.001
 """Factor by which a gap may exceed g through rounding."""
 
+Numbers = NDArray[Any]
+"""float64[parameters]: ``PARAMETERS``, and perhaps more behind them."""
+
 RATE, SENT_US, PACE, SEEN_US, PERIOD, SQUARE = range(6)
 REMEMBERED = {"rate": 0.0, "sent_us": 0.0, "pace": 0.0, "seen_us": 0.0, "period": 0.0, "square": 0.0}
-"""Memory of the policy: the link's rate over ``LINK_US`` (bytes/us) and how long it has sent; motion per us
-over ``PACE_US`` and how long the stream has run; the mean time between arrivals and its mean square."""
+"""Memory of the policy: the link's rate over ``link_s`` (bytes/us) and how long it has sent; motion per us
+over ``pace_s`` and how long the stream has run; the mean time between arrivals and its mean square."""
 
 
 @kernel
-def remember(buffer: Buffer, arrival: Arrival, memory: Memory) -> None:
+def remember(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> None:
     """Update the long means; call it at every arrival."""
     if buffer.evictions > 0:
         return
     sent_us = float(buffer.drained_us)
     if sent_us > 0:
-        memory[RATE] = running_mean(memory[RATE], buffer.drained_bytes, sent_us, memory[SENT_US], LINK_US)
+        memory[RATE] = running_mean(memory[RATE], buffer.drained_bytes, sent_us, memory[SENT_US], 1e6 * numbers[LINK_S])
         memory[SENT_US] += sent_us
     us = float(arrival.arrival_us - buffer.previous_us)
     weight = LATE if memory[PERIOD] > 0 else 1.0
@@ -74,7 +110,7 @@ def remember(buffer: Buffer, arrival: Arrival, memory: Memory) -> None:
     memory[SQUARE] += weight * (us * us - memory[SQUARE])
     if us > 0:
         step = arrival.x - buffer.previous_x
-        memory[PACE] = running_mean(memory[PACE], step, us, memory[SEEN_US], PACE_US)
+        memory[PACE] = running_mean(memory[PACE], step, us, memory[SEEN_US], 1e6 * numbers[PACE_S])
         memory[SEEN_US] += us
 
 
@@ -85,57 +121,108 @@ def bursty(memory: Memory) -> bool:
 
 
 @kernel
-def link_rate(buffer: Buffer, memory: Memory) -> float:
-    """The expected rate, bytes/us."""
-    recent = SHORT * buffer.short_rate_bytes_per_s + LONG * buffer.long_rate_bytes_per_s
-    return float(recent / 1e6 + REST * memory[RATE])
-
-
-@kernel
-def target(buffer: Buffer, arrival: Arrival, memory: Memory) -> float:
+def target(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> float:
     """g, in motion; 0 if unknown (see the module's text)."""
     s, L = len(buffer.slots), places(buffer, arrival)
     elapsed_us = float(arrival.arrival_us - buffer.dequeued_arrival_us)
     if L < LEAST or len(buffer.topics) > 1 or elapsed_us <= 0 or memory[RATE] <= 0 or memory[PACE] <= 0:
         return 0.0
-    if bursty(memory):
+    if bursty(memory) or (L <= SHORT_QUEUE and memory[SEEN_US] < SHORT_RUN_US):
         return 0.0
-    r = link_rate(buffer, memory) / mean_bytes(buffer, arrival)
+    recent = numbers[SHORT] * buffer.short_rate_bytes_per_s + numbers[LONG] * buffer.long_rate_bytes_per_s
+    r = (recent / 1e6 + (1 - numbers[SHORT] - numbers[LONG]) * memory[RATE]) / mean_bytes(buffer, arrival)
     if L > r * memory[SEEN_US]:
         return 0.0
-    m = (1 - PACED) * (arrival.x - buffer.dequeued_x) / elapsed_us + PACED * memory[PACE]
-    return float(m * HORIZON_US / (r * HORIZON_US + L - s))
+    horizon_us = 1e6 * numbers[HORIZON_S]
+    m = (1 - numbers[PACED]) * (arrival.x - buffer.dequeued_x) / elapsed_us + numbers[PACED] * memory[PACE]
+    return float(m * horizon_us / (r * horizon_us + L - s))
 
 
 @kernel
-def approach(buffer: Buffer, arrival: Arrival, g: float) -> int:
+def free_soon(buffer: Buffer, arrivals: float) -> bool:
+    """Whether the socket is free before so many more arrivals, at the rate over 0.1 s."""
+    return bool(buffer.left_bytes * 1e6 < arrivals * buffer.period_us * buffer.short_rate_bytes_per_s)
+
+
+@kernel
+def straight(v: NDArray[np.float64]) -> float:
+    """The distance up to which V is straight; 0 for an exponential V."""
+    if v[0] == EXPONENTIAL:
+        return 0.0
+    return float(v[1] if v[0] == SATURATING else v[3])
+
+
+@kernel
+def needless(buffer: Buffer, arrival: Arrival) -> int:
+    """The queued message that adds nothing, the one with the smallest gap of several; -1 if each adds something.
+
+    The newcomer is not asked, as nobody knows what follows it.
+    """
+    s, reach = len(buffer.slots), straight(buffer.v)
+    if reach == 0 or s == 0 or not buffer.busy or len(buffer.topics) > 1:
+        return -1
+    k = smallest_gap(buffer, arrival, False, s, 0.0)
+    if gap_left(buffer, arrival, k) > reach:
+        return -1
+    return k
+
+
+@kernel
+def approach(buffer: Buffer, arrival: Arrival, g: float, numbers: Numbers) -> int:
     """The decision that brings the gaps to ``g``."""
     s, room = len(buffer.slots), has_space(buffer, arrival)
     if room and (s == 0 or not buffer.busy):
         return ACCEPT
-    if s > 0 and buffer.left_bytes * 1e6 < NEAR * buffer.period_us * buffer.short_rate_bytes_per_s:
+    if s > 0 and free_soon(buffer, numbers[NEAR]):
         head, after = motion_gaps(buffer, arrival, 0)
         if abs(head + after - g) < abs(head - g):
             return 0
-    victim = smallest_gap(buffer, arrival, False, s + 1, DISCOUNT)
+    victim = smallest_gap(buffer, arrival, False, s + 1, numbers[DISCOUNT])
     if room and gap_left(buffer, arrival, victim) > WITHIN * g:
+        return ACCEPT
+    return victim
+
+
+@kernel
+def last_chance(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> bool:
+    """Whether the head of a short queue goes before its turn comes, by the rule in the module's text."""
+    s, L, rate = len(buffer.slots), buffer.capacity, buffer.short_rate_bytes_per_s
+    if s == 0 or L == 1 or L > SHORT_QUEUE or not buffer.busy or rate <= 0 or memory[RATE] <= 0:
+        return False
+    if len(buffer.topics) > 1 or steady(buffer) or bursty(memory) or not free_soon(buffer, numbers[CHANCE]):
+        return False
+    f, slowest_us, size = s / L, SLOWEST * buffer.period_us, mean_bytes(buffer, arrival)
+    us = (numbers[EARLY] + numbers[EARLY_FULL] * f) * buffer.period_us
+    us += (numbers[SLOW] - numbers[SLOW_FULL] * f) * min(1e6 * size / rate, slowest_us)
+    us += numbers[MEAN_FULL] * f * min(size / memory[RATE], slowest_us)
+    return bool(gap_left(buffer, arrival, 0) <= memory[PACE] * us)
+
+
+@kernel
+def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> int:
+    """The rule of the module's text, once ``remember`` has been called."""
+    extra = needless(buffer, arrival)
+    if extra >= 0:
+        return extra
+    if last_chance(buffer, arrival, memory, numbers):
+        return 0
+    g = target(buffer, arrival, memory, numbers)
+    if g > 0 and not steady(buffer):
+        return approach(buffer, arrival, g, numbers)
+    victim = smallest_gap(buffer, arrival, False, len(buffer.slots) + 1, 0.0)
+    if has_space(buffer, arrival) and (bursty(memory) or not spare(buffer, arrival, victim)):
         return ACCEPT
     return victim
 
 
 @built_in(
     "target-gap",
+    parameters=PARAMETERS,
     memory=REMEMBERED,
     source="own rule: min-motion-gap, towards the gap that link and queue can carry",
     reads_rate=True,
 )
 def target_gap(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Sends messages as far apart as the link's rate and the room that is left suggest; drops with room, too."""
-    remember(buffer, arrival, memory)
-    g = target(buffer, arrival, memory)
-    if g > 0 and not steady(buffer):
-        return approach(buffer, arrival, g)
-    victim = smallest_gap(buffer, arrival, False, len(buffer.slots) + 1, 0.0)
-    if has_space(buffer, arrival) and (bursty(memory) or not spare(buffer, arrival, victim)):
-        return ACCEPT
-    return victim
+    remember(buffer, arrival, memory, buffer.parameters)
+    return decide(buffer, arrival, memory, buffer.parameters)

@@ -53,17 +53,23 @@ def places(buffer: Buffer, arrival: Arrival) -> int:
 
 
 @kernel
+def spare_us(buffer: Buffer, arrival: Arrival) -> float:
+    """Time between messages that the link sends, by the rule in the module's text, us; 0 where none may be spared."""
+    s, elapsed_us = len(buffer.slots), arrival.arrival_us - buffer.dequeued_arrival_us
+    if s < WAITING or not buffer.busy or elapsed_us <= 0 or len(buffer.topics) > 1:
+        return 0.0
+    each_us, L = send_us(buffer, arrival), places(buffer, arrival)
+    if each_us <= 0 or L * each_us > SOON_US:
+        return 0.0
+    return float(HORIZON_US / (HORIZON_US / each_us + L - s))
+
+
+@kernel
 def spare(buffer: Buffer, arrival: Arrival, victim: int) -> bool:
-    """Whether a queue with room can spare ``victim`` (a slot, or REJECT), by the rule in the module's text.
+    """Whether a queue with room can spare ``victim`` (a slot, or REJECT).
 
     The link's spacing is the motion since the arrival of the message dequeued last, in proportion to time.
     """
-    s, elapsed_us = len(buffer.slots), arrival.arrival_us - buffer.dequeued_arrival_us
-    if s < WAITING or not buffer.busy or elapsed_us <= 0 or len(buffer.topics) > 1:
-        return False
-    each_us, L = send_us(buffer, arrival), places(buffer, arrival)
-    if each_us <= 0 or L * each_us > SOON_US:
-        return False
-    each_us = HORIZON_US / (HORIZON_US / each_us + L - s)
+    each_us, elapsed_us = spare_us(buffer, arrival), arrival.arrival_us - buffer.dequeued_arrival_us
     left = gap_left(buffer, arrival, victim)
-    return bool(left * elapsed_us <= (arrival.x - buffer.dequeued_x) * each_us)
+    return bool(each_us > 0 and left * elapsed_us <= (arrival.x - buffer.dequeued_x) * each_us)

@@ -21,11 +21,17 @@ def gaps_left(buffer, arrival):
 
 
 def least_gap(buffer, arrival, discount=0.0):
-    """What leaves the smallest gap; of equals the oldest. Slot k of s counts ``discount`` (1 - k / s) less."""
+    """What leaves the smallest gap; of equals the oldest. Slot k of s counts ``discount`` (1 - k / s) less.
+
+    Under B the newcomer goes where those that leave no larger a gap don't make room; once one has gone, it stays.
+    """
     *queued, newcomer = gaps_left(buffer, arrival)
-    gaps = [gap * (1 - discount * (1 - k / len(queued))) for k, gap in enumerate(queued)] + [newcomer]
-    k = gaps.index(min(gaps))
-    return k if k < len(queued) else REJECT
+    gaps = [gap * (1 - discount * (1 - k / len(queued))) for k, gap in enumerate(queued)]
+    if not gaps or (buffer.evictions == 0 and newcomer < min(gaps)):
+        return REJECT
+    excess = buffer.backlog_bytes + int(arrival["size_bytes"]) - buffer.max_bytes
+    freed = sum(int(m["size_bytes"]) for m, gap in zip(buffer.slots, gaps, strict=True) if gap <= newcomer)
+    return gaps.index(min(gaps)) if buffer.evictions > 0 or freed >= excess else REJECT
 
 
 def fits(buffer, arrival):
@@ -88,6 +94,28 @@ class Seen:
         mean, square = faded(self.periods)
         return square > 1.5 * mean * mean
 
+    def needless(self, buffer, arrival):
+        """The queued message whose neighbours lie within the straight part of V, the closest of several; or None."""
+        kind, *rest = buffer.v
+        reach = 0.0 if kind == 0 else rest[0] if kind == 1 else rest[2]
+        left = gaps_left(buffer, arrival)[:-1]
+        if not left or not buffer.busy or len(buffer.topics) > 1 or min(left) > reach or reach == 0:
+            return None
+        return left.index(min(left))
+
+    def last_chance(self, buffer, arrival):
+        """Whether the head of a queue of two to five goes before its turn."""
+        s, L, rate = len(buffer.slots), buffer.capacity, buffer.short_rate_bytes_per_s
+        period, mean_rate = buffer.period_us, running_mean(self.sent, 20e6)
+        if not 2 <= L <= 5 or s == 0 or not buffer.busy or rate <= 0 or mean_rate <= 0 or len(buffer.topics) > 1:
+            return False
+        if level(buffer) or self.bursty or not buffer.left_bytes * 1e6 < 1.02 * period * rate:
+            return False
+        size, f = (buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1), s / L
+        S, M = min(1e6 * size / rate, 16 * period), min(size / mean_rate, 16 * period)
+        us = (1.0 + 1.09 * f) * period + (0.76 - 0.92 * f) * S + 0.076 * f * M
+        return gaps_left(buffer, arrival)[0] <= running_mean(self.moved, 15e6) * us
+
     def target(self, buffer, arrival):
         """g, or None where it cannot be told."""
         L, s = places(buffer, arrival), len(buffer.slots)
@@ -99,7 +127,7 @@ class Seen:
             return None
         recent = (0.25 * buffer.short_rate_bytes_per_s + 0.25 * buffer.long_rate_bytes_per_s) / 1e6
         r = (recent + 0.5 * rate) / ((buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1))
-        if r * self.seen_us < L:
+        if r * self.seen_us < L or (L <= 5 and self.seen_us < 10e6):
             return None
         last = buffer.dequeued_x
         m = 0.6 * float(arrival["x"] - last) / elapsed_us + 0.4 * pace

@@ -107,12 +107,19 @@ def gaps_left(sender, queue, newcomer, key):
 
 
 def min_gap(key):
-    """Drop what leaves the smallest gap between its neighbours, ties to the oldest."""
+    """Drop what leaves the smallest gap between its neighbours, ties to the oldest.
+
+    Under B the newcomer goes where those that leave no larger a gap don't make room; once one has gone, it stays.
+    """
 
     def full(sender, queue, newcomer):
-        gaps = gaps_left(sender, queue, newcomer, key)
-        victim = gaps.index(min(gaps))
-        return victim if victim < len(queue) else REJECT
+        *gaps, own = gaps_left(sender, queue, newcomer, key)
+        again = sender.evictions > 0
+        if not gaps or (not again and own < min(gaps)):
+            return REJECT
+        excess = sum(m["bytes"] for m in [*queue, newcomer]) - sender.max_bytes
+        freed = sum(m["bytes"] for m, gap in zip(queue, gaps, strict=True) if gap <= own)
+        return gaps.index(min(gaps)) if again or freed >= excess else REJECT
 
     return Policy(full)
 

@@ -42,8 +42,9 @@ def uniform_of(newcomer, sender):
 
 
 def drop_random(sender, queue, newcomer):
-    """The victim is uniform over the queue and the newcomer."""
-    return one_of([*range(len(queue)), REJECT], uniform_of(newcomer, sender))
+    """The victim is uniform over the queue and the newcomer, which stays once a message has gone for it."""
+    stays = [REJECT] * (sender.evictions == 0)
+    return one_of([*range(len(queue)), *stays], uniform_of(newcomer, sender))
 
 
 class KeepLast(Policy):

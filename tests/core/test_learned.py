@@ -78,8 +78,13 @@ def twin(made):
                 mixed = math.fsum(float(made.mix[j, i]) * f[made.context[j]] * f[made.slot[i]] for j, i in pairs)
             return score(made.drop, features(k)) + mixed
 
-        choices = [(drop_score(k), k) for k in range(s)]
-        choices.append((drop_score(L), REJECT))
+        choices, own = [(drop_score(k), k) for k in range(s)], drop_score(L)
+        freed = sum(int(buffer.slots[k]["size_bytes"]) for value, k in choices if value >= own)
+        excess = buffer.backlog_bytes + int(arrival["size_bytes"]) - buffer.max_bytes
+        if buffer.evictions == 0 and freed < excess:
+            choices = []  # the newcomer would not fit if all went that score no less
+        if buffer.evictions == 0:
+            choices.append((own, REJECT))
         best = max(value for value, _ in choices)
         first = next(decision for value, decision in choices if value == best)
         if fits(buffer, arrival) and score(made.accept, features(L)) >= best:

@@ -14,7 +14,20 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import Policy
-from bufgym.policies.target_gap import PACE, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, approach, remember, target
+from bufgym.policies.target_gap import (
+    PACE,
+    PARAMETERS,
+    PERIOD,
+    RATE,
+    SEEN_US,
+    SENT_US,
+    SQUARE,
+    last_chance,
+    needless,
+)
+from bufgym.policies.target_gap import approach as approach_by
+from bufgym.policies.target_gap import remember as remember_by
+from bufgym.policies.target_gap import target as target_by
 from bufgym.policies.thinning import send_us, spare, steady
 from bufgym.scenario import Episode, messages, suites
 from bufgym.sim import run
@@ -22,6 +35,7 @@ from bufgym.sim.metrics import outcome, received
 from bufgym.traces import Trace
 
 POLICY = policies.get("target-gap")
+NUMBERS = np.array(list(PARAMETERS.values()))
 kernels = pytest.mark.kernels
 
 
@@ -54,6 +68,18 @@ def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6, square=33_333.0**2):
     memory = np.zeros(6)
     memory[[RATE, SENT_US, PACE, SEEN_US, PERIOD, SQUARE]] = rate, seen_us, pace, seen_us, 33_333, square
     return memory
+
+
+def target(buffer, arrival, memory):
+    return target_by(buffer, arrival, memory, NUMBERS)
+
+
+def approach(buffer, arrival, g):
+    return approach_by(buffer, arrival, g, NUMBERS)
+
+
+def remember(buffer, arrival, memory):
+    remember_by(buffer, arrival, memory, NUMBERS)
 
 
 @kernels
@@ -151,12 +177,44 @@ def test_long_means_are_kept():
     assert long[PACE] == pytest.approx((15e6 + 2) / (15e6 + 33_333))
 
 
+@kernels
+def test_where_v_is_straight_the_message_between_adds_nothing():
+    # In x, 0 was sent, 4, 10 and 16 wait, 20 comes: without 4 a gap of 10 is left, without 10 of 12, without 16 of 10.
+    buffer, arrival = fast(2, 5, 8, now=10)
+    for v, k in ((qoi.saturating(10), 0), (qoi.saturating(9.9), -1), (qoi.exponential(0.9), -1)):
+        assert needless(buffer._replace(v=v.array), arrival) == k
+    bend = qoi.tabulated([0, 10, 20], [0, 0.7, 1]).array
+    assert needless(buffer._replace(v=bend), arrival) == 0
+    assert needless(buffer._replace(v=bend, busy=0), arrival) == -1  # an idle link takes what there is
+
+
+@kernels
+def test_the_head_of_a_short_queue_gets_a_last_chance():
+    # L = 4, one waits: f = 1/4. The link sends one in four now, as in the mean: S = M = 4 arrivals. The head may leave
+    # 1 + 1.09 / 4 + (.76 - .92 / 4) 4 + .076 / 4 x 4 = 3.47 arrivals, 6.94 in x.
+    short = {"capacity": 4, "left_bytes": 254, "short_rate_bytes_per_s": 7500.0}
+
+    def goes(*frames, **known):
+        return last_chance(*fast(*frames, **short | known), remembered(), NUMBERS)
+
+    assert goes(1, now=3) and not goes(1, now=4)  # 3 and 4 arrivals
+    assert not goes(1, now=3, left_bytes=256)  # 1.02 arrivals of 250 bytes have not left yet
+    assert not goes(1, now=3, capacity=6) and not goes(1, now=3, medium_rate_bytes_per_s=7500.0, drained_us=1)
+    # At twice the rate S = 2: 1 + .27 + 1.06 + .08 = 2.41.
+    assert goes(1, now=2, short_rate_bytes_per_s=15000.0) and not goes(1, now=3, short_rate_bytes_per_s=15000.0)
+
+
 def twin():
     """A policy that decides alike, of what it has seen."""
     seen = Seen()
 
     def on_arrival(buffer, arrival, memory):
         seen.remember(buffer, arrival)
+        extra = seen.needless(buffer, arrival)
+        if extra is not None:
+            return extra
+        if seen.last_chance(buffer, arrival):
+            return 0
         g = seen.target(buffer, arrival)
         if g is not None and not level(buffer):
             return approached(buffer, arrival, g)

@@ -20,6 +20,7 @@ from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
 from bufgym.policies import Policy, learned, target_gap, thinning
 from bufgym.policies.scoring import unpack
+from bufgym.policies.target_gap import straight
 from bufgym.robot.c.calls import random_episode, recorded
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
@@ -27,7 +28,7 @@ SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
 """Names of the exportable rules; learned agents for one queue are exportable too."""
 _HELPERS = {
     "bufgym_gaps_of(": "gaps.h",
-    "bufgym_smallest_time_gap(": "time_gap.h",
+    "bufgym_smallest_gap(": "gaps.h",
     "bufgym_spare(": "thinning.h",
     "bufgym_approach(": "target_gap.h",
     "bufgym_thin(": "thin.h",
@@ -35,11 +36,6 @@ _HELPERS = {
 """Parts that rules share, each before its callers."""
 _LEARNED = ("features.h", "scorer.h")
 """Parts of a learned agent."""
-_TARGET = (
-    *("HORIZON_US", "SHORT", "LONG", "REST", "LINK_US", "PACED", "PACE_US", "NEAR", "DISCOUNT"),
-    *("LEAST", "BURSTY", "LATE", "WITHIN"),
-)
-"""Parameters of ``target_gap`` in C."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
 """Seed, episodes and messages of the calls in the header."""
@@ -92,8 +88,13 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "ROUNDING": repr(ROUNDING),
         "WAITING": thinning.WAITING,
         "SOON_US": repr(thinning.SOON_US),
-        **{name: repr(getattr(target_gap, name)) for name in _TARGET},
-        "UNPACED": repr(1 - target_gap.PACED),
+        **{
+            name: getattr(target_gap, name)
+            for name in ("LEAST", "SHORT_QUEUE", "SHORT_RUN_US", "SLOWEST", "BURSTY", "LATE")
+        },
+        "STRAIGHT": repr(straight(value.array)),
+        "WITHIN": repr(target_gap.WITHIN),
+        **{name.upper(): repr(number) for name, number in policy.parameters.items()},
         "STEADY_US": repr(thinning.HORIZON_US),
         "STEADY": repr(thinning.STEADY),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
@@ -112,7 +113,7 @@ def _rule(policy: Policy) -> str:
     rule = (_RULES / f"{name}.h").read_text(encoding="utf-8")
     helpers = ""
     for call, part in reversed(_HELPERS.items()):  # a helper may call the one before it
-        if call in helpers + rule:
+        if call in helpers + rule and _part(part) not in helpers:
             helpers = _part(part) + helpers
     return helpers + rule
 

@@ -6,13 +6,13 @@ share no length T. So knowing a trace by heart gains nothing in another split. A
 gets the next version.
 
 ``Suite.kind`` names the task of the scenarios: one queue, the same under stress, the topics of one client, or a fleet
-of robots. Messages of one queue have equal sizes, so that the clairvoyant's bound is exact.
+of robots. Messages of one queue have equal sizes, so that the clairvoyant's bound is exact, but for ``cameras``.
 """
 
 from __future__ import annotations
 
 from bufgym.ground.errors import unknown
-from bufgym.scenario.suites import recorded, shared_uplinks, stress, synthetic
+from bufgym.scenario.suites import cameras, recorded, shared_uplinks, stress, synthetic
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
 from bufgym.scenario.suites.synthetic import RATE_HZ, motion_value, time_value
 
@@ -28,7 +28,16 @@ __all__ = [
     "time_value",
 ]
 
-SUITES = {suite.name: suite for suite in (*synthetic.SUITES, *stress.SUITES, *recorded.SUITES, *shared_uplinks.SUITES)}
+SUITES = {
+    suite.name: suite
+    for suite in (
+        *synthetic.SUITES,
+        *cameras.SUITES,
+        *stress.SUITES,
+        *recorded.SUITES,
+        *shared_uplinks.SUITES,
+    )
+}
 """Every suite by name."""
 
 

@@ -28,6 +28,8 @@ class Setting:
     """Length of the episode's one blackout, s; None without one of a known length."""
     max_bytes: int | None = None
     """B of every sender, bytes; None for no limit."""
+    capacities: tuple[int, ...] = ()
+    """L of this scenario, messages; empty for the suite's."""
 
 
 Build = Callable[[str, Path | None], dict[str, Setting]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,6 +44,8 @@ FIRST_SEED = {"train": 1000, "validation": 2000, "test": 3000}
 
 TRACES = {"train": 24, "validation": 6, "test": 12}
 """Links in a split; some suites have a half or a third as many for each of their scenarios."""
+MORE_TRACES = {"train": 48, "validation": 48, "test": 48}
+"""The same of suites that resolve smaller differences."""
 
 
 def motions_of(split: str, count: int = 4) -> tuple[Motion, ...]:
@@ -73,12 +75,12 @@ def both_sizes(traces: Sequence[Trace], motions: tuple[Motion, ...]) -> dict[str
     return both_values(traces, motions, 230_000, "-230kB") | both_values(traces, motions, 900_000, "-900kB")
 
 
-def _lte(split: str, data: Path | None) -> dict[str, Setting]:
+def _lte(split: str, data: Path | None, count: Mapping[str, int] = TRACES) -> dict[str, Setting]:
     """Means of 3, 5, 7 and 9 MB/s around the demand of 6.9 MB/s, in turn; modes likewise."""
     first, modes = FIRST_SEED[split], list(LTE_MODES)
     traces = [
         synthetic_lte(first + k, mean_bytes_per_s=(3e6, 5e6, 7e6, 9e6)[k % 4], mode=modes[k % 3])
-        for k in range(TRACES[split])
+        for k in range(count[split])
     ]
     return both_values(traces, motions_of(split))
 
@@ -86,9 +88,9 @@ def _lte(split: str, data: Path | None) -> dict[str, Setting]:
 _MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
 
 
-def _generated(split: str, data: Path | None) -> dict[str, Setting]:
+def _generated(split: str, data: Path | None, count: Mapping[str, int] = TRACES) -> dict[str, Setting]:
     """The settings of lte-belgium-v1 over generated links and motions; the ways of moving take turns."""
-    traces = [markov_link(_MOVING[k % 6], FIRST_SEED[split] + k) for k in range(TRACES[split])]
+    traces = [markov_link(_MOVING[k % 6], FIRST_SEED[split] + k) for k in range(count[split])]
     return both_sizes(traces, motions_of(split))
 
 
@@ -178,4 +180,11 @@ SUITES = (
     Suite("outage-v1", "one blackout of 5 to 60 s on a good link", _outage),
     Suite("sustained-v1", "steady links of a quarter, half and three quarters of the demand", _sustained),
     Suite("generated-v1", "30 Hz camera over links generated like recordings of six ways of moving", _generated),
+    Suite("lte-v2", "lte-v1 on four times as many test links", functools.partial(_lte, count=MORE_TRACES), seeds=2),
+    Suite(
+        "generated-v2",
+        "generated-v1 on four times as many test links",
+        functools.partial(_generated, count=MORE_TRACES),
+        seeds=2,
+    ),
 )

@@ -76,19 +76,29 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
 {
     const struct bufgym_scorer *scorer = &bufgym_scorer;
     const int s = q->occupancy, L = BUFGYM_CAPACITY;
-    double common, best = -HUGE_VAL;
+    double common, own, best = -HUGE_VAL;
+    int64_t freed_bytes = 0;
     int i, k, decision = BUFGYM_REJECT;
     bufgym_observe_context(q, arrival);
     bufgym_observe_slots(q, arrival);
     for (i = 0; i < scorer->context; i++)
         q->f[i] = q->context[scorer->fields[i]];
     common = bufgym_begin(q, scorer, BUFGYM_DROP);
-    for (k = 0; k <= s; k++) {
-        const double dropped = bufgym_score(q, scorer, BUFGYM_DROP, common, k < s ? k : L);
+    own = bufgym_score(q, scorer, BUFGYM_DROP, common, L);
+    for (k = 0; k < s; k++) {
+        const double dropped = bufgym_score(q, scorer, BUFGYM_DROP, common, k);
+        if (dropped >= own)
+            freed_bytes += q->slots[k].size_bytes;
         if (dropped > best) {
             best = dropped;
-            decision = k < s ? k : BUFGYM_REJECT;
+            decision = k;
         }
+    }
+    /* The newcomer stays once a message has gone for it. */
+    if (q->evictions == 0
+        && (own > best || q->backlog_bytes - freed_bytes + arrival->size_bytes > BUFGYM_MAX_BYTES)) {
+        best = own;
+        decision = BUFGYM_REJECT;
     }
     if (bufgym_has_space(q, arrival)) {
         common = bufgym_begin(q, scorer, BUFGYM_KEEP);

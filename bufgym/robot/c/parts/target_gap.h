@@ -12,14 +12,14 @@ bufgym_remember(struct bufgym_queue *q, const struct bufgym_message *arrival)
     if (q->evictions > 0)
         return;
     if (sent_us > 0.0) {
-        bufgym_average(&memory[BUFGYM_RATE], (double)q->drained_bytes, sent_us, memory[BUFGYM_SENT_US], @LINK_US@);
+        bufgym_average(&memory[BUFGYM_RATE], (double)q->drained_bytes, sent_us, memory[BUFGYM_SENT_US], 1e6 * @LINK_S@);
         memory[BUFGYM_SENT_US] += sent_us;
     }
     memory[BUFGYM_PERIOD] += weight * (us - memory[BUFGYM_PERIOD]);
     memory[BUFGYM_SQUARE] += weight * (us * us - memory[BUFGYM_SQUARE]);
     if (us > 0.0) {
         const double step = arrival->x - q->previous_x;
-        bufgym_average(&memory[BUFGYM_PACE], step, us, memory[BUFGYM_SEEN_US], @PACE_US@);
+        bufgym_average(&memory[BUFGYM_PACE], step, us, memory[BUFGYM_SEEN_US], 1e6 * @PACE_S@);
         memory[BUFGYM_SEEN_US] += us;
     }
 }
@@ -43,14 +43,47 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
         return 0.0;
     if (memory[BUFGYM_RATE] <= 0.0 || memory[BUFGYM_PACE] <= 0.0)
         return 0.0;
-    if (bufgym_bursty(q))
+    if (bufgym_bursty(q) || (L <= @SHORT_QUEUE@ && memory[BUFGYM_SEEN_US] < @SHORT_RUN_US@))
         return 0.0;
     recent = @SHORT@ * (1e6 * q->short_rate) + @LONG@ * (1e6 * q->long_rate);
-    r = (recent / 1e6 + @REST@ * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
+    r = (recent / 1e6 + (1 - @SHORT@ - @LONG@) * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
     if (L > r * memory[BUFGYM_SEEN_US])
         return 0.0;
-    m = @UNPACED@ * (arrival->x - q->dequeued_x) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
-    return m * @HORIZON_US@ / (r * @HORIZON_US@ + L - q->occupancy);
+    m = (1 - @PACED@) * (arrival->x - q->dequeued_x) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
+    return m * (1e6 * @HORIZON_S@) / (r * (1e6 * @HORIZON_S@) + L - q->occupancy);
+}
+
+/* Whether the socket is free before so many more arrivals. */
+static inline int bufgym_free_soon(const struct bufgym_queue *q, double arrivals)
+{
+    return (double)q->left_bytes * 1e6 < arrivals * q->period_us * (1e6 * q->short_rate);
+}
+
+/* The queued message that adds nothing, as V is straight over its gaps; -1 if each adds something. */
+static inline int bufgym_needless(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    int k;
+    if (@STRAIGHT@ <= 0.0 || q->occupancy == 0 || q->busy == 0)
+        return -1;
+    k = bufgym_smallest_gap(q, arrival, 0, q->occupancy, 0.0);
+    return bufgym_gap_left(q, arrival, k) <= @STRAIGHT@ ? k : -1;
+}
+
+/* Whether the head of a short queue goes before its turn comes. */
+static inline int bufgym_last_chance(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    const double rate = 1e6 * q->short_rate, f = (double)q->occupancy / BUFGYM_CAPACITY;
+    const double slowest_us = @SLOWEST@ * q->period_us, mean_rate = q->memory[BUFGYM_RATE];
+    double size, us;
+    if (BUFGYM_CAPACITY == 1 || BUFGYM_CAPACITY > @SHORT_QUEUE@ || q->occupancy == 0 || q->busy == 0 || rate <= 0.0)
+        return 0;
+    if (mean_rate <= 0.0 || bufgym_steady(q) || bufgym_bursty(q) || !bufgym_free_soon(q, @CHANCE@))
+        return 0;
+    size = bufgym_mean_bytes(q, arrival);
+    us = (@EARLY@ + @EARLY_FULL@ * f) * q->period_us;
+    us += (@SLOW@ - @SLOW_FULL@ * f) * (1e6 * size / rate < slowest_us ? 1e6 * size / rate : slowest_us);
+    us += @MEAN_FULL@ * f * (size / mean_rate < slowest_us ? size / mean_rate : slowest_us);
+    return bufgym_gap_left(q, arrival, 0) <= q->memory[BUFGYM_PACE] * us;
 }
 
 /* The decision that brings the gaps to g. */
@@ -61,12 +94,12 @@ static inline int bufgym_approach(
     int victim;
     if (room && (s == 0 || q->busy == 0))
         return BUFGYM_ACCEPT;
-    if (s > 0 && (double)q->left_bytes * 1e6 < @NEAR@ * q->period_us * (1e6 * q->short_rate)) {
+    if (s > 0 && bufgym_free_soon(q, @NEAR@)) {
         const struct bufgym_gaps head = bufgym_gaps_of(q, arrival, 0);
         if (fabs(head.before_x + head.after_x - g) < fabs(head.before_x - g))
             return 0;
     }
-    victim = bufgym_smallest_gap(q, arrival, @DISCOUNT@);
+    victim = bufgym_smallest_gap(q, arrival, 0, s + 1, @DISCOUNT@);
     if (room && bufgym_gap_left(q, arrival, victim) > @WITHIN@ * g)
         return BUFGYM_ACCEPT;
     return victim;

@@ -37,27 +37,6 @@ static inline double bufgym_gap_left(
     return gaps.before_x + gaps.after_x;
 }
 
-/* The slot that would leave the smallest gap, BUFGYM_REJECT for the newcomer; of equals the oldest. That of slot k of s
-   counts `discount` (1 - k / s) less. */
-static inline int bufgym_smallest_gap(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, double discount)
-{
-    const int s = q->occupancy;
-    double smallest = HUGE_VAL;
-    int k, victim = BUFGYM_REJECT;
-    for (k = 0; k <= s; k++) {
-        const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, k);
-        double left = gaps.before_x + gaps.after_x;
-        if (k < s)
-            left *= 1 - discount * (1 - (double)k / s);
-        if (left < smallest) {
-            smallest = left;
-            victim = k;
-        }
-    }
-    return victim < s ? victim : BUFGYM_REJECT;
-}
-
 /* Whether a queue with room can spare `victim`: enough wait for the link, a full queue would soon be sent, and the
    victim's neighbours then lie no farther apart than the link sends. */
 static inline int bufgym_spare(

@@ -8,5 +8,5 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
         return BUFGYM_ACCEPT;
     if (q->evictions == 0 && (double)(arrival->arrival_us - q->slots[s - 1].arrival_us) < beta * T / (s + 1))
         return BUFGYM_REJECT;
-    return bufgym_smallest_time_gap(q, arrival, s);
+    return bufgym_smallest_gap(q, arrival, 1, s, 0.0);
 }

@@ -3,20 +3,11 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
 {
     const int s = q->occupancy;
     const double pace = bufgym_parameters[0], discount = bufgym_parameters[1];
-    double even, smallest = HUGE_VAL;
-    int k, victim = 0;
+    double even;
     if (bufgym_has_space(q, arrival))
         return BUFGYM_ACCEPT;
     even = (arrival->x - q->dequeued_x) / (s + 1);
     if (q->evictions == 0 && bufgym_gaps_of(q, arrival, s).before_x < pace * even)
         return BUFGYM_REJECT;
-    for (k = 0; k < s; k++) {
-        const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, k);
-        double merged = (gaps.before_x + gaps.after_x) * (1 - discount * (1 - (double)k / s));
-        if (merged < smallest) {
-            smallest = merged;
-            victim = k;
-        }
-    }
-    return victim;
+    return bufgym_smallest_gap(q, arrival, 0, s, discount);
 }

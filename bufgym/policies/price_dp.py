@@ -1,0 +1,182 @@
+"""Rules that see bytes: ``price-dp`` sends what its bytes are worth, ``gap-price`` is ``target-gap`` for equal sizes.
+
+A byte sent now is not there for a later message. So bytes have a price, in QoI per byte, which the target gap g sets:
+
+    lambda <- kappa (2 V(g) - V(2 g)) / mean bytes of the queue and the newcomer
+
+At the gap g the message between two gaps is worth 2 V(g) - V(2 g); kappa times that is the price of a mean message. It
+is the *unit* below. Where g is unknown, g is the even gap that the queue has now, (x_new - x_dequeued) / (s + 1).
+``chains`` finds the *advantage* of dropping each message at that price, the chains' end lying ``tail`` g behind the
+newcomer.
+
+    if a queued message adds nothing: it goes
+    elif there is room, and the queue is empty or the socket idle: accept
+    elif the socket is free before ``price_near`` more arrivals, and dropping the head has an advantage: the head goes
+    elif the queue is full: the largest advantage goes
+    elif the largest advantage exceeds ``price_threshold`` units: it goes, though there is room
+    else: accept
+
+On light and steady links this is worse than ``target-gap``, and with equal sizes mostly so. With unequal sizes it is
+better almost everywhere, as a gap says nothing of bytes. So ``gap-price`` mixes both by a share a of price-dp that
+follows the spread of sizes, which is 0 for equal ones:
+
+    sd <- standard deviation of the logarithm of bytes, over the last arrivals
+    a  <- 1 / (1 + exp(share_low - share_steep min(sd, ``WIDEST``))), but 0 below ``LEAST_SHARE``
+
+Each candidate is then worth (1 - a) (threshold g - its discounted gap) / g, as target-gap has it, plus a (its advantage
+in units - price_threshold); what is worth most goes. The head is asked likewise, with target-gap's wish for it. A share
+that also follows the load was better on random links, and worse in outages and on light links.
+
+Under B a newcomer that takes the place of several messages goes itself, unless those that are worth more to drop make
+room for it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bufgym.ground.kernel import kernel
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, suffices
+from bufgym.model.observe.on_board import mean_bytes
+from bufgym.model.qoi import merging_loss, value
+from bufgym.policies import chains, target_gap
+from bufgym.policies.gaps import discounted
+from bufgym.policies.registry import Arrival, Memory, built_in
+from bufgym.policies.target_gap import DISCOUNT, NEAR, Numbers, bursty, free_soon, needless, remember, target
+from bufgym.policies.thinning import spare_us, steady
+
+PARAMETERS = {
+    **target_gap.PARAMETERS,
+    "threshold": 1.001,
+    "head": 1.0,
+    "bias": 1.0,
+    "kappa": 0.361,
+    "tail": 0.793,
+    "price_threshold": 0.432,
+    "price_near": 3.66,
+    "share_low": 3.0,
+    "share_steep": 15.0,
+}
+"""Those of target-gap; the gap that may be left with room, in g; the head's own target, in g, and the weight of the gap
+that it would leave; the numbers of the price; and those of the share."""
+THRESHOLD, HEAD, BIAS, KAPPA, TAIL, PRICE_THRESHOLD, PRICE_NEAR, SHARE_LOW, SHARE_STEEP = range(14, 23)
+WIDEST, LEAST_SHARE = 0.4, 0.06
+
+LOG_BYTES, VARIANCE, SIZES = range(6, 9)
+REMEMBERED = {**target_gap.REMEMBERED, "log_bytes": 0.0, "variance": 0.0, "sizes": 0.0}
+"""Memory: what target-gap remembers; mean and variance of the logarithm of bytes; arrivals so far."""
+ENTRIES = len(REMEMBERED)
+SIZES_WEIGHT = 1 / 64
+"""Weight of the newest arrival in mean and variance, once so many have come."""
+
+
+@kernel
+def remember_sizes(buffer: Buffer, arrival: Arrival, memory: Memory) -> None:
+    """Update mean and variance of the logarithm of bytes; call it at every arrival."""
+    if buffer.evictions > 0:
+        return
+    memory[SIZES] += 1
+    weight = max(1 / memory[SIZES], SIZES_WEIGHT)
+    off = math.log(arrival.size_bytes) - memory[LOG_BYTES]
+    memory[LOG_BYTES] += weight * off
+    memory[VARIANCE] = (1 - weight) * (memory[VARIANCE] + weight * off * off)
+
+
+@kernel
+def share(memory: Memory, numbers: Numbers) -> float:
+    """The share of price-dp, a."""
+    sd = min(math.sqrt(memory[VARIANCE]), WIDEST)
+    a = 1 / (1 + math.exp(numbers[SHARE_LOW] - numbers[SHARE_STEEP] * sd))
+    return a if a >= LEAST_SHARE else 0.0
+
+
+TINY = 1e-30
+"""Least g and unit to divide by."""
+
+
+@kernel
+def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a: float) -> int:
+    """The decision of both rules mixed, with a share ``a`` of price-dp, once ``remember`` has been called."""
+    extra = needless(buffer, arrival)
+    if extra >= 0:
+        return extra
+    s, room, scratch = len(buffer.slots), has_space(buffer, arrival), memory[ENTRIES:]
+    if room and (s == 0 or not buffer.busy):
+        return ACCEPT
+    g = target(buffer, arrival, memory, numbers)
+    known = g > 0 and not steady(buffer)
+    if g <= 0:
+        g = (arrival.x - buffer.dequeued_x) / (s + 1)
+    longest, discount = numbers[THRESHOLD] * g, numbers[DISCOUNT]
+    if not known:
+        longest, discount = -g, 0.0
+        each_us, elapsed_us = spare_us(buffer, arrival), arrival.arrival_us - buffer.dequeued_arrival_us
+        if each_us > 0 and not bursty(memory):
+            longest = (arrival.x - buffer.dequeued_x) * each_us / elapsed_us
+    per_unit, per_gap = 0.0, (1 - a) / max(g, TINY)
+    if a > 0:
+        even = value(buffer.v, g)
+        unit = numbers[KAPPA] * merging_loss(buffer.v, g, even, g, even)
+        chains.weigh(buffer, arrival, unit / mean_bytes(buffer, arrival), arrival.x + numbers[TAIL] * g, scratch)
+        per_unit = a / max(unit, TINY)
+    if s > 0 and free_soon(buffer, numbers[NEAR] + a * (numbers[PRICE_NEAR] - numbers[NEAR])):
+        gain = per_unit * chains.advantage(scratch, 0) if a > 0 else 0.0
+        if known:
+            head, after = motion_gaps(buffer, arrival, 0)
+            wish = numbers[HEAD] * g
+            gain += per_gap / numbers[HEAD] * (abs(head - wish) - numbers[BIAS] * abs(head + after - wish))
+        if gain > 0:
+            return 0
+    own = per_gap * (longest - discounted(buffer, arrival, False, s, discount))
+    if a > 0:
+        own += per_unit * chains.advantage(scratch, s)
+    victim, best, freed_bytes = -1, -np.inf, 0
+    for k in range(s):
+        gain = per_gap * (longest - discounted(buffer, arrival, False, k, discount))
+        if a > 0:
+            gain += per_unit * chains.advantage(scratch, k)
+        if gain >= own:
+            freed_bytes += buffer.slots[k].size_bytes
+        if gain > best:
+            victim, best = k, gain
+    if room:
+        return ACCEPT if max(own, best) < a * numbers[PRICE_THRESHOLD] else victim if best >= own else REJECT
+    if buffer.evictions > 0:  # the newcomer stays, now that a message has gone for it
+        return victim
+    if best < own or (not suffices(buffer, arrival, freed_bytes)):
+        return REJECT
+    return victim
+
+
+@built_in(
+    "price-dp",
+    parameters=PARAMETERS,
+    memory=REMEMBERED,
+    work=chains.SCRATCH,
+    source="own rule: Lagrangian price of bytes [fisher1981lagrangian], best chains through the queue",
+    reads_rate=True,
+)
+def price_dp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Sends the messages that are worth their bytes at the price that link, queue and motion set."""
+    remember(buffer, arrival, memory, buffer.parameters)
+    return decide(buffer, arrival, memory, buffer.parameters, 1.0)
+
+
+@built_in(
+    "gap-price",
+    parameters=PARAMETERS,
+    memory=REMEMBERED,
+    work=chains.SCRATCH,
+    source="own rule: target-gap for equal sizes, price-dp for unequal ones",
+    reads_rate=True,
+)
+def gap_price(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """Target-gap for messages of equal size, price-dp for unequal ones, mixed by the spread of their sizes."""
+    remember(buffer, arrival, memory, buffer.parameters)
+    remember_sizes(buffer, arrival, memory)
+    a = share(memory, buffer.parameters)
+    if a == 0:
+        return target_gap.decide(buffer, arrival, memory, buffer.parameters)
+    return decide(buffer, arrival, memory, buffer.parameters, a)
