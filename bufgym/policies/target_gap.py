@@ -50,7 +50,7 @@ from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import EXPONENTIAL, SATURATING
 from bufgym.policies.gaps import gap_left, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, built_in
-from bufgym.policies.thinning import places, spare, steady
+from bufgym.policies.thinning import places, spare, steady, within
 
 PARAMETERS = {
     "horizon_s": 5.0,
@@ -133,7 +133,7 @@ def target(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -
     r = (recent / 1e6 + (1 - numbers[SHORT] - numbers[LONG]) * memory[RATE]) / mean_bytes(buffer, arrival)
     if L > r * memory[SEEN_US]:
         return 0.0
-    horizon_us = 1e6 * numbers[HORIZON_S]
+    horizon_us = within(1e6 * numbers[HORIZON_S], buffer)
     m = (1 - numbers[PACED]) * (arrival.x - buffer.dequeued_x) / elapsed_us + numbers[PACED] * memory[PACE]
     return float(m * horizon_us / (r * horizon_us + L - s))
 

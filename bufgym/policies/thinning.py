@@ -53,6 +53,12 @@ def places(buffer: Buffer, arrival: Arrival) -> int:
 
 
 @kernel
+def within(horizon_us: float, buffer: Buffer) -> float:
+    """This horizon, or the time until the stream ends if that is known and less; at least 1 us."""
+    return max(min(horizon_us, float(buffer.remaining_us)), 1.0)
+
+
+@kernel
 def spare_us(buffer: Buffer, arrival: Arrival) -> float:
     """Time between messages that the link sends, by the rule in the module's text, us; 0 where none may be spared."""
     s, elapsed_us = len(buffer.slots), arrival.arrival_us - buffer.dequeued_arrival_us
@@ -61,7 +67,8 @@ def spare_us(buffer: Buffer, arrival: Arrival) -> float:
     each_us, L = send_us(buffer, arrival), places(buffer, arrival)
     if each_us <= 0 or L * each_us > SOON_US:
         return 0.0
-    return float(HORIZON_US / (HORIZON_US / each_us + L - s))
+    horizon_us = within(HORIZON_US, buffer)
+    return float(horizon_us / (horizon_us / each_us + L - s))
 
 
 @kernel

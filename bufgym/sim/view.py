@@ -6,6 +6,7 @@ from typing import Any
 
 from bufgym.ground.kernel import at, kernel, stretch
 from bufgym.model.buffer import Buffer
+from bufgym.model.link import FOREVER
 from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
@@ -78,6 +79,7 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.window,
         sender.dequeued - sender.acked,
         sender.evictions,
+        max(sender.ends_us - sender.now_us, 0) if sender.ends_us < FOREVER else FOREVER,
         batch.parameters,
     )
 
