@@ -52,6 +52,11 @@ def level(buffer):
     return bool(near and long > 0 and buffer.drained_us > 0)
 
 
+def near(horizon_us, buffer):
+    """The horizon, or the rest of the stream if that is less and known, but no less than 1 us."""
+    return max(1.0, min(horizon_us, buffer.remaining_us))
+
+
 def spared(buffer, arrival, victim):
     """Whether a queue with room can spare ``victim``."""
     s, elapsed_us = len(buffer.slots), arrival["arrival_us"] - buffer.dequeued_arrival_us
@@ -64,7 +69,8 @@ def spared(buffer, arrival, victim):
     left = gaps_left(buffer, arrival)[s if victim == REJECT else victim]
     L = places(buffer, arrival)
     soon = L * send_us <= SOON_US
-    room_us = 60e6 / (60e6 / send_us + L - s)  # a minute's messages, and those for which there is room
+    T = near(60e6, buffer)
+    room_us = T / (T / send_us + L - s)  # a minute's messages, and those for which there is room
     return soon and left * elapsed_us <= float(arrival["x"] - last) * room_us
 
 
@@ -131,7 +137,8 @@ class Seen:
             return None
         last = buffer.dequeued_x
         m = 0.6 * float(arrival["x"] - last) / elapsed_us + 0.4 * pace
-        g = m * 5e6 / (r * 5e6 + L - s)
+        T = near(5e6, buffer)
+        g = m * T / (r * T + L - s)
         return g if g > 0 else None
 
 

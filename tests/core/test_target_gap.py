@@ -96,6 +96,21 @@ def test_the_target_is_what_comes_divided_by_what_the_link_and_the_room_carry():
 
 
 @kernels
+def test_near_the_end_of_the_stream_the_target_is_what_comes_until_then():
+    # In 2 s come 60 frames, and the link sends 15: with three waiting one in 60 / 20. In 0.2 s 6 come, 1.5 are sent.
+    def left(us):
+        return target(*fast(2, 4, 6, remaining_us=us), remembered())
+
+    assert left(2_000_000) == pytest.approx(2 * 60 / 20, rel=1e-3)
+    assert left(200_000) == pytest.approx(2 * 6 / 6.5, rel=1e-3)
+    assert left(5_000_000) == left(60_000_000) == target(*fast(2, 4, 6), remembered())  # farther than the horizon
+    # At the end, or past one that was told wrong: what has room goes in, and a full queue keeps to the link's gap.
+    assert 0 < left(0) == left(1) < 1e-4
+    full = fast(0, 1, 2, 3, 4, 5, 6, 7, remaining_us=0)
+    assert target(*full, remembered()) == pytest.approx(2 * 4.0, rel=1e-3)
+
+
+@kernels
 @pytest.mark.parametrize(
     "change",
     [{"capacity": 3}, {"max_bytes": 3999}, {"dequeued_arrival_us": 8 * 33_333}],
