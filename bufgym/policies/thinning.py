@@ -7,7 +7,7 @@ Messages leave a slow link every so many arrivals. If queued messages lie closer
 run of near neighbours, and later a hole as long as they took to send. So a message goes at once, room or not, if its
 neighbours then still lie no farther apart than the link sends at the fastest of its recent rates. No transmission is
 lost this way. The remaining room should fill up within ``HORIZON_US``, since messages waiting at the end of the stream
-are sent too; so the messages lie a little closer.
+are sent too; so the messages lie a little closer. If the robot knows that the stream ends earlier, they do by then.
 """
 
 from __future__ import annotations
@@ -54,8 +54,11 @@ def places(buffer: Buffer, arrival: Arrival) -> int:
 
 @kernel
 def within(horizon_us: float, buffer: Buffer) -> float:
-    """This horizon, or the time until the stream ends if that is known and less; at least 1 us."""
-    return max(min(horizon_us, float(buffer.remaining_us)), 1.0)
+    """This horizon, or the time until the stream ends if that is known and less.
+
+    A stream that goes on beyond the end that was told may end at any time: the horizon is then as if nothing was told.
+    """
+    return min(horizon_us, float(buffer.remaining_us)) if buffer.remaining_us > 0 else horizon_us
 
 
 @kernel

@@ -5,6 +5,7 @@
 
 import itertools
 
+from bufgym.model.link import FOREVER
 from bufgym.policies import ACCEPT, REJECT
 from bufgym.policies.thinning import SOON_US
 
@@ -53,8 +54,8 @@ def level(buffer):
 
 
 def near(horizon_us, buffer):
-    """The horizon, or the rest of the stream if that is less and known, but no less than 1 us."""
-    return max(1.0, min(horizon_us, buffer.remaining_us))
+    """The horizon, or the rest of the stream if that is less, known, and not over."""
+    return min(horizon_us, buffer.remaining_us or horizon_us)
 
 
 def spared(buffer, arrival, victim):
@@ -133,7 +134,8 @@ class Seen:
             return None
         recent = (0.25 * buffer.short_rate_bytes_per_s + 0.25 * buffer.long_rate_bytes_per_s) / 1e6
         r = (recent + 0.5 * rate) / ((buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1))
-        if r * self.seen_us < L or (L <= 5 and self.seen_us < 10e6):
+        sooner = 4 if buffer.remaining_us < FOREVER else 1
+        if sooner * r * self.seen_us < L or (L <= 5 and self.seen_us < 10e6):
             return None
         last = buffer.dequeued_x
         m = 0.6 * float(arrival["x"] - last) / elapsed_us + 0.4 * pace

@@ -92,7 +92,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "SOON_US": repr(thinning.SOON_US),
         **{
             name: getattr(target_gap, name)
-            for name in ("LEAST", "SHORT_QUEUE", "SHORT_RUN_US", "SLOWEST", "BURSTY", "LATE")
+            for name in ("LEAST", "SHORT_QUEUE", "SHORT_RUN_US", "SLOWEST", "BURSTY", "LATE", "TOLD")
         },
         "STRAIGHT": repr(straight(value.array)),
         "WITHIN": repr(target_gap.WITHIN),

@@ -48,7 +48,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
         return 0.0;
     recent = @SHORT@ * (1e6 * q->short_rate) + @LONG@ * (1e6 * q->long_rate);
     r = (recent / 1e6 + (1 - @SHORT@ - @LONG@) * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
-    if (L > r * memory[BUFGYM_SEEN_US])
+    if (L > (q->ends_us < BUFGYM_FOREVER ? @TOLD@ : 1.0) * r * memory[BUFGYM_SEEN_US])
         return 0.0;
     m = (1 - @PACED@) * (arrival->x - q->dequeued_x) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
     return m * horizon_us / (r * horizon_us + L - q->occupancy);

@@ -37,12 +37,11 @@ static inline double bufgym_gap_left(
     return gaps.before_x + gaps.after_x;
 }
 
-/* This horizon, us, or the time until the stream ends if that is known and less; at least 1 us. */
+/* This horizon, us, or the time until the stream ends if that is known, to come, and less. */
 static inline double bufgym_within(const struct bufgym_queue *q, double horizon_us)
 {
     const double left_us = (double)bufgym_remaining_us(q);
-    const double us = left_us < horizon_us ? left_us : horizon_us;
-    return us > 1.0 ? us : 1.0;
+    return left_us > 0.0 && left_us < horizon_us ? left_us : horizon_us;
 }
 
 /* Whether a queue with room can spare `victim`: enough wait for the link, a full queue would soon be sent, and the
