@@ -24,7 +24,8 @@ is straight up to where it is flat.
 No target is set while the past does not predict the future. In bursts an empty queue would leave the link idle; one
 long pause counts as a burst for some seconds. Nor is there a target for queues of fewer than ``LEAST`` messages, before
 anything has been sent, or until the stream has run for as long as a full queue takes to be sent, a short queue's for
-``SHORT_RUN_US``. If the robot knows when the stream ends, a quarter of that long is enough, and T ends there. Then the smallest gap goes, and ``thinning`` says whether it goes with room too.
+``SHORT_RUN_US``. If the robot knows when the stream ends, a quarter of that long is enough, and T ends there. Then the
+smallest gap goes, and ``thinning`` says whether it goes with room too.
 
 A queue of up to ``SHORT_QUEUE`` messages holds too little to wait for a target. Its head gets a *last chance*:
 
