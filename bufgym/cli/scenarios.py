@@ -46,6 +46,8 @@ class StreamOptions:
     """Law of the sizes: jpeg, gop, depth-colour, motion, recorded:NAME; with parameters jpeg:cv=0.3."""
     seconds: Positive | None = None
     """Length of an episode, s."""
+    tells_duration: bool = False
+    """The sender is told beforehand how long the stream lasts."""
     jitter: Least0 | None = None
     """Arrivals move by up to this part of a period."""
     scale: Positive | None = None
@@ -199,7 +201,7 @@ def _recording(
         refuse(given(recording, *MOTION), "needs --odom or --motion")
     by_motion = bool(motions) or workload.x is not None
     value = stream.value or (qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential())
-    settings = _parameters(stream, "trace", "scale")
+    settings = _parameters(stream, "trace", "scale", "tells_duration")
     uplink = _over_lte(motion=motions, random_offset=seeds is not None, value=value, workload=workload, **settings)
     source = f"from {_some([_with_gaps(motion) for motion in motions])}" if motions else "as recorded"
     places = "from the trace's start" if seeds is None else f"{seeds} random places each"

@@ -153,6 +153,8 @@ class Buffer(NamedTuple):
     evictions: int
     """Messages evicted so far for the current arrival. It is 0 at the first question; the policy is asked again while
     B still has no room. A policy that counts arrivals counts only where this is 0."""
+    remaining_us: int
+    """Time until the stream ends, as far as the robot was told, at least 0; FOREVER if it was not."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
     """float64[parameters], read-only: the policy's own settings in the order of its registration, or its weights."""
 

@@ -23,8 +23,9 @@ is straight up to where it is flat.
 
 No target is set while the past does not predict the future. In bursts an empty queue would leave the link idle; one
 long pause counts as a burst for some seconds. Nor is there a target for queues of fewer than ``LEAST`` messages, before
-anything has been sent, or until the stream has run for a quarter of the time that a full queue takes to be sent, a
-short queue's for ``SHORT_RUN_US``. Then the smallest gap goes, and ``thinning`` says whether it goes with room too.
+anything has been sent, or until the stream has run for as long as a full queue takes to be sent, a short queue's for
+``SHORT_RUN_US``. If the robot knows when the stream ends, a quarter of that long is enough, and T ends there. Then the
+smallest gap goes, and ``thinning`` says whether it goes with room too.
 
 A queue of up to ``SHORT_QUEUE`` messages holds too little to wait for a target. Its head gets a *last chance*:
 
@@ -46,11 +47,12 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, Buffer, has_space, motion_gaps, running_mean
+from bufgym.model.link import FOREVER
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import EXPONENTIAL, SATURATING
 from bufgym.policies.gaps import gap_left, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, built_in
-from bufgym.policies.thinning import places, spare, steady
+from bufgym.policies.thinning import places, spare, steady, within
 
 PARAMETERS = {
     "horizon_s": 5.0,
@@ -77,6 +79,8 @@ LEAST = 4
 """Smallest L that follows the target."""
 SHORT_QUEUE, SHORT_RUN_US = 5, 10e6
 """Largest L with a last chance for its head, and how long a stream must have run for it to follow the target, us."""
+TOLD = 4.0
+"""How many times sooner a stream follows the target if the robot knows when it ends."""
 SLOWEST = 16.0
 """Most arrivals in S and M."""
 BURSTY, LATE = 1.5, 1 / 32
@@ -131,9 +135,9 @@ def target(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -
         return 0.0
     recent = numbers[SHORT] * buffer.short_rate_bytes_per_s + numbers[LONG] * buffer.long_rate_bytes_per_s
     r = (recent / 1e6 + (1 - numbers[SHORT] - numbers[LONG]) * memory[RATE]) / mean_bytes(buffer, arrival)
-    if L > r * memory[SEEN_US]:
+    if L > (TOLD if buffer.remaining_us < FOREVER else 1.0) * r * memory[SEEN_US]:
         return 0.0
-    horizon_us = 1e6 * numbers[HORIZON_S]
+    horizon_us = within(1e6 * numbers[HORIZON_S], buffer)
     m = (1 - numbers[PACED]) * (arrival.x - buffer.dequeued_x) / elapsed_us + numbers[PACED] * memory[PACE]
     return float(m * horizon_us / (r * horizon_us + L - s))
 

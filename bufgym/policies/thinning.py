@@ -7,7 +7,7 @@ Messages leave a slow link every so many arrivals. If queued messages lie closer
 run of near neighbours, and later a hole as long as they took to send. So a message goes at once, room or not, if its
 neighbours then still lie no farther apart than the link sends at the fastest of its recent rates. No transmission is
 lost this way. The remaining room should fill up within ``HORIZON_US``, since messages waiting at the end of the stream
-are sent too; so the messages lie a little closer.
+are sent too; so the messages lie a little closer. If the robot knows that the stream ends earlier, they do by then.
 """
 
 from __future__ import annotations
@@ -53,6 +53,15 @@ def places(buffer: Buffer, arrival: Arrival) -> int:
 
 
 @kernel
+def within(horizon_us: float, buffer: Buffer) -> float:
+    """This horizon, or the time until the stream ends if that is known and less.
+
+    A stream that goes on beyond the end that was told may end at any time: the horizon is then as if nothing was told.
+    """
+    return min(horizon_us, float(buffer.remaining_us)) if buffer.remaining_us > 0 else horizon_us
+
+
+@kernel
 def spare_us(buffer: Buffer, arrival: Arrival) -> float:
     """Time between messages that the link sends, by the rule in the module's text, us; 0 where none may be spared."""
     s, elapsed_us = len(buffer.slots), arrival.arrival_us - buffer.dequeued_arrival_us
@@ -61,7 +70,8 @@ def spare_us(buffer: Buffer, arrival: Arrival) -> float:
     each_us, L = send_us(buffer, arrival), places(buffer, arrival)
     if each_us <= 0 or L * each_us > SOON_US:
         return 0.0
-    return float(HORIZON_US / (HORIZON_US / each_us + L - s))
+    horizon_us = within(HORIZON_US, buffer)
+    return float(horizon_us / (horizon_us / each_us + L - s))
 
 
 @kernel

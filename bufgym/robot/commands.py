@@ -64,7 +64,7 @@ async def send(
         capacity: L, messages.
         rate: Frames a second.
         size: Of a frame, bytes.
-        duration: Seconds.
+        duration: Seconds; the policy knows it.
         motion: File or shipped name that gives x; or 'none'.
         log: Log every decision to this file (.mcap), for replay.
         view: Show queue, drops, rates and QoI as it happens.
@@ -91,7 +91,8 @@ async def send(
                 if taker is not None:
                     taker(one)
 
-        queue = PolicyQueue(policy, capacity, value=qoi.exponential(math.exp(-1)), log=record)
+        value = qoi.exponential(math.exp(-1))
+        queue = PolicyQueue(policy, capacity, value=value, duration_s=duration, log=record)
         loop, sender = asyncio.get_running_loop(), Sender(queue, lambda: TRANSPORTS[transport](host, port))
         sending, began_s, body = asyncio.create_task(sender.run()), loop.time(), bytes(size)
         for k in range(round(rate * duration)):

@@ -5,7 +5,7 @@ need the extra ``live``.
 
 | event | fields besides ``us``, the time |
 |---|---|
-| settings | policy, parameters, capacity, max_bytes, v, decide_at, topics, window |
+| settings | policy, parameters, capacity, max_bytes, v, decide_at, topics, window, ends_us |
 | put | seq, size_bytes, x, topic, uniform, carried: bytes that the link had carried by then |
 | dequeued | seq: the socket took it |
 | gone | seq, carried: the link has carried it |
@@ -44,6 +44,7 @@ def settings(
     decide_at: str,
     topics: Sequence[Topic],
     window: int,
+    ends_us: int | None,
 ) -> Record:
     """Make the first record of a log, with all settings of the queue; V is stored as its exact numbers."""
     return {
@@ -59,6 +60,7 @@ def settings(
             {**asdict(topic), "value": None if topic.value is None else _numbers(topic.value)} for topic in topics
         ],
         "window": int(window),
+        "ends_us": ends_us,
     }
 
 

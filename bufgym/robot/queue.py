@@ -29,7 +29,7 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import check_limits
-from bufgym.model.checks import check_window, is_number, whole
+from bufgym.model.checks import between, check_window, is_number, whole
 from bufgym.model.link import MAX_TIME_US
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
@@ -76,6 +76,7 @@ class PolicyQueue:
         decide_at: str = "arrival",
         topics: Sequence[Topic] = (),
         window: int = 1,
+        duration_s: float | None = None,
         log: LogFile | Callable[[Record], None] | None = None,
         seed: int | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -91,6 +92,7 @@ class PolicyQueue:
             decide_at: "arrival" or "overflow", as in the simulator.
             topics: rules of each topic, by topic number; empty for one queue without rules.
             window: n_T, most messages handed out and not yet gone.
+            duration_s: time from now until the stream ends, as far as it is known; messages may come later.
             log: a ``LogFile`` or any function, called with a record of each event.
             seed: seed of randomised policies' draws.
             clock: seconds; steps backwards are ignored.
@@ -99,6 +101,9 @@ class PolicyQueue:
         check_limits(capacity, max_bytes)
         self.policy = get(policy)
         value = qoi.exponential() if value is None else value
+        if duration_s is not None:
+            between("duration_s", duration_s, 0, MAX_TIME_US / 1e6, "s")
+        ends_us = None if duration_s is None else round(1e6 * duration_s)
         self._row = LiveRow(
             self.policy,
             capacity,
@@ -107,6 +112,7 @@ class PolicyQueue:
             decide_at=decide_at,
             topics=topics,
             window=check_window(window),
+            ends_us=ends_us,
             room=whole("room", room, 8, 2**30),
         )
         self.left_bytes: Callable[[], int | None] = lambda: None
@@ -130,7 +136,7 @@ class PolicyQueue:
         self._closed = False
         self.dropped = 0
         """Messages dropped so far."""
-        self._tell(settings(self.policy, capacity, value, max_bytes, decide_at, topics, window))
+        self._tell(settings(self.policy, capacity, value, max_bytes, decide_at, topics, window, ends_us))
 
     # --- in ----------------------------------------------------------------------------------------------------------
 

@@ -58,10 +58,10 @@ def _replayed(records: Sequence[Record], policy: Policy | None) -> Replay:
     if policy is None:
         policy = replace(get(made["policy"]), parameters=made["parameters"])
     topics = [Topic(**{**topic, "value": topic["value"] and value_of(topic["value"])}) for topic in made["topics"]]
-    episode = Episode(_arrivals(records), Link(_trace(records)), window=made["window"])
+    episode = Episode(_arrivals(records), Link(_trace(records)), window=made["window"], ends_us=made.get("ends_us"))
     senders = run(
         policy,
-        [replace(episode, window=made["window"])],
+        [episode],
         made["capacity"],
         value_of(made["v"]),
         max_bytes=made["max_bytes"],

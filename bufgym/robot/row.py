@@ -48,6 +48,7 @@ class LiveRow:
         decide_at: str = "arrival",
         topics: Sequence[Topic] = (),
         window: int = 1,
+        ends_us: int | None = None,
         room: int = ROOM,
     ) -> None:
         if policy.unbounded or policy.privileged is not None:
@@ -59,7 +60,7 @@ class LiveRow:
         )
         # A dummy episode resets the row; its link has two knots and carries nothing.
         nothing = Trace("live", np.array([0, 1]), np.array([0, 0]), "stop")
-        self.senders.load(0, Episode(messages(np.array([0]), 1), Link(nothing), window=window))
+        self.senders.load(0, Episode(messages(np.array([0]), 1), Link(nothing), window=window, ends_us=ends_us))
         self.senders.follow(policy)
         self.memory = policy.new_memory(1, self.senders.capacity)
         self._use(self.senders.batch, room)

@@ -79,6 +79,7 @@ async def play(
         value=value,
         topics=topics,
         window=episode.window,
+        duration_s=None if episode.ends_us is None else episode.ends_us / 1e6,
         seed=seed,
         log=None if log is None else log.append,
         clock=lambda: (time.monotonic() - began_s) * speed,

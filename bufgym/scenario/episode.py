@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import check_window, whole
-from bufgym.model.link import Link
+from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_ack_delay
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
@@ -66,6 +66,8 @@ class Episode:
     """Receivers of each message, and copies that a copying client sends."""
     value: Value | None = None
     """V for the episode's QoI; None for the scenario's."""
+    ends_us: int | None = None
+    """Time at which the robot was told that its stream ends, us, right or wrong; None if it was not told."""
     one_scene: bool = field(init=False, repr=False)
     """Whether x never falls, even across topics: only then can all messages share one queue."""
 
@@ -81,6 +83,7 @@ class Episode:
         whole("first_decision", self.first_decision)
         whole("last_decision", self.last_decision, 0, 2**62)
         whole("consumers", self.consumers, 1, MAX_MESSAGES // n)
+        check_end(self.ends_us)
         for name, size_bytes in self.encodings.items():
             if np.shape(size_bytes) != (n,):
                 raise BufgymError(f"encodings[{name!r}]: must be int64[{n}], the bytes of each message")
@@ -126,6 +129,12 @@ class Episode:
         arrivals["seq"] = np.arange(len(arrivals))
         encodings = {name: np.repeat(sizes, self.consumers) for name, sizes in self.encodings.items()}
         return replace(self, arrivals=read_only(arrivals), encodings=encodings, consumers=1)
+
+
+def check_end(ends_us: Any) -> None:
+    """Raise unless this is a time, us, or None."""
+    if ends_us is not None:
+        whole("ends_us", ends_us, 0, MAX_TIME_US)
 
 
 def check_link(link: Any) -> Link:

@@ -15,7 +15,7 @@ from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.scenario import registry
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
-from bufgym.scenario.episode import Episode, Streams, check_link
+from bufgym.scenario.episode import Episode, Streams, check_end, check_link
 from bufgym.scenario.uplink import Uplink
 
 MAX_ROBOTS = 256
@@ -30,9 +30,12 @@ class FleetEpisode:
     """MESSAGE[n] of each robot, read-only, in order of arrival."""
     link: Link
     """The cell's link, shared by all."""
+    ends_us: int | None = None
+    """Time at which each robot was told that its stream ends, as in ``Episode``."""
 
     def __post_init__(self) -> None:
         check_robots(len(self.arrivals))
+        check_end(self.ends_us)
         check_link(self.link)
         robots, last_us, total_bytes = [], 0, 0
         for i, arrivals in enumerate(self.arrivals):
@@ -58,12 +61,12 @@ class FleetEpisode:
 
     def episode(self, robot: int) -> Episode:
         """The episode of one robot as if it had the cell to itself."""
-        return Episode(self.arrivals[robot], self.link)
+        return Episode(self.arrivals[robot], self.link, ends_us=self.ends_us)
 
     def with_uniforms(self, rng: np.random.Generator) -> FleetEpisode:
         """The same episode with a fresh uniform draw beside each arrival, for randomised policies."""
         arrivals = [self.episode(i).with_uniforms(rng).arrivals for i in range(self.robots)]
-        return FleetEpisode(tuple(arrivals), self.link)
+        return replace(self, arrivals=tuple(arrivals))
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ class FleetScenario:
         """Draw one episode."""
         first = self._cell.draw(streams)
         others = [self._beside(first.arrivals["arrival_us"], streams, robot) for robot in range(1, self.robots)]
-        return FleetEpisode((first.arrivals, *others), first.link)
+        return FleetEpisode((first.arrivals, *others), first.link, first.ends_us)
 
     def _beside(self, arrival_us: NDArray[np.int64], streams: Streams, robot: int) -> NDArray[Any]:
         """MESSAGE[n] of one more robot whose camera ticks at these times."""

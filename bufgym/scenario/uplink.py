@@ -65,6 +65,8 @@ class Uplink:
     """Law of the sizes: equal, jpeg, gop, depth-colour, motion or recorded:NAME (``bufgym.traces.generate.sizes``)."""
     duration_s: float = 30.0
     """Length of an episode's arrivals, s."""
+    tells_duration: bool = False
+    """Whether the sender is told ``duration_s``, or a workload's length, beforehand."""
     scale: tuple[float, ...] = (1.0,)
     """Factors on the link's capacity; one of them is drawn for an episode."""
     random_offset: bool = True
@@ -127,7 +129,10 @@ class Uplink:
             arrivals = _replayed(self.workload)
             self._move(arrivals, streams.arrival)
         trace, offset_us = place_link(self._links, streams.link, self.random_offset, self.link_offset_s)
-        return Episode(read_only(arrivals), Link(trace, offset_us, int(self.propagation_us)))
+        ends_us = None
+        if self.tells_duration:
+            ends_us = round(1e6 * self.duration_s) if self.workload is None else int(arrivals["arrival_us"][-1])
+        return Episode(read_only(arrivals), Link(trace, offset_us, int(self.propagation_us)), ends_us=ends_us)
 
     def stream(
         self, rng: np.random.Generator, robot: int = 0, arrival_us: NDArray[np.int64] | None = None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
-from bufgym.model.link import KnotStore
+from bufgym.model.link import FOREVER, KnotStore
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy
@@ -26,7 +26,7 @@ Begun = tuple[int, Episode, np.random.Generator | None]
 
 _EPISODE = ("arrivals", "first_decision", "last_decision")
 _TRACE = ("first_knot", "last_knot", "after", "segment_now", "segment_finish")
-_DELAYS = ("offset_us", "propagation_us", "window", "ack_delay_us", "v_start")
+_DELAYS = ("offset_us", "propagation_us", "window", "ack_delay_us", "v_start", "ends_us")
 _LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in (*_EPISODE, *_TRACE, *_DELAYS)])
 """Fields of SENDER that differ from episode to episode."""
 
@@ -127,6 +127,7 @@ class Senders:
             *(n, episode.first_decision, episode.last_decision),
             *(first_knot, last_knot, after, first_knot, first_knot),
             *(link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us, v_start),
+            FOREVER if episode.ends_us is None else episode.ends_us,
         )
         batch.senders.view(np.int64)[i * len(beginning) : (i + 1) * len(beginning)] = beginning
 

@@ -59,6 +59,7 @@ SENDER = np.dtype(
         ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
         ("offset_us", np.int64),
         ("propagation_us", np.int64),
+        ("ends_us", np.int64),  # when the stream ends, as far as it was told; FOREVER if it was not
         # clock
         ("now_us", np.int64),
         ("next", np.int64),  # the next arrival, or the one that waits for a decision

@@ -6,6 +6,7 @@ from typing import Any
 
 from bufgym.ground.kernel import at, kernel, stretch
 from bufgym.model.buffer import Buffer
+from bufgym.model.link import FOREVER
 from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
@@ -40,14 +41,16 @@ def view(batch: Batch, i: int) -> Buffer:
             while at(batch.slots, i, k).topic != arrival.topic:
                 k += 1
             dequeued_arrival_us, dequeued_x = at(batch.slots, i, k).arrival_us, at(batch.slots, i, k).x
-    left_bytes, left_fraction = 0, 0.0
+    busy, left_bytes, left_fraction = 0, 0, 0.0
     if sender.busy > 0:
+        busy = 1
         total_bytes = held_bytes(batch, i)
         if sender.measures == 1 and sender.waiting == ARRIVAL_WAITS:
             left_bytes = sender.left_bytes
         else:
             left_bytes = left_of(batch, i, total_bytes)
         left_fraction = left_bytes / total_bytes
+    remaining_us = max(sender.ends_us - sender.now_us, 0) if sender.ends_us < FOREVER else FOREVER
     return Buffer(
         stretch(batch.slots, i, first, occupancy),
         sender.capacity,
@@ -60,7 +63,7 @@ def view(batch: Batch, i: int) -> Buffer:
         dequeued_seq,
         previous_us,
         previous_x,
-        1 if sender.busy > 0 else 0,
+        busy,
         left_bytes,
         left_fraction,
         sender.now_us - sender.last_dequeue_us,
@@ -78,6 +81,7 @@ def view(batch: Batch, i: int) -> Buffer:
         sender.window,
         sender.dequeued - sender.acked,
         sender.evictions,
+        remaining_us,
         batch.parameters,
     )
 

@@ -5,6 +5,7 @@
 
 import itertools
 
+from bufgym.model.link import FOREVER
 from bufgym.policies import ACCEPT, REJECT
 from bufgym.policies.thinning import SOON_US
 
@@ -52,6 +53,11 @@ def level(buffer):
     return bool(near and long > 0 and buffer.drained_us > 0)
 
 
+def near(horizon_us, buffer):
+    """The horizon, or the rest of the stream if that is less, known, and not over."""
+    return min(horizon_us, buffer.remaining_us or horizon_us)
+
+
 def spared(buffer, arrival, victim):
     """Whether a queue with room can spare ``victim``."""
     s, elapsed_us = len(buffer.slots), arrival["arrival_us"] - buffer.dequeued_arrival_us
@@ -64,7 +70,8 @@ def spared(buffer, arrival, victim):
     left = gaps_left(buffer, arrival)[s if victim == REJECT else victim]
     L = places(buffer, arrival)
     soon = L * send_us <= SOON_US
-    room_us = 60e6 / (60e6 / send_us + L - s)  # a minute's messages, and those for which there is room
+    T = near(60e6, buffer)
+    room_us = T / (T / send_us + L - s)  # a minute's messages, and those for which there is room
     return soon and left * elapsed_us <= float(arrival["x"] - last) * room_us
 
 
@@ -127,11 +134,13 @@ class Seen:
             return None
         recent = (0.25 * buffer.short_rate_bytes_per_s + 0.25 * buffer.long_rate_bytes_per_s) / 1e6
         r = (recent + 0.5 * rate) / ((buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1))
-        if r * self.seen_us < L or (L <= 5 and self.seen_us < 10e6):
+        sooner = 4 if buffer.remaining_us < FOREVER else 1
+        if sooner * r * self.seen_us < L or (L <= 5 and self.seen_us < 10e6):
             return None
         last = buffer.dequeued_x
         m = 0.6 * float(arrival["x"] - last) / elapsed_us + 0.4 * pace
-        g = m * 5e6 / (r * 5e6 + L - s)
+        T = near(5e6, buffer)
+        g = m * T / (r * T + L - s)
         return g if g > 0 else None
 
 

@@ -62,6 +62,8 @@ def test_a_message_that_breaks_a_rule(fields: dict[str, Any], message: str) -> N
         ({"arrivals": np.zeros((3, 1), MESSAGE)}, "arrivals: must be MESSAGE"),
         ({"link": None}, "link: None is not a bufgym.model.link Link"),
         ({"window": 0}, "window = 0"),
+        ({"ends_us": -1}, "ends_us = -1: must be a whole number from 0 to"),
+        ({"ends_us": 0.5}, "ends_us = 0.5"),
         ({"consumers": 0}, "consumers = 0: must be a whole number from 1 to 3333333"),
         ({"first_decision": 0.5}, "first_decision = 0.5"),
         ({"last_decision": 2**63}, "last_decision = 9223372036854775808"),
@@ -71,6 +73,16 @@ def test_a_message_that_breaks_a_rule(fields: dict[str, Any], message: str) -> N
 def test_other_parameters(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(BufgymError, match=message):
         replace(Episode(THREE, STEADY), **changes)
+
+
+def test_what_the_robot_was_told_survives() -> None:
+    rng, told = np.random.default_rng(0), Episode(THREE, STEADY, encodings={"json": np.ones(3, np.int64)}, ends_us=7)
+    fleet = FleetEpisode((THREE, THREE), STEADY, 7)
+    others = told.with_uniforms(rng), told.encoded("json"), told.copied(2), told.valued(V)
+    for episode in (*others, fleet.episode(1), fleet.with_uniforms(rng).episode(0)):
+        assert episode.ends_us == 7
+    with pytest.raises(BufgymError, match="ends_us = -7"):
+        FleetEpisode((THREE, THREE), STEADY, -7)
 
 
 def test_another_encoding_keeps_the_rules_too() -> None:

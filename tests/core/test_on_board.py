@@ -89,6 +89,8 @@ def test_fields_by_hand():
     assert on_link["time_to_free"] == 0.75
     assert seen(left_bytes=9_000)["time_to_free"] == 1
     assert seen()["time_to_free"] == 0
+    assert [seen(remaining_us=us)["remaining"] for us in (0, 10_000_000, 30_000_000)] == [0, 0.5, 0.75]
+    assert seen()["remaining"] == 1  # nobody told it
 
 
 def test_only_those_who_read_the_rate_have_it_measured():

@@ -10,11 +10,14 @@ from hypothesis import strategies as st
 
 from bufgym import policies, scenario
 from bufgym.ground.errors import BufgymError
-from bufgym.scenario import LAWS, SCENARIOS, Interruption, Streams, Uplink, messages
+from bufgym.model.link import FOREVER
+from bufgym.policies import Policy
+from bufgym.scenario import LAWS, SCENARIOS, FleetScenario, Interruption, Streams, Uplink, messages
 from bufgym.scenario.arrivals import check_messages
 from bufgym.scenario.draws import place
 from bufgym.sim import run
 from bufgym.traces import Motion
+from bufgym.traces.workload import Workload
 
 STEADY = trace([(0, 0), (1_000_000, 5_000_000)], "loop")
 FADING = trace([(0, 0), (500_000, 4_000_000), (900_000, 4_000_000), (1_000_000, 4_100_000)], "loop")
@@ -187,6 +190,27 @@ def test_what_is_refused(build, rule):
 
 def uplink(**parameters):
     return Uplink(**{"traces": (STEADY,), **parameters})
+
+
+@pytest.mark.parametrize("workload", [None, Workload("played", np.array([0, 70_000]), np.array([1, 1]))])
+def test_the_sender_is_told_how_long_the_stream_lasts_if_the_scenario_says_so(workload):
+    told = uplink(duration_s=2.5, tells_duration=True, workload=workload)
+    drawn, not_told = told.draw(Streams.seeded(1)), replace(told, tells_duration=False).draw(Streams.seeded(1))
+    assert drawn.ends_us == (2_500_000 if workload is None else 70_000) and not_told.ends_us is None
+    assert np.array_equal(drawn.arrivals, not_told.arrivals)
+    if workload is None:
+        assert FleetScenario(2, told).draw(Streams.seeded(1)).episode(1).ends_us == 2_500_000
+    seen = []
+
+    def on_arrival(buffer, arrival, memory):
+        seen.append(buffer.remaining_us)
+        return policies.REJECT
+
+    for episode in (drawn, not_told):
+        run(Policy("watches", on_arrival), [episode], 3, told.value)
+    n = len(drawn.arrivals)
+    assert seen[:n] == (drawn.ends_us - drawn.arrivals["arrival_us"]).tolist()
+    assert set(seen[n:]) == {FOREVER}
 
 
 def test_get():

@@ -96,6 +96,22 @@ def test_the_target_is_what_comes_divided_by_what_the_link_and_the_room_carry():
 
 
 @kernels
+def test_near_the_end_of_the_stream_the_target_is_what_comes_until_then():
+    # In 2 s come 60 frames, and the link sends 15: with three waiting one in 60 / 20. In 0.2 s 6 come, 1.5 are sent.
+    def left(us):
+        return target(*fast(2, 4, 6, remaining_us=us), remembered())
+
+    assert left(2_000_000) == pytest.approx(2 * 60 / 20, rel=1e-3)
+    assert left(200_000) == pytest.approx(2 * 6 / 6.5, rel=1e-3)
+    assert left(5_000_000) == left(60_000_000) == target(*fast(2, 4, 6), remembered())  # farther than the horizon
+    assert left(0) == left(5_000_000)  # past an end that was told wrong
+    # Just before it: what has room goes in, and a full queue keeps to the link's gap.
+    assert 0 < left(1) < 1e-4
+    full = fast(0, 1, 2, 3, 4, 5, 6, 7, remaining_us=1)
+    assert target(*full, remembered()) == pytest.approx(2 * 4.0, rel=1e-3)
+
+
+@kernels
 @pytest.mark.parametrize(
     "change",
     [{"capacity": 3}, {"max_bytes": 3999}, {"dequeued_arrival_us": 8 * 33_333}],
@@ -118,6 +134,9 @@ def test_a_large_newcomer_takes_no_place_from_those_that_wait():
 def test_a_stream_must_have_run_for_as_long_as_the_queue_takes_to_be_sent():
     # L = 8 at 7.5 a second: 1.07 s.
     assert target(*fast(2, 4), remembered(seen_us=1.06e6)) == 0
+    # A quarter of that, 0.267 s, where the robot knows when it ends.
+    assert target(*fast(2, 4, remaining_us=10**7), remembered(seen_us=0.26e6)) == 0
+    assert target(*fast(2, 4, remaining_us=10**7), remembered(seen_us=0.27e6)) > 0
     assert target(*fast(2, 4), remembered(seen_us=1.07e6)) > 0
     assert target(*fast(2, 4), remembered(rate=0.0)) == 0
     # Bursts are not followed.
@@ -228,8 +247,9 @@ def twin():
 @given(cases(max_messages=25), VALUES)
 def test_decides_as_its_twin(case, v):
     assert same(case.run(POLICY, v), case.run(twin(), v))
-    overflow = replace(case, decide_at="overflow")
-    assert same(overflow.run(POLICY, v), overflow.run(twin(), v))
+    told = replace(case.episode, ends_us=int(case.episode.arrivals["arrival_us"][-1]) * 3 // 4)
+    for other in (replace(case, decide_at="overflow"), replace(case, episode=told)):
+        assert same(other.run(POLICY, v), other.run(twin(), v))
 
 
 def test_over_fading_links_less_is_lost_than_by_the_smallest_gap_alone():
@@ -272,6 +292,15 @@ def test_the_room_that_is_left_is_to_be_filled_in_a_minute():
     # One frame in four is sent, 450 in a minute; with 26 places more 4 x 450 / 476 = 3.78.
     assert not spare(*waiting(1, 4, 8, now=12, capacity=29), 0)  # leaves a gap of 4
     assert spare(*waiting(1, 4, 8, now=12, capacity=3), 0)
+
+
+@kernels
+def test_or_by_the_end_of_the_stream():
+    # 15 frames are sent in 2 s; with 3 places more 4 x 15 / 18 = 3.33, with 1 more 3.75.
+    assert spare(*waiting(2, 5, 7, capacity=6, remaining_us=2_000_000), REJECT)  # leaves a gap of 2
+    assert not spare(*waiting(1, 4, 8, now=12, capacity=4, remaining_us=2_000_000), 0)  # leaves a gap of 4
+    assert spare(*waiting(1, 4, 8, now=12, capacity=3, remaining_us=2_000_000), 0)  # no room: one frame in four
+    assert not spare(*waiting(2, 5, 7, remaining_us=1), REJECT)
 
 
 @kernels

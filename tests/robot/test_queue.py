@@ -44,14 +44,16 @@ def test_drop_oldest_by_hand() -> None:
 
 
 def test_the_policy_sees_how_much_of_the_message_in_transmission_is_left() -> None:
-    seen = []
+    seen: list[Any] = []
+    remaining: list[int] = []
 
     def watches(buffer: Any, arrival: Any, memory: Any) -> int:
         "Accept while there is room."
         seen.append((buffer.busy, buffer.left_bytes, buffer.now_us, buffer.dequeued))
+        remaining.append(buffer.remaining_us)
         return policies.ACCEPT if len(buffer.slots) < buffer.capacity else policies.REJECT
 
-    bench = Bench(policy := Policy("watches", watches), 2, window=2)
+    bench = Bench(policy := Policy("watches", watches), 2, window=2, duration_s=35e-6)
     for at_us, left in ((10, 0), (20, 700), (30, 1700), (40, 1650), (50, -5)):
         bench.left = left
         bench.put(at_us)
@@ -59,7 +61,9 @@ def test_the_policy_sees_how_much_of_the_message_in_transmission_is_left() -> No
     # 0 goes at once; then 700 of it are left, then with 1 in the socket 700 + 1000; its last byte is left until gone.
     assert seen == [(0, 0, 10, 0), (1, 700, 20, 1), (1, 1700, 30, 2), (1, 1650, 40, 2), (1, 1001, 50, 2)]
     bench.gone(60)
+    assert remaining == [25, 15, 5, 0, 0]
     assert replay(bench.records, policy).differences == ()
+    assert remaining == [25, 15, 5, 0, 0] * 2
 
 
 @pytest.mark.parametrize("name", PLAYABLE)
@@ -78,6 +82,7 @@ def test_a_log_replayed_makes_the_same_decisions(name: str, data: st.DataObject)
         room=draw(st.sampled_from([8, 1024])),
         decide_at=draw(st.sampled_from(["arrival", "overflow"])),
         max_bytes=draw(st.sampled_from([None, 4000])),
+        duration_s=draw(st.sampled_from([None, 0.5])),
     )
     rng = np.random.default_rng(draw(st.integers(0, 10**6)))
     calls, slow = draw(st.integers(1, 40)), draw(st.floats(0.0, 0.9))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bufgym.ground.kernel import kernel
 from bufgym.ground.modules import first_line
 from bufgym.model.buffer import Buffer, gaps
+from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import Field, Function, declare, divide_row, squash, writer  # noqa: F401 (in generated lines)
 from bufgym.model.observe.own import OWN_FIELDS, OwnField
 
@@ -135,6 +136,12 @@ def size_spread(buffer: Buffer, arrival: Any) -> float:
 def load(buffer: Buffer, arrival: Any) -> float:
     "the bytes that arrive, kept or not, a running mean over about 8 arrivals: more than 0.5 = the link falls behind"
     return squash(1e6 * buffer.arrival_bytes, carried(buffer, arrival))
+
+
+@_context("time", "g/(g+r), r = 10 s")
+def remaining(buffer: Buffer, arrival: Any) -> float:
+    "time until the stream ends, as far as the robot was told; 1 where it was not"
+    return squash(float(buffer.remaining_us), 10e6) if buffer.remaining_us < FOREVER else 1.0
 
 
 # --- each slot -------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import at, compile_for, kernel, local, records
-from bufgym.model.link import Link
+from bufgym.model.link import FOREVER, Link
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy, signatures
 from bufgym.scenario import Episode, messages
@@ -23,7 +23,7 @@ from bufgym.sim.transition import next_event
 from bufgym.sim.view import arrival_of, view
 from bufgym.traces import Trace
 
-INIT, ARRIVAL, DEQUEUE, SENT = range(4)
+INIT, ARRIVAL, DEQUEUE, SENT, ENDS = range(5)
 """Kinds of calls, as in ``parts/parity.h``."""
 
 CALL = np.dtype(
@@ -61,6 +61,8 @@ def _record(
     n = 0
     for i in range(len(batch.senders)):
         n = _note(calls, n, INIT, 0, 0)
+        if batch.senders[i].ends_us < FOREVER:
+            n = _note(calls, n, ENDS, batch.senders[i].ends_us, 0)
         event, sent = next_event(batch, None, i), 0
         while event != END:
             sender = batch.senders[i]
@@ -109,7 +111,7 @@ def recorded(
     senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
     senders.follow(policy)
     # An arrival may need as many evictions as the queue holds, but each message is evicted only once.
-    most = sum(1 + 4 * len(episode.arrivals) for episode in episodes)
+    most = sum(2 + 4 * len(episode.arrivals) for episode in episodes)
     calls = records(most, CALL)
     on_arrival, on_departure, _, _ = policy.compiled
     batch = senders.batch._replace(parameters=policy.parameter_array)
@@ -119,7 +121,10 @@ def recorded(
 
 
 def random_episode(rng: np.random.Generator, n: int, largest_bytes: int | None = None) -> Episode:
-    """Draw n messages with random times, sizes up to the largest and motion, on a link of changing rate."""
+    """Draw n messages with random times, sizes up to the largest and motion, on a link of changing rate.
+
+    In every second episode the robot is told, rightly or not, when the stream ends.
+    """
     period_us, size_bytes = rng.choice([10_000, 33_333, 100_000]), int(rng.choice([2_000, 60_000, 230_000]))
     jitter, spread = rng.choice([0.0, 0.3, 3.0]), rng.choice([0.0, 0.5])
     step_us = rng.gamma(1 / jitter, period_us * jitter, n) if jitter > 0 else np.full(n, period_us)
@@ -131,4 +136,6 @@ def random_episode(rng: np.random.Generator, n: int, largest_bytes: int | None =
     shares[0] = 1.5  # the link carries something
     trace = Trace.steps([(s, share * demand) for s, share in zip(seconds, shares, strict=True)])
     arrivals = messages(np.cumsum(step_us).astype(np.int64), sizes.astype(np.int64), np.cumsum(step))
-    return Episode(arrivals, Link(trace, offset_us=int(rng.integers(trace.duration_us))))
+    link = Link(trace, offset_us=int(rng.integers(trace.duration_us)))
+    ends_us = int(arrivals["arrival_us"][-1] * rng.uniform(0.5, 1.5)) if rng.random() < 0.5 else None
+    return Episode(arrivals, link, ends_us=ends_us)

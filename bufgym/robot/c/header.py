@@ -15,6 +15,7 @@ from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, printable
 from bufgym.ground.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
+from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
@@ -74,6 +75,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "NAME": _comment(policy.name),
         "VERSION": __version__,
         "CAPACITY": capacity,
+        "FOREVER": FOREVER,
         "UNLIMITED": UNLIMITED_BYTES,
         "MAX_BYTES": "BUFGYM_UNLIMITED" if unlimited else f"INT64_C({max_bytes})",
         "LIMIT": "no limit" if unlimited else max_bytes,
@@ -90,7 +92,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "SOON_US": repr(thinning.SOON_US),
         **{
             name: getattr(target_gap, name)
-            for name in ("LEAST", "SHORT_QUEUE", "SHORT_RUN_US", "SLOWEST", "BURSTY", "LATE")
+            for name in ("LEAST", "SHORT_QUEUE", "SHORT_RUN_US", "SLOWEST", "BURSTY", "LATE", "TOLD")
         },
         "STRAIGHT": repr(straight(value.array)),
         "WITHIN": repr(target_gap.WITHIN),

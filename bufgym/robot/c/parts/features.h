@@ -76,6 +76,8 @@ static inline void bufgym_observe_context(struct bufgym_queue *q, const struct b
     context[BUFGYM_NEWCOMER_BYTES] = bufgym_squash(1e6 * (double)arrival->size_bytes, carried);
     context[BUFGYM_SIZE_SPREAD] = bufgym_deviation(q, arrival);
     context[BUFGYM_LOAD] = bufgym_squash(1e6 * q->arrival_bytes, carried);
+    context[BUFGYM_REMAINING] =
+        q->ends_us == BUFGYM_FOREVER ? 1.0 : bufgym_squash((double)bufgym_remaining_us(q), 1e7);
 }
 
 /* The fields of each candidate: empty slots are 0, the newcomer is the last. */

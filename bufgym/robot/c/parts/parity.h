@@ -2,7 +2,7 @@
 #ifdef BUFGYM_PARITY
 /* --- calls of an episode and what Python decided: bufgym_parity() says whether this machine decides the same --- */
 
-enum { BUFGYM_INIT, BUFGYM_ARRIVAL, BUFGYM_DEQUEUE, BUFGYM_SENT };
+enum { BUFGYM_INIT, BUFGYM_ARRIVAL, BUFGYM_DEQUEUE, BUFGYM_SENT, BUFGYM_ENDS };
 
 struct bufgym_call {
     int64_t kind, at_us, size_bytes, left_bytes, decision;
@@ -19,6 +19,8 @@ static inline int bufgym_play(struct bufgym_queue *q, const struct bufgym_call *
         bufgym_dequeue(q, call->at_us, &message);
     else if (call->kind == BUFGYM_SENT)
         bufgym_sent(q, call->at_us, call->size_bytes);
+    else if (call->kind == BUFGYM_ENDS)
+        q->ends_us = call->at_us;
     else
         bufgym_init(q, call->at_us);
     return 0;

@@ -9,6 +9,7 @@
 #ifndef BUFGYM_CAPACITY
 #define BUFGYM_CAPACITY @CAPACITY@ /* L: messages queued at most */
 #endif
+#define BUFGYM_FOREVER INT64_C(@FOREVER@)
 #define BUFGYM_UNLIMITED INT64_C(@UNLIMITED@)
 #ifndef BUFGYM_MAX_BYTES
 #define BUFGYM_MAX_BYTES @MAX_BYTES@ /* B: bytes queued at most */
@@ -34,6 +35,7 @@ struct bufgym_queue {
     struct bufgym_message dropped; /* the last one to be evicted or rejected */
     int evictions;                 /* for the arrival at hand, which has no room yet; 0: it is settled */
     int64_t now_us;
+    int64_t ends_us; /* when the stream ends; yours to set after bufgym_init if you know it */
     /* the socket */
     int busy;            /* messages in it */
     int64_t held_bytes;  /* all their bytes, those transmitted included */
@@ -76,6 +78,14 @@ static inline void bufgym_average(double *mean, double amount, double us, double
 static inline int bufgym_has_space(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     return q->occupancy < BUFGYM_CAPACITY && q->backlog_bytes + arrival->size_bytes <= BUFGYM_MAX_BYTES;
+}
+
+/* Time until the stream ends, us, at least 0; BUFGYM_FOREVER where the queue was not told. */
+static inline int64_t bufgym_remaining_us(const struct bufgym_queue *q)
+{
+    if (q->ends_us == BUFGYM_FOREVER)
+        return BUFGYM_FOREVER;
+    return q->ends_us > q->now_us ? q->ends_us - q->now_us : 0;
 }
 
 @POLICY@
@@ -155,6 +165,7 @@ static inline void bufgym_init(struct bufgym_queue *q, int64_t now_us)
 {
     memset(q, 0, sizeof *q);
     q->now_us = q->last_dequeue_us = now_us;
+    q->ends_us = BUFGYM_FOREVER;
     memcpy(q->memory, bufgym_memory, sizeof q->memory);
 }
 

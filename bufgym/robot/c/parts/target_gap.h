@@ -37,6 +37,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     const double *memory = q->memory;
     const int L = bufgym_places(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
+    const double horizon_us = bufgym_within(q, 1e6 * @HORIZON_S@);
     double recent, r, m;
     /* The first test is for compilers, which leave out then what a short queue never does. */
     if (BUFGYM_CAPACITY < @LEAST@ || L < @LEAST@ || elapsed_us <= 0.0)
@@ -47,10 +48,10 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
         return 0.0;
     recent = @SHORT@ * (1e6 * q->short_rate) + @LONG@ * (1e6 * q->long_rate);
     r = (recent / 1e6 + (1 - @SHORT@ - @LONG@) * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
-    if (L > r * memory[BUFGYM_SEEN_US])
+    if (L > (q->ends_us < BUFGYM_FOREVER ? @TOLD@ : 1.0) * r * memory[BUFGYM_SEEN_US])
         return 0.0;
     m = (1 - @PACED@) * (arrival->x - q->dequeued_x) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
-    return m * (1e6 * @HORIZON_S@) / (r * (1e6 * @HORIZON_S@) + L - q->occupancy);
+    return m * horizon_us / (r * horizon_us + L - q->occupancy);
 }
 
 /* Whether the socket is free before so many more arrivals. */

@@ -37,6 +37,13 @@ static inline double bufgym_gap_left(
     return gaps.before_x + gaps.after_x;
 }
 
+/* This horizon, us, or the time until the stream ends if that is known, to come, and less. */
+static inline double bufgym_within(const struct bufgym_queue *q, double horizon_us)
+{
+    const double left_us = (double)bufgym_remaining_us(q);
+    return left_us > 0.0 && left_us < horizon_us ? left_us : horizon_us;
+}
+
 /* Whether a queue with room can spare `victim`: enough wait for the link, a full queue would soon be sent, and the
    victim's neighbours then lie no farther apart than the link sends. */
 static inline int bufgym_spare(
@@ -44,13 +51,14 @@ static inline int bufgym_spare(
 {
     const int s = q->occupancy, L = bufgym_places(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
+    const double horizon_us = bufgym_within(q, @STEADY_US@);
     double each_us = bufgym_send_us(q, arrival);
     /* The first test is for compilers, which see then that no such queue has room here. */
     if (BUFGYM_CAPACITY <= @WAITING@ || s < @WAITING@ || q->busy == 0 || elapsed_us <= 0.0 || each_us <= 0.0)
         return 0;
     if (L * each_us > @SOON_US@)
         return 0;
-    each_us = @STEADY_US@ / (@STEADY_US@ / each_us + L - s);
+    each_us = horizon_us / (horizon_us / each_us + L - s);
     return bufgym_gap_left(q, arrival, victim) * elapsed_us
         <= (arrival->x - q->dequeued_x) * each_us;
 }
