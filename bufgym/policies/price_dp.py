@@ -21,7 +21,7 @@ better almost everywhere, as a gap says nothing of bytes. So ``gap-price`` mixes
 follows the spread of sizes, which is 0 for equal ones:
 
     sd <- standard deviation of the logarithm of bytes, over the last arrivals
-    a  <- 1 / (1 + exp(share_low - share_steep min(sd, ``WIDEST``))), but 0 below ``LEAST_SHARE``
+    a  <- 1 / (1 + exp(share_low - share_steep sd)), but 0 below ``LEAST_SHARE``
 
 Each candidate is then worth (1 - a) (threshold g - its discounted gap) / g, as target-gap has it, plus a (its advantage
 in units - price_threshold); what is worth most goes. The head is asked likewise, with target-gap's wish for it. A share
@@ -52,19 +52,18 @@ PARAMETERS = {
     "threshold": 1.001,
     "head": 1.0,
     "bias": 1.0,
-    "kappa": 0.361,
-    "tail": 0.793,
-    "price_threshold": 0.432,
+    "kappa": 0.48,
+    "tail": 0.8,
+    "price_threshold": 0.43,
     "price_near": 3.66,
-    "share_low": 3.0,
-    "share_steep": 15.0,
+    "share_low": 5.0,
+    "share_steep": 60.0,
 }
 """Those of target-gap; the gap that may be left with room, in g; the head's own target, in g, and the weight of the gap
 that it would leave; the numbers of the price; and those of the share."""
 THRESHOLD, HEAD, BIAS, KAPPA, TAIL, PRICE_THRESHOLD, PRICE_NEAR, SHARE_LOW, SHARE_STEEP = range(14, 23)
-WIDEST, LEAST_SHARE = 0.4, 0.06
-"""Largest spread in a, and smallest a that is not 0. Structural: a is 0.95 at ``WIDEST``, nearly all, and 0.047 for
-equal sizes, which are to be ``target-gap`` exactly."""
+LEAST_SHARE = 0.06
+"""Smallest a that is not 0. Structural: equal sizes have 0.007, and are to be ``target-gap`` exactly."""
 
 LOG_BYTES, VARIANCE, SIZES = range(6, 9)
 REMEMBERED = {**target_gap.REMEMBERED, "log_bytes": 0.0, "variance": 0.0, "sizes": 0.0}
@@ -90,8 +89,7 @@ def remember_sizes(buffer: Buffer, arrival: Arrival, memory: Memory) -> None:
 @kernel
 def share(memory: Memory, numbers: Numbers) -> float:
     """The share of price-dp, a."""
-    sd = min(math.sqrt(memory[VARIANCE]), WIDEST)
-    a = 1 / (1 + math.exp(numbers[SHARE_LOW] - numbers[SHARE_STEEP] * sd))
+    a = 1 / (1 + math.exp(numbers[SHARE_LOW] - numbers[SHARE_STEEP] * math.sqrt(memory[VARIANCE])))
     return a if a >= LEAST_SHARE else 0.0
 
 

@@ -188,7 +188,7 @@ def approach(buffer: Buffer, arrival: Arrival, g: float, numbers: Numbers) -> in
 @kernel
 def last_chance(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> bool:
     """Whether the head of a short queue goes before its turn comes, by the rule in the module's text."""
-    s, L, rate = len(buffer.slots), buffer.capacity, buffer.short_rate_bytes_per_s
+    s, L, rate = len(buffer.slots), places(buffer, arrival), buffer.short_rate_bytes_per_s
     if s == 0 or L == 1 or L > SHORT_QUEUE or not buffer.busy or rate <= 0 or memory[RATE] <= 0:
         return False
     if len(buffer.topics) > 1 or steady(buffer) or bursty(memory) or not free_soon(buffer, numbers[CHANCE]):

@@ -105,7 +105,7 @@ class Seen:
 
     def last_chance(self, buffer, arrival):
         """Whether the head of a queue of two to five goes before its turn."""
-        s, L, rate = len(buffer.slots), buffer.capacity, buffer.short_rate_bytes_per_s
+        s, L, rate = len(buffer.slots), places(buffer, arrival), buffer.short_rate_bytes_per_s
         period, mean_rate = buffer.period_us, running_mean(self.sent, 20e6)
         if not 2 <= L <= 5 or s == 0 or not buffer.busy or rate <= 0 or mean_rate <= 0 or len(buffer.topics) > 1:
             return False

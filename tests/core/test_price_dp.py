@@ -110,10 +110,12 @@ def test_the_spread_of_sizes_sets_the_share():
         buffer, arrival = queue(now_bytes=size)
         remember_sizes(buffer, arrival, memory)
     assert memory[LOG_BYTES] == pytest.approx(np.log(200)) and memory[VARIANCE] == pytest.approx(np.log(2) ** 2)
-    assert share(memory, NUMBERS) == pytest.approx(1 / (1 + np.exp(-3)))  # ln 2 counts .4: 3 - 15 x .4 = -3
+    assert share(memory, NUMBERS) == pytest.approx(1)
+    memory[VARIANCE] = 0.1**2
+    assert share(memory, NUMBERS) == pytest.approx(1 / (1 + np.exp(-1)))  # 5 - 60 x .1
     remember_sizes(buffer._replace(evictions=1), arrival, memory)  # the same arrival once more
-    assert memory[VARIANCE] == pytest.approx(np.log(2) ** 2)
-    memory[VARIANCE] = 0.016**2  # 1 / (1 + exp(3 - .24)) = .0595, less than LEAST_SHARE
+    assert memory[VARIANCE] == 0.1**2
+    memory[VARIANCE] = 0.037**2  # 1 / (1 + exp(5 - 2.22)) = .0584, less than LEAST_SHARE
     assert share(memory, NUMBERS) == 0
 
 

@@ -72,10 +72,11 @@ static inline int bufgym_needless(const struct bufgym_queue *q, const struct buf
 /* Whether the head of a short queue goes before its turn comes. */
 static inline int bufgym_last_chance(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
-    const double rate = 1e6 * q->short_rate, f = (double)q->occupancy / BUFGYM_CAPACITY;
+    const int L = bufgym_places(q, arrival);
+    const double rate = 1e6 * q->short_rate, f = (double)q->occupancy / L;
     const double slowest_us = @SLOWEST@ * q->period_us, mean_rate = q->memory[BUFGYM_RATE];
     double size, us;
-    if (BUFGYM_CAPACITY == 1 || BUFGYM_CAPACITY > @SHORT_QUEUE@ || q->occupancy == 0 || q->busy == 0 || rate <= 0.0)
+    if (L == 1 || L > @SHORT_QUEUE@ || q->occupancy == 0 || q->busy == 0 || rate <= 0.0)
         return 0;
     if (mean_rate <= 0.0 || bufgym_steady(q) || bufgym_bursty(q) || !bufgym_free_soon(q, @CHANCE@))
         return 0;
