@@ -4,6 +4,9 @@ Many policies have a parameter that their source chose for another stream than a
 meets a suite twice: with its source's parameters, and with parameters from a grid search on the validation split. The
 test split is never used here.
 
+A rule of our own has too many parameters to cross. Each of them is tried alone around its default (``AROUND``), on the
+train split: ``python -m agents.tune SUITE --policies target-gap,gap-price --split train`` finds the constants again.
+
 A setting replaces the default only if its score is higher by more than chance. The test is that the paired bootstrap
 interval of the difference, see ``score``, lies above 0. The choices are kept in ``tuned.json``, see ``tuned``.
 """
@@ -83,6 +86,17 @@ GRIDS = {
 }
 """Grids of the tuned policies. At one end, such as a long lifespan or a small step, some become drop-oldest."""
 
+_TARGET = ("horizon_s", "short", "long", "link_s", "paced", "pace_s")
+AROUND = {
+    "target-gap": (),
+    "price-dp": (*_TARGET, "kappa", "tail", "price_threshold", "price_near"),
+    "gap-price": (),
+}
+"""Policies whose parameters are tried one at a time, and which; empty for all. ``price-dp`` has those of ``gap-price``
+too and reads only these."""
+FACTORS = (0.5, 0.7, 1.4, 2.0)
+"""Factors on a default that is tried around."""
+
 FIXED = {
     "ros-keep-last": "it stands for ROS 2 as delivered, with its default depth of 10",
     "foxglove-sdk": "it stands for the Foxglove SDK as delivered, with its default backlog of 1024 messages",
@@ -95,18 +109,21 @@ FIXED = {
 
 
 def settings(policy: str) -> list[str]:
-    """List a policy's default as its plain name, then every other setting of its grid."""
+    """List a policy's default as its plain name, then every other setting of its grid or around its default."""
     if policy in FIXED:
         raise BufgymError(f"policy {policy}: is not tuned: {FIXED[policy]}")
-    if policy not in GRIDS:
-        raise BufgymError(f"policy {policy!r}: no grid of settings; tuned are: {', '.join(GRIDS)}")
-    default, axes = policies.get(policy), GRIDS[policy].axes
-    specs = [policy]
-    for numbers in product(*axes.values()):
-        setting = default.with_parameters(**dict(zip(axes, numbers, strict=True)))
-        if setting.parameters != default.parameters:
-            specs.append(setting.name)
-    return specs
+    if policy not in GRIDS and policy not in AROUND:
+        raise BufgymError(f"policy {policy!r}: no grid of settings; tuned are: {', '.join((*GRIDS, *AROUND))}")
+    default = policies.get(policy)
+    changes: list[dict[str, float]]
+    if policy in GRIDS:
+        axes = GRIDS[policy].axes
+        changes = [dict(zip(axes, numbers, strict=True)) for numbers in product(*axes.values())]
+    else:
+        names = AROUND[policy] or tuple(default.parameters)
+        changes = [{name: float(f"{factor * default.parameters[name]:.3g}")} for name in names for factor in FACTORS]
+    made = [default.with_parameters(**change) for change in changes]
+    return [policy, *(setting.name for setting in made if setting.parameters != default.parameters)]
 
 
 # --- the search ------------------------------------------------------------------------------------------------------
@@ -157,11 +174,11 @@ def tune(
     seeds: int | None = None,
     jobs: int | None = None,
 ) -> list[Choice]:
-    """Try the grids of the policies, by default of all that have one, on a suite; return a choice for each.
+    """Try the settings of policies, by default of all in ``GRIDS``, on a suite; return a choice for each.
 
     Args:
         suite: its name.
-        names: policies of ``GRIDS``.
+        names: policies of ``GRIDS`` and ``AROUND``.
         split: "validation" or "train".
         data: folder of recordings, for suites that need one.
         seeds: episodes on each trace; None for the suite's own number.
@@ -247,7 +264,9 @@ def plain(choices: Sequence[Choice]) -> str:
             mark = ", ".join(mark for mark, marked in marks if marked is tried)
             lines.append([tried.spec, text(tried.score, 3), text(tried.regret, 4), gain, mark])
         head = ["setting", "score", "regret", "better than the default", ""]
-        out += [f"{choice.policy}: {GRIDS[choice.policy].why}", Table(head, [("", lines)]).plain(), ""]
+        grid = GRIDS.get(choice.policy)
+        why = grid.why if grid else f"one parameter at a time, times {', '.join(f'{factor:g}' for factor in FACTORS)}"
+        out += [f"{choice.policy}: {why}", Table(head, [("", lines)]).plain(), ""]
     return "\n".join(out).rstrip()
 
 

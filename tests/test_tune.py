@@ -17,7 +17,8 @@ from bufgym.benchmark.tasks import TASKS
 from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.scenario import Interruption, suites
+from bufgym.scenario import Interruption, Uplink, suites
+from bufgym.traces import Trace
 
 LENGTHS = {"tiny-twelve": 12, "tiny-nine": 9}
 """T of each suite, L = 2. Of messages 1..T, `decimate:every=k` accepts 1, 1 + k, 1 + 2k, ... and keeps the last two.
@@ -97,14 +98,47 @@ def test_what_cannot_be_tuned(suite: str, names: list[str], more: dict[str, Any]
 
 
 def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> None:
-    """A grid begins with the default and repeats nothing."""
+    """Settings begin with the default and repeat nothing."""
     built_in = [policies.get(name) for name in policies.names()]
     with_parameters = {p.name for p in built_in if p.parameters and p.on_arrival.__module__.startswith("bufgym.")}
-    assert with_parameters == set(tune.GRIDS) ^ set(tune.FIXED)
-    for name in tune.GRIDS:
+    kinds = (tune.GRIDS, tune.AROUND, tune.FIXED)
+    assert with_parameters == set().union(*kinds) and len(with_parameters) == sum(map(len, kinds))
+    for name in (*tune.GRIDS, *tune.AROUND):
         specs = tune.settings(name)
         parameters = {tuple(policies.get(spec).parameters.items()) for spec in specs}
         assert specs[0] == name and len(parameters) == len(specs) > 1
+
+
+def test_one_parameter_at_a_time_around_the_default() -> None:
+    default = policies.get("gap-price").parameters
+    specs = tune.settings("gap-price")
+    assert len(specs) == 1 + len(tune.FACTORS) * len(default)
+    assert "gap-price:near=3" in specs and "gap-price:kappa=0.722" in specs  # twice 1.5 and 0.361
+    for spec in specs[1:]:
+        assert len(dict(policies.get(spec).parameters).items() - default.items()) == 1
+    assert not any("discount" in spec for spec in tune.settings("price-dp"))
+
+
+@pytest.mark.parametrize("sizes", ["equal", "jpeg"])
+def test_rules_of_our_own_are_tuned_for_equal_and_for_unequal_sizes(
+    sizes: str, monkeypatch: pytest.MonkeyPatch, splits: list[str]
+) -> None:
+    """The price of bytes changes what gap-price does only where sizes differ; price-dp reads each of its numbers."""
+    link = Trace.steps([(2, 2e6), (1, 0), (3, 1e6), (2, 4e6)], name="fading")
+    scenario = Uplink((link,), sizes=sizes, duration_s=20.0, value=qoi.exponential(0.5))
+    settings = {"one": suites.Setting(scenario, "a camera")}
+    tiny = suites.Suite("tiny-camera", "", lambda split, data: settings, capacities=(4,), seeds=3)
+    monkeypatch.setitem(suites.SUITES, "tiny-camera", tiny)
+    moved: dict[str, set[str]] = {}
+    for choice in tune.tune("tiny-camera", list(tune.AROUND), split="train", jobs=1):
+        gained = [tried.spec.partition(":")[2] for tried in choice.tried if abs(tried.gain.value) > 1e-12]
+        moved[choice.policy] = {spec.partition("=")[0] for spec in gained}
+        assert choice.chosen.gain.value >= 0 and 0 < choice.default.score.value < 1
+    assert "horizon_s" in moved["target-gap"]
+    assert moved["price-dp"] <= set(tune.AROUND["price-dp"]) and "kappa" in moved["price-dp"]
+    assert ("kappa" in moved["gap-price"]) == (sizes == "jpeg")
+    if sizes == "equal":
+        assert moved["gap-price"] - moved["target-gap"] <= {"share_low"}  # half of it is a share of .18 for equal sizes
 
 
 def compared(base: Sequence[float], default: Sequence[float], other: Sequence[float], best: float) -> Choice:

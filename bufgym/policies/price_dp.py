@@ -63,13 +63,15 @@ PARAMETERS = {
 that it would leave; the numbers of the price; and those of the share."""
 THRESHOLD, HEAD, BIAS, KAPPA, TAIL, PRICE_THRESHOLD, PRICE_NEAR, SHARE_LOW, SHARE_STEEP = range(14, 23)
 LEAST_SHARE = 0.06
+"""Smallest a that is not 0. Structural: equal sizes have 0.007, and are to be ``target-gap`` exactly."""
 
 LOG_BYTES, VARIANCE, SIZES = range(6, 9)
 REMEMBERED = {**target_gap.REMEMBERED, "log_bytes": 0.0, "variance": 0.0, "sizes": 0.0}
 """Memory: what target-gap remembers; mean and variance of the logarithm of bytes; arrivals so far."""
 ENTRIES = len(REMEMBERED)
 SIZES_WEIGHT = 1 / 64
-"""Weight of the newest arrival in mean and variance, once so many have come."""
+"""Weight of the newest arrival in mean and variance, once so many have come. Structural: two seconds of a camera, more
+than one group of pictures."""
 
 
 @kernel

@@ -35,7 +35,8 @@ A queue of up to ``SHORT_QUEUE`` messages holds too little to wait for a target.
         if the head's neighbours lie no farther apart than the scene moves in
            (early + early_full f) arrivals + (slow - slow_full f) S + mean_full f M: the head goes
 
-The numbers are the policy's parameters. ``python -m agents.tune target-gap`` looks for them on a suite's links.
+The numbers are the policy's parameters. ``python -m agents.tune SUITE --policies target-gap --split train`` finds them
+again. The other constants are structural, and are not tuned.
 """
 
 from __future__ import annotations
@@ -76,19 +77,20 @@ tail's; and the numbers of the last chance."""
 HORIZON_S, SHORT, LONG, LINK_S, PACED, PACE_S, NEAR, DISCOUNT = range(8)
 CHANCE, EARLY, EARLY_FULL, SLOW, SLOW_FULL, MEAN_FULL = range(8, 14)
 LEAST = 4
-"""Smallest L that follows the target."""
+"""Smallest L that follows the target. Structural: with fewer, one message too many is a large part of the queue."""
 SHORT_QUEUE, SHORT_RUN_US = 5, 10e6
-"""Largest L with a last chance for its head, and how long a stream must have run for it to follow the target, us."""
+"""Largest L with a last chance for its head, and how long a stream must have run for it to follow the target, us.
+Structural: the last chance was found on the laws of ``switching-v1``, which has L up to 5 and streams of 10 s."""
 TOLD = 4.0
 """How many times sooner a stream follows the target if the robot knows when it ends."""
 SLOWEST = 16.0
-"""Most arrivals in S and M."""
+"""Most arrivals in S and M. Structural: a link that stands still would make both infinite."""
 BURSTY, LATE = 1.5, 1 / 32
 """Arrivals are bursty if the mean square of the time between them exceeds ``BURSTY`` times the square of its mean. The
 ratio is 2 for a Poisson process and 10 for bursts of ten. The newest time has weight ``LATE`` in both means, so that
-a whole burst does not look like an even stream."""
+a whole burst does not look like an even stream. Structural: a camera's jitter keeps the ratio near 1."""
 WITHIN = 1.001
-"""Factor by which a gap may exceed g through rounding."""
+"""Factor by which a gap may exceed g through rounding. Structural."""
 
 Numbers = NDArray[Any]
 """float64[parameters]: ``PARAMETERS``, and perhaps more behind them."""

@@ -25,6 +25,7 @@ PINNED = {
     "lte-v2": "72a00fc946ca3b3c",
     "generated-v2": "5b1268420f2f1a12",
     "jpeg-v1": "320eb578731b8f31",
+    "switching-v1": "c970a9db24bc3b5a",
     "stress-v1": "c2de3821b0b1fd20",
 }
 """SHA-256 of all episodes of the test split. A suite is frozen: whoever wants another makes the next version."""

@@ -1,4 +1,4 @@
-"""Suites over made-up links: LTE, generated like recordings, blackouts, steady links, one interruption."""
+"""Suites over made-up links: LTE, generated like recordings, blackouts, steady, switching, one interruption."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
@@ -166,6 +168,52 @@ def _interruption(split: str, data: Path | None) -> dict[str, Setting]:
     }
 
 
+TOPS, STAYS = (0.75, 0.9, 1.2, 1.4), (0.8, 0.9, 0.95)
+"""Top rates of switching links over the demand, and chances to keep a rate from one arrival to the next; the links take
+them in turn. The top rate is never the demand: a link at exactly the demand favours rules that keep it so."""
+SWITCHING_HZ, SWITCHING_BYTES, SWITCHING_MESSAGES = 10.0, 100_000, 100
+SWITCHING_LINKS = {"train": 108, "validation": 36, "test": 108}
+"""Switching links of a split; each has a law of its own, and carries one episode."""
+
+
+def switching_link(seed: int, top: float, stay: float) -> Trace:
+    """A link that switches at arrivals among four rates, and keeps the demand's rate after the stream.
+
+    The rates are 0, about a quarter and about half of the demand, and ``top`` of it. The link keeps its rate with the
+    chance ``stay``, and takes each other rate equally often.
+    """
+    rng = np.random.Generator(np.random.PCG64(seed))
+    rates = (0.0, 0.25 * rng.uniform(0.7, 1.4), 0.5 * rng.uniform(0.8, 1.3), top)
+    demand, state, steps = SWITCHING_HZ * SWITCHING_BYTES, int(4 * rng.random()), []
+    for _ in range(SWITCHING_MESSAGES):
+        steps.append((1 / SWITCHING_HZ, rates[state] * demand))
+        if rng.random() >= stay:
+            state = (state + 1 + int(3 * rng.random())) % len(rates)
+    return Trace.steps([*steps, (1.0, demand)], name=f"switching-{seed}", after="hold")
+
+
+def _switching(split: str, data: Path | None) -> dict[str, Setting]:
+    links = tuple(
+        switching_link(FIRST_SEED[split] + k, TOPS[k % len(TOPS)], STAYS[k % len(STAYS)])
+        for k in range(SWITCHING_LINKS[split])
+    )
+    return {
+        f"switching-{base:g}": Setting(
+            Uplink(
+                traces=links,
+                rate_hz=SWITCHING_HZ,
+                jitter=0.0,
+                size_bytes=SWITCHING_BYTES,
+                duration_s=SWITCHING_MESSAGES / SWITCHING_HZ,
+                random_offset=False,
+                value=qoi.exponential(base),
+            ),
+            f"100 messages of 100 kB at 10 Hz over links that switch among four rates; V = 1 - {base:g}^d",
+        )
+        for base in (0.5, 0.618, 0.8)
+    }
+
+
 LTE = Suite("lte-v1", "30 Hz camera over synthetic LTE links", _lte)
 
 SUITES = (
@@ -179,6 +227,7 @@ SUITES = (
     LTE,
     Suite("outage-v1", "one blackout of 5 to 60 s on a good link", _outage),
     Suite("sustained-v1", "steady links of a quarter, half and three quarters of the demand", _sustained),
+    Suite("switching-v1", "short queues over links that switch among four rates", _switching, (2, 3, 4, 5), seeds=1),
     Suite("generated-v1", "30 Hz camera over links generated like recordings of six ways of moving", _generated),
     Suite("lte-v2", "lte-v1 on four times as many test links", functools.partial(_lte, count=MORE_TRACES), seeds=2),
     Suite(
