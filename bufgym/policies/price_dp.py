@@ -116,7 +116,7 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
         g = (arrival.x - buffer.dequeued_x) / (s + 1)
     longest, discount = numbers[THRESHOLD] * g, numbers[DISCOUNT]
     if not known:
-        longest, discount = -g, numbers[SPARE_DISCOUNT]
+        longest, discount = -g if a > 0 else -max(g, TINY), numbers[SPARE_DISCOUNT]
         each_us, elapsed_us = spare_us(buffer, arrival), arrival.arrival_us - buffer.dequeued_arrival_us
         if each_us > 0 and not bursty(memory):
             longest = numbers[SPARE] * ((arrival.x - buffer.dequeued_x) * each_us / elapsed_us)
