@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -34,7 +34,7 @@ GUIDED = "guided"
 ACTIONS = ("slots", GUIDED)
 """What an action is: the slot that goes, or numbers of the rule."""
 INPUT_FIELDS = tuple(
-    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0, function=inputs)
+    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0, function=cast(Any, inputs))
     for name, meaning in INPUTS.items()
 )
 """Fields observed with ``fields="guided"``."""
@@ -136,9 +136,9 @@ class Guiding:
         """Forget all in ``rows``, where episodes begin."""
         self._guide.memory[rows] = 0.0
 
-    def step(self, *arguments: Any) -> None:
+    def step(self, batch: Batch, rows: Any, actions: Any, rewarded: Any, output: StepOutput) -> None:
         """``step_guided`` with the arguments of ``step_rows``."""
-        step_guided(*arguments, self._guide)
+        step_guided(batch, rows, actions, rewarded, output, self._guide)
 
     def take(self, name: str, actions: Any) -> NDArray[np.int64]:
         """Keep the actions, float[outputs] of the one row or float[n, outputs], for the next step.
