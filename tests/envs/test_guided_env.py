@@ -131,7 +131,7 @@ def test_gymnasiums_checker_has_nothing_to_say(env_id: str) -> None:
     ("make", "message"),
     [
         (lambda: SenderEnv(actions="guide"), "unknown actions 'guide'; did you mean 'guided'?"),
-        (lambda: SenderEnv(fields="guide"), "fields = 'guide': must be 'guided' or a list of names"),
+        (lambda: SenderEnv(fields="guide"), "fields = 'guide': must be a list of names, or 'guided'"),
         (lambda: SenderEnv("topics", actions="guided"), "actions = 'guided': .*, not several topics"),
         (lambda: SenderEnv("topics", fields="guided"), "fields = 'guided': .*, not several topics"),
         (lambda: FleetVecEnv(actions="guided"), "actions = 'guided': .*, not a cell of robots"),
