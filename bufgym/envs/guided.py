@@ -13,15 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.envs.step import (
-    StepOutput,
-    advance,
-    decision_of,
-    delivered_qoi,
-    write_mask,
-    write_observation,
-    write_rewards,
-)
+from bufgym.envs.step import StepOutput, advance, decision_of, write_observation, write_rewards, write_state
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.kernel import bundle, direct, kernel, local, stretch
 from bufgym.model.observe import Field
@@ -59,22 +51,6 @@ class Guide(NamedTuple):
     sees: int
 
 
-@kernel
-def write_inputs(batch: Batch, i: int, output: StepOutput, guide: Guide) -> None:
-    """Write what ``write_observation`` does, with the rule's inputs as the observation."""
-    waits = batch.senders[i].waiting != NOTHING_WAITS
-    output.terminated[i] = not waits
-    output.qoi[i] = delivered_qoi(batch, i)
-    if waits:
-        row = stretch(output.flat, i, 0, N_INPUTS)
-        inputs(local(view(batch, i)), arrival_of(batch, i), guide.memory[i], guide.base, row)
-        write_mask(batch, i, output.action_mask)
-    else:
-        output.flat[i, :] = 0.0
-        output.action_mask[i, :] = False
-        output.action_mask[i, batch.senders[i].capacity] = True
-
-
 @direct
 @kernel
 def step_guided(
@@ -103,12 +79,14 @@ def step_guided(
             output.reward_terms[i, :] = 0.0
         else:
             write_rewards(batch, i, rewarded, output)
-        if sender.waiting == ARRIVAL_WAITS:
+        waits = sender.waiting == ARRIVAL_WAITS
+        if waits:
             recall(local(view(batch, i)), arrival_of(batch, i), guide.memory[i], guide.base)
-        if guide.sees == 1:
-            write_inputs(batch, i, output, guide)
-        else:
-            write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
+        if guide.sees == 0:
+            write_observation(batch, i, not waits, output)
+        elif write_state(batch, i, not waits, output):
+            row = stretch(output.flat, i, 0, N_INPUTS)
+            inputs(local(view(batch, i)), arrival_of(batch, i), guide.memory[i], guide.base, row)
 
 
 def is_guided(actions: str, fields: Any, why_not: str = "") -> bool:

@@ -117,7 +117,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self.rows.output.terminated[0] = False  # also if no arrival asks: the first step then ends the episode
         return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
 
-    def step(self, action: np.int64 | int | NDArray[np.floating[Any]]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.int64 | int | NDArray[np.floating[Any]]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rows = self.rows
         if rows.output.terminated.item():
             why = "" if rows.senders.episodes[0] is None else "the episode has ended: "
