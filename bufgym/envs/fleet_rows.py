@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.envs.guided import is_guided
 from bufgym.envs.rows import Rows, Threads
 from bufgym.envs.step import step_cells
 from bufgym.envs.vector import SenderVectorEnv
@@ -38,6 +39,7 @@ class FleetRows(Rows):
             raise BufgymError(
                 f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
             )
+        is_guided(options.get("actions", "slots"), options.get("fields"), "a cell of robots")
         n = cells * scenario.robots
         super().__init__(n, scenario.uplink, capacity, reward=term, **options)
         self.reward = reward

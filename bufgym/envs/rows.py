@@ -18,6 +18,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
+from bufgym.envs.guided import INPUT_FIELDS, guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_rows
@@ -134,7 +135,8 @@ class Rows:
         max_bytes: int | None = None,
         decide_at: str = "arrival",
         reward: str | Mapping[str, float] = "retained",
-        fields: Sequence[str] | None = None,
+        actions: str = "slots",
+        fields: str | Sequence[str] | None = None,
         observation: str = "dict",
         info: str = "full",
         bound: bool = False,
@@ -144,7 +146,8 @@ class Rows:
     ) -> None:
         if info not in INFOS:
             raise BufgymError(f"info = {info!r}: must be one of {', '.join(map(repr, INFOS))}")
-        self.shows_mask, self.shows_all, self.is_steady = info != "none", info in ("full", "steady"), info == "steady"
+        self.shows_all, self.is_steady = info in ("full", "steady"), info == "steady"
+        self.shows_mask = info != "none" and actions == "slots"
         self.scenario = scenarios.get(scenario, **parameters)
         topics = self.scenario.topics
         self.senders = Senders(
@@ -167,10 +170,14 @@ class Rows:
         self._term_names = [term.name for term in self.terms]
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
+        self.guiding = guiding(n, self.capacity, actions, fields, "several topics" if topics else "")
+        self._acts = self.guiding if self.guiding and self.guiding.acts else None
+        if self.guiding and self.guiding.sees:
+            slot_fields, context_fields, fields = (), INPUT_FIELDS, None
         self.form = ObservationForm(observation, slot_fields, context_fields, self.capacity, fields)
         self._handed = Handed(self.form)
         self.observation_space = self.form.space
-        self.action_space = spaces.Discrete(self.capacity + 2)
+        self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.capacity + 2)
         self.streams: list[Streams | None] = [None] * n
         self._pool_size = pool
         self._draw = self.from_pool(self.scenario.draw)
@@ -205,6 +212,8 @@ class Rows:
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
+        if self.guiding:
+            self.guiding.begin(rows)
         self._run(self._load(rows, episodes), NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
@@ -240,7 +249,8 @@ class Rows:
         return rows
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output)
+        step = self.guiding.step if self.guiding else step_rows
+        step(self.senders.batch, rows, actions, self.rewarded, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step."""
@@ -289,6 +299,8 @@ class Rows:
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""
+        if self._acts:
+            return int(self._acts.take(name, action)[0])
         try:
             number = operator.index(action)
         except TypeError:
@@ -301,6 +313,8 @@ class Rows:
 
     def actions(self, actions: Any) -> NDArray[np.int64]:
         """Convert one action for each row to the kernels' form; the error names the first row that is wrong."""
+        if self._acts:
+            return self._acts.take("actions", actions)
         numbers = np.asarray(actions)
         if numbers.dtype.kind not in "iu":
             raise BufgymError(f"actions are {numbers.dtype}: must be whole numbers (int64)")

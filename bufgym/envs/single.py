@@ -56,7 +56,11 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``max_bytes``: B, bytes, by default without limit.
     - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
     - ``reward``: a term's name, or weights by name; terms of your own take part only if named.
-    - ``fields``: names of the fields to observe, your own included; by default all fields of the tables.
+    - ``actions``: "slots", as above, or "guided" (one queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule
+      gap-price for this decision, by the table ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is
+      no mask, and no invalid action.
+    - ``fields``: names of the fields to observe, your own included; by default all fields of the tables. "guided" for
+      what the rule knows, ``bufgym.policies.guided.INPUTS``, all in [-4, 4].
     - ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,
       and at an episode's end its summary; "none" has only this summary.
@@ -113,7 +117,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self.rows.output.terminated[0] = False  # also if no arrival asks: the first step then ends the episode
         return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
 
-    def step(self, action: np.int64 | int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.int64 | int | NDArray[np.floating[Any]]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rows = self.rows
         if rows.output.terminated.item():
             why = "" if rows.senders.episodes[0] is None else "the episode has ended: "

@@ -128,16 +128,28 @@ def delivered_qoi(batch: Batch, i: int) -> float:
 
 
 @kernel
-def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> None:
-    """Write row ``i``'s observation, action mask and H; without a decision due, zeros and L as the one valid action."""
-    sender = batch.senders[i]
+def write_state(batch: Batch, i: int, ended: bool, output: StepOutput) -> bool:
+    """Write whether row ``i`` has ended, its H and action mask; return whether a decision is due.
+
+    Without one, also write an observation of zeros, with L as the one valid action.
+    """
     output.terminated[i] = ended
     output.qoi[i] = delivered_qoi(batch, i)
-    if sender.waiting == NOTHING_WAITS:
+    if batch.senders[i].waiting == NOTHING_WAITS:
         output.flat[i, :] = 0.0
         output.action_mask[i, :] = False
-        output.action_mask[i, sender.capacity] = True
+        output.action_mask[i, batch.senders[i].capacity] = True
+        return False
+    write_mask(batch, i, output.action_mask)
+    return True
+
+
+@kernel
+def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> None:
+    """Write row ``i``'s state and the observation of its tables' fields."""
+    if not write_state(batch, i, ended, output):
         return
+    sender = batch.senders[i]
     buffer, entries = local(view(batch, i)), sender.capacity + 1
     if batch.several is not None:
         arriving = sender.waiting == ARRIVAL_WAITS
@@ -150,7 +162,6 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
         arrival = arrival_of(batch, i)
         observe_slots(buffer, arrival, table(output.flat, i, 0, _SLOT_FIELDS, entries))
         observe_context(buffer, arrival, stretch(output.flat, i, _SLOT_FIELDS * entries, _CONTEXT_FIELDS))
-    write_mask(batch, i, output.action_mask)
 
 
 @kernel

@@ -126,7 +126,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return self.rows.observation(), self._info()
 
     def step(
-        self, actions: NDArray[np.int64]
+        self, actions: NDArray[np.int64] | NDArray[np.floating[Any]]
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         rows = self.rows
         actions = rows.actions(actions)

@@ -42,7 +42,7 @@ from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, 
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import merging_loss, value
 from bufgym.policies import chains, target_gap
-from bufgym.policies.gaps import discounted
+from bufgym.policies.gaps import discounted, gap_left
 from bufgym.policies.registry import Arrival, Memory, built_in
 from bufgym.policies.target_gap import DISCOUNT, NEAR, Numbers, bursty, free_soon, needless, remember, target
 from bufgym.policies.thinning import spare_us, steady
@@ -58,10 +58,15 @@ PARAMETERS = {
     "price_near": 3.66,
     "share_low": 5.0,
     "share_steep": 60.0,
+    "price_discount": 0.0,
+    "spare": 1.0,
+    "spare_discount": 0.0,
 }
 """Those of target-gap; the gap that may be left with room, in g; the head's own target, in g, and the weight of the gap
-that it would leave; the numbers of the price; and those of the share."""
+that it would leave; the numbers of the price; those of the share; what dropping slot k of s is worth besides, in units,
+times 1 - k / s; and, without a target, the gap that may be left with room, in thinning's, and the discount."""
 THRESHOLD, HEAD, BIAS, KAPPA, TAIL, PRICE_THRESHOLD, PRICE_NEAR, SHARE_LOW, SHARE_STEEP = range(14, 23)
+PRICE_DISCOUNT, SPARE, SPARE_DISCOUNT = range(23, 26)
 LEAST_SHARE = 0.06
 """Smallest a that is not 0. Structural: equal sizes have 0.007, and are to be ``target-gap`` exactly."""
 
@@ -112,10 +117,10 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
         g = (arrival.x - buffer.dequeued_x) / (s + 1)
     longest, discount = numbers[THRESHOLD] * g, numbers[DISCOUNT]
     if not known:
-        longest, discount = -g, 0.0
+        longest, discount = -g if a > 0 else -max(g, TINY), numbers[SPARE_DISCOUNT]
         each_us, elapsed_us = spare_us(buffer, arrival), arrival.arrival_us - buffer.dequeued_arrival_us
         if each_us > 0 and not bursty(memory):
-            longest = (arrival.x - buffer.dequeued_x) * each_us / elapsed_us
+            longest = numbers[SPARE] * ((arrival.x - buffer.dequeued_x) * each_us / elapsed_us)
     per_unit, per_gap = 0.0, (1 - a) / max(g, TINY)
     if a > 0:
         even = value(buffer.v, g)
@@ -137,12 +142,14 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
     for k in range(s):
         gain = per_gap * (longest - discounted(buffer, arrival, False, k, discount))
         if a > 0:
-            gain += per_unit * chains.advantage(scratch, k)
+            gain += per_unit * chains.advantage(scratch, k) + a * numbers[PRICE_DISCOUNT] * (1 - k / s)
         if gain >= own:
             freed_bytes += buffer.slots[k].size_bytes
         if gain > best:
             victim, best = k, gain
     if room:
+        if a == 0 and gap_left(buffer, arrival, victim if best >= own else REJECT) > longest:  # not discounted
+            return ACCEPT
         return ACCEPT if max(own, best) < a * numbers[PRICE_THRESHOLD] else victim if best >= own else REJECT
     if buffer.evictions > 0:  # the newcomer stays, now that a message has gone for it
         return victim

@@ -127,6 +127,13 @@ def bursty(memory: Memory) -> bool:
 
 
 @kernel
+def link_rate(buffer: Buffer, memory: Memory, numbers: Numbers) -> float:
+    """The link's rate by its three means, bytes/us."""
+    recent = numbers[SHORT] * buffer.short_rate_bytes_per_s + numbers[LONG] * buffer.long_rate_bytes_per_s
+    return float(recent / 1e6 + (1 - numbers[SHORT] - numbers[LONG]) * memory[RATE])
+
+
+@kernel
 def target(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> float:
     """g, in motion; 0 if unknown (see the module's text)."""
     s, L = len(buffer.slots), places(buffer, arrival)
@@ -135,8 +142,7 @@ def target(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -
         return 0.0
     if bursty(memory) or (L <= SHORT_QUEUE and memory[SEEN_US] < SHORT_RUN_US):
         return 0.0
-    recent = numbers[SHORT] * buffer.short_rate_bytes_per_s + numbers[LONG] * buffer.long_rate_bytes_per_s
-    r = (recent / 1e6 + (1 - numbers[SHORT] - numbers[LONG]) * memory[RATE]) / mean_bytes(buffer, arrival)
+    r = link_rate(buffer, memory, numbers) / mean_bytes(buffer, arrival)
     if L > (TOLD if buffer.remaining_us < FOREVER else 1.0) * r * memory[SEEN_US]:
         return 0.0
     horizon_us = within(1e6 * numbers[HORIZON_S], buffer)

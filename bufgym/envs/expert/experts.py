@@ -26,6 +26,8 @@ def rows_of(env: Any) -> Rows:
     rows = getattr(getattr(env, "unwrapped", env), "rows", None)
     if not isinstance(rows, Rows):
         raise BufgymError(f"expert: {env!r} is no environment of bufgym, nor a native batch of them")
+    if rows.guiding and rows.guiding.acts:
+        raise BufgymError("actions = 'guided': an expert answers with slots; make the environment with actions='slots'")
     return rows
 
 
