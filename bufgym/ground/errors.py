@@ -50,12 +50,7 @@ def unknown(what: str, name: str, known: Iterable[str], also: str = "") -> Bufgy
 
 
 def where(
-    path: str | PathLike[str],
-    line: int | None,
-    value: object | None,
-    rule: str,
-    *,
-    field: str | None = None,
+    path: str | PathLike[str], line: int | None, value: object | None, rule: str, *, field: str | None = None
 ) -> str:
     """Say where an error is, which value is wrong, and which rule it breaks.
 

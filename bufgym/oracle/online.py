@@ -102,12 +102,7 @@ class OnlineOptimum:
 
 
 def online_optimum(
-    capacity: int,
-    probabilities: ArrayLike,
-    v: Value,
-    *,
-    objective: str = "ratio",
-    max_states: int = 50_000_000,
+    capacity: int, probabilities: ArrayLike, v: Value, *, objective: str = "ratio", max_states: int = 50_000_000
 ) -> OnlineOptimum:
     """Solve for L = ``capacity`` and P(T = t), t = 0, 1, ... (such as ``law(scenario)``).
 

@@ -63,10 +63,7 @@ class Receiver:
     """
 
     def __init__(
-        self,
-        on_message: Callable[[Received], Awaitable[None] | None],
-        *,
-        max_body_bytes: int = MAX_BODY_BYTES,
+        self, on_message: Callable[[Received], Awaitable[None] | None], *, max_body_bytes: int = MAX_BODY_BYTES
     ) -> None:
         self.faults: deque[str] = deque(maxlen=100)
         """Why connections ended, the last 100."""

@@ -110,10 +110,7 @@ class ShapedLink:
                 far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
             await loop.sock_connect(far, self._target)
             sender, receiver = (far, near) if self._back else (near, far)
-            tasks = [
-                asyncio.create_task(self._up(sender, receiver)),
-                asyncio.create_task(self._down(receiver, sender)),
-            ]
+            tasks = [asyncio.create_task(self._up(sender, receiver)), asyncio.create_task(self._down(receiver, sender))]
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except OSError:
             pass  # the target does not listen: the sender reconnects

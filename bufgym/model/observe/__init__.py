@@ -11,16 +11,7 @@ from bufgym.model.observe.on_board import (
     observe_on_board,
     observe_on_board_slots,
 )
-from bufgym.model.observe.own import (
-    OWN_FIELDS,
-    OWN_TERMS,
-    OwnField,
-    OwnTerm,
-    field,
-    own_field,
-    own_term,
-    reward_term,
-)
+from bufgym.model.observe.own import OWN_FIELDS, OWN_TERMS, OwnField, OwnTerm, field, own_field, own_term, reward_term
 from bufgym.model.observe.queue import CONTEXT_FIELDS, SLOT_FIELDS, observe_context, observe_slots
 from bufgym.model.observe.terms import TOPIC_REWARD_TERMS, terms_for
 from bufgym.model.observe.topics import (

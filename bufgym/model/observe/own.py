@@ -81,13 +81,7 @@ Entry = TypeVar("Entry", OwnField, OwnTerm)
 
 
 def field(
-    name: str,
-    *,
-    per: str,
-    unit: str = "",
-    low: float = 0.0,
-    high: float = 1.0,
-    compile: bool = False,
+    name: str, *, per: str, unit: str = "", low: float = 0.0, high: float = 1.0, compile: bool = False
 ) -> Callable[[Function], Function]:
     """Register the decorated function as the observation field ``name``; it comes back unchanged.
 

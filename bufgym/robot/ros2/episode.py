@@ -64,10 +64,7 @@ def play(
         raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
     warm(PolicyQueue(policy, capacity, value=value))
     with programs.running(
-        receive=_receive,
-        send=partial(_send, policy, capacity, value),
-        viewer=_view,
-        camera=partial(_publish, episode),
+        receive=_receive, send=partial(_send, policy, capacity, value), viewer=_view, camera=partial(_publish, episode)
     ) as begun:
         return asyncio.run(_play(begun, episode))
 

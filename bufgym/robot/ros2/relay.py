@@ -150,10 +150,7 @@ class RosSender:
 
 
 async def receive(
-    port: int,
-    host: str = "127.0.0.1",
-    transport: str = "tcp",
-    say: Callable[[str], None] = lambda text: None,
+    port: int, host: str = "127.0.0.1", transport: str = "tcp", say: Callable[[str], None] = lambda text: None
 ) -> None:
     """Run the other end: republish messages with their publishers' quality of service, until cancelled.
 

@@ -35,16 +35,7 @@ from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
-from bufgym.traces.formats.speed_tests import (
-    INTERVAL,
-    REMARK,
-    RULER,
-    RUN,
-    RUNS,
-    read_iperf3,
-    read_nuttcp,
-    read_runs,
-)
+from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_iperf3, read_nuttcp, read_runs
 from bufgym.traces.formats.tables import CSV_HEADER, RATES_HEADER, read_belgium, read_csv, read_mbit, read_rates
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace

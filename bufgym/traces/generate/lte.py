@@ -66,12 +66,7 @@ LTE_MODES: Final[dict[LteMode, LteParameters]] = {
 _CEILING: Final = 1.6
 
 
-def synthetic_lte(
-    seed: int,
-    duration_s: int = 300,
-    mean_bytes_per_s: float = 10e6,
-    mode: LteMode = "drive",
-) -> Trace:
+def synthetic_lte(seed: int, duration_s: int = 300, mean_bytes_per_s: float = 10e6, mode: LteMode = "drive") -> Trace:
     """An LTE-like trace with one sample a second, which loops.
 
     Args:
