@@ -12,26 +12,7 @@ from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
 from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, interruptible, kernel, located
 
 __all__ = [
-    "FOLDER",
-    "JIT",
-    "BundleType",
-    "NotKeptError",
-    "at",
-    "bundle",
-    "compile_for",
-    "compile_here",
-    "compile_silently",
-    "direct",
-    "entry",
-    "interruptible",
-    "item",
-    "kernel",
-    "local",
-    "located",
-    "named",
-    "only_kept",
-    "prefetch",
-    "records",
-    "stretch",
-    "table",
-]
+    "FOLDER", "JIT", "BundleType", "NotKeptError", "at", "bundle", "compile_for", "compile_here", "compile_silently",
+    "direct", "entry", "interruptible", "item", "kernel", "local", "located", "named", "only_kept", "prefetch",
+    "records", "stretch", "table",
+]  # fmt: skip
