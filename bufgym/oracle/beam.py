@@ -21,19 +21,13 @@ from bufgym.oracle.programme import Problem, Room, waiting_cost
 class States(NamedTuple):
     """The states at each message, best first; arrays over [messages, width]."""
 
-    used: NDArray[np.int64]
-    """[messages]: number of states in use."""
-    end: NDArray[np.int64]
-    """Byte at which the message ends."""
+    used: NDArray[np.int64]  # [messages]: number of states in use
+    end: NDArray[np.int64]  # byte at which the message ends
     gain: NDArray[np.float64]
-    net: NDArray[np.float64]
-    """Gain less the prices paid."""
-    promise: NDArray[np.float64]
-    """Rank of the state: ``net`` plus an upper bound of the gain to come."""
-    parent: NDArray[np.int64]
-    """[messages, width, 2]: the message sent before, and its state; -1 for none."""
-    latest: NDArray[np.int64]
-    """[messages]: the latest end of any state at this message or one before it."""
+    net: NDArray[np.float64]  # gain less the prices paid
+    promise: NDArray[np.float64]  # rank of the state: ``net`` plus an upper bound of the gain to come
+    parent: NDArray[np.int64]  # [messages, width, 2]: the message sent before, and its state; -1 for none
+    latest: NDArray[np.int64]  # [messages]: the latest end of any state at this message or one before it
 
 
 def new_states(messages: int, width: int) -> States:

@@ -31,8 +31,7 @@ from bufgym.oracle.programme import NEVER
 from bufgym.policies.registry import register
 from bufgym.scenario import Episode
 
-_SHORT = 2_000
-"""Messages of an episode whose plan takes a fraction of a second on any link."""
+_SHORT = 2_000  # messages of an episode whose plan takes a fraction of a second on any link
 
 
 @dataclass(frozen=True)

@@ -21,31 +21,19 @@ from bufgym.sim.state import ARRIVAL_WAITS, CARRIES, Batch
 
 
 class Work(NamedTuple):
-    """Work space of ``find_values`` for queues of up to L messages.
+    """Work space of ``find_values`` for queues of up to L messages."""
 
-    Fields:
-        x: float64[L + 1], coordinates of the queued messages and of the newcomer, its last.
-        first: float64[L + 1], gain of each if it is sent next.
-        pair: float64[L + 1, L + 1], gain of the second if it is sent after the first.
-        own: float64[L + 2, L + 1], best gain of so many of the queue's own messages, of which this is the last.
-        jump: float64[L + 2, L + 1], best gain after these if only later arrivals follow.
-        target: int64[L + 2, L + 1], the first of those arrivals; -1 for none.
-        slots: int64[L + 1], messages queued after the action.
-        arrived: int64[L + 2], arrivals after the newcomer by the time of the t-th transmission.
-        future: float64[messages], gain after each later arrival.
-        forced: float64[2, L + 1 + messages], gain of each candidate.
-    """
-
-    x: NDArray[np.float64]
-    first: NDArray[np.float64]
-    pair: NDArray[np.float64]
+    x: NDArray[np.float64]  # float64[L + 1], coordinates of the queued messages and of the newcomer, its last
+    first: NDArray[np.float64]  # float64[L + 1], gain of each if it is sent next
+    pair: NDArray[np.float64]  # float64[L + 1, L + 1], gain of the second if it is sent after the first
     own: NDArray[np.float64]
-    jump: NDArray[np.float64]
-    target: NDArray[np.int64]
-    slots: NDArray[np.int64]
-    arrived: NDArray[np.int64]
-    future: NDArray[np.float64]
-    forced: NDArray[np.float64]
+    """float64[L + 2, L + 1], best gain of so many of the queue's own messages, of which this is the last."""
+    jump: NDArray[np.float64]  # float64[L + 2, L + 1], best gain after these if only later arrivals follow
+    target: NDArray[np.int64]  # int64[L + 2, L + 1], the first of those arrivals; -1 for none
+    slots: NDArray[np.int64]  # int64[L + 1], messages queued after the action
+    arrived: NDArray[np.int64]  # int64[L + 2], arrivals after the newcomer by the time of the t-th transmission
+    future: NDArray[np.float64]  # float64[messages], gain after each later arrival
+    forced: NDArray[np.float64]  # float64[2, L + 1 + messages], gain of each candidate
 
 
 def new_work(capacity: int, messages: int) -> Work:

@@ -39,26 +39,17 @@ SHARES = (1 / 16, 1 / 4, 1.0)
 LABELS = 1 << 14
 """Initial room for labels; it doubles whenever it runs out."""
 
-_ROUNDING = 1e-9
-"""Tolerance: the bounds add the same numbers in another order."""
+_ROUNDING = 1e-9  # tolerance: the bounds add the same numbers in another order
 
 
 class Labels(NamedTuple):
-    """All labels, message by message; message i has ``first[i] : first[i + 1]``, by rising end and gain.
+    """All labels, message by message; message i has ``first[i] : first[i + 1]``, by rising end and gain."""
 
-    Fields:
-        first: int64[messages + 1], index of a message's first label.
-        latest: int64[messages + 1], the latest end of any label at the messages before it.
-        end: int64[room], the byte at which the label's last message ends.
-        gain: float64[room], the gain in H by the messages so far.
-        parent: int64[room], the label before it; -1 at the first message of a plan.
-    """
-
-    first: NDArray[np.int64]
-    latest: NDArray[np.int64]
-    end: NDArray[np.int64]
-    gain: NDArray[np.float64]
-    parent: NDArray[np.int64]
+    first: NDArray[np.int64]  # int64[messages + 1], index of a message's first label
+    latest: NDArray[np.int64]  # int64[messages + 1], the latest end of any label at the messages before it
+    end: NDArray[np.int64]  # int64[room], the byte at which the label's last message ends
+    gain: NDArray[np.float64]  # float64[room], the gain in H by the messages so far
+    parent: NDArray[np.int64]  # int64[room], the label before it; -1 at the first message of a plan
 
 
 def best(

@@ -34,8 +34,7 @@ from bufgym.policies.registry import Policy
 
 OBJECTIVES = ("ratio", "qoi")
 
-_MOST = 2**61
-"""Cut-off for binomial coefficients: larger ones belong to no state that fits into memory."""
+_MOST = 2**61  # cut-off for binomial coefficients: larger ones belong to no state that fits into memory
 
 
 @dataclass(frozen=True, eq=False)

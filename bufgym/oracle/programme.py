@@ -24,50 +24,34 @@ BLOCK = 32
 
 
 class Problem(NamedTuple):
-    """One episode as the kernels read it; arrays over messages.
+    """One episode as the kernels read it; arrays over messages."""
 
-    Fields:
-        c: int64, bytes that the link can have carried when the message arrives.
-        size: int64, bytes of the message.
-        limit: int64, bytes that may still have to pass before it when it arrives, at most; or NEVER.
-        x: float64, coordinate of the message.
-        v: ``Value.array``.
-        ends: the link's last byte.
-        between: int64, the last message before it that could have been sent before it arrives; -1: none.
-        idle: int64, after a message before ``between`` that ends by this byte, ``between`` could be sent in time.
-        grid: bytes to a grid step.
-        future: float64[messages, steps], no plan gains more after message i, if that ends at byte
-            (c_i // grid + k) * grid or later.
-    """
-
-    c: NDArray[np.int64]
-    size: NDArray[np.int64]
-    limit: NDArray[np.int64]
-    x: NDArray[np.float64]
-    v: NDArray[np.float64]
-    ends: int
+    c: NDArray[np.int64]  # int64, bytes that the link can have carried when the message arrives
+    size: NDArray[np.int64]  # int64, bytes of the message
+    limit: NDArray[np.int64]  # int64, bytes that may still have to pass before it when it arrives, at most; or NEVER
+    x: NDArray[np.float64]  # float64, coordinate of the message
+    v: NDArray[np.float64]  # ``Value.array``
+    ends: int  # the link's last byte
     between: NDArray[np.int64]
+    """int64, the last message before it that could have been sent before it arrives; -1: none."""
     idle: NDArray[np.int64]
-    grid: int
+    """int64, after a message before ``between`` that ends by this byte, ``between`` could be sent in time."""
+    grid: int  # bytes to a grid step
     future: NDArray[np.float64]
+    """float64[messages, steps], no plan gains more after message i, if that ends at byte (c_i // grid + k) * grid or
+    later."""
 
 
 class Room(NamedTuple):
-    """Room in the queue, and the price that a message pays for waiting in it (see ``unequal``).
+    """Room in the queue, and the price that a message pays for waiting in it (see ``unequal``)."""
 
-    Fields:
-        capacity: L, messages.
-        max_bytes: B, bytes.
-        until: float64[2, steps], sum of the prices of all arrivals before this grid position; of a message, of a byte.
-        before: float64[2, messages + 1], the same sum over the arrivals before each message.
-        begun: float64[messages, steps], like ``future``, if the message begins there after waiting; less its price.
-    """
-
-    capacity: int
-    max_bytes: int
+    capacity: int  # L, messages
+    max_bytes: int  # B, bytes
     until: NDArray[np.float64]
-    before: NDArray[np.float64]
+    """float64[2, steps], sum of the prices of all arrivals before this grid position; of a message, of a byte."""
+    before: NDArray[np.float64]  # float64[2, messages + 1], the same sum over the arrivals before each message
     begun: NDArray[np.float64]
+    """float64[messages, steps], like ``future``, if the message begins there after waiting; less its price."""
 
 
 def new_problem(

@@ -16,8 +16,7 @@ RATE_S: Final = 1.0
 """Time before now over which rates are computed."""
 QOI_S: Final = 30.0
 """Time before now whose messages count for QoI."""
-_MOST: Final = 10_000
-"""Messages of a topic that are remembered for its QoI."""
+_MOST: Final = 10_000  # messages of a topic that are remembered for its QoI
 
 
 class _Put:

@@ -25,8 +25,7 @@ from bufgym.robot.tasks import Tasks
 
 MAX_STREAMS: Final = 64
 """Number of latest senders that are remembered."""
-_GREETING_S: Final = 20.0
-"""Time for a sender's greeting; later the connection is closed."""
+_GREETING_S: Final = 20.0  # time for a sender's greeting; later the connection is closed
 
 
 class Received(NamedTuple):

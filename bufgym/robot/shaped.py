@@ -20,13 +20,11 @@ from bufgym.robot.tasks import Tasks
 
 RECEIVE_BUFFER_BYTES: Final = 16_384
 _PIECE_BYTES: Final = 16_384
-_MOST_PIECES: Final = 4096
-"""Limit on pieces on their way to the receiver at a time."""
+_MOST_PIECES: Final = 4096  # limit on pieces on their way to the receiver at a time
 _SLACK_S: Final = 0.005
 """Longest wait for the next bytes during which the link counts as busy. Programs need this time between an ack and the
 next message, so it is not charged to the link."""
-_STALL_S: Final = 0.1
-"""Longest stall of this program, on a busy machine, that a busy link makes up for."""
+_STALL_S: Final = 0.1  # longest stall of this program, on a busy machine, that a busy link makes up for
 
 
 class ShapedLink:

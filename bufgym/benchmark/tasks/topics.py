@@ -23,8 +23,7 @@ from bufgym.sim.metrics import TopicOutcome, received, topic_outcomes, weighted_
 BASELINE = "robofleet"
 """Robofleet's client as published."""
 
-_RIVALS = ("drop-oldest", "rosbridge")
-"""Made for one queue, but what a robot's topics meet today."""
+_RIVALS = ("drop-oldest", "rosbridge")  # made for one queue, but what a robot's topics meet today
 
 _OUTCOME = {name: float for name in columns_of(TopicOutcome) if name != "topic"} | {"arrived": int}
 

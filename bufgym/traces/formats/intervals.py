@@ -19,17 +19,11 @@ MAX_HOLD_S: Final = 86_400
 
 
 class Knots(NamedTuple):
-    """A capacity as it was read.
+    """A capacity as it was read."""
 
-    Attributes:
-        time_us: int64[K], microseconds, from 0.
-        cumulative_bytes: int64[K], bytes up to each time, from 0.
-        note: what the trace's `source` should say about the reading; empty for nothing.
-    """
-
-    time_us: Int64Array
-    cumulative_bytes: Int64Array
-    note: str = ""
+    time_us: Int64Array  # int64[K], microseconds, from 0
+    cumulative_bytes: Int64Array  # int64[K], bytes up to each time, from 0
+    note: str = ""  # what the trace's `source` should say about the reading; empty for nothing
 
 
 class Intervals:
@@ -88,19 +82,12 @@ class Intervals:
 
 
 class Rate(NamedTuple):
-    """The rate from some time on.
+    """The rate from some time on."""
 
-    Attributes:
-        line: where it is stated.
-        time: its time as it is written in the line.
-        start_us: its time, microseconds.
-        bytes_per_us: bytes a microsecond.
-    """
-
-    line: Line
-    time: str
-    start_us: int
-    bytes_per_us: float
+    line: Line  # where it is stated
+    time: str  # its time as it is written in the line
+    start_us: int  # its time, microseconds
+    bytes_per_us: float  # bytes a microsecond
 
 
 def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:

@@ -47,14 +47,10 @@ _SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json", ".list", ".out")
 class Format:
     """How to recognise a format by its first line, and how to read its knots."""
 
-    layout: str
-    """What a line looks like, in words."""
-    fits: Callable[[str], object]
-    """Whether a first line is one of this format."""
-    read: Callable[..., Knots]
-    """Reads a file's knots; with `columns`, the one to read is its second argument."""
-    columns: tuple[str, ...] = ()
-    """The columns to choose from, the default first; empty where there is no choice."""
+    layout: str  # what a line looks like, in words
+    fits: Callable[[str], object]  # whether a first line is one of this format
+    read: Callable[..., Knots]  # reads a file's knots; with `columns`, the one to read is its second argument
+    columns: tuple[str, ...] = ()  # the columns to choose from, the default first; empty where there is no choice
 
 
 def _cells(*patterns: str, between: str = r"\s+") -> Callable[[str], object]:

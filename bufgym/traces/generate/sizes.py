@@ -45,10 +45,8 @@ IN_TURN: Final = {"rvl-jpeg": ("rvl", "jpeg90")}
 class Moving(NamedTuple):
     """The motion of a stream's messages."""
 
-    motion: Motion
-    """The recording that gives x."""
-    time_us: Int64Array
-    """int64[n], times of the messages on it."""
+    motion: Motion  # the recording that gives x
+    time_us: Int64Array  # int64[n], times of the messages on it
 
 
 class Range(NamedTuple):
