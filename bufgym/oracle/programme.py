@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.qoi import value
 
 NEVER = -1
@@ -26,18 +25,18 @@ BLOCK = 32
 class Problem(NamedTuple):
     """One episode as the kernels read it; arrays over messages."""
 
-    c: NDArray[np.int64]  # int64, bytes that the link can have carried when the message arrives
-    size: NDArray[np.int64]  # int64, bytes of the message
-    limit: NDArray[np.int64]  # int64, bytes that may still have to pass before it when it arrives, at most; or NEVER
-    x: NDArray[np.float64]  # float64, coordinate of the message
-    v: NDArray[np.float64]  # ``Value.array``
+    c: Ints  # int64, bytes that the link can have carried when the message arrives
+    size: Ints  # int64, bytes of the message
+    limit: Ints  # int64, bytes that may still have to pass before it when it arrives, at most; or NEVER
+    x: Floats  # float64, coordinate of the message
+    v: Floats  # ``Value.array``
     ends: int  # the link's last byte
-    between: NDArray[np.int64]
+    between: Ints
     """int64, the last message before it that could have been sent before it arrives; -1: none."""
-    idle: NDArray[np.int64]
+    idle: Ints
     """int64, after a message before ``between`` that ends by this byte, ``between`` could be sent in time."""
     grid: int  # bytes to a grid step
-    future: NDArray[np.float64]
+    future: Floats
     """float64[messages, steps], no plan gains more after message i, if that ends at byte (c_i // grid + k) * grid or
     later."""
 
@@ -47,22 +46,15 @@ class Room(NamedTuple):
 
     capacity: int  # L, messages
     max_bytes: int  # B, bytes
-    until: NDArray[np.float64]
+    until: Floats
     """float64[2, steps], sum of the prices of all arrivals before this grid position; of a message, of a byte."""
-    before: NDArray[np.float64]  # float64[2, messages + 1], the same sum over the arrivals before each message
-    begun: NDArray[np.float64]
+    before: Floats  # float64[2, messages + 1], the same sum over the arrivals before each message
+    begun: Floats
     """float64[messages, steps], like ``future``, if the message begins there after waiting; less its price."""
 
 
 def new_problem(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    limit: NDArray[np.int64],
-    certain: NDArray[np.int64],
-    x: NDArray[np.float64],
-    v: NDArray[np.float64],
-    ends: int,
-    steps: int,
+    c: Ints, size: Ints, limit: Ints, certain: Ints, x: Floats, v: Floats, ends: int, steps: int
 ) -> Problem:
     """Set up one episode on a grid of ``steps`` to a mean message, or fewer (``MAX_CELLS``); ``future`` is 0.
 
@@ -76,14 +68,7 @@ def new_problem(
 
 
 @kernel
-def find_idle(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    limit: NDArray[np.int64],
-    certain: NDArray[np.int64],
-    between: NDArray[np.int64],
-    idle: NDArray[np.int64],
-) -> None:
+def find_idle(c: Ints, size: Ints, limit: Ints, certain: Ints, between: Ints, idle: Ints) -> None:
     """Fill ``between`` and ``idle`` (see ``Problem``); ``certain`` as in ``new_problem``."""
     for i in range(len(c)):
         m = i - 1
@@ -130,7 +115,7 @@ def find_future(p: Problem) -> None:
 
 
 @kernel
-def find_priced_future(p: Problem, room: Room, last: NDArray[np.int64], best: NDArray[np.float64]) -> None:
+def find_priced_future(p: Problem, room: Room, last: Ints, best: Floats) -> None:
     """Fill ``future`` and ``room.begun`` from the last message back; ``last`` and ``best`` are work space, [positions].
 
     What j gains if i ends at a grid position is V(x_j - x_i) plus a number that does not depend on i. V is concave: the
@@ -169,9 +154,7 @@ def find_priced_future(p: Problem, room: Room, last: NDArray[np.int64], best: ND
 
 
 @kernel
-def offer(
-    p: Problem, room: Room, i: int, j: int, low: int, right: int, last: NDArray[np.int64], best: NDArray[np.float64]
-) -> None:
+def offer(p: Problem, room: Room, i: int, j: int, low: int, right: int, last: Ints, best: Floats) -> None:
     """Raise ``best`` to what j after i gains at grid positions ``low`` to ``right``, and note j in ``last``."""
     if low >= right or p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
         return

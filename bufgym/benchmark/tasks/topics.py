@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -161,12 +162,7 @@ def _folded(copies: Sequence[TopicOutcome]) -> Row:
 # --- the summary -----------------------------------------------------------------------------------------------------
 
 
-def _seconds(number: float) -> str:
-    return decimal(number, 2)
-
-
-def _one_digit(number: float) -> str:
-    return decimal(number, 1)
+_seconds, _one_digit = (partial(decimal, digits=digits) for digits in (2, 1))
 
 
 def _messages(number: float) -> str:
