@@ -20,7 +20,7 @@ ROOMS = ("model", "sim", "policies", "oracle", "envs")
 """Rooms of the core. All kernels that decide what a sender does are in these."""
 LEAST = 0.95
 """Share of lines that must run."""
-DECORATORS = {"kernel", "direct", "declare", "_context", "_slot", "built_in"}
+DECORATORS = {"kernel", "direct", "built_in"}
 CALLS = {"kernel", "direct", "compile_for"}
 HOOKS = {"on_arrival", "on_departure", "on_dequeue", "on_send", "function"}
 

@@ -55,6 +55,4 @@ for _id, (_scenario, _) in ON_TASKS.items():
             kwargs={"scenario": _scenario, "reward": "covered"},
         )
 
-__getattr__ = _on_demand(
-    __name__, Comparison="benchmark.compare", compare="benchmark.compare", make_policy="benchmark.compare"
-)
+__getattr__ = _on_demand(__name__)

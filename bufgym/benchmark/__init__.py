@@ -15,4 +15,4 @@ if TYPE_CHECKING:
 
 __all__ = ["TASKS", "Sweep", "drops", "leaderboard", "read_rows", "report", "run_sweep", "write_rows"]
 
-__getattr__ = on_demand(__name__, TASKS="tasks", Sweep="sweep", read_rows="rows", run_sweep="sweep", write_rows="rows")
+__getattr__ = on_demand(__name__)

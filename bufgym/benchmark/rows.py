@@ -35,8 +35,7 @@ upper bound, and ``regret`` = 1 - H / clairvoyant. They are None if no bound was
 a policy that is not bound by L.
 """
 
-_MORE: Layout = {"training_seed": int}
-"""Optional columns of any layout; columns of other names hold floats."""
+_MORE: Layout = {"training_seed": int}  # optional columns of any layout; columns of other names hold floats
 
 
 def checked_target(path: str | os.PathLike[str]) -> Path:

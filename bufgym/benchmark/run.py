@@ -21,8 +21,7 @@ from bufgym.scenario.numbered import by_trace, draw
 
 __all__ = ["bar", "by_trace", "check_distinct", "draw", "run"]
 
-_BATCH_MESSAGES = 1_000_000
-"""Messages held at a time, 88 bytes each; many seeds run in several batches."""
+_BATCH_MESSAGES = 1_000_000  # messages held at a time, 88 bytes each; many seeds run in several batches
 
 
 def run(

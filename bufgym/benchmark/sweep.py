@@ -129,11 +129,9 @@ class Shard:
         return f"{self.label}-{self.trace}-{self.seeds[0]}"
 
 
-_TRIES = 3
-"""Worker deaths in a row, without a finished shard between them, that end the run."""
+_TRIES = 3  # worker deaths in a row, without a finished shard between them, that end the run
 
-_LOADED: set[str] = set()
-"""Policy files that this process has run for a shard."""
+_LOADED: set[str] = set()  # policy files that this process has run for a shard
 
 
 def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:

@@ -63,12 +63,7 @@ def validate(row: str, /, *, file: Path = Path(DEFAULT), data: str | None = None
         print(f"  {key}: {again.values[key].value:.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {file}")
 
 
-def perf(
-    *,
-    json: Path | None = None,
-    repeats: Count = 3,
-    quick: bool = False,
-) -> None:
+def perf(*, json: Path | None = None, repeats: Count = 3, quick: bool = False) -> None:
     """Measure bufgym's own speed on this machine.
 
     Args:

@@ -229,10 +229,7 @@ def _over(uplink: Uplink) -> str:
 
 
 def _measured(uplink: Uplink, x: str) -> list[str]:
-    return [
-        f"QoI = 1 + sum of V(step in x) over the messages received; V = {uplink.value.name}.",
-        f"x is {x}.",
-    ]
+    return [f"QoI = 1 + sum of V(step in x) over the messages received; V = {uplink.value.name}.", f"x is {x}."]
 
 
 def _motions(names: Sequence[str], measured: MotionOptions) -> tuple[Motion, ...]:

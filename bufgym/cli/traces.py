@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from bufgym.traces import Trace
 
 _PICTURES = (".png", ".svg", ".pdf")
-_MOST_DRAWN = 5_000
-"""Most rates in a picture some 1300 pixels wide; more rates are averaged over this many windows."""
+_MOST_DRAWN = 5_000  # most rates in a picture some 1300 pixels wide; more rates are averaged over this many windows
 
 
 Files = Annotated[list[str], Parameter(help="A file, or a shipped name.")]

@@ -20,4 +20,4 @@ if TYPE_CHECKING:
 __all__ = ["FleetEnv", "FleetVecEnv", "ObservationForm", "SenderEnv", "SenderVectorEnv", "parallel_env"]
 
 
-__getattr__ = on_demand(__name__, FleetEnv="fleet", ObservationForm="observation", parallel_env="fleet")
+__getattr__ = on_demand(__name__)

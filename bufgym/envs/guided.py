@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -26,7 +26,7 @@ GUIDED = "guided"
 ACTIONS = ("slots", GUIDED)
 """What an action is: the slot that goes, or numbers of the rule."""
 INPUT_FIELDS = tuple(
-    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0, function=cast(Any, inputs))
+    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0)
     for name, meaning in INPUTS.items()
 )
 """Fields observed with ``fields="guided"``."""

@@ -14,10 +14,8 @@ import traceback
 from collections.abc import Iterable
 from os import PathLike
 
-_MOST_CHARACTERS = 60
-"""Longest value shown in a message, characters: a broken file can hold a line of any length."""
-_MOST_MESSAGE = 2000
-"""Longest message, characters."""
+_MOST_CHARACTERS = 60  # longest value shown in a message, characters: a broken file can hold a line of any length
+_MOST_MESSAGE = 2000  # longest message, characters
 
 
 def printable(text: object) -> str:
@@ -50,12 +48,7 @@ def unknown(what: str, name: str, known: Iterable[str], also: str = "") -> Bufgy
 
 
 def where(
-    path: str | PathLike[str],
-    line: int | None,
-    value: object | None,
-    rule: str,
-    *,
-    field: str | None = None,
+    path: str | PathLike[str], line: int | None, value: object | None, rule: str, *, field: str | None = None
 ) -> str:
     """Say where an error is, which value is wrong, and which rule it breaks.
 

@@ -6,6 +6,8 @@ leaderboards, results and configurations of clients, therefore never get here.
 
 from __future__ import annotations
 
+import ast
+import functools
 import importlib.util
 import inspect
 import os
@@ -103,15 +105,22 @@ def needs(function: Any) -> int:
     return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters)
 
 
-def on_demand(package: str, **modules: str) -> Callable[[str], Any]:
-    """Make a room's ``__getattr__``: public names that are imported only when they are first asked for.
+def on_demand(package: str) -> Callable[[str], Any]:
+    """Make a room's ``__getattr__``: what it imports ``if TYPE_CHECKING`` is imported when it is first asked for."""
 
-    ``modules`` maps a name to the module of ``package`` that defines it: ``on_demand(__name__, Server="server")``.
-    """
+    @functools.cache
+    def places() -> dict[str, str]:
+        """The module of each public name; a name that is itself a module has that of its room."""
+        blocks = [node for node in ast.parse(inspect.getsource(sys.modules[package])).body if isinstance(node, ast.If)]
+        lines = [line for block in blocks for line in block.body if isinstance(line, ast.ImportFrom)]
+        return {name.name: str(line.module) for line in lines for name in line.names}
 
     def get(name: str) -> Any:
-        if name not in modules:
+        place = None if name.startswith("__") else places().get(name)
+        if place is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+        if place == package:
+            return importlib.import_module(f"{package}.{name}")
+        return getattr(importlib.import_module(place), name)
 
     return get

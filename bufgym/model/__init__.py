@@ -13,4 +13,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Buffer", "Link", "Topic", "Value", "observe", "qoi"]
 
-__getattr__ = on_demand(__name__, Buffer="buffer", Link="link", Topic="topics", Value="qoi")
+__getattr__ = on_demand(__name__)

@@ -6,17 +6,6 @@ from bufgym.oracle.measure import BASELINE, measured, normalised_score, regret
 from bufgym.oracle.online import OnlineOptimum, online_optimum
 
 __all__ = [
-    "BASELINE",
-    "EveryLength",
-    "OnlineOptimum",
-    "Plan",
-    "by_length",
-    "clairvoyant",
-    "ideal",
-    "integer",
-    "law",
-    "measured",
-    "normalised_score",
-    "online_optimum",
-    "regret",
-]
+    "BASELINE", "EveryLength", "OnlineOptimum", "Plan", "by_length", "clairvoyant", "ideal", "integer", "law",
+    "measured", "normalised_score", "online_optimum", "regret",
+]  # fmt: skip

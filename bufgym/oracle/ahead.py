@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import at, kernel
+from bufgym.ground.kernel import Floats, Ints, at, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 
@@ -40,26 +40,20 @@ class Ahead(NamedTuple):
         follow: int32[room], the message to send next for this gain; -1 for none.
     """
 
-    c: NDArray[np.int64]
-    between: NDArray[np.int64]
-    idle: NDArray[np.int64]
-    link: NDArray[np.int64]
-    begin: NDArray[np.int64]
-    stop: NDArray[np.int64]
-    latest: NDArray[np.int64]
-    gain: NDArray[np.float64]
+    c: Ints
+    between: Ints
+    idle: Ints
+    link: Ints
+    begin: Ints
+    stop: Ints
+    latest: Ints
+    gain: Floats
     follow: NDArray[np.int32]
 
 
 @kernel
 def find_steps(
-    batch: Batch,
-    ahead: Ahead,
-    i: int,
-    place: int,
-    latest: NDArray[np.int64],
-    gain: NDArray[np.float64],
-    follow: NDArray[np.int32],
+    batch: Batch, ahead: Ahead, i: int, place: int, latest: Ints, gain: Floats, follow: NDArray[np.int32]
 ) -> int:
     """Write the steps of sender ``i``'s episode from ``place`` on; return their end, NO_ROOM or NO_WORK_SPACE.
 

@@ -11,9 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.programme import Problem, Room, waiting_cost
 
@@ -21,19 +20,13 @@ from bufgym.oracle.programme import Problem, Room, waiting_cost
 class States(NamedTuple):
     """The states at each message, best first; arrays over [messages, width]."""
 
-    used: NDArray[np.int64]
-    """[messages]: number of states in use."""
-    end: NDArray[np.int64]
-    """Byte at which the message ends."""
-    gain: NDArray[np.float64]
-    net: NDArray[np.float64]
-    """Gain less the prices paid."""
-    promise: NDArray[np.float64]
-    """Rank of the state: ``net`` plus an upper bound of the gain to come."""
-    parent: NDArray[np.int64]
-    """[messages, width, 2]: the message sent before, and its state; -1 for none."""
-    latest: NDArray[np.int64]
-    """[messages]: the latest end of any state at this message or one before it."""
+    used: Ints  # [messages]: number of states in use
+    end: Ints  # byte at which the message ends
+    gain: Floats
+    net: Floats  # gain less the prices paid
+    promise: Floats  # rank of the state: ``net`` plus an upper bound of the gain to come
+    parent: Ints  # [messages, width, 2]: the message sent before, and its state; -1 for none
+    latest: Ints  # [messages]: the latest end of any state at this message or one before it
 
 
 def new_states(messages: int, width: int) -> States:
@@ -57,7 +50,7 @@ def ends_too_early(p: Problem, i: int, e: int, j: int) -> bool:
 
 
 @kernel
-def search(p: Problem, room: Room, states: States, plan: NDArray[np.int64]) -> tuple[int, float]:
+def search(p: Problem, room: Room, states: States, plan: Ints) -> tuple[int, float]:
     """Find a good plan; return (length, gain) and write its messages to ``plan``, the last one first."""
     best_gain, best_message, best_state = 0.0, -1, -1
     for j in range(len(p.c)):

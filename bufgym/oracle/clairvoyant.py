@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import interruptible, kernel
+from bufgym.ground.kernel import Floats, Ints, interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
 from bufgym.oracle import labels, unequal
@@ -31,8 +31,7 @@ from bufgym.oracle.programme import NEVER
 from bufgym.policies.registry import register
 from bufgym.scenario import Episode
 
-_SHORT = 2_000
-"""Messages of an episode whose plan takes a fraction of a second on any link."""
+_SHORT = 2_000  # messages of an episode whose plan takes a fraction of a second on any link
 
 
 @dataclass(frozen=True)
@@ -93,13 +92,7 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
 
 @kernel
 def _relaxed_limits(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    capacity: int,
-    max_bytes: int,
-    reach: NDArray[np.int64],
-    largest: NDArray[np.int64],
-    limit: NDArray[np.int64],
+    c: Ints, size: Ints, capacity: int, max_bytes: int, reach: Ints, largest: Ints, limit: Ints
 ) -> None:
     """Fill ``limit``: message i finds no room if more than ``limit[i]`` bytes have to pass before it.
 
@@ -133,9 +126,7 @@ def _relaxed_limits(
 
 
 @kernel
-def _fits(
-    c: NDArray[np.int64], size: NDArray[np.int64], capacity: int, max_bytes: int, ends: int, leaves: NDArray[np.int64]
-) -> bool:
+def _fits(c: Ints, size: Ints, capacity: int, max_bytes: int, ends: int, leaves: Ints) -> bool:
     """Whether a sender with no other arrivals has room for each of these messages, and the link carries them all.
 
     Message k is queued until the link has carried ``leaves[k]`` bytes.
@@ -156,19 +147,19 @@ def _fits(
 # --- as a policy -----------------------------------------------------------------------------------------------------
 
 
-def privileged(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDArray[np.float64]:
+def privileged(episode: Episode, capacity: int, max_bytes: int, v: Value) -> Floats:
     """The plan as a policy's memory: 1 for each message to keep."""
     limit = None if max_bytes >= UNLIMITED_BYTES else max_bytes
     return clairvoyant(episode, capacity, v, max_bytes=limit).kept.astype(np.float64)
 
 
 @register("clairvoyant", privileged=privileged, source="bufgym.oracle.clairvoyant", compile=True)
-def follow(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+def follow(buffer: Buffer, arrival: Any, memory: Floats) -> int:
     """Knows the whole link and workload beforehand: the bound that no other policy exceeds."""
     return ACCEPT if memory[arrival.seq] > 0 else REJECT
 
 
-def integer_plan(episode: Episode, capacity: int, max_bytes: int, v: Value) -> NDArray[np.float64]:
+def integer_plan(episode: Episode, capacity: int, max_bytes: int, v: Value) -> Floats:
     """Write ``evenly_kept`` as a policy's memory; raise unless the episode is one interruption."""
     arrivals = np.asarray(episode.arrivals)
     T, size = len(arrivals) - 2, int(arrivals["size_bytes"][0])

@@ -14,38 +14,26 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import at, kernel
+from bufgym.ground.kernel import Floats, Ints, at, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.ahead import TIE, Ahead, sends, step_of
 from bufgym.sim.state import ARRIVAL_WAITS, CARRIES, Batch
 
 
 class Work(NamedTuple):
-    """Work space of ``find_values`` for queues of up to L messages.
+    """Work space of ``find_values`` for queues of up to L messages."""
 
-    Fields:
-        x: float64[L + 1], coordinates of the queued messages and of the newcomer, its last.
-        first: float64[L + 1], gain of each if it is sent next.
-        pair: float64[L + 1, L + 1], gain of the second if it is sent after the first.
-        own: float64[L + 2, L + 1], best gain of so many of the queue's own messages, of which this is the last.
-        jump: float64[L + 2, L + 1], best gain after these if only later arrivals follow.
-        target: int64[L + 2, L + 1], the first of those arrivals; -1 for none.
-        slots: int64[L + 1], messages queued after the action.
-        arrived: int64[L + 2], arrivals after the newcomer by the time of the t-th transmission.
-        future: float64[messages], gain after each later arrival.
-        forced: float64[2, L + 1 + messages], gain of each candidate.
-    """
-
-    x: NDArray[np.float64]
-    first: NDArray[np.float64]
-    pair: NDArray[np.float64]
-    own: NDArray[np.float64]
-    jump: NDArray[np.float64]
-    target: NDArray[np.int64]
-    slots: NDArray[np.int64]
-    arrived: NDArray[np.int64]
-    future: NDArray[np.float64]
-    forced: NDArray[np.float64]
+    x: Floats  # float64[L + 1], coordinates of the queued messages and of the newcomer, its last
+    first: Floats  # float64[L + 1], gain of each if it is sent next
+    pair: Floats  # float64[L + 1, L + 1], gain of the second if it is sent after the first
+    own: Floats
+    """float64[L + 2, L + 1], best gain of so many of the queue's own messages, of which this is the last."""
+    jump: Floats  # float64[L + 2, L + 1], best gain after these if only later arrivals follow
+    target: Ints  # int64[L + 2, L + 1], the first of those arrivals; -1 for none
+    slots: Ints  # int64[L + 1], messages queued after the action
+    arrived: Ints  # int64[L + 2], arrivals after the newcomer by the time of the t-th transmission
+    future: Floats  # float64[messages], gain after each later arrival
+    forced: Floats  # float64[2, L + 1 + messages], gain of each candidate
 
 
 def new_work(capacity: int, messages: int) -> Work:

@@ -24,9 +24,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.programme import Problem, find_future, new_problem
 
@@ -39,36 +38,20 @@ SHARES = (1 / 16, 1 / 4, 1.0)
 LABELS = 1 << 14
 """Initial room for labels; it doubles whenever it runs out."""
 
-_ROUNDING = 1e-9
-"""Tolerance: the bounds add the same numbers in another order."""
+_ROUNDING = 1e-9  # tolerance: the bounds add the same numbers in another order
 
 
 class Labels(NamedTuple):
-    """All labels, message by message; message i has ``first[i] : first[i + 1]``, by rising end and gain.
+    """All labels, message by message; message i has ``first[i] : first[i + 1]``, by rising end and gain."""
 
-    Fields:
-        first: int64[messages + 1], index of a message's first label.
-        latest: int64[messages + 1], the latest end of any label at the messages before it.
-        end: int64[room], the byte at which the label's last message ends.
-        gain: float64[room], the gain in H by the messages so far.
-        parent: int64[room], the label before it; -1 at the first message of a plan.
-    """
-
-    first: NDArray[np.int64]
-    latest: NDArray[np.int64]
-    end: NDArray[np.int64]
-    gain: NDArray[np.float64]
-    parent: NDArray[np.int64]
+    first: Ints  # int64[messages + 1], index of a message's first label
+    latest: Ints  # int64[messages + 1], the latest end of any label at the messages before it
+    end: Ints  # int64[room], the byte at which the label's last message ends
+    gain: Floats  # float64[room], the gain in H by the messages so far
+    parent: Ints  # int64[room], the label before it; -1 at the first message of a plan
 
 
-def best(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    limit: NDArray[np.int64],
-    x: NDArray[np.float64],
-    v: NDArray[np.float64],
-    ends: int,
-) -> tuple[NDArray[np.int64], float]:
+def best(c: Ints, size: Ints, limit: Ints, x: Floats, v: Floats, ends: int) -> tuple[Ints, float]:
     """Find the best plan; return its messages in order and its gain, H - 1."""
     n = len(c)
     problem, guide = new_problem(c, size, limit, limit, x, v, ends, GRID), np.empty(n, np.int64)
@@ -102,7 +85,7 @@ def fill(problem: Problem, enough: float, labels: Labels) -> Labels:
     return labels
 
 
-def plan_of(labels: Labels) -> tuple[NDArray[np.int64], float]:
+def plan_of(labels: Labels) -> tuple[Ints, float]:
     """Messages on the way to the best label (the last one if several are equal) and its gain; none and 0 if none is
     sent.
     """
@@ -138,7 +121,7 @@ def most(p: Problem) -> float:
 
 
 @kernel
-def guided(p: Problem, plan: NDArray[np.int64]) -> tuple[int, float]:
+def guided(p: Problem, plan: Ints) -> tuple[int, float]:
     """Write one good plan, taking as next message always the best by ``future``; return (length, gain)."""
     i, e, gain, length = -1, 0, 0.0, 0
     while True:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import interruptible, kernel
+from bufgym.ground.kernel import Floats, Ints, interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.checks import whole
 from bufgym.model.qoi import Value
@@ -34,8 +34,7 @@ from bufgym.policies.registry import Policy
 
 OBJECTIVES = ("ratio", "qoi")
 
-_MOST = 2**61
-"""Cut-off for binomial coefficients: larger ones belong to no state that fits into memory."""
+_MOST = 2**61  # cut-off for binomial coefficients: larger ones belong to no state that fits into memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +43,7 @@ class OnlineOptimum:
 
     capacity: int
     """L, messages."""
-    probabilities: NDArray[np.float64]
+    probabilities: Floats
     """float64[t_max + 1]: P(T = t) for t = 0..t_max, the longest possible length."""
     objective: str
     """One of ``OBJECTIVES``."""
@@ -87,7 +86,7 @@ class OnlineOptimum:
         """
         return Policy(f"online-optimum:L={self.capacity}", self._on_arrival, source="dynamic programme, exact")
 
-    def _on_arrival(self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+    def _on_arrival(self, buffer: Buffer, arrival: Any, memory: Floats) -> int:
         """A full queue drops what the exact dynamic programme over the unknown length T drops."""
         if buffer.capacity != self.capacity:
             raise BufgymError(f"online-optimum: made for L = {self.capacity}, but the buffer has L = {buffer.capacity}")
@@ -102,12 +101,7 @@ class OnlineOptimum:
 
 
 def online_optimum(
-    capacity: int,
-    probabilities: ArrayLike,
-    v: Value,
-    *,
-    objective: str = "ratio",
-    max_states: int = 50_000_000,
+    capacity: int, probabilities: ArrayLike, v: Value, *, objective: str = "ratio", max_states: int = 50_000_000
 ) -> OnlineOptimum:
     """Solve for L = ``capacity`` and P(T = t), t = 0, 1, ... (such as ``law(scenario)``).
 
@@ -136,14 +130,7 @@ def online_optimum(
 
 
 @kernel
-def _solve(
-    gain: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    binomial: NDArray[np.int64],
-    kept: NDArray[np.int64],
-    best: NDArray[np.float64],
-    decisions: NDArray[Any],
-) -> None:
+def _solve(gain: Floats, weight: Floats, binomial: Ints, kept: Ints, best: Floats, decisions: NDArray[Any]) -> None:
     """Fill ``best`` and ``decisions`` backwards from t_max arrivals to L; ties drop the oldest.
 
     ``gain`` is V(0..t_max + 1), ``weight`` the weight of each T = t, and ``binomial[n, k]`` = C(n, k). ``kept``,
@@ -182,7 +169,7 @@ def _solve(
             kept[k] += 1
 
 
-def _binomials(t_max: int, L: int) -> NDArray[np.int64]:
+def _binomials(t_max: int, L: int) -> Ints:
     """C(n, k), int64[t_max + 1, L + 2]."""
     table = np.zeros((t_max + 1, L + 2), np.int64)
     table[:, 0] = 1
@@ -191,7 +178,7 @@ def _binomials(t_max: int, L: int) -> NDArray[np.int64]:
     return table
 
 
-def _checked(probabilities: ArrayLike) -> NDArray[np.float64]:
+def _checked(probabilities: ArrayLike) -> Floats:
     """Copy without the impossible lengths at the end; BufgymError if these are no probabilities."""
     try:
         p = np.array(probabilities, np.float64)

@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.qoi import value
 
 NEVER = -1
@@ -24,61 +23,38 @@ BLOCK = 32
 
 
 class Problem(NamedTuple):
-    """One episode as the kernels read it; arrays over messages.
+    """One episode as the kernels read it; arrays over messages."""
 
-    Fields:
-        c: int64, bytes that the link can have carried when the message arrives.
-        size: int64, bytes of the message.
-        limit: int64, bytes that may still have to pass before it when it arrives, at most; or NEVER.
-        x: float64, coordinate of the message.
-        v: ``Value.array``.
-        ends: the link's last byte.
-        between: int64, the last message before it that could have been sent before it arrives; -1: none.
-        idle: int64, after a message before ``between`` that ends by this byte, ``between`` could be sent in time.
-        grid: bytes to a grid step.
-        future: float64[messages, steps], no plan gains more after message i, if that ends at byte
-            (c_i // grid + k) * grid or later.
-    """
-
-    c: NDArray[np.int64]
-    size: NDArray[np.int64]
-    limit: NDArray[np.int64]
-    x: NDArray[np.float64]
-    v: NDArray[np.float64]
-    ends: int
-    between: NDArray[np.int64]
-    idle: NDArray[np.int64]
-    grid: int
-    future: NDArray[np.float64]
+    c: Ints  # int64, bytes that the link can have carried when the message arrives
+    size: Ints  # int64, bytes of the message
+    limit: Ints  # int64, bytes that may still have to pass before it when it arrives, at most; or NEVER
+    x: Floats  # float64, coordinate of the message
+    v: Floats  # ``Value.array``
+    ends: int  # the link's last byte
+    between: Ints
+    """int64, the last message before it that could have been sent before it arrives; -1: none."""
+    idle: Ints
+    """int64, after a message before ``between`` that ends by this byte, ``between`` could be sent in time."""
+    grid: int  # bytes to a grid step
+    future: Floats
+    """float64[messages, steps], no plan gains more after message i, if that ends at byte (c_i // grid + k) * grid or
+    later."""
 
 
 class Room(NamedTuple):
-    """Room in the queue, and the price that a message pays for waiting in it (see ``unequal``).
+    """Room in the queue, and the price that a message pays for waiting in it (see ``unequal``)."""
 
-    Fields:
-        capacity: L, messages.
-        max_bytes: B, bytes.
-        until: float64[2, steps], sum of the prices of all arrivals before this grid position; of a message, of a byte.
-        before: float64[2, messages + 1], the same sum over the arrivals before each message.
-        begun: float64[messages, steps], like ``future``, if the message begins there after waiting; less its price.
-    """
-
-    capacity: int
-    max_bytes: int
-    until: NDArray[np.float64]
-    before: NDArray[np.float64]
-    begun: NDArray[np.float64]
+    capacity: int  # L, messages
+    max_bytes: int  # B, bytes
+    until: Floats
+    """float64[2, steps], sum of the prices of all arrivals before this grid position; of a message, of a byte."""
+    before: Floats  # float64[2, messages + 1], the same sum over the arrivals before each message
+    begun: Floats
+    """float64[messages, steps], like ``future``, if the message begins there after waiting; less its price."""
 
 
 def new_problem(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    limit: NDArray[np.int64],
-    certain: NDArray[np.int64],
-    x: NDArray[np.float64],
-    v: NDArray[np.float64],
-    ends: int,
-    steps: int,
+    c: Ints, size: Ints, limit: Ints, certain: Ints, x: Floats, v: Floats, ends: int, steps: int
 ) -> Problem:
     """Set up one episode on a grid of ``steps`` to a mean message, or fewer (``MAX_CELLS``); ``future`` is 0.
 
@@ -92,14 +68,7 @@ def new_problem(
 
 
 @kernel
-def find_idle(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    limit: NDArray[np.int64],
-    certain: NDArray[np.int64],
-    between: NDArray[np.int64],
-    idle: NDArray[np.int64],
-) -> None:
+def find_idle(c: Ints, size: Ints, limit: Ints, certain: Ints, between: Ints, idle: Ints) -> None:
     """Fill ``between`` and ``idle`` (see ``Problem``); ``certain`` as in ``new_problem``."""
     for i in range(len(c)):
         m = i - 1
@@ -146,7 +115,7 @@ def find_future(p: Problem) -> None:
 
 
 @kernel
-def find_priced_future(p: Problem, room: Room, last: NDArray[np.int64], best: NDArray[np.float64]) -> None:
+def find_priced_future(p: Problem, room: Room, last: Ints, best: Floats) -> None:
     """Fill ``future`` and ``room.begun`` from the last message back; ``last`` and ``best`` are work space, [positions].
 
     What j gains if i ends at a grid position is V(x_j - x_i) plus a number that does not depend on i. V is concave: the
@@ -185,9 +154,7 @@ def find_priced_future(p: Problem, room: Room, last: NDArray[np.int64], best: ND
 
 
 @kernel
-def offer(
-    p: Problem, room: Room, i: int, j: int, low: int, right: int, last: NDArray[np.int64], best: NDArray[np.float64]
-) -> None:
+def offer(p: Problem, room: Room, i: int, j: int, low: int, right: int, last: Ints, best: Floats) -> None:
     """Raise ``best`` to what j after i gains at grid positions ``low`` to ``right``, and note j in ``last``."""
     if low >= right or p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
         return

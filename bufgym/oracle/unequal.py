@@ -21,9 +21,8 @@ round gives a bound; the least of all is returned.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
 from bufgym.oracle import beam
@@ -42,16 +41,8 @@ WIDTH, LAST_WIDTH = 8, 64
 
 
 def best(
-    c: NDArray[np.int64],
-    size: NDArray[np.int64],
-    limit: NDArray[np.int64],
-    certain: NDArray[np.int64],
-    x: NDArray[np.float64],
-    v: NDArray[np.float64],
-    ends: int,
-    capacity: int,
-    max_bytes: int,
-) -> tuple[NDArray[np.int64], float]:
+    c: Ints, size: Ints, limit: Ints, certain: Ints, x: Floats, v: Floats, ends: int, capacity: int, max_bytes: int
+) -> tuple[Ints, float]:
     """Find messages of a plan that keeps to L and B, in order, and an upper bound of any such plan's gain, H - 1."""
     n = len(c)
     byte_limit = max_bytes < UNLIMITED_BYTES
@@ -94,7 +85,7 @@ def best(
     return plan, max(plan_gain, min(bound, gain + float((rooms * kept_prices).sum())))
 
 
-def _priced(p: Problem, prices: NDArray[np.float64], capacity: int, max_bytes: int) -> Room:
+def _priced(p: Problem, prices: Floats, capacity: int, max_bytes: int) -> Room:
     """Make room at these prices [2, messages], and fill the programme's ``future`` under them."""
     before = np.concatenate([np.zeros((2, 1)), np.cumsum(prices, axis=1)], axis=1)
     positions = np.arange(int(p.c[-1]) // p.grid + p.future.shape[1] + 1) * p.grid
@@ -105,7 +96,7 @@ def _priced(p: Problem, prices: NDArray[np.float64], capacity: int, max_bytes: i
 
 
 @kernel
-def follow(p: Problem, room: Room, message: NDArray[np.int64], begin: NDArray[np.int64]) -> tuple[int, float]:
+def follow(p: Problem, room: Room, message: Ints, begin: Ints) -> tuple[int, float]:
     """Write the programme's own best plan, which need not keep to the room; return (length, gain less prices).
 
     ``message`` and ``begin``, the byte at which each begins, are int64[messages], filled up to the length.
@@ -146,9 +137,7 @@ def follow(p: Problem, room: Room, message: NDArray[np.int64], begin: NDArray[np
 
 
 @kernel
-def count_queued(
-    p: Problem, message: NDArray[np.int64], begin: NDArray[np.int64], length: int, queued: NDArray[np.float64]
-) -> None:
+def count_queued(p: Problem, message: Ints, begin: Ints, length: int, queued: Floats) -> None:
     """Fill ``queued``, float64[2, messages]: messages and bytes that this plan has in the queue after each arrival."""
     queued[:, :] = 0.0
     for k in range(length):

@@ -35,14 +35,10 @@ MESSAGES = 20
 class CameraMotion:
     """One motion of the camera."""
 
-    label: str
-    """Label in the picture."""
-    view: Callable[[float], tuple[float, float]]
-    """Left and right edge of a message's view, given the message's number."""
-    dimensions: int
-    """1 if the view has edges in one direction, 2 if it has the same edges in both."""
-    formula: Value
-    """V as the paper gives it."""
+    label: str  # label in the picture
+    view: Callable[[float], tuple[float, float]]  # left and right edge of a message's view, given the message's number
+    dimensions: int  # 1 if the view has edges in one direction, 2 if it has the same edges in both
+    formula: Value  # V as the paper gives it
 
     def new(self, d: float) -> float:
         """Fraction of a view that was not in the view ``d`` messages earlier."""

@@ -42,10 +42,8 @@ _TIME: Final = "builtin_interfaces/msg/Time"
 class Kind(NamedTuple):
     """A kind of message."""
 
-    type: str
-    """Its ROS type."""
-    frame_id: str
-    """The frame_id of its header by default."""
+    type: str  # its ROS type
+    frame_id: str  # the frame_id of its header by default
 
 
 KINDS: Final = {

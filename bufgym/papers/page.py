@@ -14,10 +14,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.papers import FIGURES, TAKES_DATA, figure
 from bufgym.papers.figure import facts_of, source, statements
 
-PAPERS = {
-    "afr": "AFR [wang2022afr]",
-    "robofleet": "Robofleet [sikand2021robofleet]",
-}
+PAPERS = {"afr": "AFR [wang2022afr]", "robofleet": "Robofleet [sikand2021robofleet]"}
 """Prefix of a section's name -> the paper with its key in references.bib."""
 
 VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}

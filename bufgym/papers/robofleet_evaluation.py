@@ -55,18 +55,13 @@ MBIT = 125_000
 class SendingProgram:
     """A sending program: its policy and its operator's settings of the topics."""
 
-    policy: str
-    """Its name in ``bufgym.policies``."""
-    label: str
-    """Label in legends."""
-    short: str
-    """Label in tables."""
+    policy: str  # its name in ``bufgym.policies``
+    label: str  # label in legends
+    short: str  # label in tables
     colour: str
     marker: str
-    all_no_drop: bool = False
-    """Whether every topic is no_drop."""
-    queued: bool = False
-    """Whether each topic has a queue of its own, of ``queue_size`` messages."""
+    all_no_drop: bool = False  # whether every topic is no_drop
+    queued: bool = False  # whether each topic has a queue of its own, of ``queue_size`` messages
 
     @property
     def style(self) -> dict[str, Any]:
@@ -92,14 +87,10 @@ SHORT = {name: program.short for name, program in PROGRAMS.items()}
 class Sent:
     """Outcome of every message of one run, in order of arrival; arrays have shape [messages]."""
 
-    topic: NDArray[np.int64]
-    """Index of the message's stream."""
-    consumer: NDArray[np.int64]
-    """Consumer of this copy if the sender makes copies, otherwise 0."""
-    arrival_s: NDArray[np.float64]
-    """Arrival time at the sender."""
-    received_s: NDArray[np.float64]
-    """Receipt time at the server; NaN for a dropped message."""
+    topic: NDArray[np.int64]  # index of the message's stream
+    consumer: NDArray[np.int64]  # consumer of this copy if the sender makes copies, otherwise 0
+    arrival_s: NDArray[np.float64]  # arrival time at the sender
+    received_s: NDArray[np.float64]  # receipt time at the server; NaN for a dropped message
 
     @property
     def latency_s(self) -> NDArray[np.float64]:

@@ -24,38 +24,8 @@ if TYPE_CHECKING:
     from bufgym.relay.wire import Message, RefusedError
 
 __all__ = [
-    "BagSource",
-    "Config",
-    "Foxglove",
-    "Limits",
-    "Message",
-    "Nats",
-    "RefusedError",
-    "Robot",
-    "RobotClient",
-    "Rotation",
-    "Rule",
-    "Server",
-    "Session",
-    "Source",
-    "StoreLimits",
-    "Tls",
-    "Tokens",
-    "compiled",
-    "load",
-    "security",
-    "serve_forever",
-    "token",
-]
-__getattr__ = on_demand(
-    __name__,
-    **dict.fromkeys(("Config", "Foxglove", "Limits", "Nats", "Rotation", "Rule", "StoreLimits"), "config"),
-    **dict.fromkeys(("Tls", "Tokens", "load"), "config"),
-    **dict.fromkeys(("Robot", "Source"), "robot"),
-    **dict.fromkeys(("Server", "serve_forever"), "server"),
-    **dict.fromkeys(("Session", "security", "token"), "session"),
-    **dict.fromkeys(("Message", "RefusedError"), "wire"),
-    RobotClient="client",
-    BagSource="bag",
-    compiled="policies",
-)
+    "BagSource", "Config", "Foxglove", "Limits", "Message", "Nats", "RefusedError", "Robot", "RobotClient", "Rotation",
+    "Rule", "Server", "Session", "Source", "StoreLimits", "Tls", "Tokens", "compiled", "load", "security",
+    "serve_forever", "token",
+]  # fmt: skip
+__getattr__ = on_demand(__name__)

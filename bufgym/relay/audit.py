@@ -16,8 +16,7 @@ from bufgym.ground.errors import printable
 from bufgym.relay.config import Rotation
 
 FILE: Final = "audit.jsonl"
-_MOST_CHARACTERS: Final = 300
-"""Length limit of a text from outside."""
+_MOST_CHARACTERS: Final = 300  # length limit of a text from outside
 _RECENT: Final = 1_000
 
 

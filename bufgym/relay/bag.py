@@ -16,8 +16,7 @@ from bufgym.relay.robot import Robot
 from bufgym.scenario import Stream
 from bufgym.traces.formats.bags import messages, read_bag
 
-_LATE_S = 1.0
-"""Delay beyond which playback does not catch up but continues from the present."""
+_LATE_S = 1.0  # delay beyond which playback does not catch up but continues from the present
 
 
 class BagSource:

@@ -30,8 +30,7 @@ from bufgym.relay.session import Session
 from bufgym.robot.log import Record
 from bufgym.robot.queue import Item, PolicyQueue
 
-_POLL_S: Final = (0.001, 0.016)
-"""Time between two checks for departures: at first, and when nothing moves."""
+_POLL_S: Final = (0.001, 0.016)  # time between two checks for departures: at first, and when nothing moves
 
 
 @dataclass(eq=False)
@@ -40,8 +39,7 @@ class _Away:
 
     queue: PolicyQueue
     item: Item
-    answered: asyncio.Future[None] | None = None
-    """On a no_drop topic: done when the relay holds it."""
+    answered: asyncio.Future[None] | None = None  # on a no_drop topic: done when the relay holds it
     written: bool = False
 
 

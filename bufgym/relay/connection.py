@@ -44,8 +44,7 @@ class Connection:
 
     session: Mailbox
     permissions: Permissions
-    name: str
-    """Sender's name as others see it."""
+    name: str  # sender's name as others see it
     acks = True
 
     def __init__(self, hub: Hub, socket: ServerConnection, verifier: Verifier | None) -> None:

@@ -60,8 +60,7 @@ class Member(Protocol):
     session: Mailbox
     permissions: Permissions
     subscriptions: dict[str, Subscription]
-    acks: bool
-    """Whether its client acks no_drop messages; otherwise it gets them like all others."""
+    acks: bool  # whether its client acks no_drop messages; otherwise it gets them like all others
 
     @property
     def sent(self) -> int:

@@ -16,8 +16,7 @@ RATE_S: Final = 1.0
 """Time before now over which rates are computed."""
 QOI_S: Final = 30.0
 """Time before now whose messages count for QoI."""
-_MOST: Final = 10_000
-"""Messages of a topic that are remembered for its QoI."""
+_MOST: Final = 10_000  # messages of a topic that are remembered for its QoI
 
 
 class _Put:
@@ -121,12 +120,9 @@ class Monitor:
         if not settled:
             return None
         # A new queue may count x from 0 again: only the sum of rising x is a distance.
-        most, got = (value.information(_grown([put.x for put in some])) for some in (settled, _kept(settled)))
+        kept = [put for put in settled if put.left]
+        most, got = (value.information(_grown([put.x for put in some])) for some in (settled, kept))
         return min(1.0, got / most)
-
-
-def _kept(puts: list[_Put]) -> list[_Put]:
-    return [put for put in puts if put.left]
 
 
 def _grown(xs: list[float]) -> list[float]:

@@ -14,8 +14,7 @@ from bufgym.ground.errors import BufgymError
 MAX_CHARACTERS: Final = 512
 MAX_MEMORY_BYTES: Final = 2**18
 """Memory limit of one expression's automaton."""
-_KEPT: Final = 1024
-"""Expressions kept compiled; viewers with the same expression share it."""
+_KEPT: Final = 1024  # expressions kept compiled; viewers with the same expression share it
 
 
 class Pattern:

@@ -25,8 +25,7 @@ from bufgym.ground.errors import BufgymError
 MOST_BYTES: Final = 4 * 2**20
 """Limit on the payloads of a piece."""
 _MAGIC: Final = b"\x89MCAP0\r\n"
-_STEP_BYTES: Final = 2**18
-"""Distance between two indexed places of a file."""
+_STEP_BYTES: Final = 2**18  # distance between two indexed places of a file
 
 
 def recordings(folder: Path | None) -> list[dict[str, Any]]:

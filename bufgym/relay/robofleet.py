@@ -30,8 +30,7 @@ from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import WireError
 
 SUBSCRIPTION_TYPES: Final = ("amrl_msgs/RobofleetSubscription", "RobofleetSubscription")
-_FIRST: Final = 4
-"""Offset of a table's field 0 in its vtable; each further field is 2 bytes on."""
+_FIRST: Final = 4  # offset of a table's field 0 in its vtable; each further field is 2 bytes on
 
 
 class Flat(NamedTuple):
@@ -39,8 +38,7 @@ class Flat(NamedTuple):
 
     type: str
     topic: str
-    pattern: str = ""
-    """Pattern of a subscription."""
+    pattern: str = ""  # pattern of a subscription
     subscribe: bool = False
 
 

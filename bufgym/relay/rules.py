@@ -17,8 +17,7 @@ from bufgym.relay.config import Rule
 from bufgym.relay.patterns import pattern
 
 Verb = Literal["send", "receive"]
-_REMEMBERED: Final = 4_096
-"""Answers cached for one identity."""
+_REMEMBERED: Final = 4_096  # answers cached for one identity
 
 
 @dataclass(frozen=True)
@@ -26,12 +25,9 @@ class Identity:
     """Proven identity of the other end of a connection."""
 
     address: str = ""
-    email: str = ""
-    """E-mail of a verified token or certificate."""
-    own: str = ""
-    """The relay's own part, as in ``Rule.own``."""
-    until_s: float = math.inf
-    """End of its token, s since 1970."""
+    email: str = ""  # E-mail of a verified token or certificate
+    own: str = ""  # the relay's own part, as in ``Rule.own``
+    until_s: float = math.inf  # end of its token, s since 1970
 
     @property
     def key(self) -> str:

@@ -42,20 +42,13 @@ class Mailbox:
 
     name: str
     identity: Identity
-    temporary: bool
-    """Whether the session ends with its connection."""
-    received: int = 0
-    """Highest number of a no_drop message taken from it."""
-    numbered: int = 0
-    """Highest number of a no_drop message for it."""
-    held: int = 0
-    """Number of messages for it that are not acked."""
-    durable: dict[str, str] = field(default_factory=dict)
-    """id -> pattern of the messages held for it while it is away."""
-    seen_s: float = 0.0
-    """Time of its last connection, s since 1970."""
-    id: int | None = None
-    """Id in the store; None while there is nothing to remember."""
+    temporary: bool  # whether the session ends with its connection
+    received: int = 0  # highest number of a no_drop message taken from it
+    numbered: int = 0  # highest number of a no_drop message for it
+    held: int = 0  # number of messages for it that are not acked
+    durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
+    seen_s: float = 0.0  # time of its last connection, s since 1970
+    id: int | None = None  # id in the store; None while there is nothing to remember
 
     @property
     def columns(self) -> tuple[Any, ...]:
@@ -75,8 +68,7 @@ class Settled(NamedTuple):
     sender: Mailbox
     seq: int
     receivers: int
-    lost: int
-    """Number of receivers whose sessions were forgotten before they acked it."""
+    lost: int  # number of receivers whose sessions were forgotten before they acked it
 
 
 class Store:

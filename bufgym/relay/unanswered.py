@@ -22,8 +22,7 @@ class Pending:
     """A message on its way."""
 
     message: wire.Message
-    answered: asyncio.Future[None]
-    """Done when the relay holds the message; a BufgymError if it was refused."""
+    answered: asyncio.Future[None]  # done when the relay holds the message; a BufgymError if it was refused
 
 
 class Unanswered:

@@ -20,28 +20,7 @@ if TYPE_CHECKING:
     from bufgym.robot.shaped import ShapedLink
 
 __all__ = [
-    "TRANSPORTS",
-    "Item",
-    "LogFile",
-    "Odometry",
-    "PolicyQueue",
-    "Received",
-    "Receiver",
-    "Recording",
-    "Replay",
-    "Sender",
-    "ShapedLink",
-    "read_log",
-    "replay",
-]
-__getattr__ = on_demand(
-    __name__,
-    **dict.fromkeys(("LogFile", "read_log"), "log"),
-    **dict.fromkeys(("Item", "PolicyQueue"), "queue"),
-    **dict.fromkeys(("Received", "Receiver", "Recording"), "receiver"),
-    **dict.fromkeys(("Replay", "replay"), "replaying"),
-    Odometry="odometry",
-    Sender="sender",
-    ShapedLink="shaped",
-    TRANSPORTS="channels",
-)
+    "TRANSPORTS", "Item", "LogFile", "Odometry", "PolicyQueue", "Received", "Receiver", "Recording", "Replay", "Sender",
+    "ShapedLink", "read_log", "replay",
+]  # fmt: skip
+__getattr__ = on_demand(__name__)

@@ -16,8 +16,7 @@ from typing import Any, Final, Protocol
 
 from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, header, whole
 
-_MOST_WAITING: Final = 1024
-"""Limit on frames waiting to be taken, more than a sender ever has unacked."""
+_MOST_WAITING: Final = 1024  # limit on frames waiting to be taken, more than a sender ever has unacked
 
 
 class Bus(Protocol):

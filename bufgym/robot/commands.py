@@ -153,13 +153,7 @@ async def receive(
 
 
 async def link(
-    *,
-    trace: str,
-    to: str,
-    port: Port = PORT + 1,
-    scale: Positive = 1.0,
-    delay_ms: Least0 = 0.0,
-    back: bool = False,
+    *, trace: str, to: str, port: Port = PORT + 1, scale: Positive = 1.0, delay_ms: Least0 = 0.0, back: bool = False
 ) -> None:
     """Put a link of a trace's capacity between real sockets (a TCP proxy, without root).
 

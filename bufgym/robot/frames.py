@@ -29,14 +29,11 @@ class FrameError(ConnectionError):
 class Frame(NamedTuple):
     """One frame."""
 
-    kind: int
-    """GREETING, DATA, ACK or GOODBYE."""
+    kind: int  # GREETING, DATA, ACK or GOODBYE
     number: int
     """Index of the message among all that the socket dequeued; in a receiver's greeting the next one expected."""
-    seq: int = 0
-    """Index of the message among all that were put; in a receiver's greeting the largest body in bytes."""
-    at_us: int = 0
-    """Time of the put by the queue's clock."""
+    seq: int = 0  # index of the message among all that were put; in a receiver's greeting the largest body in bytes
+    at_us: int = 0  # time of the put by the queue's clock
     x: float = 0.0
     topic: int = 0
     body: bytes | memoryview = b""

@@ -22,8 +22,7 @@ class Margin:
     episodes: int
     live: Interval
     simulated: Interval
-    share: Interval
-    """Live over simulated."""
+    share: Interval  # live over simulated
 
     def __str__(self) -> str:
         live, simulated, share = map(_percent, (self.live, self.simulated, self.share))

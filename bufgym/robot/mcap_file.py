@@ -8,8 +8,7 @@ from typing import Any, Final
 
 from bufgym.robot.extra import needs
 
-_FLUSH_S: Final = 0.5
-"""Time between flushes; a killed program loses what it has written since the last one."""
+_FLUSH_S: Final = 0.5  # time between flushes; a killed program loses what it has written since the last one
 
 
 class McapFile:

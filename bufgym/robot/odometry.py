@@ -14,8 +14,7 @@ import numpy as np
 from bufgym.traces import MotionSettings
 from bufgym.traces.poses import angles
 
-_NORM = 0.9, 1.1
-"""Norms of a valid quaternion; some drivers send zeros at first."""
+_NORM = 0.9, 1.1  # norms of a valid quaternion; some drivers send zeros at first
 
 
 class Odometry:

@@ -127,10 +127,7 @@ def check_messages(mark: str) -> None:
 
 
 def publish_in_time(
-    episode: Episode,
-    began_s: float,
-    move: Callable[[int, float], None],
-    show: Callable[[int, int], None],
+    episode: Episode, began_s: float, move: Callable[[int, float], None], show: Callable[[int, int], None]
 ) -> None:
     """Call ``move(frame, metres along a straight way)`` and ``show(frame, bytes)`` when the episode's messages arrive.
 

@@ -141,12 +141,7 @@ class PolicyQueue:
     # --- in ----------------------------------------------------------------------------------------------------------
 
     def put(
-        self,
-        message: Any,
-        size_bytes: int,
-        x: float | None = None,
-        topic: int = 0,
-        at_us: int | None = None,
+        self, message: Any, size_bytes: int, x: float | None = None, topic: int = 0, at_us: int | None = None
     ) -> int:
         """Put a message; the policy decides at once. Returns its ``seq`` and never blocks.
 

@@ -25,8 +25,7 @@ from bufgym.robot.tasks import Tasks
 
 MAX_STREAMS: Final = 64
 """Number of latest senders that are remembered."""
-_GREETING_S: Final = 20.0
-"""Time for a sender's greeting; later the connection is closed."""
+_GREETING_S: Final = 20.0  # time for a sender's greeting; later the connection is closed
 
 
 class Received(NamedTuple):
@@ -63,10 +62,7 @@ class Receiver:
     """
 
     def __init__(
-        self,
-        on_message: Callable[[Received], Awaitable[None] | None],
-        *,
-        max_body_bytes: int = MAX_BODY_BYTES,
+        self, on_message: Callable[[Received], Awaitable[None] | None], *, max_body_bytes: int = MAX_BODY_BYTES
     ) -> None:
         self.faults: deque[str] = deque(maxlen=100)
         """Why connections ended, the last 100."""

@@ -30,11 +30,9 @@ class LiveRun:
     simulated_delivered: int
     live_qoi: float
     simulated_qoi: float
-    best_qoi: float
-    """The clairvoyant's H."""
+    best_qoi: float  # the clairvoyant's H
     transport: str = "tcp"
-    live_s: tuple[float, ...] = ()
-    """Times from a message's arrival at the queue to its receipt, in order of receipt."""
+    live_s: tuple[float, ...] = ()  # times from a message's arrival at the queue to its receipt, in order of receipt
     simulated_s: tuple[float, ...] = ()
 
     @property

@@ -22,8 +22,7 @@ RETRY_S: Final = 0.5
 PATIENCE_S: Final = 20.0
 """Time for the receiver's answer to the greeting."""
 _POLL_S: Final = 0.001
-_MOST_UNACKED: Final = 256
-"""Limit on messages that await the receiver's ack, where they count as left before it."""
+_MOST_UNACKED: Final = 256  # limit on messages that await the receiver's ack, where they count as left before it
 
 
 class Sender:

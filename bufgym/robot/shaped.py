@@ -20,13 +20,11 @@ from bufgym.robot.tasks import Tasks
 
 RECEIVE_BUFFER_BYTES: Final = 16_384
 _PIECE_BYTES: Final = 16_384
-_MOST_PIECES: Final = 4096
-"""Limit on pieces on their way to the receiver at a time."""
+_MOST_PIECES: Final = 4096  # limit on pieces on their way to the receiver at a time
 _SLACK_S: Final = 0.005
 """Longest wait for the next bytes during which the link counts as busy. Programs need this time between an ack and the
 next message, so it is not charged to the link."""
-_STALL_S: Final = 0.1
-"""Longest stall of this program, on a busy machine, that a busy link makes up for."""
+_STALL_S: Final = 0.1  # longest stall of this program, on a busy machine, that a busy link makes up for
 
 
 class ShapedLink:
@@ -110,10 +108,7 @@ class ShapedLink:
                 far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
             await loop.sock_connect(far, self._target)
             sender, receiver = (far, near) if self._back else (near, far)
-            tasks = [
-                asyncio.create_task(self._up(sender, receiver)),
-                asyncio.create_task(self._down(receiver, sender)),
-            ]
+            tasks = [asyncio.create_task(self._up(sender, receiver)), asyncio.create_task(self._down(receiver, sender))]
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except OSError:
             pass  # the target does not listen: the sender reconnects

@@ -22,13 +22,6 @@ except ModuleNotFoundError as error:
     raise BufgymError(f"bufgym.sb3 needs {error.name}: {install('train')}") from None
 
 __all__ = [
-    "GymVecEnv",
-    "SlotExtractor",
-    "SlotPolicy",
-    "SlotScorer",
-    "as_policy",
-    "export",
-    "make_vec_env",
-    "takes_masks",
+    "GymVecEnv", "SlotExtractor", "SlotPolicy", "SlotScorer", "as_policy", "export", "make_vec_env", "takes_masks",
     "weights_of",
-]
+]  # fmt: skip

@@ -30,12 +30,7 @@ from bufgym.ground.errors import BufgymError
 
 
 def make_vec_env(
-    env_id: str,
-    n_envs: int = 1,
-    seed: int | None = None,
-    *,
-    monitor_dir: str | None = None,
-    **settings: Any,
+    env_id: str, n_envs: int = 1, seed: int | None = None, *, monitor_dir: str | None = None, **settings: Any
 ) -> VecEnv:
     """Make ``n_envs`` rows of a native batch for stable-baselines3.
 
@@ -132,11 +127,7 @@ class GymVecEnv(VecEnv):
 
     def _episode(self, i: int) -> dict[str, Any]:
         """Entries of ``Monitor`` for the episode that environment ``i`` has ended."""
-        episode = {
-            "r": float(self._returns[i]),
-            "l": int(self._lengths[i]),
-            "t": time.perf_counter() - self._born,
-        }
+        episode = {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": time.perf_counter() - self._born}
         if self.results is not None:
             self.results.write_row({**episode, "r": round(episode["r"], 6), "t": round(episode["t"], 6)})
         return episode

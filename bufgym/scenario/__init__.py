@@ -17,22 +17,6 @@ from bufgym.scenario.registry import SCENARIOS, get, register
 from bufgym.scenario.uplink import Uplink
 
 __all__ = [
-    "LAWS",
-    "MAX_ROBOTS",
-    "SCENARIOS",
-    "Client",
-    "Episode",
-    "FleetEpisode",
-    "FleetScenario",
-    "Interruption",
-    "Scenario",
-    "Stream",
-    "Streams",
-    "Uplink",
-    "draw",
-    "get",
-    "messages",
-    "read_client",
-    "register",
-    "robofleet_example",
-]
+    "LAWS", "MAX_ROBOTS", "SCENARIOS", "Client", "Episode", "FleetEpisode", "FleetScenario", "Interruption", "Scenario",
+    "Stream", "Streams", "Uplink", "draw", "get", "messages", "read_client", "register", "robofleet_example",
+]  # fmt: skip

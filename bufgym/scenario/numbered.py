@@ -77,8 +77,7 @@ def _part(scenario: Any, trace: str | int | None) -> Any:
 
 
 MAX_EPISODES = 10**6
-_SEED = 704_251
-"""A seed that people do not use, so that rows of a benchmark differ from the episodes of a pool."""
+_SEED = 704_251  # A seed that people do not use, so that rows of a benchmark differ from the episodes of a pool
 
 
 class Pool:

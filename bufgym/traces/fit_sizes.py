@@ -29,8 +29,7 @@ LEAST: Final = 100
 MOST_EVERY: Final = 300
 """Longest group of pictures that is looked for."""
 _RHOS: Final = np.round(np.arange(0, 1, 0.005), 3)
-_SHARE: Final = 0.95
-"""Part of the groups, or of the pairs, that must be alike to be taken as such."""
+_SHARE: Final = 0.95  # part of the groups, or of the pairs, that must be alike to be taken as such
 
 
 def fits(path: StrPath) -> dict[str, list[str]]:

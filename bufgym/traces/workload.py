@@ -17,21 +17,13 @@ MAX_MESSAGE_BYTES: Final = 10**10
 
 
 class TopicSummary(NamedTuple):
-    """One topic of a workload.
+    """One topic of a workload."""
 
-    Attributes:
-        topic: its name.
-        messages: how many there are.
-        rate_hz: messages a second between its first and its last; NaN for fewer than two.
-        total_bytes: of all its messages.
-        share: its share of the workload's bytes, 0..1.
-    """
-
-    topic: str
-    messages: int
-    rate_hz: float
-    total_bytes: int
-    share: float
+    topic: str  # its name
+    messages: int  # how many there are
+    rate_hz: float  # messages a second between its first and its last; NaN for fewer than two
+    total_bytes: int  # of all its messages
+    share: float  # its share of the workload's bytes, 0..1
 
 
 @dataclass(frozen=True, eq=False)

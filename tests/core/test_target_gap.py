@@ -14,17 +14,7 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import Policy
-from bufgym.policies.target_gap import (
-    PACE,
-    PARAMETERS,
-    PERIOD,
-    RATE,
-    SEEN_US,
-    SENT_US,
-    SQUARE,
-    last_chance,
-    needless,
-)
+from bufgym.policies.target_gap import PACE, PARAMETERS, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, last_chance, needless
 from bufgym.policies.target_gap import approach as approach_by
 from bufgym.policies.target_gap import remember as remember_by
 from bufgym.policies.target_gap import target as target_by

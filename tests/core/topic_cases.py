@@ -122,10 +122,7 @@ class TopicCase:
     def beside_its_twin(self, check: Callable[[str, Senders, Any], None]) -> tuple[Senders, Any]:
         """Product and twin after the same answers to the same events; ``check(event, senders, twin)`` sees each."""
         senders = self.senders()
-        batch, to_kernel = (
-            senders.batch,
-            {"decision": decide, "send": answer_send, "dequeue": answer_dequeue},
-        )
+        batch, to_kernel = (senders.batch, {"decision": decide, "send": answer_send, "dequeue": answer_dequeue})
 
         def ask(twin: Any, event: str) -> Any:
             assert EVENTS[next_event(batch, None, 0)] == event

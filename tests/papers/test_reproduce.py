@@ -41,10 +41,7 @@ SMALL: dict[str, dict[str, Any]] = {
 """Options that keep each figure short; a new figure must add its own."""
 
 OF_FRAMES = [name for name, options in SMALL.items() if "offsets" in options]
-NEEDS_LIBRARIES = {
-    "robofleet-table1": ("rosbags", "flatbuffers"),
-    **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy")),
-}
+NEEDS_LIBRARIES = {"robofleet-table1": ("rosbags", "flatbuffers"), **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy"))}
 
 CLAIMS = Path(__file__).parent.parent.parent / "docs" / "claims.md"
 SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9"}

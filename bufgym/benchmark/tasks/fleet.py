@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -73,10 +74,6 @@ class FleetTask(Task):
 
     def quantities(self) -> tuple[Quantity, ...]:
         afr = self.baseline
-
-        def four_digits(number: float) -> str:
-            return decimal(number, 4)
-
         same = f"the same robot's H under {afr}"
         above = f"robots whose H is above {same}"
         below = f"robots whose H is below {same}. The rest are equal"
@@ -87,7 +84,9 @@ class FleetTask(Task):
             Quantity("above", f"robots above {afr}'s", percent, above, versus=afr, drawn=True),
             Quantity("below", "below", percent, below, interval=False, versus=afr),
             Quantity("worst", "worst robot", score, "the least H of a robot, mean over episodes", interval=False),
-            Quantity("fairness", "fairness", four_digits, f"{jain} (Jain, Chiu and Hawe 1984)", interval=False),
+            Quantity(
+                "fairness", "fairness", partial(decimal, digits=4), f"{jain} (Jain, Chiu and Hawe 1984)", interval=False
+            ),
         )
 
     def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,7 @@ from bufgym.sim.metrics import TopicOutcome, received, topic_outcomes, weighted_
 BASELINE = "robofleet"
 """Robofleet's client as published."""
 
-_RIVALS = ("drop-oldest", "rosbridge")
-"""Made for one queue, but what a robot's topics meet today."""
+_RIVALS = ("drop-oldest", "rosbridge")  # made for one queue, but what a robot's topics meet today
 
 _OUTCOME = {name: float for name in columns_of(TopicOutcome) if name != "topic"} | {"arrived": int}
 
@@ -162,12 +162,7 @@ def _folded(copies: Sequence[TopicOutcome]) -> Row:
 # --- the summary -----------------------------------------------------------------------------------------------------
 
 
-def _seconds(number: float) -> str:
-    return decimal(number, 2)
-
-
-def _one_digit(number: float) -> str:
-    return decimal(number, 1)
+_seconds, _one_digit = (partial(decimal, digits=digits) for digits in (2, 1))
 
 
 def _messages(number: float) -> str:

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 JIT = not cast(Any, numba.config).DISABLE_JIT
 """False where compilation is off and every kernel runs as its Python source."""
 
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
 
 def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Zeroed records whose fields read as attributes (``a[i].field``) in kernels, compiled or not."""

@@ -57,8 +57,7 @@ def _cache_folder() -> str:
 FOLDER = _cache_folder() if JIT else ""
 """Folder for machine code; empty if nothing is compiled."""
 
-_KEPT_VERSIONS = 16
-"""Most files of one kernel: one for each set of argument types and each state of its sources."""
+_KEPT_VERSIONS = 16  # most files of one kernel: one for each set of argument types and each state of its sources
 
 
 class Code:

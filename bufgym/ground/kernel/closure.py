@@ -31,8 +31,7 @@ TOOLS = (
 )
 """Versions of all that translates kernels, with the sources of this package that take part."""
 _VERSIONED = ("numba", "numpy", "llvmlite")
-_HAS_DOCSTRING = 0x4000000
-"""A flag of code from Python 3.13 on."""
+_HAS_DOCSTRING = 0x4000000  # A flag of code from Python 3.13 on
 
 
 def closure(function: Any) -> str:

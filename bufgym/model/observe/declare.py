@@ -1,7 +1,7 @@
-"""How a field is declared, and how a table of fields becomes a kernel.
+"""What a field is, and how a table of fields becomes a kernel.
 
-A field is one function, declared with its group and unit; its name and meaning are the function's own. ``writer`` makes
-the kernel that calls every function of a table.
+A field's number is an expression of what the kernel that writes it has at hand. ``writer`` makes the kernel that has a
+line for every field of a table.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.ground.modules import first_line
 
 # So that 0 / (0 + reference) is 0 where nothing moved at all.
 TINY = 1e-30
@@ -42,25 +41,13 @@ class Field:
     high: float = 1.0
     """Largest value."""
     _: KW_ONLY
-    function: Function
-    """Computes it. With a ``reference`` or a ``mean`` it gives the length g, of which g / (g + r) is observed."""
+    number: str = ""
+    """Its number as an expression. With a ``reference`` or a ``mean`` it is the length g, of which g / (g + r) is
+    observed."""
     reference: str = ""
-    """r as an expression of the function's arguments; it may differ from slot to slot."""
+    """r, which may differ from slot to slot, as an expression."""
     mean: str = ""
     """The same for an r of the whole queue."""
-
-
-def declare(
-    table: list[Field], per: str, group: str, unit: str, reference: str = "", mean: str = ""
-) -> Callable[[Function], Function]:
-    """Add the decorated function to ``table`` as the field of its name; it comes back as a kernel."""
-
-    def add(function: Function) -> Function:
-        name, text, made = function.__name__, first_line(function), kernel(function)
-        table.append(Field(name, per, group, unit, text, function=made, reference=reference, mean=mean))
-        return made
-
-    return add
 
 
 def writer(
@@ -75,18 +62,22 @@ def writer(
     """Make the kernel ``write(arguments)`` that has a line for each of ``fields``.
 
     ``scaled`` is the line of a field with a reference, ``mean`` of one with a mean, ``plain`` of others and by default
-    of those too. An empty line leaves the field out. In a line {i} is the place, counted from ``first``, {f} the
-    function, and {r} the reference or mean. ``module`` is the ``globals()`` that hold all that lines name.
+    of those too. An empty line leaves the field out. In a line {i} is the place, counted from ``first``, {n} the
+    number, and {r} the reference or mean. ``module`` is the ``globals()`` that hold all that lines name.
     """
-    lines = [f"def write({arguments}):"]
+    lines = []
     for i, field in enumerate(fields, first):
         line = scaled if field.reference else mean if field.mean else plain
-        line = plain if line is None else line
-        if line:
-            lines.append("    " + line.format(i=i, f=field.function.__name__, r=field.reference or field.mean))
-    made: dict[str, Any] = {}
-    exec("\n".join(lines), module, made)
-    return kernel(made["write"])
+        lines.append((plain if line is None else line).format(i=i, n=field.number, r=field.reference or field.mean))
+    return kernel(made(module, arguments, *filter(None, lines)))
+
+
+def made(module: dict[str, Any], arguments: str, *lines: str) -> Function:
+    """Make the function of these arguments and lines, whose globals are ``module``."""
+    found: dict[str, Any] = {}
+    exec("\n    ".join([f"def write({arguments}):", *lines]), module, found)
+    function: Function = found["write"]
+    return function
 
 
 @kernel

@@ -7,58 +7,16 @@ gaps counted in messages or per byte.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.ground.modules import first_line
 from bufgym.model.buffer import Buffer, gaps
-from bufgym.model.link import FOREVER
-from bufgym.model.observe.declare import Field, Function, declare, divide_row, squash, writer  # noqa: F401 (in generated lines)
+from bufgym.model.link import FOREVER  # noqa: F401 (in generated lines)
+from bufgym.model.observe.declare import Field, divide_row, made, squash, writer  # noqa: F401 (in generated lines)
 from bufgym.model.observe.own import OWN_FIELDS, OwnField
-
-ON_BOARD_FIELDS: list[OwnField] = []
-"""Context fields, in the order in which ``observe_on_board`` writes them."""
-ON_BOARD_SLOT_FIELDS: list[OwnField] = []
-"""Slot fields, in the order in which ``observe_on_board_slots`` writes them."""
-_LENGTHS: list[Field] = []
-"""The slot fields before they are divided by their means."""
-
-
-def _context(group: str, unit: str) -> Callable[[Function], Function]:
-    """Register the decorated function as a context field of its own name; it comes back as a kernel."""
-
-    def add(function: Function) -> Function:
-        name, meaning = function.__name__, first_line(function)
-        OWN_FIELDS[name] = OwnField(name, "context", group, unit, meaning, function=function, compile=True)
-        ON_BOARD_FIELDS.append(OWN_FIELDS[name])
-        return kernel(function)
-
-    return add
-
-
-def _slot(group: str, unit: str, mean: Function) -> Callable[[Function], Function]:
-    """Register the decorated function, which gives a slot's length g, as the field g / (g + r) of its own name.
-
-    ``mean`` gives r, which is computed once for all slots.
-    """
-
-    def add(function: Function) -> Function:
-        length = declare(_LENGTHS, "slot", group, unit, mean=f"{mean.__name__}(buffer, arrival)")(function)
-
-        def squashed(buffer: Buffer, arrival: Any, k: int) -> float:
-            return squash(length(buffer, arrival, k), mean(buffer, arrival))
-
-        name, meaning = function.__name__, first_line(function)
-        OWN_FIELDS[name] = OwnField(name, "slot", group, unit, meaning, function=squashed, compile=True)
-        ON_BOARD_SLOT_FIELDS.append(OWN_FIELDS[name])
-        return length
-
-    return add
-
 
 # --- the link --------------------------------------------------------------------------------------------------------
 
@@ -75,33 +33,9 @@ def demand(buffer: Buffer, arrival: Any) -> float:
     return 1e6 * mean_bytes(buffer, arrival) / max(buffer.period_us, 1.0)
 
 
-@_context("link", "g/(g+r), r = demand")
-def rate_short(buffer: Buffer, arrival: Any) -> float:
-    "the link's rate, a running mean over about 0.1 s; demand: a message of mean size at each arrival"
-    return squash(buffer.short_rate_bytes_per_s, demand(buffer, arrival))
-
-
-@_context("link", "g/(g+r), r = demand")
-def rate_medium(buffer: Buffer, arrival: Any) -> float:
-    "the same over about 0.5 s"
-    return squash(buffer.medium_rate_bytes_per_s, demand(buffer, arrival))
-
-
-@_context("link", "g/(g+r), r = demand")
-def rate_long(buffer: Buffer, arrival: Any) -> float:
-    "the same over about 2 s"
-    return squash(buffer.long_rate_bytes_per_s, demand(buffer, arrival))
-
-
-@_context("link", "g/(g+r), r = rate over 2 s")
-def rate_trend(buffer: Buffer, arrival: Any) -> float:
-    "the link's rate over 0.1 s beside that over 2 s: 0.5 = steady, more = it rises"
-    return squash(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)
-
-
-@_context("link", "g/(g+r), r = arrival period")
+@kernel
 def time_to_free(buffer: Buffer, arrival: Any) -> float:
-    "time until the message in transmission has left, at the rate over 0.1 s; 1 where that is 0"
+    """Time until the message in transmission has left, beside the arrival period."""
     if buffer.left_bytes == 0:
         return 0.0
     at_rate = 1e6 * buffer.left_bytes
@@ -114,15 +48,9 @@ def carried(buffer: Buffer, arrival: Any) -> float:
     return float(buffer.long_rate_bytes_per_s * max(buffer.period_us, 1.0))
 
 
-@_context("link", "g/(g+r), r = bytes that the link carries in an arrival period")
-def newcomer_bytes(buffer: Buffer, arrival: Any) -> float:
-    "the newcomer's bytes; the link's rate is that over 2 s: 0.5 = just keeps up, 1 = nothing carried yet"
-    return squash(1e6 * arrival.size_bytes, carried(buffer, arrival))
-
-
-@_context("queue", "standard deviation, at most 1")
+@kernel
 def size_spread(buffer: Buffer, arrival: Any) -> float:
-    "spread of the natural logarithm of bytes, over the queued messages and the newcomer: 0 = all alike"
+    """Standard deviation of the natural logarithm of bytes, at most 1."""
     n, newcomer = len(buffer.slots) + 1, math.log(max(arrival.size_bytes, 1))
     total, squares = 0.0, 0.0
     for k in range(n - 1):
@@ -130,18 +58,6 @@ def size_spread(buffer: Buffer, arrival: Any) -> float:
         total += off
         squares += off * off
     return math.sqrt(min(max((squares - total * total / n) / n, 0.0), 1.0))
-
-
-@_context("link", "g/(g+r), r = rate over 2 s")
-def load(buffer: Buffer, arrival: Any) -> float:
-    "the bytes that arrive, kept or not, a running mean over about 8 arrivals: more than 0.5 = the link falls behind"
-    return squash(1e6 * buffer.arrival_bytes, carried(buffer, arrival))
-
-
-@_context("time", "g/(g+r), r = 10 s")
-def remaining(buffer: Buffer, arrival: Any) -> float:
-    "time until the stream ends, as far as the robot was told; 1 where it was not"
-    return squash(float(buffer.remaining_us), 10e6) if buffer.remaining_us < FOREVER else 1.0
 
 
 # --- each slot -------------------------------------------------------------------------------------------------------
@@ -169,24 +85,6 @@ def even_index_gap(buffer: Buffer, arrival: Any) -> float:
 
 
 @kernel
-def two_even_index_gaps(buffer: Buffer, arrival: Any) -> float:
-    """Twice the even spacing."""
-    return 2 * even_index_gap(buffer, arrival)
-
-
-@_slot("queue", "g/(g+r), r = even spacing in messages", even_index_gap)
-def index_before(buffer: Buffer, arrival: Any, k: int) -> float:
-    "messages that arrived since the message kept before it, itself included"
-    return index_gaps(buffer, arrival, k)[0]
-
-
-@_slot("queue", "g/(g+r), r = 2 x even spacing in messages", two_even_index_gaps)
-def index_merged(buffer: Buffer, arrival: Any, k: int) -> float:
-    "gap in messages left if it is dropped"
-    return index_gaps(buffer, arrival, k)[1]
-
-
-@kernel
 def bytes_of(buffer: Buffer, arrival: Any, k: int) -> int:
     """Bytes of slot ``k``; the newcomer is ``len(buffer.slots)``."""
     return int(arrival.size_bytes if k == len(buffer.slots) else buffer.slots[k].size_bytes)
@@ -207,25 +105,68 @@ def mean_per_byte(buffer: Buffer, arrival: Any) -> float:
     return total / (len(buffer.slots) + 1)
 
 
-@_slot("link", "g/(g+r), r = bytes that the link carries in an arrival period", carried)
-def bytes_in_period(buffer: Buffer, arrival: Any, k: int) -> float:
-    "its bytes; the link's rate is that over 2 s"
-    return 1e6 * bytes_of(buffer, arrival, k)
+# --- the tables ------------------------------------------------------------------------------------------------------
+
+_CONTEXT = (
+    Field("rate_short", "context", "link", "g/(g+r), r = demand",
+          "the link's rate, a running mean over about 0.1 s; demand: a message of mean size at each arrival",
+          number="squash(buffer.short_rate_bytes_per_s, demand(buffer, arrival))"),
+    Field("rate_medium", "context", "link", "g/(g+r), r = demand", "the same over about 0.5 s",
+          number="squash(buffer.medium_rate_bytes_per_s, demand(buffer, arrival))"),
+    Field("rate_long", "context", "link", "g/(g+r), r = demand", "the same over about 2 s",
+          number="squash(buffer.long_rate_bytes_per_s, demand(buffer, arrival))"),
+    Field("rate_trend", "context", "link", "g/(g+r), r = rate over 2 s",
+          "the link's rate over 0.1 s beside that over 2 s: 0.5 = steady, more = it rises",
+          number="squash(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)"),
+    Field("time_to_free", "context", "link", "g/(g+r), r = arrival period",
+          "time until the message in transmission has left, at the rate over 0.1 s; 1 where that is 0",
+          number="time_to_free(buffer, arrival)"),
+    Field("newcomer_bytes", "context", "link", "g/(g+r), r = bytes that the link carries in an arrival period",
+          "the newcomer's bytes; the link's rate is that over 2 s: 0.5 = just keeps up, 1 = nothing carried yet",
+          number="squash(1e6 * arrival.size_bytes, carried(buffer, arrival))"),
+    Field("size_spread", "context", "queue", "standard deviation, at most 1",
+          "spread of the natural logarithm of bytes, over the queued messages and the newcomer: 0 = all alike",
+          number="size_spread(buffer, arrival)"),
+    Field("load", "context", "link", "g/(g+r), r = rate over 2 s", "the bytes that arrive, kept or not, "
+          "a running mean over about 8 arrivals: more than 0.5 = the link falls behind",
+          number="squash(1e6 * buffer.arrival_bytes, carried(buffer, arrival))"),
+    Field("remaining", "context", "time", "g/(g+r), r = 10 s",
+          "time until the stream ends, as far as the robot was told; 1 where it was not",
+          number="squash(float(buffer.remaining_us), 10e6) if buffer.remaining_us < FOREVER else 1.0"),
+)  # fmt: skip
+_SLOTS = (
+    Field("index_before", "slot", "queue", "g/(g+r), r = even spacing in messages",
+          "messages that arrived since the message kept before it, itself included",
+          number="index_gaps(buffer, arrival, k)[0]", mean="even_index_gap(buffer, arrival)"),
+    Field("index_merged", "slot", "queue", "g/(g+r), r = 2 x even spacing in messages",
+          "gap in messages left if it is dropped",
+          number="index_gaps(buffer, arrival, k)[1]", mean="2 * even_index_gap(buffer, arrival)"),
+    Field("bytes_in_period", "slot", "link", "g/(g+r), r = bytes that the link carries in an arrival period",
+          "its bytes; the link's rate is that over 2 s",
+          number="1e6 * bytes_of(buffer, arrival, k)", mean="carried(buffer, arrival)"),
+    Field("gap_per_byte", "slot", "motion", "g/(g+r), r = mean of the queue",
+          "motion gap left if it is dropped, for each of its bytes",
+          number="merged_per_byte(buffer, arrival, k)", mean="mean_per_byte(buffer, arrival)"),
+)  # fmt: skip
 
 
-@_slot("motion", "g/(g+r), r = mean of the queue", mean_per_byte)
-def gap_per_byte(buffer: Buffer, arrival: Any, k: int) -> float:
-    "motion gap left if it is dropped, for each of its bytes"
-    return merged_per_byte(buffer, arrival, k)
+def _registered(field: Field, arguments: str, number: str) -> OwnField:
+    function = made(globals(), arguments, f"return {number}")
+    OWN_FIELDS[field.name] = OwnField(**vars(field), function=function, compile=True)
+    return OWN_FIELDS[field.name]
 
 
-# --- the kernels -----------------------------------------------------------------------------------------------------
-
-observe_on_board = writer(globals(), ON_BOARD_FIELDS, "buffer, arrival, context", "context[{i}] = {f}(buffer, arrival)")
+ON_BOARD_FIELDS = [_registered(field, "buffer, arrival", field.number) for field in _CONTEXT]
+"""Context fields, in the order in which ``observe_on_board`` writes them."""
+ON_BOARD_SLOT_FIELDS = [
+    _registered(field, "buffer, arrival, k", f"squash({field.number}, {field.mean})") for field in _SLOTS
+]
+"""Slot fields, in the order in which ``observe_on_board_slots`` writes them."""
+observe_on_board = writer(globals(), _CONTEXT, "buffer, arrival, context", "context[{i}] = {n}")
 """Write every value of ``ON_BOARD_FIELDS`` into ``context`` (float[fields])."""
-_OF_SLOT, _LENGTH = "buffer, arrival, k, column, rows", "rows[{i}, column] = {f}(buffer, arrival, k)"
-_write = writer(globals(), _LENGTHS, _OF_SLOT, _LENGTH)
-_divide = writer(globals(), _LENGTHS, "buffer, arrival, rows", "divide_row(rows[{i}], {r})")
+_write = writer(globals(), _SLOTS, "buffer, arrival, k, column, rows", "rows[{i}, column] = {n}")
+# A mean is computed once for all slots.
+_divide = writer(globals(), _SLOTS, "buffer, arrival, rows", "divide_row(rows[{i}], {r})")
 
 
 @kernel

@@ -40,12 +40,11 @@ from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, Rewa
 
 @dataclass(frozen=True)
 class OwnField(Field):
-    """A field observed where it is named.
-
-    Its ``function`` is (buffer, arrival) -> number for the context, (buffer, arrival, k) -> number for a slot.
-    """
+    """A field observed where it is named."""
 
     _: KW_ONLY
+    function: Function
+    """(buffer, arrival) -> number for the context, (buffer, arrival, k) -> number for a slot."""
     compile: bool = False
     """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
 
@@ -82,13 +81,7 @@ Entry = TypeVar("Entry", OwnField, OwnTerm)
 
 
 def field(
-    name: str,
-    *,
-    per: str,
-    unit: str = "",
-    low: float = 0.0,
-    high: float = 1.0,
-    compile: bool = False,
+    name: str, *, per: str, unit: str = "", low: float = 0.0, high: float = 1.0, compile: bool = False
 ) -> Callable[[Function], Function]:
     """Register the decorated function as the observation field ``name``; it comes back unchanged.
 

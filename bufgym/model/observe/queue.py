@@ -1,7 +1,7 @@
-"""The fields of one queue, ``SLOT_FIELDS`` and ``CONTEXT_FIELDS``, each a function, and the kernels made of them.
+"""The fields of one queue, ``SLOT_FIELDS`` and ``CONTEXT_FIELDS``, and the kernels made of them.
 
-A slot's function sees its ``Slot``, a context's the ``Newcomer``: what several fields share is computed once. Several
-topics have the same fields; ``topics`` only fills in other neighbours.
+A slot's number is made of its ``Slot``, a context's of the ``Newcomer``: what several fields share is computed once.
+Several topics have the same fields; ``topics`` only fills in other neighbours.
 """
 
 from __future__ import annotations
@@ -12,117 +12,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps_among
-from bufgym.model.observe.declare import TINY, Field, declare, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps_among  # noqa: F401 (in generated lines)
+from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
 from bufgym.model.qoi import merging_loss, value
 
 # Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
 ROUNDING = 1e-12
-
-_SLOTS: list[Field] = []
-_CONTEXT: list[Field] = []
 
 
 # --- slots -----------------------------------------------------------------------------------------------------------
 
 
 class Slot(NamedTuple):
-    """A queued message or the newcomer, beside its neighbours.
+    """A queued message or the newcomer, beside its neighbours."""
 
-    Fields:
-        rank: (k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer.
-        back_us: time since the message kept before it, us.
-        merged_us: time gap left if it is dropped, us.
-        back_x: motion since the message before it.
-        merged_x: motion gap left if it is dropped.
-        lost: V lost if it alone is dropped.
-        loss: the same as a part of H: weighted with several topics.
-        size_bytes: its bytes.
-        even_us: the even time spacing, us.
-        even_x: the even motion spacing.
-        even_lost: V lost by merging two even gaps.
-        mean_bytes: mean bytes of the queued messages and the newcomer.
-    """
-
-    rank: float
-    back_us: float
-    merged_us: float
-    back_x: float
-    merged_x: float
-    lost: float
-    loss: float
-    size_bytes: int
-    even_us: float
-    even_x: float
-    even_lost: float
-    mean_bytes: float
+    rank: float  # (k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer
+    back_us: float  # time since the message kept before it, us
+    merged_us: float  # time gap left if it is dropped, us
+    back_x: float  # motion since the message before it
+    merged_x: float  # motion gap left if it is dropped
+    lost: float  # V lost if it alone is dropped
+    loss: float  # the same as a part of H: weighted with several topics
+    size_bytes: int  # its bytes
+    even_us: float  # the even time spacing, us
+    even_x: float  # the even motion spacing
+    even_lost: float  # V lost by merging two even gaps
+    mean_bytes: float  # mean bytes of the queued messages and the newcomer
 
 
-@declare(_SLOTS, "slot", "queue", "flag")
-def occupied(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "1 where the slot holds a message (the newcomer's always does)"
-    return 1.0
-
-
-@declare(_SLOTS, "slot", "queue", "fraction")
-def rank(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "(k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer"
-    return slot.rank
-
-
-@declare(_SLOTS, "slot", "time", "g/(g+r), r = even time spacing", reference="slot.even_us")
-def time_before(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "time since the message kept before it"
-    return slot.back_us
-
-
-@declare(_SLOTS, "slot", "time", "g/(g+r), r = 2 x even time spacing", reference="2 * slot.even_us")
-def time_merged(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "time gap left if it is dropped"
-    return slot.merged_us
-
-
-@declare(_SLOTS, "slot", "motion", "g/(g+r), r = even motion spacing", reference="slot.even_x")
-def motion_before(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "motion since the message before it"
-    return slot.back_x
-
-
-@declare(_SLOTS, "slot", "motion", "g/(g+r), r = 2 x even motion spacing", reference="2 * slot.even_x")
-def motion_merged(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "motion gap left if it is dropped"
-    return slot.merged_x
-
-
-@declare(_SLOTS, "slot", "value", "QoI")
-def loss(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "V(a) + V(b) - V(a+b): QoI lost if it alone is dropped now"
-    return slot.loss
-
-
-@declare(_SLOTS, "slot", "queue", "g/(g+r), r = mean queued size", mean="slot.mean_bytes")
-def size(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "its bytes"
-    return slot.size_bytes
-
-
-@declare(_SLOTS, "slot", "value", "l/(l+r), r = that of an even gap", reference="slot.even_lost")
-def relative_loss(buffer: Buffer, arrival: Any, slot: Slot) -> float:
-    "the same loss, free of V's scale"
-    return slot.lost
-
-
-SLOT_FIELDS = tuple(_SLOTS)
-_LENGTH, _SQUASHED = (
-    "rows[{i}, column] = {f}(buffer, arrival, slot)",
-    "squash_row(rows[{i}], {r})",
-)
-_RATIO = "rows[{i}, column] = squash({f}(buffer, arrival, slot), {r})"
+SLOT_FIELDS = (
+    Field("occupied", "slot", "queue", "flag", "1 where the slot holds a message (the newcomer's always does)",
+          number="1.0"),
+    Field("rank", "slot", "queue", "fraction", "(k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer",
+          number="slot.rank"),
+    Field("time_before", "slot", "time", "g/(g+r), r = even time spacing", "time since the message kept before it",
+          number="slot.back_us", reference="slot.even_us"),
+    Field("time_merged", "slot", "time", "g/(g+r), r = 2 x even time spacing", "time gap left if it is dropped",
+          number="slot.merged_us", reference="2 * slot.even_us"),
+    Field("motion_before", "slot", "motion", "g/(g+r), r = even motion spacing", "motion since the message before it",
+          number="slot.back_x", reference="slot.even_x"),
+    Field("motion_merged", "slot", "motion", "g/(g+r), r = 2 x even motion spacing", "motion gap left if it is dropped",
+          number="slot.merged_x", reference="2 * slot.even_x"),
+    Field("loss", "slot", "value", "QoI", "V(a) + V(b) - V(a+b): QoI lost if it alone is dropped now",
+          number="slot.loss"),
+    Field("size", "slot", "queue", "g/(g+r), r = mean queued size", "its bytes",
+          number="slot.size_bytes", mean="slot.mean_bytes"),
+    Field("relative_loss", "slot", "value", "l/(l+r), r = that of an even gap", "the same loss, free of V's scale",
+          number="slot.lost", reference="slot.even_lost"),
+)  # fmt: skip
+_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
 _OF_SLOT, _OF_ROWS = "buffer, arrival, slot, column, rows", "buffer, arrival, slot, rows"
 _write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH)
 _squash_rows = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", _SQUASHED, _SQUASHED)
 # With references of its own for each slot.
-write_by_slot = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, _RATIO)
+write_by_slot = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, "rows[{i}, column] = squash({n}, {r})")
 squash_means = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", "", _SQUASHED)
 
 
@@ -171,96 +114,40 @@ def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]])
 
 
 class Newcomer(NamedTuple):
-    """The newcomer beside what came before it; all 0 where the socket asks.
+    """The newcomer beside what came before it; all 0 where the socket asks."""
 
-    Fields:
-        gap_us: time since the previous arrival, us.
-        gap_x: motion since then.
-        even_us: the even time spacing, us.
-        even_x: the even motion spacing.
-        even_gain: V of it.
-        even_value: the same as a part of H: weighted with several topics.
-        even_lost: V lost by merging two even gaps.
-    """
-
-    gap_us: float
-    gap_x: float
-    even_us: float
-    even_x: float
-    even_gain: float
-    even_value: float
-    even_lost: float
+    gap_us: float  # time since the previous arrival, us
+    gap_x: float  # motion since then
+    even_us: float  # the even time spacing, us
+    even_x: float  # the even motion spacing
+    even_gain: float  # V of it
+    even_value: float  # the same as a part of H: weighted with several topics
+    even_lost: float  # V lost by merging two even gaps
 
 
-@declare(_CONTEXT, "context", "queue", "fraction of L")
-def occupancy(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "messages queued"
-    return len(buffer.slots) / buffer.capacity
-
-
-@declare(_CONTEXT, "context", "queue", "fraction of B")
-def backlog(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "bytes queued; 0 where there is no byte limit"
-    return buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0
-
-
-@declare(_CONTEXT, "context", "time", "g/(g+r), r = even time spacing")
-def arrival_time_gap(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "time since the previous arrival"
-    return squash(newcomer.gap_us, newcomer.even_us)
-
-
-@declare(_CONTEXT, "context", "motion", "g/(g+r), r = even motion spacing")
-def arrival_motion_gap(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "motion since then"
-    return squash(newcomer.gap_x, newcomer.even_x)
-
-
-@declare(_CONTEXT, "context", "link", "flag")
-def busy(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "1 while a message is in transmission"
-    return float(buffer.busy)
-
-
-@declare(_CONTEXT, "context", "link", "fraction")
-def left(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "part of the message in transmission that is still to be transmitted"
-    return buffer.left_fraction
-
-
-@declare(_CONTEXT, "context", "link", "g/(g+r), r = L + 1 arrival periods")
-def stalled(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "time since a message was last dequeued"
-    return squash(buffer.stalled_us, (buffer.capacity + 1) * buffer.period_us)
-
-
-@declare(_CONTEXT, "context", "link", "n/(n+1)")
-def departures(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "messages dequeued since the previous arrival"
-    return squash(buffer.departures, 1.0)
-
-
-@declare(_CONTEXT, "context", "link", "g/(g+r), r = 1")
-def service_ratio(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "running mean of departures per arrival"
-    return squash(buffer.service_ratio, 1.0)
-
-
-@declare(_CONTEXT, "context", "value", "QoI")
-def even_value(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "V of the even motion spacing e"
-    return newcomer.even_value
-
-
-@declare(_CONTEXT, "context", "value", "fraction")
-def bend(buffer: Buffer, arrival: Any, newcomer: Newcomer) -> float:
-    "(2 V(e) - V(2e)) / V(e): 0 where V is straight, 1 where it is flat"
-    return newcomer.even_lost / max(newcomer.even_gain, TINY)
-
-
-CONTEXT_FIELDS = tuple(_CONTEXT)
-_LINE = "context[{i}] = {f}(buffer, arrival, newcomer)"
-write_context = writer(globals(), CONTEXT_FIELDS, "buffer, arrival, newcomer, context", _LINE)
+CONTEXT_FIELDS = (
+    Field("occupancy", "context", "queue", "fraction of L", "messages queued",
+          number="len(buffer.slots) / buffer.capacity"),
+    Field("backlog", "context", "queue", "fraction of B", "bytes queued; 0 where there is no byte limit",
+          number="buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0"),
+    Field("arrival_time_gap", "context", "time", "g/(g+r), r = even time spacing", "time since the previous arrival",
+          number="squash(newcomer.gap_us, newcomer.even_us)"),
+    Field("arrival_motion_gap", "context", "motion", "g/(g+r), r = even motion spacing", "motion since then",
+          number="squash(newcomer.gap_x, newcomer.even_x)"),
+    Field("busy", "context", "link", "flag", "1 while a message is in transmission", number="float(buffer.busy)"),
+    Field("left", "context", "link", "fraction", "part of the message in transmission that is still to be transmitted",
+          number="buffer.left_fraction"),
+    Field("stalled", "context", "link", "g/(g+r), r = L + 1 arrival periods", "time since a message was last dequeued",
+          number="squash(buffer.stalled_us, (buffer.capacity + 1) * buffer.period_us)"),
+    Field("departures", "context", "link", "n/(n+1)", "messages dequeued since the previous arrival",
+          number="squash(buffer.departures, 1.0)"),
+    Field("service_ratio", "context", "link", "g/(g+r), r = 1", "running mean of departures per arrival",
+          number="squash(buffer.service_ratio, 1.0)"),
+    Field("even_value", "context", "value", "QoI", "V of the even motion spacing e", number="newcomer.even_value"),
+    Field("bend", "context", "value", "fraction", "(2 V(e) - V(2e)) / V(e): 0 where V is straight, 1 where it is flat",
+          number="newcomer.even_lost / max(newcomer.even_gain, TINY)"),
+)  # fmt: skip
+write_context = writer(globals(), CONTEXT_FIELDS, "buffer, arrival, newcomer, context", "context[{i}] = {n}")
 
 
 @kernel

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first
-from bufgym.model.observe.declare import TINY, Field, declare, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
+from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first  # noqa: F401 (in generated lines)
+from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
 from bufgym.model.observe.queue import (
     CONTEXT_FIELDS,
     ROUNDING,
@@ -21,126 +21,61 @@ from bufgym.model.observe.queue import (
     write_context,
 )
 from bufgym.model.qoi import merging_loss, value
-from bufgym.model.topics import NO_DEADLINE_US
+from bufgym.model.topics import NO_DEADLINE_US  # noqa: F401 (in generated lines)
 
 _SECOND_US = 1_000_000
 
-_SLOTS: list[Field] = []
-_CONTEXT: list[Field] = []
-
 
 class OfTopic(NamedTuple):
-    """A message among those of all topics.
+    """A message among those of all topics."""
 
-    Fields:
-        k: its slot.
-        topic: TOPIC: its topic's settings and past.
-        own: whether its topic is the newcomer's.
-        age_us: time since its arrival, us.
-        priority: the highest priority.
-        weight: the largest weight.
-        gain: what its delivery adds to H, in units of that weight.
-        per_byte: the same for each byte of it.
-        mean_per_byte: the mean of that over the queue.
-    """
-
-    k: int
-    topic: Any
-    own: bool
-    age_us: int
-    priority: float
-    weight: float
-    gain: float
-    per_byte: float
-    mean_per_byte: float
+    k: int  # its slot
+    topic: Any  # TOPIC: its topic's settings and past
+    own: bool  # whether its topic is the newcomer's
+    known_us: int  # arrival of its topic's message dequeued last; 0 before there is one
+    age_us: int  # time since its arrival, us
+    priority: float  # the highest priority
+    weight: float  # the largest weight
+    gain: float  # what its delivery adds to H, in units of that weight
+    per_byte: float  # the same for each byte of it
+    mean_per_byte: float  # the mean of that over the queue
 
 
-@declare(_SLOTS, "slot", "topic", "fraction of the highest")
-def priority(buffer: Buffer, slot: OfTopic) -> float:
-    "priority of its topic"
-    return float(slot.topic.priority / slot.priority)
-
-
-@declare(_SLOTS, "slot", "topic", "fraction of the largest")
-def weight(buffer: Buffer, slot: OfTopic) -> float:
-    "weight of its topic in the sum of H"
-    return float(slot.topic.weight / slot.weight)
-
-
-@declare(_SLOTS, "slot", "topic", "flag")
-def no_drop(buffer: Buffer, slot: OfTopic) -> float:
-    "1 where it may not be dropped"
-    return float(slot.topic.no_drop)
-
-
-@declare(_SLOTS, "slot", "topic", "flag")
-def oldest(buffer: Buffer, slot: OfTopic) -> float:
-    "1 where it is the oldest of its topic, the only one that may be sent"
-    return 1.0 if slot.k < len(buffer.slots) and is_first(buffer, slot.k) else 0.0
-
-
-@declare(_SLOTS, "slot", "topic", "flag")
-def own(buffer: Buffer, slot: OfTopic) -> float:
-    "1 where its topic is the newcomer's; 0 when the socket asks"
-    return 1.0 if slot.own else 0.0
-
-
-@declare(_SLOTS, "slot", "topic", "g/(g+r), r = 1 s")
-def waited(buffer: Buffer, slot: OfTopic) -> float:
-    "time since its arrival"
-    return squash(slot.age_us, _SECOND_US)
-
-
-@declare(_SLOTS, "slot", "topic", "g/(g+r), r = 1 s")
-def silence(buffer: Buffer, slot: OfTopic) -> float:
-    "time since the arrival of its topic's message dequeued last"
-    known_us = slot.topic.dequeued_arrival_us if slot.topic.dequeued > 0 else 0
-    return squash(max(buffer.now_us - known_us, 0), _SECOND_US)
-
-
-@declare(_SLOTS, "slot", "topic", "g/(g+r), r = its deadline")
-def lateness(buffer: Buffer, slot: OfTopic) -> float:
-    "time since its arrival; 0 without a deadline"
-    return squash(slot.age_us, slot.topic.deadline_us) if slot.topic.deadline_us < NO_DEADLINE_US else 0.0
-
-
-@declare(_SLOTS, "slot", "topic", "fraction of L")
-def queued(buffer: Buffer, slot: OfTopic) -> float:
-    "messages of its topic in the buffer"
-    return float(slot.topic.queued / buffer.capacity)
-
-
-@declare(_SLOTS, "slot", "topic", "QoI, weighted")
-def gain(buffer: Buffer, slot: OfTopic) -> float:
-    "what its delivery adds to H"
-    return slot.gain
-
-
-@declare(_SLOTS, "slot", "topic", "g/(g+r), r = mean of the queue", mean="slot.mean_per_byte")
-def gain_per_byte(buffer: Buffer, slot: OfTopic) -> float:
-    "the same for each byte of it"
-    return slot.per_byte
-
-
-@declare(_CONTEXT, "context", "topic", "flag")
-def socket_asks(buffer: Buffer, arriving: bool) -> float:
-    "1 where the socket asks what to send, 0 at an arrival"
-    return 0.0 if arriving else 1.0
-
-
-@declare(_CONTEXT, "context", "topic", "n/(n+r), r = n_T")
-def in_flight(buffer: Buffer, arriving: bool) -> float:
-    "messages sent and not yet acknowledged"
-    return squash(buffer.in_flight, buffer.window)
-
-
-TOPIC_SLOT_FIELDS, TOPIC_CONTEXT_FIELDS = tuple(_SLOTS), tuple(_CONTEXT)
-_FIRST, _FIRST_CONTEXT = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
-_LENGTH, _SQUASHED = "rows[{i}, column] = {f}(buffer, slot)", "squash_row(rows[{i}], {r})"
+TOPIC_SLOT_FIELDS = (
+    Field("priority", "slot", "topic", "fraction of the highest", "priority of its topic",
+          number="float(slot.topic.priority / slot.priority)"),
+    Field("weight", "slot", "topic", "fraction of the largest", "weight of its topic in the sum of H",
+          number="float(slot.topic.weight / slot.weight)"),
+    Field("no_drop", "slot", "topic", "flag", "1 where it may not be dropped", number="float(slot.topic.no_drop)"),
+    Field("oldest", "slot", "topic", "flag", "1 where it is the oldest of its topic, the only one that may be sent",
+          number="1.0 if slot.k < len(buffer.slots) and is_first(buffer, slot.k) else 0.0"),
+    Field("own", "slot", "topic", "flag", "1 where its topic is the newcomer's; 0 when the socket asks",
+          number="1.0 if slot.own else 0.0"),
+    Field("waited", "slot", "topic", "g/(g+r), r = 1 s", "time since its arrival",
+          number="squash(slot.age_us, _SECOND_US)"),
+    Field("silence", "slot", "topic", "g/(g+r), r = 1 s", "time since the arrival of its topic's message dequeued last",
+          number="squash(max(buffer.now_us - slot.known_us, 0), _SECOND_US)"),
+    Field("lateness", "slot", "topic", "g/(g+r), r = its deadline", "time since its arrival; 0 without a deadline",
+          number="squash(slot.age_us, slot.topic.deadline_us) if slot.topic.deadline_us < NO_DEADLINE_US else 0.0"),
+    Field("queued", "slot", "topic", "fraction of L", "messages of its topic in the buffer",
+          number="float(slot.topic.queued / buffer.capacity)"),
+    Field("gain", "slot", "topic", "QoI, weighted", "what its delivery adds to H", number="slot.gain"),
+    Field("gain_per_byte", "slot", "topic", "g/(g+r), r = mean of the queue", "the same for each byte of it",
+          number="slot.per_byte", mean="slot.mean_per_byte"),
+)  # fmt: skip
+TOPIC_CONTEXT_FIELDS = (
+    Field("socket_asks", "context", "topic", "flag", "1 where the socket asks what to send, 0 at an arrival",
+          number="0.0 if arriving else 1.0"),
+    Field("in_flight", "context", "topic", "n/(n+r), r = n_T", "messages sent and not yet acknowledged",
+          number="squash(buffer.in_flight, buffer.window)"),
+)  # fmt: skip
+_FIRST = len(SLOT_FIELDS)
+_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
 _write = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, column, rows", _LENGTH, first=_FIRST)
 _squash_means = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, rows", "", mean=_SQUASHED, first=_FIRST)
-_LINE = "context[{i}] = {f}(buffer, arriving)"
-_write_context = writer(globals(), TOPIC_CONTEXT_FIELDS, "buffer, arriving, context", _LINE, first=_FIRST_CONTEXT)
+_write_context = writer(
+    globals(), TOPIC_CONTEXT_FIELDS, "buffer, arriving, context", "context[{i}] = {n}", first=len(CONTEXT_FIELDS)
+)
 
 
 @kernel
@@ -201,7 +136,8 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         per_byte = kept(gain / message.size_bytes, rows)
         gain_sum += per_byte
         age_us = buffer.now_us - message.arrival_us
-        of = OfTopic(k, topic, own, age_us, priority, weight, gain, per_byte, gain_sum / (k + 1))
+        known_us = topic.dequeued_arrival_us if topic.dequeued > 0 else 0
+        of = OfTopic(k, topic, own, known_us, age_us, priority, weight, gain, per_byte, gain_sum / (k + 1))
         _write(buffer, of, column, rows)
         if k == count - 1:  # the means are complete
             squash_means(buffer, arrival, slot, rows)

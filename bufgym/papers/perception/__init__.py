@@ -18,20 +18,9 @@ if TYPE_CHECKING:
     from bufgym.papers.perception.tracking import Tracker, difference, jumped, track
     from bufgym.papers.perception.views import Coverage, seen_shares
 
-# fmt: off
 __all__ = [
     "Coverage", "OrbSimilarity", "Sequence", "Tracker", "difference", "fuse", "grid_of", "jumped", "made_up_room",
     "map_error", "open_sequence", "orbbuf_by", "points_of", "seen_shares", "track",
-]
-# fmt: on
+]  # fmt: skip
 
-__getattr__ = on_demand(
-    __name__,
-    **dict.fromkeys(("fuse", "grid_of", "map_error", "points_of"), "mapping"),
-    **dict.fromkeys(("OrbSimilarity", "orbbuf_by"), "orb"),
-    **dict.fromkeys(("Tracker", "difference", "jumped", "track"), "tracking"),
-    **dict.fromkeys(("Coverage", "seen_shares"), "views"),
-    Sequence="frames",
-    made_up_room="room",
-    open_sequence="recordings",
-)
+__getattr__ = on_demand(__name__)

@@ -31,8 +31,7 @@ COVERED_M: Final = 0.05
 MOST_VOXELS: Final = 2**25
 """A larger grid would take more than 256 MB."""
 
-_BOX_STRIDE: Final = 8
-"""Step between the frames and pixels that measure the box."""
+_BOX_STRIDE: Final = 8  # step between the frames and pixels that measure the box
 
 
 @dataclass(frozen=True)
@@ -43,12 +42,9 @@ class VoxelGrid:
         BufgymError: no voxel, or too many.
     """
 
-    origin_m: tuple[float, float, float]
-    """Centre of the first voxel, world coordinates, m."""
-    shape: tuple[int, int, int]
-    """Voxels along x, y and z."""
-    voxel_m: float = VOXEL_M
-    """Edge of a voxel, m."""
+    origin_m: tuple[float, float, float]  # centre of the first voxel, world coordinates, m
+    shape: tuple[int, int, int]  # voxels along x, y and z
+    voxel_m: float = VOXEL_M  # edge of a voxel, m
 
     def __post_init__(self) -> None:
         if min(self.shape) < 2 or math.prod(self.shape) > MOST_VOXELS:
@@ -93,10 +89,8 @@ class Map:
     """A truncated signed distance function."""
 
     grid: VoxelGrid
-    tsdf: npt.NDArray[np.float32]
-    """float32[grid.shape], -1..1, in units of the truncation."""
-    weight: npt.NDArray[np.float32]
-    """float32[grid.shape], number of frames averaged in each voxel."""
+    tsdf: npt.NDArray[np.float32]  # float32[grid.shape], -1..1, in units of the truncation
+    weight: npt.NDArray[np.float32]  # float32[grid.shape], number of frames averaged in each voxel
 
     @staticmethod
     def empty(grid: VoxelGrid) -> Map:
@@ -136,10 +130,8 @@ class MapError:
 
     to_reference_m: float
     """Root mean square distance from the map's points to the nearest reference points, m; shows wrong parts."""
-    from_reference_m: float
-    """The same from the reference's points to the map's, m; shows missing parts too."""
-    uncovered: float
-    """Share of the reference's points without a point of the map within `COVERED_M`."""
+    from_reference_m: float  # the same from the reference's points to the map's, m; shows missing parts too
+    uncovered: float  # share of the reference's points without a point of the map within `COVERED_M`
 
     @property
     def rmse_m(self) -> float:

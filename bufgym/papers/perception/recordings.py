@@ -60,10 +60,8 @@ class ImageFiles(Sequence):
     camera: Camera
     time_us: Int64Array
     poses: Float64Array
-    depths: Seq[File]
-    """The depth's file of each frame."""
-    images: Seq[File]
-    """The picture's."""
+    depths: Seq[File]  # the depth's file of each frame
+    images: Seq[File]  # the picture's
     units_per_m: float = MM_PER_M
 
     def depth(self, k: int) -> Depth:

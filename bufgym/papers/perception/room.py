@@ -45,8 +45,7 @@ class Furniture:
     things: Float64Array
     """Boxes, then balls, float64[n, 8]. A box has centre, half sizes, cosine and sine of its turn about z; the first is
     the room itself. A ball has centre, radius and zeros."""
-    balls: int
-    """Index of the first ball."""
+    balls: int  # index of the first ball
 
 
 class MadeUpRoom(Sequence):

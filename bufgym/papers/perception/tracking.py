@@ -57,10 +57,8 @@ class Track:
 
     poses: Float64Array
     """float64[m, 4, 4], the poses found for the frames that arrived, camera to world; NaN from the failure on."""
-    where: int | None
-    """The frame (index of the sequence) at which tracking failed; None if it never did."""
-    model: Map
-    """Map of the frames until then, at the poses found."""
+    where: int | None  # the frame (index of the sequence) at which tracking failed; None if it never did
+    model: Map  # map of the frames until then, at the poses found
 
     @property
     def failed(self) -> bool:

@@ -37,8 +37,7 @@ __all__ = ["UNTOUCHED", "install"]
 
 UNTOUCHED: Final = ("/rosout", "/tf", "/tf_static", "/clock")
 """Small topics that every node reads. A policy named for one of them still rules it."""
-_ROOM: Final = 4096
-"""Size of a queue's bookkeeping, half a MB for each subscriber."""
+_ROOM: Final = 4096  # size of a queue's bookkeeping, half a MB for each subscriber
 
 
 @contextmanager

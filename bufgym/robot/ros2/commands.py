@@ -39,15 +39,7 @@ async def send(
     with contextlib.ExitStack() as stack:
         file = None if log is None else stack.enter_context(LogFile(log))
         robot = RosSender(
-            client,
-            host,
-            port,
-            policy=policy,
-            capacity=capacity,
-            odometry=odom,
-            transport=transport,
-            log=file,
-            say=say,
+            client, host, port, policy=policy, capacity=capacity, odometry=odom, transport=transport, log=file, say=say
         )
         await robot.run()
 

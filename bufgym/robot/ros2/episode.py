@@ -36,12 +36,9 @@ from bufgym.traces import Trace, load_motion
 
 _DOMAIN = 20 + os.getpid() % 40 * 2
 """Domain of the robot; the base has the next. Each process has its own, because two may run at a time."""
-_WARM_UP = -1
-"""Number of a frame before the first, because a new DDS publisher needs time to find its subscribers."""
-_DEPTH = 100
-"""History depth of each topic in DDS; on one machine nothing waits there for long."""
-_SETTLED_S = 1.0
-"""Time after which published messages have arrived."""
+_WARM_UP = -1  # number of a frame before the first, because a new DDS publisher needs time to find its subscribers
+_DEPTH = 100  # history depth of each topic in DDS; on one machine nothing waits there for long
+_SETTLED_S = 1.0  # time after which published messages have arrived
 
 
 def player() -> Play:
@@ -64,10 +61,7 @@ def play(
         raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
     warm(PolicyQueue(policy, capacity, value=value))
     with programs.running(
-        receive=_receive,
-        send=partial(_send, policy, capacity, value),
-        viewer=_view,
-        camera=partial(_publish, episode),
+        receive=_receive, send=partial(_send, policy, capacity, value), viewer=_view, camera=partial(_publish, episode)
     ) as begun:
         return asyncio.run(_play(begun, episode))
 

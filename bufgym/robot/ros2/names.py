@@ -19,8 +19,7 @@ from bufgym.robot.frames import FrameError
 DEPTH: Final = 10
 """Default history depth, because DDS does not announce a publisher's own."""
 _MAX_NAME_BYTES: Final = 255
-_HEAD: Final = struct.Struct("!BBBH")
-"""Bytes of name and type, flags, depth."""
+_HEAD: Final = struct.Struct("!BBBH")  # bytes of name and type, flags, depth
 _RELIABLE, _TRANSIENT_LOCAL = 1, 2
 _NAME: Final = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _TYPE: Final = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
@@ -41,10 +40,8 @@ def needs_rclpy() -> Iterator[None]:
 class Published:
     """A topic with its publishers' settings on the robot."""
 
-    name: str
-    """Name with its namespace, such as "/camera/image"."""
-    type: str
-    """ "sensor_msgs/msg/Image"."""
+    name: str  # name with its namespace, such as "/camera/image"
+    type: str  # "sensor_msgs/msg/Image"
     reliable: bool = True
     transient_local: bool = False
     depth: int = DEPTH

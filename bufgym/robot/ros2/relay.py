@@ -31,8 +31,7 @@ SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 """Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
 LOOK_S: Final = 0.2
 """Time between two searches for publishers."""
-_MATCH_S: Final = 1.0
-"""Longest wait of a new publisher's first message for a subscriber."""
+_MATCH_S: Final = 1.0  # longest wait of a new publisher's first message for a subscriber
 
 
 def resolved(name: str) -> str:
@@ -150,10 +149,7 @@ class RosSender:
 
 
 async def receive(
-    port: int,
-    host: str = "127.0.0.1",
-    transport: str = "tcp",
-    say: Callable[[str], None] = lambda text: None,
+    port: int, host: str = "127.0.0.1", transport: str = "tcp", say: Callable[[str], None] = lambda text: None
 ) -> None:
     """Run the other end: republish messages with their publishers' quality of service, until cancelled.
 

@@ -16,27 +16,11 @@ from bufgym.scenario.suites import cameras, recorded, shared_uplinks, stress, sy
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
 from bufgym.scenario.suites.synthetic import RATE_HZ, motion_value, time_value
 
-__all__ = [
-    "CAPACITIES",
-    "RATE_HZ",
-    "SPLITS",
-    "SUITES",
-    "Setting",
-    "Suite",
-    "get",
-    "motion_value",
-    "time_value",
-]
+__all__ = ["CAPACITIES", "RATE_HZ", "SPLITS", "SUITES", "Setting", "Suite", "get", "motion_value", "time_value"]
 
 SUITES = {
     suite.name: suite
-    for suite in (
-        *synthetic.SUITES,
-        *cameras.SUITES,
-        *stress.SUITES,
-        *recorded.SUITES,
-        *shared_uplinks.SUITES,
-    )
+    for suite in (*synthetic.SUITES, *cameras.SUITES, *stress.SUITES, *recorded.SUITES, *shared_uplinks.SUITES)
 }
 """Every suite by name."""
 

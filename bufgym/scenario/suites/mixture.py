@@ -20,15 +20,11 @@ class SuiteScenario:
     Episodes have the V of their own scenario. Only suites of one queue are allowed.
     """
 
-    suite: str = "lte-v1"
-    """Its name."""
-    split: str = "train"
-    """"train", "validation" or "test"."""
-    data: str | None = None
-    """Folder of recordings, for suites that need one."""
+    suite: str = "lte-v1"  # its name
+    split: str = "train"  # "train", "validation" or "test"
+    data: str | None = None  # folder of recordings, for suites that need one
 
-    topics: ClassVar[tuple[Topic, ...]] = ()
-    """Empty: one queue."""
+    topics: ClassVar[tuple[Topic, ...]] = ()  # empty: one queue
 
     def __post_init__(self) -> None:
         suite = suites.get(self.suite)

@@ -46,8 +46,7 @@ def _belgium(split: str, data: Path | None) -> dict[str, Setting]:
     return both_sizes(traces, _tum(split, data))
 
 
-_MOST_TRACES = 12
-"""Most recordings in a split; a larger folder gives evenly spaced ones, in the order of their names."""
+_MOST_TRACES = 12  # most recordings in a split; a larger folder gives evenly spaced ones, in the order of their names
 
 
 def _every_fifth(pattern: str, size_bytes: int) -> Build:

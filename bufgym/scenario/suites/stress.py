@@ -31,13 +31,11 @@ CAPACITIES = (1, 2, 3, 15, 64, 200)
 
 _TRACES = 2
 _MESSAGES = 600
-_FADING = 0.3
-"""Mean of a fading link, as a share of the demand."""
+_FADING = 0.3  # mean of a fading link, as a share of the demand
 
 _TABLE = "tabulated:0=0,2=0.5,10=0.8,60=1"
 """V over frame indices with corners: half of the view is new after 2 frames, all of it after 60."""
-_MOTION_TABLE = "tabulated:0=0,0.05=0.4,0.5=0.7,3=1"
-"""The same over fields of view."""
+_MOTION_TABLE = "tabulated:0=0,0.05=0.4,0.5=0.7,3=1"  # the same over fields of view
 
 
 def _fading(split: str, demand_bytes_per_s: float, share: float = _FADING) -> tuple[Trace, ...]:

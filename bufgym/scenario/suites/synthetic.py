@@ -97,8 +97,7 @@ def _generated(split: str, data: Path | None, count: Mapping[str, int] = TRACES)
 
 
 OUTAGES_S = (5, 10, 20, 40, 60)
-_AROUND_S = 60
-"""Seconds of the episode outside the blackout."""
+_AROUND_S = 60  # seconds of the episode outside the blackout
 
 
 def _outage(split: str, data: Path | None) -> dict[str, Setting]:

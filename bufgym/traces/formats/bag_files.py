@@ -28,10 +28,8 @@ MAX_CHUNK_BYTES: Final = 2**28
 MAX_TOPICS: Final = 10_000
 MAX_METADATA_BYTES: Final = 2**23
 
-_RECORD: Final = struct.Struct("<BQ")
-"""An MCAP record's kind and length."""
-_MESSAGE: Final = struct.Struct("<HIQQ")
-"""BagTopic, sequence number, when it was logged and when it was published, ns."""
+_RECORD: Final = struct.Struct("<BQ")  # an MCAP record's kind and length
+_MESSAGE: Final = struct.Struct("<HIQQ")  # bagTopic, sequence number, when it was logged and when it was published, ns
 _STORAGE: Final = re.compile(r"\s*(storage_identifier|compression_format|compression_mode):(.*)")
 _PIECE_BYTES: Final = 2**20
 

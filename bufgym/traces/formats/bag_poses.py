@@ -27,12 +27,9 @@ _LISTED_FRAMES: Final = 8
 class BagTopic:
     """What the messages of one topic are."""
 
-    topic: str
-    """Its name."""
-    type: str
-    """The ROS message type, such as "nav_msgs/msg/Odometry"; the schema's name elsewhere."""
-    encoding: str
-    """"cdr", "ros1" or what the MCAP file says."""
+    topic: str  # its name
+    type: str  # the ROS message type, such as "nav_msgs/msg/Odometry"; the schema's name elsewhere
+    encoding: str  # "cdr", "ros1" or what the MCAP file says
 
 
 def carries_poses(type: str) -> bool:

@@ -43,22 +43,14 @@ _MAGICS: Final = {b"\x89MCAP0\r\n": "mcap", b"#ROSBAG V": "ros1", b"SQLite forma
 class Bag:
     """What a recording holds, in order of arrival."""
 
-    path: str
-    """The file or folder."""
-    kind: str
-    """"mcap", "ros1" or "rosbag2"."""
-    topics: dict[str, str]
-    """Topic -> type, in order of name."""
-    time_ns: Int64Array
-    """int64[n], when the recorder logged each message, ns since its epoch; non-decreasing."""
-    size_bytes: Int64Array
-    """int64[n], serialised, at least 1."""
-    topic: Int64Array
-    """int64[n], which of `topics`."""
-    poses: Poses | None = None
-    """The poses of the requested odometry, None if none was requested."""
-    poses_from_ns: int = 0
-    """When the poses' times begin, ns since the recorder's epoch."""
+    path: str  # the file or folder
+    kind: str  # "mcap", "ros1" or "rosbag2"
+    topics: dict[str, str]  # topic -> type, in order of name
+    time_ns: Int64Array  # int64[n], when the recorder logged each message, ns since its epoch; non-decreasing
+    size_bytes: Int64Array  # int64[n], serialised, at least 1
+    topic: Int64Array  # int64[n], which of `topics`
+    poses: Poses | None = None  # the poses of the requested odometry, None if none was requested
+    poses_from_ns: int = 0  # when the poses' times begin, ns since the recorder's epoch
 
 
 def matching(source: str, names: Sequence[str], patterns: Sequence[str] | None) -> list[str]:

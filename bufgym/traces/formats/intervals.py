@@ -19,24 +19,18 @@ MAX_HOLD_S: Final = 86_400
 
 
 class Knots(NamedTuple):
-    """A capacity as it was read.
+    """A capacity as it was read."""
 
-    Attributes:
-        time_us: int64[K], microseconds, from 0.
-        cumulative_bytes: int64[K], bytes up to each time, from 0.
-        note: what the trace's `source` should say about the reading; empty for nothing.
-    """
-
-    time_us: Int64Array
-    cumulative_bytes: Int64Array
-    note: str = ""
+    time_us: Int64Array  # int64[K], microseconds, from 0
+    cumulative_bytes: Int64Array  # int64[K], bytes up to each time, from 0
+    note: str = ""  # what the trace's `source` should say about the reading; empty for nothing
 
 
 class Intervals:
     """Measurements that follow each other, collected and checked one at a time."""
 
     def __init__(self) -> None:
-        self._us = array("q")
+        self.us = array("q")  # their lengths
         self._bytes = array("q")
         self._end_us: int | None = None
 
@@ -46,7 +40,7 @@ class Intervals:
             raise line.error(count, f"must be at most {MAX_INTERVAL_BYTES} in an interval", "bytes")
         if length_us * count >= PRODUCT_LIMIT:
             raise line.error(length_us * count, "must be below 2**62", "bytes x microseconds of the interval")
-        self._us.append(length_us)
+        self.us.append(length_us)
         self._bytes.append(count)
 
     def add_ending_at(self, line: Line, end_ms: str, length_ms: str, count: str) -> None:
@@ -68,18 +62,14 @@ class Intervals:
         self._end_us = end_us
         self.add(line, length_us, bytes_in_interval)
 
-    def median_us(self) -> int:
-        """The median length, microseconds."""
-        return round(float(np.median(np.asarray(self._us))))
-
     def __len__(self) -> int:
-        return len(self._us)
+        return len(self.us)
 
     def knots(self, path: StrPath, note: str = "") -> Knots:
         """The capacity of all intervals together."""
-        if not self._us:
+        if not self.us:
             raise fault(path, "holds no measurement: must hold at least one")
-        columns = (np.asarray(column, np.int64) for column in (self._us, self._bytes))
+        columns = (np.asarray(column, np.int64) for column in (self.us, self._bytes))
         time_us, cumulative = (np.append(0, np.cumsum(column)) for column in columns)
         if time_us[-1] > MAX_DURATION_S * US_PER_S:
             duration_s = f"{time_us[-1] / US_PER_S:g}"
@@ -88,19 +78,12 @@ class Intervals:
 
 
 class Rate(NamedTuple):
-    """The rate from some time on.
+    """The rate from some time on."""
 
-    Attributes:
-        line: where it is stated.
-        time: its time as it is written in the line.
-        start_us: its time, microseconds.
-        bytes_per_us: bytes a microsecond.
-    """
-
-    line: Line
-    time: str
-    start_us: int
-    bytes_per_us: float
+    line: Line  # where it is stated
+    time: str  # its time as it is written in the line
+    start_us: int  # its time, microseconds
+    bytes_per_us: float  # bytes a microsecond
 
 
 def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
@@ -127,6 +110,6 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     if not len(intervals):
         line = previous.line
         raise line.error(line.text, "must have a second line: how long a single rate holds is unknown")
-    length_us = intervals.median_us()
+    length_us = round(float(np.median(np.asarray(intervals.us))))
     intervals.add(previous.line, length_us, round(previous.bytes_per_us * length_us))
     return intervals.knots(path)

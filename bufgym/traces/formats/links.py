@@ -35,16 +35,7 @@ from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
-from bufgym.traces.formats.speed_tests import (
-    INTERVAL,
-    REMARK,
-    RULER,
-    RUN,
-    RUNS,
-    read_iperf3,
-    read_nuttcp,
-    read_runs,
-)
+from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_iperf3, read_nuttcp, read_runs
 from bufgym.traces.formats.tables import CSV_HEADER, RATES_HEADER, read_belgium, read_csv, read_mbit, read_rates
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace
@@ -56,14 +47,10 @@ _SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json", ".list", ".out")
 class Format:
     """How to recognise a format by its first line, and how to read its knots."""
 
-    layout: str
-    """What a line looks like, in words."""
-    fits: Callable[[str], object]
-    """Whether a first line is one of this format."""
-    read: Callable[..., Knots]
-    """Reads a file's knots; with `columns`, the one to read is its second argument."""
-    columns: tuple[str, ...] = ()
-    """The columns to choose from, the default first; empty where there is no choice."""
+    layout: str  # what a line looks like, in words
+    fits: Callable[[str], object]  # whether a first line is one of this format
+    read: Callable[..., Knots]  # reads a file's knots; with `columns`, the one to read is its second argument
+    columns: tuple[str, ...] = ()  # the columns to choose from, the default first; empty where there is no choice
 
 
 def _cells(*patterns: str, between: str = r"\s+") -> Callable[[str], object]:

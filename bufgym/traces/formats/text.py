@@ -52,16 +52,11 @@ class Line(NamedTuple):
     """A line of a file, with methods that parse its cells.
 
     Each method raises a TraceError that names file, line, value and rule.
-
-    Attributes:
-        path: the file.
-        number: of the line, counted from 1; 0 if `path` names the place.
-        text: of the line, without surrounding white space.
     """
 
-    path: StrPath
-    number: int
-    text: str
+    path: StrPath  # the file
+    number: int  # of the line, counted from 1; 0 if `path` names the place
+    text: str  # of the line, without surrounding white space
 
     def error(self, value: object | None, rule: str, field: str | None = None) -> TraceError:
         """The error to raise about this line."""

@@ -11,14 +11,6 @@ from bufgym.traces.generate.parameters import LinkParameters, OutageParameters, 
 from bufgym.traces.generate.rules import ramp, steady, tunnel
 
 __all__ = [
-    "LinkParameters",
-    "OutageParameters",
-    "drive_motion",
-    "fitted_links",
-    "markov_link",
-    "ramp",
-    "read_links",
-    "steady",
-    "synthetic_lte",
-    "tunnel",
-]
+    "LinkParameters", "OutageParameters", "drive_motion", "fitted_links", "markov_link", "ramp", "read_links", "steady",
+    "synthetic_lte", "tunnel",
+]  # fmt: skip

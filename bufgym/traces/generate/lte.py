@@ -39,20 +39,13 @@ class LteParameters:
 
     levels: tuple[float, float, float]
     """Levels of the states "good", "fair", "poor": log of the rate relative to "fair"."""
-    stay_s: float
-    """Mean stay in a state, s; the next state is one of its neighbours."""
-    spread: float
-    """Standard deviation of the AR(1) process, log units."""
-    memory: float
-    """Correlation of the AR(1) process from one second to the next."""
-    fade_chance: float
-    """Chance a second that a breakdown begins."""
-    fade_mean_s: float
-    """Mean length of a breakdown, s; geometric, cut off at MAX_FADE_S."""
-    outage_share: float = 0.5
-    """Share of breakdowns without any capacity."""
-    fade_depth: float = 0.06
-    """What the other breakdowns leave of the rate."""
+    stay_s: float  # mean stay in a state, s; the next state is one of its neighbours
+    spread: float  # standard deviation of the AR(1) process, log units
+    memory: float  # correlation of the AR(1) process from one second to the next
+    fade_chance: float  # chance a second that a breakdown begins
+    fade_mean_s: float  # mean length of a breakdown, s; geometric, cut off at MAX_FADE_S
+    outage_share: float = 0.5  # share of breakdowns without any capacity
+    fade_depth: float = 0.06  # what the other breakdowns leave of the rate
 
 
 LTE_MODES: Final[dict[LteMode, LteParameters]] = {
@@ -66,12 +59,7 @@ LTE_MODES: Final[dict[LteMode, LteParameters]] = {
 _CEILING: Final = 1.6
 
 
-def synthetic_lte(
-    seed: int,
-    duration_s: int = 300,
-    mean_bytes_per_s: float = 10e6,
-    mode: LteMode = "drive",
-) -> Trace:
+def synthetic_lte(seed: int, duration_s: int = 300, mean_bytes_per_s: float = 10e6, mode: LteMode = "drive") -> Trace:
     """An LTE-like trace with one sample a second, which loops.
 
     Args:

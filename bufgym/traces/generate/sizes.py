@@ -45,10 +45,8 @@ IN_TURN: Final = {"rvl-jpeg": ("rvl", "jpeg90")}
 class Moving(NamedTuple):
     """The motion of a stream's messages."""
 
-    motion: Motion
-    """The recording that gives x."""
-    time_us: Int64Array
-    """int64[n], times of the messages on it."""
+    motion: Motion  # the recording that gives x
+    time_us: Int64Array  # int64[n], times of the messages on it
 
 
 class Range(NamedTuple):
@@ -61,11 +59,8 @@ class Range(NamedTuple):
 
 Numbers: TypeAlias = Mapping[str, float]
 Draw: TypeAlias = Callable[[int, np.random.Generator, Numbers, Moving | None], Float64Array]
-_RHO, _CV, _RATIO = Range(0.97, 0, 0.9999), Range(0.4, 0, 10), Range(4, 0.01, 1000)
-
-
-def _jpeg(n: int, rng: np.random.Generator, p: Numbers, _: Moving | None) -> Float64Array:
-    return _slow(n, rng, p) * _noise(n, rng, p)
+_SLOW = {"rho": Range(0.97, 0, 0.9999), "cv": Range(0.4, 0, 10)}
+_NOISE, _RATIO = {"noise": Range(0.15, 0, 10)}, {"ratio": Range(4, 0.01, 1000)}
 
 
 def _gop(n: int, rng: np.random.Generator, p: Numbers, _: Moving | None) -> Float64Array:
@@ -90,19 +85,10 @@ def _motion(n: int, rng: np.random.Generator, p: Numbers, moving: Moving | None)
 
 LAWS: Final[Mapping[str, tuple[Draw, Mapping[str, Range]]]] = {
     EQUAL: (lambda n, rng, p, moving: np.ones(n), {}),
-    "jpeg": (_jpeg, {"rho": _RHO, "cv": _CV, "noise": Range(0.15, 0, 10)}),
-    "gop": (
-        _gop,
-        {
-            "every": Range(30, 1, 10_000),
-            "ratio": _RATIO,
-            "rho": Range(0.9, 0, 0.9999),
-            "cv": _CV,
-            "noise": Range(0.15, 0, 10),
-        },
-    ),
-    "depth-colour": (_depth_colour, {"ratio": _RATIO, "rho": _RHO, "cv": _CV, "noise": Range(0.05, 0, 10)}),
-    "motion": (_motion, {"exponent": Range(0.3, -3, 3), "noise": Range(0.15, 0, 10)}),
+    "jpeg": (lambda n, rng, p, moving: _slow(n, rng, p) * _noise(n, rng, p), _SLOW | _NOISE),
+    "gop": (_gop, {"every": Range(30, 1, 10_000)} | _RATIO | _SLOW | {"rho": Range(0.9, 0, 0.9999)} | _NOISE),
+    "depth-colour": (_depth_colour, _RATIO | _SLOW | {"noise": Range(0.05, 0, 10)}),
+    "motion": (_motion, {"exponent": Range(0.3, -3, 3)} | _NOISE),
 }
 """Name -> (function that draws sizes of mean 1, the law's parameters)."""
 
@@ -139,11 +125,8 @@ def parsed(text: str) -> tuple[str, Numbers, str]:
     for setting in rest.split(",") if rest else []:
         key, _, number = (part.strip() for part in setting.partition("="))
         if key not in ranges:
-            raise (
-                unknown(f"parameter of sizes {name!r}", key, ranges)
-                if ranges
-                else BufgymError(f"sizes {text!r}: {name!r} has no parameters")
-            )
+            none = BufgymError(f"sizes {text!r}: {name!r} has no parameters")
+            raise unknown(f"parameter of sizes {name!r}", key, ranges) if ranges else none
         try:
             numbers[key] = float(number)
         except ValueError:
