@@ -26,8 +26,7 @@ GUIDED = "guided"
 ACTIONS = ("slots", GUIDED)
 """What an action is: the slot that goes, or numbers of the rule."""
 INPUT_FIELDS = tuple(
-    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0)
-    for name, meaning in INPUTS.items()
+    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
 )
 """Fields observed with ``fields="guided"``."""
 

@@ -10,7 +10,8 @@ residual policy learning does [silver2018residual; johannink2019residual]. ``OUT
     r <- the rule's link rate;  size <- mean bytes of the queue and the newcomer
     come <- x_new - x_dequeued;  g <- the target gap, or come / (s + 1) where it is unknown
 
-``linear`` is the policy whose outputs are linear in the inputs. A measured steady link keeps the plain rule.
+``linear`` is the policy whose outputs are linear in the inputs, times 1 - ``plain``: the plain rule stays on a measured
+steady link, and until the link has carried anything.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ INPUTS = {
     "one": "always 1",
     "head_gap": "lg(the gap left if the head goes, g); 0 for an empty queue",
     "share": "a, the share of price-dp in the plain rule",
-    "steady": "1 on a measured steady link, otherwise 0",
+    "plain": "1 on a measured steady link, and until the link has carried anything; otherwise 0",
 }
 """Names and meanings of the inputs, in their order."""
 MOST = 3.0
@@ -146,7 +147,7 @@ def inputs(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, o
     out[12] = 1.0
     out[13] = lg(gap_left(buffer, arrival, 0), g) if s > 0 else 0.0
     out[14] = share(rule, numbers)
-    out[15] = 1.0 if steady(buffer) else 0.0
+    out[15] = 1.0 if steady(buffer) or rate <= 0 else 0.0
 
 
 @kernel

@@ -90,7 +90,7 @@ def test_inputs_are_what_the_rule_knows():
     seen = np.zeros(len(INPUTS))
     guided.inputs(buffer, arrival, memory, guided.BASE, seen)
     size, s, r, g = 200.0, 1, (0.25 * 100 + 0.25 * 50 + 0.5 * 50) / 1e6, 3.0 / 2
-    a = 1 / (1 + np.exp(3 - 1.5))
+    a = 1 / (1 + np.exp(5 - 6))
     by_hand = {
         "short": np.log(2),
         "medium": -np.log(2),
@@ -107,7 +107,7 @@ def test_inputs_are_what_the_rule_knows():
         "one": 1.0,
         "head_gap": np.log(3.0 / g),
         "share": a,
-        "steady": 0.0,
+        "plain": 0.0,
     }
     assert dict(zip(INPUTS, seen, strict=True)) == pytest.approx(by_hand)
 
