@@ -69,11 +69,11 @@ def test_outputs_set_the_numbers_of_the_rule():
     assert changed(discount=0.5) == pytest.approx({"discount": 0.665, "spare_discount": 0.5})
     assert changed(near=0.5) == pytest.approx({"near": 1.5 * e, "price_near": 3.66 * e})
     assert changed(head=0.5, bias=-0.5) == pytest.approx({"head": e, "bias": 1 / e})
-    assert changed(kappa=0.5, tail=-0.5) == pytest.approx({"kappa": 0.361 * e, "tail": 0.793 / e})
-    assert changed(price_threshold=-0.25) == pytest.approx({"price_threshold": 0.182})
+    assert changed(kappa=0.5, tail=-0.5) == pytest.approx({"kappa": 0.48 * e, "tail": 0.8 / e})
+    assert changed(price_threshold=-0.25) == pytest.approx({"price_threshold": 0.18})
     assert changed(price_discount=0.25) == pytest.approx({"price_discount": 0.25})
-    assert changed(share=0.25) == pytest.approx({"share_low": 2.0})
-    assert changed(share=100) == pytest.approx({"share_low": 3.0 - 4 * guided.MOST})
+    assert changed(share=0.25) == pytest.approx({"share_low": 4.0})
+    assert changed(share=100) == pytest.approx({"share_low": 5.0 - 4 * guided.MOST})
 
 
 @kernels
