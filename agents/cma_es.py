@@ -30,8 +30,8 @@ from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Settings
 from bufgym.ground.files import replaced
 from bufgym.policies import weights
-from bufgym.policies.learned import Weights
-from bufgym.policies.learned_topics import TopicWeights
+from bufgym.policies.guided import GuidedWeights
+from bufgym.policies.weights import AnyWeights
 
 POPULATION = 16
 """Candidates per generation."""
@@ -39,18 +39,20 @@ MEMORY = 10
 """Generations over which the strategy's mean is averaged, exponentially."""
 DIAGONAL = 100
 """Number of weights from which a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
+FULL = 400
+"""The same for agents that guide a rule, whose weights work together."""
 
 
 # --- how candidates are evaluated ------------------------------------------------------------------------------------
 
-Evaluate = Callable[[Sequence[Weights | TopicWeights], int], list[tuple[float, int]]]
+Evaluate = Callable[[Sequence[AnyWeights], int], list[tuple[float, int]]]
 """(candidates, part of the training episodes) -> (fitness, decisions) of each, in their order."""
 
 
 def evaluation_here(objective: Objective) -> Evaluate:
     """Evaluate candidates in this process, one after the other."""
 
-    def evaluate(candidates: Sequence[Weights | TopicWeights], part: int) -> list[tuple[float, int]]:
+    def evaluate(candidates: Sequence[AnyWeights], part: int) -> list[tuple[float, int]]:
         return [_evaluated(objective, candidate, part) for candidate in candidates]
 
     return evaluate
@@ -64,7 +66,7 @@ def evaluation(settings: Settings, folder: Path, seed: int, objective: Objective
         return
     with connected(settings.backend, settings.address or None) as call_each:
 
-        def evaluate(candidates: Sequence[Weights | TopicWeights], part: int) -> list[tuple[float, int]]:
+        def evaluate(candidates: Sequence[AnyWeights], part: int) -> list[tuple[float, int]]:
             calls = [(settings, folder, seed, candidate, part) for candidate in candidates]
             return call_each(evaluated_on_a_worker, calls)
 
@@ -76,7 +78,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def evaluated_on_a_worker(
-    settings: Settings, folder: Path, seed: int, candidate: Weights | TopicWeights, part: int
+    settings: Settings, folder: Path, seed: int, candidate: AnyWeights, part: int
 ) -> tuple[float, int]:
     """The fitness and the decisions of one candidate. Each process draws and bounds the episodes once."""
     with _ONE_AT_A_TIME:
@@ -85,10 +87,10 @@ def evaluated_on_a_worker(
 
 @functools.lru_cache(maxsize=32)  # several seeds, and runs one after the other, meet on one worker
 def _objective(settings: Settings, folder: Path, seed: int) -> Objective:
-    return OBJECTIVES[settings.kind](settings, folder, seed)
+    return OBJECTIVES[settings.objective](settings, folder, seed)
 
 
-def _evaluated(objective: Objective, candidate: Weights | TopicWeights, part: int) -> tuple[float, int]:
+def _evaluated(objective: Objective, candidate: AnyWeights, part: int) -> tuple[float, int]:
     fitness = objective.fitness(policy_of(objective.name, candidate), part)
     return fitness, objective.decisions(part)
 
@@ -100,7 +102,7 @@ def _evaluated(objective: Objective, candidate: Weights | TopicWeights, part: in
 class Evolution:
     """The state of one seed's evolution, as in a checkpoint."""
 
-    like: Weights | TopicWeights
+    like: AnyWeights
     """Weights with the numbers that are not searched."""
     strategy: Any
     """pycma's strategy."""
@@ -114,19 +116,20 @@ class Evolution:
     """Time spent training, s."""
 
     @staticmethod
-    def around(like: Weights | TopicWeights, sigma: float, seed: int) -> Evolution:
+    def around(like: AnyWeights, sigma: float, seed: int) -> Evolution:
         """A new search around these weights."""
         begin = to_vector(like)
-        options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
+        diagonal = FULL if isinstance(like, GuidedWeights) else DIAGONAL
+        options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > diagonal}
         return Evolution(like, cma.CMAEvolutionStrategy(begin, sigma, options), begin)
 
-    def weights(self, vector: Vector) -> Weights | TopicWeights:
+    def weights(self, vector: Vector) -> AnyWeights:
         """The agent with these numbers."""
-        weights: Weights | TopicWeights = with_vector(self.like, vector)
+        weights: AnyWeights = with_vector(self.like, vector)
         return weights
 
     @property
-    def agent(self) -> Weights | TopicWeights:
+    def agent(self) -> AnyWeights:
         """The agent so far."""
         return self.weights(self.average)
 
@@ -149,7 +152,7 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
     """
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
-    objective = OBJECTIVES[settings.kind](settings, folder, seed)
+    objective = OBJECTIVES[settings.objective](settings, folder, seed)
     checkpoint = home / "evolution.pkl"  # only from your own run: pickles run code when they are read
     if checkpoint.exists():
         state: Evolution = pickle.loads(checkpoint.read_bytes())

@@ -20,7 +20,7 @@ from bufgym.benchmark.run import draw
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.tasks.queue import best
 from bufgym.oracle import BASELINE, normalised_score, regret
-from bufgym.policies import registry
+from bufgym.policies import Policy, registry
 from bufgym.scenario import Scenario, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import Outcome, outcome
@@ -56,8 +56,8 @@ class FixedEpisodes:
         self._base = math.fsum(result.qoi for result in self.run(BASELINE))
         self._best = math.fsum(plan.qoi for plan in self._plans)
 
-    def run(self, policy: str) -> list[Outcome]:
-        """Outcomes of a registered policy."""
+    def run(self, policy: str | Policy) -> list[Outcome]:
+        """Outcomes of a policy."""
         senders = run(registry.get(policy), self.episodes, self.capacity, self.scenario.value)
         return [outcome(senders, i) for i in range(len(self.episodes))]
 

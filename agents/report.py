@@ -28,7 +28,7 @@ from bufgym.benchmark.table import aligned, same, told_once, unranked
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
 from bufgym.oracle import BASELINE
-from bufgym.policies import Policy, registry, weights
+from bufgym.policies import Policy, load, registry, weights
 
 COLUMNS = (
     ("QoI", "qoi", 1, ".3f"),
@@ -115,10 +115,13 @@ def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], be
     test, validation = FixedEpisodes(settings, "test"), FixedEpisodes(settings, "validation")
     outcomes = test.run_fixed()
     for run in runs:
-        outcomes[agent_name(run)] = test.play(training.load(settings, run))
+        outcomes[agent_name(run)] = (
+            test.run(load(run.model)) if settings.evolves else test.play(training.load(settings, run))
+        )
     rows = test.rows(outcomes)
     entries, alike = summarise(outcomes, rows, agent_name(best)), same(rows)
     print(table(entries, agent_name(best), alike))
+    print(verdict(entries, agent_name(best)))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = _save(folder, settings, runs, best, held_out=held_out, scores=entries)
@@ -137,6 +140,16 @@ def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], be
         notes=twins,
     )
     return notes
+
+
+def verdict(entries: Sequence[dict[str, Any]], agent: str) -> str:
+    """One sentence: whether the agent beats the best rule written by hand, and by how much."""
+    learned = shipped("agents", "agents/pretrained", "*.safetensors")
+    rules = (e for e in entries if e["policy"] not in learned and not e["policy"].startswith("agent"))
+    rule = next(e for e in rules if registry.get(e["policy"]).ranked)
+    low, high = sorted(-bound for bound in rule["minus_agent_95"])
+    won = "beats" if low > 0 else "loses to" if high < 0 else "cannot be told from"
+    return f"{agent} {won} the best rule, {rule['policy']}: QoI {-rule['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
 def rules(episodes: FixedEpisodes) -> dict[str, float]:

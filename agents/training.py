@@ -47,7 +47,7 @@ def train_all(settings: Settings, folder: Path) -> list[Run]:
     if settings.kind == "queue":
         ValidationSets(settings, folder, progress=True)  # compute the clairvoyant's bounds once for all seeds
     if settings.backend == "local":
-        return each_seed(cma_es.train if settings.algo == "evolution" else train_seed, settings, folder)
+        return each_seed(cma_es.train if settings.evolves else train_seed, settings, folder)
     with begun(settings.backend, settings.address or None) as address:
         return each_seed(cma_es.train, replace(settings, address=address), folder)
 
@@ -229,7 +229,7 @@ LEARNERS: dict[str, tuple[Any, Callable[[Settings, VecEnv], Any]]] = {
 }
 """Algorithm -> (its class, function that makes an untrained one)."""
 
-ALGORITHMS = (*LEARNERS, "evolution")
+ALGORITHMS = (*LEARNERS, "evolution", "guided")
 """Values of ``--algo``."""
 
 

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.settings import Settings
-from bufgym.policies import Policy, learned, learned_topics
+from bufgym.policies import Policy, guided, learned, learned_topics
+from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.learned import Network, Weights
 from bufgym.policies.learned_topics import TopicWeights
+from bufgym.policies.weights import AnyWeights
 
 Vector = NDArray[np.float64]
 
@@ -49,7 +51,7 @@ class Objective(ABC):
         self.settings, self.folder, self.seed = settings, folder, seed
 
     @abstractmethod
-    def start(self) -> Weights | TopicWeights:
+    def start(self) -> AnyWeights:
         """The weights at which the search begins."""
 
     @abstractmethod
@@ -70,8 +72,10 @@ class Objective(ABC):
         return (self.measure(policy, self.judges),)
 
 
-def policy_of(name: str, weights: Weights | TopicWeights) -> Policy:
+def policy_of(name: str, weights: AnyWeights) -> Policy:
     """Make the policy of these weights."""
+    if isinstance(weights, GuidedWeights):
+        return guided.linear(name, weights.weight)
     if isinstance(weights, TopicWeights):
         return learned_topics.policy(name, weights)
     return learned.policy(name, weights)
@@ -80,17 +84,21 @@ def policy_of(name: str, weights: Weights | TopicWeights) -> Policy:
 # --- weights as a vector ---------------------------------------------------------------------------------------------
 
 
-def to_vector(weights: Weights | TopicWeights) -> Vector:
+def to_vector(weights: AnyWeights) -> Vector:
     """The searched numbers, float64[n]: networks one after the other, then the mixing.
 
     Context and bias add the same to every candidate's score, so they matter in ``accept`` alone, which stays linear.
     """
+    if isinstance(weights, GuidedWeights):
+        return weights.weight.reshape(-1).astype(np.float64)
     numbers, searched = _numbers(weights)
     return np.concatenate(numbers)[np.concatenate(searched)]
 
 
-def with_vector(weights: Weights | TopicWeights, vector: Vector) -> Any:
+def with_vector(weights: AnyWeights, vector: Vector) -> Any:
     """These weights with the searched numbers replaced."""
+    if isinstance(weights, GuidedWeights):
+        return GuidedWeights(vector.reshape(weights.weight.shape).astype(np.float32))
     parts, searched = _numbers(weights)
     numbers = np.concatenate(parts)
     numbers[np.concatenate(searched)] = vector

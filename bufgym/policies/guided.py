@@ -17,7 +17,8 @@ steady link, and until the link has carried anything.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,11 +217,40 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return follow(buffer, arrival, memory, base, outputs)
 
 
-def linear(name: str, weights: NDArray[np.floating[Any]]) -> Policy:
+@dataclass(frozen=True)
+class GuidedWeights:
+    """Weights of an agent whose outputs are linear in the inputs, as in a file."""
+
+    weight: NDArray[np.float32]
+    """float32[outputs, inputs], W."""
+
+    SLOT_NAMES: ClassVar[tuple[str, ...]] = ()
+    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = tuple(INPUTS)
+    NETWORKS: ClassVar[tuple[str, ...]] = ("guided",)
+    TABLE: ClassVar[list[Any]] = [list(INPUTS.items()), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
+    """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.CONTEXT_NAMES
+
+    @property
+    def guided(self) -> GuidedWeights:
+        """The one network."""
+        return self
+
+    def tensors(self) -> dict[str, NDArray[np.float32]]:
+        """The numbers by name."""
+        return {"weight": self.weight}
+
+
+def linear(name: str, weights: NDArray[np.floating[Any]], about: str = "", source: str = "") -> Policy:
     """Make the policy with outputs W c for the inputs c; ``weights`` is W [outputs, inputs]. W = 0 is gap-price."""
     W = np.asarray(weights, np.float64)
     if W.shape != (N_OUTPUTS, N_INPUTS) or not np.isfinite(W).all():
         rule = f"must be {N_OUTPUTS} x {N_INPUTS} finite numbers"
         raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")
     numbers = tuple(np.concatenate([BASE, W.reshape(-1)]).tolist())
-    return Policy(name, on_arrival, weights=numbers, memory=REMEMBERED, work=WORK, compile=True, reads_rate=True)
+    policy = Policy(name, on_arrival, weights=numbers, memory=REMEMBERED, work=WORK, compile=True, reads_rate=True)
+    return replace(policy, about=about, source=source)

@@ -2,8 +2,9 @@
 
 The file has the float32 tensors of ``learned.Weights`` by name. ``drop.skip`` is [inputs] and ``drop.bias`` [1]. Each
 hidden layer has ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs]. ``drop.out`` is [outputs of the last
-layer]. The names ``accept.*`` follow, and in a scheduler's file (``learned_topics``) ``send.*``. The header's metadata
-has one entry, ``bufgym``, a JSON object that describes the file:
+layer]. The names ``accept.*`` follow, and in a scheduler's file (``learned_topics``) ``send.*``. An agent that guides a
+rule (``guided``) has the one tensor ``guided.weight`` [outputs, inputs]. The header's metadata has one entry,
+``bufgym``, a JSON object that describes the file:
 
     format        number of this format
     name          the policy's
@@ -34,7 +35,8 @@ from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_whole, replaced
 from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, TOPIC_FIELDS
-from bufgym.policies import learned, learned_topics
+from bufgym.policies import guided, learned, learned_topics
+from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.registry import Policy
@@ -42,7 +44,8 @@ from bufgym.policies.scoring import Network
 
 StrPath = str | os.PathLike[str]
 Tensors = dict[str, NDArray[np.float32]]
-Kind = type[Weights] | type[TopicWeights]
+AnyWeights = Weights | TopicWeights | GuidedWeights
+Kind = type[Weights] | type[TopicWeights] | type[GuidedWeights]
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
@@ -68,6 +71,13 @@ def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
     return hashlib.sha256(json.dumps(table).encode()).hexdigest()
 
 
+def _definition(kind: Kind, names: Sequence[str]) -> str:
+    """The ``observation`` of a file of this kind."""
+    if kind is GuidedWeights:
+        return hashlib.sha256(json.dumps(GuidedWeights.TABLE).encode()).hexdigest()
+    return observation_hash(kind is TopicWeights, names)
+
+
 def load(path: StrPath) -> Policy:
     """Load the policy in a file, for every L; it runs compiled, like built-in policies.
 
@@ -79,6 +89,8 @@ def load(path: StrPath) -> Policy:
     source = f"{Path(path).name}, sha256 {metadata['sha256'][:12]}"
     if isinstance(weights, TopicWeights):
         return learned_topics.policy(name, weights, about, source)
+    if isinstance(weights, GuidedWeights):
+        return guided.linear(name, weights.weight, about, source)
     return learned.policy(name, weights, about, source)
 
 
@@ -93,7 +105,7 @@ def load_shipped(name: str, path: Path) -> Policy:
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
-def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any]) -> Path:
+def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
     """Write a learned policy, whole or not at all.
 
     Args:
@@ -112,7 +124,7 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
         "format": FORMAT,
         **about,
         "fields": list(weights.fields),
-        "observation": observation_hash(isinstance(weights, TopicWeights), weights.fields),
+        "observation": _definition(type(weights), weights.fields),
         "bufgym": __version__,
         "sha256": _sha256(weights.fields, tensors),
     }
@@ -130,7 +142,7 @@ def save(path: StrPath, weights: Weights | TopicWeights, about: Mapping[str, Any
     return target
 
 
-def _tensors(weights: Weights | TopicWeights) -> Tensors:
+def _tensors(weights: AnyWeights) -> Tensors:
     """Name -> tensor, little-endian and in C order, as in the file."""
     tensors = {
         f"{network}.{name}": np.ascontiguousarray(tensor, "<f4")
@@ -161,29 +173,33 @@ def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:
         BufgymError: no such file, or one that breaks a rule of the format.
     """
     weights, metadata = read_any(path)
-    if isinstance(weights, TopicWeights):
-        raise BufgymError(f"{path}: a scheduler for several topics, not a policy for one queue")
-    return weights, metadata
+    if isinstance(weights, Weights):
+        return weights, metadata
+    what = "a scheduler for several topics" if isinstance(weights, TopicWeights) else "an agent that guides a rule"
+    raise BufgymError(f"{path}: {what}, not a slot scorer for one queue")
 
 
-def read_any(path: StrPath) -> tuple[Weights | TopicWeights, dict[str, Any]]:
+def read_any(path: StrPath) -> tuple[AnyWeights, dict[str, Any]]:
     """As ``read``, for either kind."""
     return _parsed(path, read_whole(path, MAX_BYTES))
 
 
-def _parsed(path: StrPath, data: bytes) -> tuple[Weights | TopicWeights, dict[str, Any]]:
+def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     if len(data) > MAX_BYTES:
         raise BufgymError(f"{path}: larger than the {MAX_BYTES} bytes that a learned policy may have")
     try:
         entries = dict(cast(Any, safetensors).deserialize(data))
     except safetensors.SafetensorError as error:
         raise BufgymError(f"{path}: no safetensors file, or a broken one: {error}") from None
-    kind: Kind = TopicWeights if any(name.startswith("send.") for name in entries) else Weights
+    prefixes = {name.partition(".")[0] for name in entries}
+    kind: Kind = GuidedWeights if "guided" in prefixes else TopicWeights if "send" in prefixes else Weights
     metadata = _metadata(path, data, kind)
     tensors = _checked_tensors(path, entries, metadata["fields"], kind)
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
+    if kind is GuidedWeights:
+        return GuidedWeights(tensors["guided.weight"]), metadata
     mix = {"mix": tensors.pop(MIX)} if MIX in tensors else {}
     networks = [
         Network.of({name.removeprefix(f"{n}."): tensors[name] for name in tensors if name.startswith(f"{n}.")})
@@ -219,7 +235,7 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
         refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
     if not isinstance(about, str) or not about.isprintable():
         refuse("about", "must be one line of text")
-    if metadata["observation"] != observation_hash(kind is TopicWeights, fields if isinstance(fields, list) else ()):
+    if metadata["observation"] != _definition(kind, fields if isinstance(fields, list) else ()):
         versions = f"(bufgym {metadata['bufgym']} wrote it, this is {__version__})"
         refuse("observation", f"trained on other observations than this bufgym's: train it again {versions}")
     if not isinstance(fields, list) or not fields:
@@ -264,7 +280,8 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
         _refuse(path, name, rule, what="shape of ", value=list(shapes[name]))
 
     widths: list[int] = []
-    for k in range(kind.LAYERS):
+    layers = 0 if kind is GuidedWeights else cast(Any, kind).LAYERS
+    for k in range(layers):
         name = f"drop.{k}.bias"
         if name not in shapes:
             if f"drop.{k}.weight" in shapes:
@@ -278,6 +295,8 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
         for network in kind.NETWORKS
         for name, shape in Network.shapes(len(fields), widths).items()
     }
+    if kind is GuidedWeights:
+        required = {"guided.weight": (guided.N_OUTPUTS, len(guided.INPUTS))}
     if MIX in shapes and kind is Weights:
         slots = sum(name in kind.SLOT_NAMES for name in fields)
         required[MIX] = (len(fields) - slots, slots)
@@ -285,7 +304,7 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
         if name not in shapes:
             _refuse(path, name, "is missing")
         if name not in required:
-            _refuse(path, name, f"has no place in networks of {len(widths)} hidden layers ({kind.LAYERS} at most)")
+            _refuse(path, name, f"has no place in networks of {len(widths)} hidden layers ({layers} at most)")
     for name, shape in required.items():
         if shapes[name] != shape:
             refuse_shape(name, f"must be {list(shape)} for {len(fields)} fields and hidden layers of {widths}")

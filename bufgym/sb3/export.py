@@ -15,8 +15,9 @@ from torch import nn
 
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength
-from bufgym.policies import Policy, learned, learned_topics
+from bufgym.policies import Policy, guided, learned, learned_topics
 from bufgym.policies import weights as files
+from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.learned import Network, Weights
 from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.weights import StrPath
@@ -48,7 +49,10 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
     notes = {"name": name, "about": about, **run_notes(path)}
     if isinstance(weights, TopicWeights):
         return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
-    return files.save(out, weights, {**notes, "regret": regrets(learned.policy(name, weights))})
+    policy = (
+        guided.linear(name, weights.weight) if isinstance(weights, GuidedWeights) else learned.policy(name, weights)
+    )
+    return files.save(out, weights, {**notes, "regret": regrets(policy)})
 
 
 # --- weights ---------------------------------------------------------------------------------------------------------
