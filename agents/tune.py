@@ -121,7 +121,8 @@ def settings(policy: str) -> list[str]:
         changes = [dict(zip(axes, numbers, strict=True)) for numbers in product(*axes.values())]
     else:
         names = AROUND[policy] or tuple(default.parameters)
-        changes = [{name: float(f"{factor * default.parameters[name]:.3g}")} for name in names for factor in FACTORS]
+        numbers = {name: default.parameters[name] for name in names if default.parameters[name] > 0}  # 0 has no factors
+        changes = [{name: float(f"{factor * n:.3g}")} for name, n in numbers.items() for factor in FACTORS]
     made = [default.with_parameters(**change) for change in changes]
     return [policy, *(setting.name for setting in made if setting.parameters != default.parameters)]
 

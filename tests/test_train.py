@@ -13,7 +13,10 @@ from train_cases import DropOldest, KilledError, columns, in_a_folder_of_its_own
 import train
 from agents import held_out, runs, training
 from agents.callbacks import Curve, checkpoints
+from agents.held_out import FixedEpisodes
+from agents.objectives import guided
 from agents.settings import Settings
+from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
@@ -53,6 +56,22 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
     assert (folder / "model.zip").exists() and list((folder / "seed-0" / "tensorboard").glob("events*"))
     printed = capsys.readouterr().out
     assert "drop-oldest" in printed and "agent (seed 0)" in printed
+
+
+def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, capsys: Capsys) -> None:
+    monkeypatch.setattr(guided, "PARTS", 2)
+    monkeypatch.setattr(guided, "EPISODES", 2)
+    settings = dataclasses.replace(TINY, algo="guided", capacity=8, duration_s=3.0, steps=3_000, validate_every=3_000)
+    train.main(settings)
+    folder = Path("runs/tiny")
+    (_, first), *_ = columns(folder / "seed-0" / "validation.csv", "steps", "qoi")
+    judges = FixedEpisodes(settings, "validation")
+    assert first == np.mean([outcome.qoi for outcome in judges.run("gap-price")])
+    agent = policies.load(folder / "model.safetensors")
+    rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["scores"]
+    told = {row["policy"]: row["qoi"] for row in rows}
+    assert told["agent (seed 0)"] == np.mean([o.qoi for o in FixedEpisodes(settings, "test").run(agent)])
+    assert "the best rule, " in capsys.readouterr().out
 
 
 def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: Patch) -> None:
@@ -127,7 +146,7 @@ def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("algo", training.ALGORITHMS)
+@pytest.mark.parametrize("algo", [name for name in training.ALGORITHMS if name != "guided"])
 def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -> None:
     train.main(dataclasses.replace(SUITE, algo=algo))
     folder = Path("runs/tiny")

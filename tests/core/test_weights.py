@@ -90,7 +90,7 @@ def test_a_scheduler_is_no_policy_for_one_queue(path):
     weights.save(path, made(4, kind=TOPICS), ABOUT)
     policy = policies.load(path)
     assert policy.schedules and policy.for_topics and policy.ranked
-    with pytest.raises(BufgymError, match=r"small\.safetensors: a scheduler for several topics, not a policy for one"):
+    with pytest.raises(BufgymError, match=r"a scheduler for several topics, not a slot scorer for one"):
         weights.read(path)
     # Nor is it one without its third network.
     tensors, metadata = parts_of(path)

@@ -63,7 +63,7 @@ def test_actions_are_the_outputs_of_a_policy_over_their_scales(case: str) -> Non
     action = np.random.default_rng(1).integers(-2, 3, len(OUTPUTS)).astype(np.float32) / 4
     weights = np.zeros((len(OUTPUTS), len(INPUTS)))
     weights[:, list(INPUTS).index("one")] = action * SCALES
-    env, gone = played(case, lambda seen: action * (1 - seen["steady"]))
+    env, gone = played(case, lambda seen: action * (1 - seen["plain"]))
     assert np.array_equal(gone, rolled(env, case, linear("constant", weights)))
 
 
