@@ -110,7 +110,7 @@ def on_demand(package: str) -> Callable[[str], Any]:
 
     @functools.cache
     def places() -> dict[str, str]:
-        """The module of each public name; a name that is itself a module has that of its room."""
+        """The module of each public name; a module's own name maps to its room."""
         blocks = [node for node in ast.parse(inspect.getsource(sys.modules[package])).body if isinstance(node, ast.If)]
         lines = [line for block in blocks for line in block.body if isinstance(line, ast.ImportFrom)]
         return {name.name: str(line.module) for line in lines for name in line.names}

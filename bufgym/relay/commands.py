@@ -36,7 +36,7 @@ def say(text: str) -> None:
 
 
 async def serve(*, config: str, check: bool = False) -> None:
-    """Run the server, with what a configuration allows; Ctrl-C ends it.
+    """Run the server under a configuration; Ctrl-C ends it.
 
     Args:
         config: As examples/relay.toml.

@@ -69,7 +69,7 @@ class Message(NamedTuple):
 
 
 def encode(message: Message) -> bytes:
-    """The binary frame; the names are checked, as those of ``decode`` are."""
+    """The binary frame; names are checked, as in ``decode`` are."""
     _check(message)
     names = [name.encode() for name in (message.topic, message.type, message.encoding, message.sender)]
     return b"".join(

@@ -116,7 +116,7 @@ def _in_turn(log_size: Float64Array) -> str:
 
 
 def _parts(log_size: Float64Array, drawn_anew: float | None = None) -> str:
-    """`rho`, `cv` and `noise` of log sizes; the variance of what is drawn anew may be known."""
+    """`rho`, `cv` and `noise` of log sizes; the variance of the part drawn anew may be known."""
     about = log_size - log_size.mean()
     lags = np.arange(1, min(LAGS, len(about) // 3) + 1)
     covariance = np.array([about[h:] @ about[:-h] / (len(about) - h) for h in lags])

@@ -98,6 +98,20 @@ def test_of_equal_gaps_the_largest_goes():
 
 
 @kernels
+def test_under_a_byte_limit_the_newcomer_goes_unless_enough_of_no_larger_a_gap_make_room():
+    # B is 300 bytes, and 250 must go. Of 1, 2 and 3 each leaves a gap of 2, as does the newcomer at 4.
+    even, uneven = [(1.0, 100), (2.0, 100), (3.0, 100)], [(1.0, 100), (1.2, 100), (3.0, 100)]
+    room = {"max_bytes": 300, "now": 4.0, "now_bytes": 250}
+    assert decided("min-motion-gap", *even, **room) == 0
+    # Of 1, 1.2 and 3 two leave 1.2 and 2, but the last 2.8: 200 bytes are not enough, and none goes in vain.
+    assert decided("min-motion-gap", *uneven, **room) == REJECT
+    assert decided("min-motion-gap", *uneven, evictions=1, **room) == 0  # too late to turn back
+    large = room | {"now_bytes": 299}
+    assert decided("price-dp", *even, **large) == REJECT
+    assert decided("price-dp", *even, evictions=1, **large) == 0
+
+
+@kernels
 def test_an_idle_socket_or_an_empty_queue_takes_what_comes():
     assert decided("price-dp", (1.0, 100), busy=0) == ACCEPT
     assert decided("price-dp", now_bytes=10**6) == ACCEPT

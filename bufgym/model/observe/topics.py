@@ -27,7 +27,7 @@ _SECOND_US = 1_000_000
 
 
 class OfTopic(NamedTuple):
-    """A message among those of all topics."""
+    """One message among several topics."""
 
     k: int  # its slot
     topic: Any  # TOPIC: its topic's settings and past
