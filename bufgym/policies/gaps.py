@@ -44,8 +44,8 @@ def discounted(buffer: Buffer, arrival: Arrival, in_time: bool, k: int, discount
 def smallest_gap(buffer: Buffer, arrival: Arrival, in_time: bool, slots: int, discount: float) -> int:
     """What leaves the smallest ``discounted`` gap, of the first ``slots`` and the oldest if several do.
 
-    The newcomer, slot s, is REJECT. Under B it may take the place of several messages. Then it goes itself, unless messages
-    with no larger a gap make room for it. Once one of them has gone, the newcomer stays.
+    The newcomer, slot s, is REJECT. Under B it may take the place of several messages. Then it goes itself, unless
+    messages with no larger a gap make room for it. Once one of them has gone, the newcomer stays.
     """
     s, victim, smallest = len(buffer.slots), REJECT, np.inf
     asked = s if buffer.evictions > 0 else slots
