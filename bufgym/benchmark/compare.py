@@ -177,7 +177,7 @@ def compare(
 
 
 def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
-    """The policies, then those that the comparison with ``rival`` needs."""
+    """The policies, then the ones that a comparison with ``rival`` needs."""
     more = [] if rival is None else [rival, make_policy(task.reference)]
     known = {policy.name for policy in chosen}
     return [*chosen, *({policy.name: policy for policy in more if policy.name not in known}.values())]

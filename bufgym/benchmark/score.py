@@ -93,7 +93,7 @@ class Scores:
     * ``improvement``: paired probability of improvement over ``REFERENCE``, mean over the discriminative cells: the
       share of episodes with H above the reference's, plus half the share with the same H.
     * ``share``: share of ``REFERENCE``'s regret, a ratio of sums; NaN where the reference loses nothing.
-    * ``against``: ``share`` minus that of the policy ``against``, paired; only where one is named.
+    * ``against``: ``share`` minus the share of the policy ``against``, paired; only where one is named.
     """
 
     standings: list[Standing]  # ranked policies first, best score first

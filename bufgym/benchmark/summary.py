@@ -62,7 +62,7 @@ class Summary:
 
 
 def difference(title: str, against: str) -> Quantity:
-    """Make the quantity of the paired difference of another, ``title``, to that of the policy ``against``."""
+    """Make the quantity of the paired difference of another, ``title``, to the policy ``against``."""
     about = f"paired difference of {title}: both met the same episodes, and a draw of links serves both"
     return Quantity("against", f"{title}, minus {against}'s", signed, about, versus=against)
 

@@ -106,7 +106,7 @@ def needs(function: Any) -> int:
 
 
 def on_demand(package: str) -> Callable[[str], Any]:
-    """Make a room's ``__getattr__``: what it imports ``if TYPE_CHECKING`` is imported when it is first asked for."""
+    """Make a room's ``__getattr__``: names imported ``if TYPE_CHECKING`` are imported when first asked for."""
 
     @functools.cache
     def places() -> dict[str, str]:

@@ -147,5 +147,5 @@ class Reproduction(ClientFigure):
 
 
 def least_share(sent: Sent, received: NDArray[np.bool_]) -> float:
-    """Smallest share of a consumer's messages that reached it; ``received``, bool[messages], marks those that count."""
+    """Smallest share of a consumer's messages that reached it; ``received``, bool[messages], marks the counted ones."""
     return float((np.bincount(sent.consumer, received) / np.bincount(sent.consumer)).min())

@@ -153,7 +153,7 @@ def inputs(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, o
 
 @kernel
 def set_numbers(outputs: NDArray[Any], base: Numbers, numbers: NDArray[np.float64]) -> bool:
-    """Write into ``numbers`` those of ``base``, changed by ``outputs``; return whether any output is not zero."""
+    """Copy ``base`` into ``numbers``, changed by ``outputs``; return whether any output is not zero."""
     changed = False
     for k in range(NUMBERS):
         numbers[k] = base[k]

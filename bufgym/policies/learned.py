@@ -4,7 +4,7 @@ One small network scores every candidate, a queued message or the newcomer. Its 
 and of the context (``model.observe``), so one set of weights serves every L; ``scoring`` has the formula. The *drop*
 network scores dropping the candidate. The *accept* network scores accepting the newcomer, where there is room. The
 policy takes the decision that scores highest; ties go to the oldest message. Under a byte limit a newcomer that would
-take the place of several messages is dropped, unless those that score no less make room for it.
+take the place of several messages is dropped, unless messages with no lower a score make room.
 
 The context c may also change the weights of the candidate's own features s, by the matrix ``mix`` M: the score of
 dropping it grows by c M s. So one agent can weigh a rank or a gap differently where V is straight and where it is flat.

@@ -24,10 +24,10 @@ follows the spread of sizes, which is 0 for equal ones:
     a  <- 1 / (1 + exp(share_low - share_steep sd)), but 0 below ``LEAST_SHARE``
 
 Each candidate is then worth (1 - a) (threshold g - its discounted gap) / g, as target-gap has it, plus a (its advantage
-in units - price_threshold); what is worth most goes. The head is asked likewise, with target-gap's wish for it. A share
+in units - price_threshold); the best candidate goes. The head is asked likewise, with target-gap's wish for it. A share
 that also follows the load was better on random links, and worse in outages and on light links.
 
-Under B a newcomer that takes the place of several messages goes itself, unless those that are worth more to drop make
+Under B a newcomer that takes the place of several messages goes itself, unless better candidates make
 room for it.
 """
 

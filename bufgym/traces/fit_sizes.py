@@ -1,7 +1,7 @@
 """Fit the laws of `generate.sizes` to recorded sizes: `bufgym trace fit --sizes FILE`.
 
 The slow part and the part drawn anew come from the covariances of log sizes at lags 1 to `LAGS`, cv^2 of the slow part
-times rho^lag, by least squares; what is left of the variance is drawn anew. Long trends of a short recording count as
+times rho^lag, by least squares; the rest of the variance is drawn anew. Long trends of a short recording count as
 memory, so rho is known to no more than a few per cent.
 """
 
