@@ -1,0 +1,105 @@
+"""One agent for all links: outputs that guide ``gap-price``, evolved on twelve families at once.
+
+``python -m agents.joint train --seed 0`` writes runs/joint/seed-0.safetensors; ``python -m agents.joint show FILE ...``
+compares agents with the rules on the validation links, or with ``--split test`` on links that chose nothing.
+
+The fitness of a candidate on a part of the training runs is the mean of its shares of AFR's regret over the families,
+plus ``WORSE`` times the mean by which it is worse than the plain rule, plus a pull to zero. The agent is the mean of
+the last ``MEMORY`` means of CMA-ES, in which the noise of single parts cancels.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cma
+import numpy as np
+from cyclopts import App
+
+from agents.families import Family, families
+from bufgym import policies
+from bufgym.policies import Policy, guided, weights
+from bufgym.policies.guided import N_INPUTS, N_OUTPUTS, GuidedWeights
+
+FOLDER = Path("runs/joint")
+SIGMA, POPULATION, MEMORY = 0.02, 16, 20
+"""First step size (0.1 diverges), candidates a generation, and means in the average."""
+PARTS, WORSE, PULL = 5, 0.4, 1e-5
+RUNS = {
+    **{"task": 16, "default-frames": 18, "lte": 16, "generated": 24, "outage": 10, "sustained": 10},
+    **{"interruption": 24, "random": 20, "unequal-heavy": 14, "unequal-light": 14, "equal-heavy": 8, "equal-light": 8},
+}
+"""Runs of each family in a part."""
+RULE = "gap-price"
+
+app = App("agents.joint", help_format="plaintext")
+
+
+def agent(vector: np.ndarray) -> Policy:
+    """The agent of these numbers."""
+    return guided.linear("joint", vector.reshape(N_OUTPUTS, N_INPUTS))
+
+
+@app.command
+def train(*, seed: int = 0, cpu_s: float = 220.0, out: Path | None = None) -> None:
+    """Evolve one seed.
+
+    Args:
+        seed: of the search, and of the choice of runs.
+        cpu_s: processor time for the search.
+        out: the agent's file; by default runs/joint/seed-SEED.safetensors.
+    """
+    rng, rule = np.random.default_rng(seed), policies.get(RULE)
+    parts: list[list[Family]] = [[] for _ in range(PARTS)]
+    for name, runs in families("train", FOLDER).items():
+        order, n = rng.permutation(len(runs)), RUNS[name]
+        for p, part in enumerate(parts):
+            part.append(Family(name, [runs[order[(p * n + j) % len(runs)]] for j in range(n)]))
+    plain = [np.array([family.share(rule) for family in part]) for part in parts]
+    decisions = sum(family.decisions for family in parts[0])
+
+    def fitness(vector: np.ndarray, p: int) -> float:
+        shares = np.array([family.share(agent(vector)) for family in parts[p]])
+        return float(shares.mean() + WORSE * np.maximum(shares - plain[p], 0).mean() + PULL * np.square(vector).sum())
+
+    options = {"popsize": POPULATION, "seed": seed + 1, "verbose": -9}
+    search = cma.CMAEvolutionStrategy(np.zeros(N_OUTPUTS * N_INPUTS), SIGMA, options)
+    means, began, generation = [search.mean], time.process_time(), 0
+    while time.process_time() - began < cpu_s:
+        vectors = search.ask()
+        search.tell(vectors, [fitness(vector, generation % PARTS) for vector in vectors])
+        means.append(search.mean.copy())
+        generation += 1
+        if generation % 10 == 0:
+            spent = time.process_time() - began
+            print(
+                f"seed {seed}: {generation} generations of {POPULATION} x {decisions:,} decisions, {spent:.0f} s",
+                flush=True,
+            )
+    found = np.mean(means[-MEMORY:], axis=0).reshape(N_OUTPUTS, N_INPUTS).astype(np.float32)
+    notes = {"name": "learned", "training": f"python -m agents.joint train --seed {seed} --cpu-s {cpu_s:g}"}
+    file = weights.save(out or FOLDER / f"seed-{seed}.safetensors", GuidedWeights(found), {**notes, "seeds": [seed]})
+    print(f"wrote {file}")
+
+
+@app.command
+def show(*files: Path, split: str = "validation") -> None:
+    """Compare agents with the rules, family by family.
+
+    Args:
+        files: agents.
+        split: validation or test.
+    """
+    rule, agents = policies.get(RULE), [policies.load(file) for file in files]
+    print("shares of AFR's regret; in brackets the 95 % interval of the difference to gap-price, over links")
+    for name, runs in families(split, FOLDER).items():
+        family = Family(name, runs)
+        rules = ", ".join(f"{n} {family.share(policies.get(n)):.3f}" for n in ("target-gap", "price-dp", RULE))
+        told = [family.against(each, rule) for each in agents]
+        own = "; ".join(f"{value:.3f} [{less.low:+.3f}, {less.high:+.3f}]" for value, less in told)
+        print(f"{name}: {rules}; agents {own}", flush=True)
+
+
+if __name__ == "__main__":
+    app()

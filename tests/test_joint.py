@@ -1,0 +1,72 @@
+"""One agent for all links: its families, the fitness of a candidate, and the search from end to end, tiny."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_cases import Capsys, Patch
+from train_cases import in_a_folder_of_its_own  # noqa: F401
+
+from agents import families, joint
+from agents.families import Family, run_of
+from bufgym import policies
+from bufgym.policies import guided, weights
+from bufgym.scenario import Uplink
+from bufgym.traces import Trace
+
+
+def runs() -> list[families.Run]:
+    """Two links that carry a third of 30 messages a second."""
+    links = (Trace.steps([(1.0, 4e6), (1.0, 5e5)], name="a"), Trace.steps([(2.0, 3e6), (1.0, 1e6)], name="b"))
+    return [
+        run_of(link.name, Uplink(traces=(link,), duration_s=6.0), seed, L, max_bytes)
+        for link in links
+        for seed in range(2)
+        for L, max_bytes in ((4, None), (8, 8 * 230_000))
+    ]
+
+
+def test_shares_are_sums_over_the_links_drawn() -> None:
+    family, rule = Family("small", runs()), policies.get("gap-price")
+    afr, h = policies.get("afr"), family.play(rule)
+    assert family.share(afr) == 1 and family.decisions == 8 * 180
+    assert family.share(rule) == pytest.approx((family.best - h).sum() / (family.best - family.afr).sum())
+    only_b = family.shares(h, np.array([[0.0, 1.0]]))  # the last four runs
+    assert only_b == pytest.approx((family.best - h)[4:].sum() / (family.best - family.afr)[4:].sum())
+    assert family.against(rule, rule)[1] == (0, 0, 0)
+    ratios = (1 - h / family.best + 0.01) / (1 - family.afr / family.best + 0.01)
+    assert Family("random", runs()).share(rule) == pytest.approx(ratios.mean())
+
+
+def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
+    few = runs()
+    monkeypatch.setattr(joint, "families", lambda split, folder: {"task": few, "random": few})
+    monkeypatch.setattr(joint, "RUNS", {"task": 4, "random": 4})
+    monkeypatch.setattr(joint, "POPULATION", 4)
+    family = Family("task", few)
+    assert family.share(joint.agent(np.zeros(160))) == family.share(policies.get("gap-price"))
+    file = tmp_path / "agent.safetensors"
+    joint.train(seed=3, cpu_s=0.3, out=file)
+    found, notes = weights.read_any(file)
+    assert isinstance(found, guided.GuidedWeights) and 0 < np.abs(found.weight).max() < 1
+    assert notes["training"] == "python -m agents.joint train --seed 3 --cpu-s 0.3"
+    joint.show(file)
+    lines = capsys.readouterr().out.splitlines()
+    assert f"agents {family.share(policies.load(file)):.3f} [" in next(
+        line for line in lines if line.startswith("task: ")
+    )
+
+
+def test_every_family_is_drawn_anew_for_each_split(tmp_path: Path, monkeypatch: Patch) -> None:
+    names = ("of_suite", "task", "default_frames", "random_streams")
+    monkeypatch.setattr(families, "merged", lambda found, chosen=bool: [found])
+    for name in names:
+        monkeypatch.setattr(families, name, lambda split="", *rest, **options: {"split": split})
+    assert list(families.families("train", tmp_path)) == list(joint.RUNS)
+    assert len(list(tmp_path.glob("train-*.pkl"))) == len(joint.RUNS)
+
+
+def test_random_streams_are_the_same_for_a_seed() -> None:
+    one, again = (families.random_streams("validation", 3) for _ in range(2))
+    assert [run["best"] for run in one] == [run["best"] for run in again]
+    assert len({run["capacity"] for run in families.random_streams("train", 6)}) > 1
