@@ -1,7 +1,7 @@
 """One agent for all links: outputs that guide ``gap-price``, evolved on twelve families at once.
 
-``python -m agents.joint train --seed 0`` writes runs/joint/seed-0.safetensors; ``python -m agents.joint show FILE ...``
-compares agents with the rules on the validation links, or with ``--split test`` on links that chose nothing.
+``python -m agents.joint --seed 0`` writes runs/joint/seed-0.safetensors. ``python -m agents.joint FILE ...`` compares
+agents with the rules on the validation links, or with ``--split test`` on links that chose nothing.
 
 The fitness of a candidate on a part of the training runs is the mean of its shares of AFR's regret over the families,
 plus ``WORSE`` times the mean by which it is worse than the plain rule, plus a pull to zero. The agent is the mean of
@@ -11,13 +11,14 @@ the last ``MEMORY`` means of CMA-ES, in which the noise of single parts cancels.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import cma
 import numpy as np
-from cyclopts import App
 
 from agents.families import Family, families
+from agents.page import command
 from bufgym import policies
 from bufgym.policies import Policy, guided, weights
 from bufgym.policies.guided import N_INPUTS, N_OUTPUTS, GuidedWeights
@@ -33,23 +34,14 @@ RUNS = {
 """Runs of each family in a part."""
 RULE = "gap-price"
 
-app = App("agents.joint", help_format="plaintext")
-
 
 def agent(vector: np.ndarray) -> Policy:
     """The agent of these numbers."""
     return guided.linear("joint", vector.reshape(N_OUTPUTS, N_INPUTS))
 
 
-@app.command
-def train(*, seed: int = 0, cpu_s: float = 220.0, out: Path | None = None) -> None:
-    """Evolve one seed.
-
-    Args:
-        seed: of the search, and of the choice of runs.
-        cpu_s: processor time for the search.
-        out: the agent's file; by default runs/joint/seed-SEED.safetensors.
-    """
+def train(seed: int, cpu_s: float, out: Path) -> None:
+    """Evolve one seed for so much processor time, and write its agent."""
     rng, rule = np.random.default_rng(seed), policies.get(RULE)
     parts: list[list[Family]] = [[] for _ in range(PARTS)]
     for name, runs in families("train", FOLDER).items():
@@ -78,19 +70,13 @@ def train(*, seed: int = 0, cpu_s: float = 220.0, out: Path | None = None) -> No
                 flush=True,
             )
     found = np.mean(means[-MEMORY:], axis=0).reshape(N_OUTPUTS, N_INPUTS).astype(np.float32)
-    notes = {"name": "learned", "training": f"python -m agents.joint train --seed {seed} --cpu-s {cpu_s:g}"}
-    file = weights.save(out or FOLDER / f"seed-{seed}.safetensors", GuidedWeights(found), {**notes, "seeds": [seed]})
+    notes = {"name": "learned", "training": f"python -m agents.joint --seed {seed} --cpu-s {cpu_s:g}"}
+    file = weights.save(out, GuidedWeights(found), {**notes, "seeds": [seed]})
     print(f"wrote {file}")
 
 
-@app.command
-def show(*files: Path, split: str = "validation") -> None:
-    """Compare agents with the rules, family by family.
-
-    Args:
-        files: agents.
-        split: validation or test.
-    """
+def show(files: Sequence[Path], split: str) -> None:
+    """Compare agents with the rules on a split, family by family."""
     rule, agents = policies.get(RULE), [policies.load(file) for file in files]
     print("shares of AFR's regret; in brackets the 95 % interval of the difference to gap-price, over links")
     for name, runs in families(split, FOLDER).items():
@@ -101,5 +87,21 @@ def show(*files: Path, split: str = "validation") -> None:
         print(f"{name}: {rules}; agents {own}", flush=True)
 
 
+def main(*files: Path, seed: int = 0, cpu_s: float = 220.0, out: Path | None = None, split: str = "validation") -> None:
+    """Evolve one agent for all links; or, given files, compare agents with the rules.
+
+    Args:
+        files: agents to compare.
+        seed: of the search, and of the choice of training runs.
+        cpu_s: processor time for the search.
+        out: the agent's file; by default runs/joint/seed-SEED.safetensors.
+        split: validation or test, of the links to compare on.
+    """
+    if files:
+        show(files, split)
+    else:
+        train(seed, cpu_s, out or FOLDER / f"seed-{seed}.safetensors")
+
+
 if __name__ == "__main__":
-    app()
+    command(main)

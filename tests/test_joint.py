@@ -46,11 +46,11 @@ def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeyp
     family = Family("task", few)
     assert family.share(joint.agent(np.zeros(160))) == family.share(policies.get("gap-price"))
     file = tmp_path / "agent.safetensors"
-    joint.train(seed=3, cpu_s=0.3, out=file)
+    joint.main(seed=3, cpu_s=0.3, out=file)
     found, notes = weights.read_any(file)
     assert isinstance(found, guided.GuidedWeights) and 0 < np.abs(found.weight).max() < 1
-    assert notes["training"] == "python -m agents.joint train --seed 3 --cpu-s 0.3"
-    joint.show(file)
+    assert notes["training"] == "python -m agents.joint --seed 3 --cpu-s 0.3"
+    joint.main(file)
     lines = capsys.readouterr().out.splitlines()
     assert f"agents {family.share(policies.load(file)):.3f} [" in next(
         line for line in lines if line.startswith("task: ")
