@@ -28,10 +28,18 @@ from bufgym.oracle import BASELINE, measure, normalised_score
 from bufgym.policies import Policy
 from bufgym.sb3 import takes_masks
 from bufgym.scenario import Episode
-from bufgym.sim import run
+from bufgym.sim import Senders, run
 from bufgym.sim.metrics import Outcome, outcome
 
 Numbers = NDArray[np.float64]
+
+
+def qoi_of(policy: Policy, senders: Senders, episodes: Sequence[Episode]) -> Numbers:
+    """H of each episode under a policy; ``senders`` has a row for each, and is loaded anew."""
+    senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
+    senders.run(policy)
+    sender = senders.batch.senders
+    return np.asarray(sender["delivered_gain"] + (sender["transmitted"] > 0), np.float64)
 
 
 def play(agent: Any, env: MixedEnv, episodes: Sequence[Episode]) -> list[Outcome]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation import Numbers
+from agents.evaluation import Numbers, qoi_of
 from bufgym import policies
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, times_drawn
 from bufgym.benchmark.run import by_trace, draw
@@ -186,10 +186,7 @@ class Family:
         """H of each run, float64[runs]."""
         h = np.empty(len(self.best))
         for own, episodes, senders in self._groups:
-            senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
-            senders.run(policy)
-            sender = senders.batch.senders
-            h[own] = sender["delivered_gain"] + (sender["transmitted"] > 0)
+            h[own] = qoi_of(policy, senders, episodes)
         return h
 
     def shares(self, h: Numbers, weights: NDArray[np.float64] | None = None) -> Numbers:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from agents.evaluation import qoi_of
 from agents.held_out import FixedEpisodes, split_scenario
 from agents.objectives.objective import Objective
 from bufgym.benchmark.run import draw
@@ -34,10 +35,7 @@ class Played:
 
     def qoi(self, policy: Policy) -> float:
         """Mean H."""
-        self._senders.load_all([(i, episode, None) for i, episode in enumerate(self.episodes)])
-        self._senders.run(policy)
-        sender = self._senders.batch.senders
-        return float((sender["delivered_gain"] + (sender["transmitted"] > 0)).mean())
+        return float(qoi_of(policy, self._senders, self.episodes).mean())
 
 
 class GuidedObjective(Objective):

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation import ValidationSets, Verdict
+from agents.evaluation import ValidationSets, Verdict, qoi_of
 from agents.mixed_env import Cell, cells
 from agents.objectives.objective import Objective
 from agents.settings import Settings
@@ -125,11 +125,7 @@ class SampledRegrets:
         """Regret of each cell."""
         by_cell = []
         for episodes, senders, most in zip(self.episodes, self._senders, self._best, strict=True):
-            for i, episode in enumerate(episodes):
-                senders.load(i, episode)
-            senders.run(policy)
-            sender = senders.batch.senders
-            by_cell.append(regret(float((sender["delivered_gain"] + (sender["transmitted"] > 0)).sum()), most))
+            by_cell.append(regret(float(qoi_of(policy, senders, episodes).sum()), most))
         return np.array(by_cell)
 
 

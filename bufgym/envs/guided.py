@@ -73,19 +73,18 @@ def step_guided(
                 decide(batch, i, decision_of(actions[i], sender.capacity))
         if begins or asks != NOTHING_WAITS:
             advance(batch, i)
-        if begins:
-            rewarded[i, :] = 0.0
-            output.reward_terms[i, :] = 0.0
-        else:
-            write_rewards(batch, i, rewarded, output)
+        write_rewards(batch, i, begins, rewarded, output)
         waits = sender.waiting == ARRIVAL_WAITS
-        if waits:
-            recall(local(view(batch, i)), arrival_of(batch, i), guide.memory[i], guide.base)
         if guide.sees == 0:
             write_observation(batch, i, not waits, output)
-        elif write_state(batch, i, not waits, output):
-            row = stretch(output.flat, i, 0, N_INPUTS)
-            inputs(local(view(batch, i)), arrival_of(batch, i), guide.memory[i], guide.base, row)
+        else:
+            write_state(batch, i, not waits, output)
+        if waits:
+            buffer, arrival = local(view(batch, i)), arrival_of(batch, i)
+            recall(buffer, arrival, guide.memory[i], guide.base)
+            if guide.sees == 1:
+                row = stretch(output.flat, i, 0, N_INPUTS)
+                inputs(buffer, arrival, guide.memory[i], guide.base, row)
 
 
 def is_guided(actions: str, fields: Any, why_not: str = "") -> bool:

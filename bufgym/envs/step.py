@@ -95,9 +95,16 @@ def settle_gains(batch: Batch, i: int, ended: bool) -> None:
 
 
 @kernel
-def write_rewards(batch: Batch, i: int, rewarded: NDArray[np.float64], output: StepOutput) -> None:
-    """Write the gain of each reward term of row ``i`` since the step before; ``rewarded`` keeps the totals."""
+def write_rewards(batch: Batch, i: int, begins: bool, rewarded: NDArray[np.float64], output: StepOutput) -> None:
+    """Write the gain of each reward term of row ``i`` since the step before; ``rewarded`` keeps the totals.
+
+    An episode that ``begins`` has gained nothing.
+    """
     sender, terms = batch.senders[i], output.reward_terms
+    if begins:
+        rewarded[i, :] = 0.0
+        terms[i, :] = 0.0
+        return
     terms[i, DELIVERED] = sender.delivered_gain - rewarded[i, DELIVERED]
     terms[i, RETAINED] = sender.retained_gain - rewarded[i, RETAINED]
     rewarded[i, DELIVERED] = sender.delivered_gain
@@ -229,11 +236,7 @@ def step_rows(
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
         if begins or asks != NOTHING_WAITS:
             advance(batch, i)
-        if begins:
-            rewarded[i, :] = 0.0
-            output.reward_terms[i, :] = 0.0
-        else:
-            write_rewards(batch, i, rewarded, output)
+        write_rewards(batch, i, begins, rewarded, output)
         write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
 
 
@@ -295,9 +298,5 @@ def step_cells(
             advance_cell(batch, shares, c)
         ended = not decisions_due(batch, shares, c)
         for i in range(first, first + robots):
-            if begins:
-                rewarded[i, :] = 0.0
-                output.reward_terms[i, :] = 0.0
-            else:
-                write_rewards(batch, i, rewarded, output)
+            write_rewards(batch, i, begins, rewarded, output)
             write_observation(batch, i, ended, output)

@@ -209,6 +209,15 @@ def suffices(buffer: Buffer, arrival: Any, freed_bytes: int) -> bool:
 
 
 @kernel
+def stays(buffer: Buffer, arrival: Any, ahead: bool, freed_bytes: int) -> bool:
+    """Whether the newcomer stays where there is no room: it is ``ahead``, and the bytes behind it make room.
+
+    Once a message has gone for it, it stays in any case.
+    """
+    return bool(buffer.evictions > 0 or (ahead and suffices(buffer, arrival, freed_bytes)))
+
+
+@kernel
 def fill(buffer: Buffer) -> float:
     """Fill level of the queue by messages or by bytes, whichever is higher; 1 when full."""
     return max(len(buffer.slots) / buffer.capacity, buffer.backlog_bytes / buffer.max_bytes)

@@ -227,6 +227,7 @@ class GuidedWeights:
     SLOT_NAMES: ClassVar[tuple[str, ...]] = ()
     CONTEXT_NAMES: ClassVar[tuple[str, ...]] = tuple(INPUTS)
     NETWORKS: ClassVar[tuple[str, ...]] = ("guided",)
+    LAYERS: ClassVar[int] = 0
     TABLE: ClassVar[list[Any]] = [list(INPUTS.items()), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
     """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
 

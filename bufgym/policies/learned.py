@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, suffices
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, stays
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
     ON_BOARD_FIELDS,
@@ -72,8 +72,7 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
             freed_bytes += buffer.slots[k].size_bytes
         if dropped > best:
             best, decision = dropped, k
-    # Once a message has gone for the newcomer, that stays.
-    if buffer.evictions == 0 and (own > best or not suffices(buffer, arrival, freed_bytes)):
+    if not stays(buffer, arrival, own <= best, freed_bytes):
         best, decision = own, REJECT
     if has_space(buffer, arrival):
         common = begin(scorer, KEEP, scratch)

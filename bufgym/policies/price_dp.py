@@ -38,7 +38,7 @@ import math
 import numpy as np
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, suffices
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, stays
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import merging_loss, value
 from bufgym.policies import chains, target_gap
@@ -150,12 +150,10 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
     if room:
         if a == 0 and gap_left(buffer, arrival, victim if best >= own else REJECT) > longest:  # not discounted
             return ACCEPT
-        return ACCEPT if max(own, best) < a * numbers[PRICE_THRESHOLD] else victim if best >= own else REJECT
-    if buffer.evictions > 0:  # the newcomer stays, now that a message has gone for it
-        return victim
-    if best < own or (not suffices(buffer, arrival, freed_bytes)):
-        return REJECT
-    return victim
+        if max(own, best) < a * numbers[PRICE_THRESHOLD]:
+            return ACCEPT
+        return victim if best >= own else REJECT
+    return victim if stays(buffer, arrival, best >= own, freed_bytes) else REJECT
 
 
 @built_in(

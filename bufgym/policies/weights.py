@@ -280,8 +280,7 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
         _refuse(path, name, rule, what="shape of ", value=list(shapes[name]))
 
     widths: list[int] = []
-    layers = 0 if kind is GuidedWeights else cast(Any, kind).LAYERS
-    for k in range(layers):
+    for k in range(kind.LAYERS):
         name = f"drop.{k}.bias"
         if name not in shapes:
             if f"drop.{k}.weight" in shapes:
@@ -304,7 +303,7 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
         if name not in shapes:
             _refuse(path, name, "is missing")
         if name not in required:
-            _refuse(path, name, f"has no place in networks of {len(widths)} hidden layers ({layers} at most)")
+            _refuse(path, name, f"has no place in networks of {len(widths)} hidden layers ({kind.LAYERS} at most)")
     for name, shape in required.items():
         if shapes[name] != shape:
             refuse_shape(name, f"must be {list(shape)} for {len(fields)} fields and hidden layers of {widths}")
