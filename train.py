@@ -26,13 +26,16 @@ def _typed(*, settings: Annotated[Settings, Parameter(name="*")] = Settings()) -
 
 def main(settings: Settings) -> None:
     """Train, evaluate, report."""
+    settings = settings.resolved()
     try:
         folder = prepare(settings)
         # Only once the settings are known to be good: torch takes seconds to load.
         from agents import report, training
 
         with locked(folder):
-            report.report(settings, folder, training.train_all(settings, folder))
+            lines = report.lines_to_beat(settings)
+            runs = training.train_all(settings, folder)
+            report.report(settings, folder, runs, training.train_beside(settings, folder, runs), lines)
     except BufgymError as error:
         raise SystemExit(f"error: {error}") from None
     except OSError as error:

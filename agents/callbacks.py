@@ -117,9 +117,10 @@ class Validation(BetweenUpdates):
     def _on_rollout_start(self) -> None:
         self.validate(self.model)
 
-    def validate(self, model: Any) -> None:
-        """Validate if it is due."""
-        if not self.validations.due(model.num_timesteps):
+    def validate(self, model: Any, last: bool = False) -> None:
+        """Validate if it is due, or the last time."""
+        done = bool(self.validations.rows) and self.validations.rows[-1][0] == model.num_timesteps
+        if done or not (last or self.validations.due(model.num_timesteps)):
             return
         save(model, self.home)
         measures = self.measure(model)

@@ -87,7 +87,7 @@ def evaluated_on_a_worker(
 
 @functools.lru_cache(maxsize=32)  # several seeds, and runs one after the other, meet on one worker
 def _objective(settings: Settings, folder: Path, seed: int) -> Objective:
-    return OBJECTIVES[settings.objective](settings, folder, seed)
+    return OBJECTIVES[settings.kind](settings, folder, seed)
 
 
 def _evaluated(objective: Objective, candidate: AnyWeights, part: int) -> tuple[float, int]:
@@ -152,7 +152,7 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
     """
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
-    objective = OBJECTIVES[settings.objective](settings, folder, seed)
+    objective = OBJECTIVES[settings.kind](settings, folder, seed)
     checkpoint = home / "evolution.pkl"  # only from your own run: pickles run code when they are read
     if checkpoint.exists():
         state: Evolution = pickle.loads(checkpoint.read_bytes())

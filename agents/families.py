@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from agents.evaluation import Numbers, qoi_of
 from bufgym import policies
-from bufgym.benchmark.bootstrap import Interval, percentile_interval, times_drawn
+from bufgym.benchmark.bootstrap import RESAMPLES, Interval, percentile_interval, times_drawn
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.tasks.queue import best
 from bufgym.ground.files import replaced
@@ -30,6 +30,8 @@ from bufgym.sim import Senders
 from bufgym.traces import Trace, drive_motion, markov_link, synthetic_lte
 
 MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
+UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
+"""Suites over recorded uplinks."""
 FIRST_SEED = {"train": 20_000, "validation": 21_000, "test": 22_000}
 """Seeds of links made here count up from these."""
 LEAST, MOST = 0.01, 4.0
@@ -47,11 +49,11 @@ def run_of(link: str, scenario: Any, seed: int, capacity: int, max_bytes: int | 
 
 
 def of_suite(
-    name: str, split: str, capacities: Sequence[int] = (), seeds: int = 1, every: int = 1
+    name: str, split: str, capacities: Sequence[int] = (), seeds: int = 1, every: int = 1, data: str | None = None
 ) -> dict[str, list[Run]]:
-    """The runs of a suite's scenarios by label, on every so many of its links."""
+    """The runs of a suite's scenarios by label, on every so many of its links; ``data``: folder of recordings."""
     suite, found = suites.get(name), {}
-    for label, setting in suite.settings(split).items():
+    for label, setting in suite.settings(split, data).items():
         found[label] = [
             run_of(trace, scenario, seed, L, setting.max_bytes)
             for trace, scenario in by_trace(setting.scenario)[::every]
@@ -128,8 +130,11 @@ def random_streams(split: str, count: int = 120) -> list[Run]:
     return runs
 
 
-def families(split: str, folder: Path) -> dict[str, list[Run]]:
-    """All families by name; the bounds take minutes and are kept in ``folder``."""
+def families(split: str, folder: Path, data: str | None = None) -> dict[str, list[Run]]:
+    """All families by name; the bounds take minutes and are kept in ``folder``.
+
+    With ``data``, a folder of recordings, there is one more that no agent learns from: recorded uplinks.
+    """
     cameras: dict[str, list[Run]] = {}
 
     def camera(load: str, equal: bool) -> list[Run]:
@@ -151,6 +156,10 @@ def families(split: str, folder: Path) -> dict[str, list[Run]]:
         "equal-heavy": lambda: camera("heavy", True),
         "equal-light": lambda: camera("light", True),
     }
+    if data:
+        makers["uplinks"] = lambda: [
+            run for name in UPLINKS for run in merged(of_suite(name, split, (5, 15), data=data))
+        ]
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for name, make in makers.items():
@@ -201,8 +210,8 @@ class Family:
         """The share of AFR's regret."""
         return float(self.shares(self.play(policy))[0])
 
-    def against(self, policy: Policy, rival: Policy) -> tuple[float, Interval]:
-        """The policy's share, and how far it lies above the rival's, with an interval over links."""
-        weights = times_drawn(int(self._link.max()) + 1, 1000, np.random.default_rng(0))
-        own, other = (self.shares(self.play(each), weights) for each in (policy, rival))
-        return float(own[0]), percentile_interval(own - other)
+    def against(self, policies: Sequence[Policy]) -> list[tuple[float, list[Interval]]]:
+        """Each policy's share, and how far it lies above each other's, with an interval over links."""
+        weights = times_drawn(int(self._link.max()) + 1, RESAMPLES, np.random.default_rng(0))
+        shares = [self.shares(self.play(policy), weights) for policy in policies]
+        return [(float(own[0]), [percentile_interval(own - other) for other in shares]) for own in shares]

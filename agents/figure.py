@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.runs import Run
 from bufgym.benchmark.bootstrap import Interval
 
 _LINES = ("tab:gray", "tab:green", "tab:blue")
@@ -19,9 +18,8 @@ _LINES = ("tab:gray", "tab:green", "tab:blue")
 
 def draw(
     path: Path,
-    runs: Sequence[Run],
-    curves: Sequence[NDArray[Any]],
-    measure: str,
+    curves: Mapping[str, NDArray[Any]],
+    labels: tuple[str, str],
     bars: Mapping[str, Interval],
     title: str,
     *,
@@ -32,9 +30,8 @@ def draw(
 
     Args:
         path: the picture.
-        runs: one a curve.
-        curves: (steps, measure) of each run, float[rows, 2].
-        measure: the curves' measure.
+        curves: (seconds, measure) of each agent by its name, float[rows, 2].
+        labels: of the curves' axes.
         bars: policy -> score, best first.
         title: the episodes of the scores.
         lines: values of fixed policies in the curves' measure.
@@ -49,12 +46,12 @@ def draw(
     figure = Figure(figsize=(12, 4.4 + 0.16 * max(0, len(bars) - 14)), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
-    for run, curve in zip(runs, curves, strict=True):
-        left.plot(curve[:, 0] / 1e6, curve[:, 1], "o-", markersize=3, color=None if len(runs) > 1 else "tab:orange")
-        left.lines[-1].set_label(f"agent (seed {run.seed})")
+    for name, curve in curves.items():
+        style = "x:" if "PPO" in name else "o-"
+        left.plot(*curve.T, style, markersize=3, color=None if len(curves) > 2 else "tab:orange", label=name)
     for (name, level), colour in zip((lines or {}).items(), _LINES, strict=False):
         left.axhline(level, color=colour, linestyle="--", linewidth=1, label=f"{name} {level:.3f}")
-    left.set(xlabel="decisions, millions", ylabel=measure, title="Training")
+    left.set(xlabel=labels[0], ylabel=labels[1], title="Training")
     left.set_xlim(left=0)
     left.grid(alpha=0.3)
     left.legend(frameon=False)

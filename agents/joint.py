@@ -1,7 +1,8 @@
 """One agent for all links: outputs that guide ``gap-price``, evolved on twelve families at once.
 
 ``python -m agents.joint --seed 0`` writes runs/joint/seed-0.safetensors. ``python -m agents.joint FILE ...`` compares
-agents with the rules on the validation links, or with ``--split test`` on links that chose nothing.
+agents with the rules on the validation links, or with ``--split test`` on links that chose nothing. ``--data DIR`` adds
+recorded uplinks.
 
 The fitness of a candidate on a part of the training runs is the mean of its shares of AFR's regret over the families,
 plus ``WORSE`` times the mean by which it is worse than the plain rule, plus a pull to zero. The agent is the mean of
@@ -17,8 +18,8 @@ from pathlib import Path
 import cma
 import numpy as np
 
-from agents.families import Family, families
-from agents.page import command
+from agents.families import Family, Run, families
+from agents.page import command, publish, table, written
 from bufgym import policies
 from bufgym.policies import Policy, guided, weights
 from bufgym.policies.guided import N_INPUTS, N_OUTPUTS, GuidedWeights
@@ -33,6 +34,9 @@ RUNS = {
 }
 """Runs of each family in a part."""
 RULE = "gap-price"
+RULES = ("target-gap", "price-dp", RULE)
+CPU_S = 400.0
+"""Processor time of a search, s."""
 
 
 def agent(vector: np.ndarray) -> Policy:
@@ -75,30 +79,60 @@ def train(seed: int, cpu_s: float, out: Path) -> None:
     print(f"wrote {file}")
 
 
-def show(files: Sequence[Path], split: str) -> None:
-    """Compare agents with the rules on a split, family by family."""
-    rule, agents = policies.get(RULE), [policies.load(file) for file in files]
-    print("shares of AFR's regret; in brackets the 95 % interval of the difference to gap-price, over links")
-    for name, runs in families(split, FOLDER).items():
-        family = Family(name, runs)
-        rules = ", ".join(f"{n} {family.share(policies.get(n)):.3f}" for n in ("target-gap", "price-dp", RULE))
-        told = [family.against(each, rule) for each in agents]
-        own = "; ".join(f"{value:.3f} [{less.low:+.3f}, {less.high:+.3f}]" for value, less in told)
-        print(f"{name}: {rules}; agents {own}", flush=True)
+def split_up(found: dict[str, list[Run]]) -> dict[str, list[Run]]:
+    """The families, that of the default frames by L."""
+    shown: dict[str, list[Run]] = {}
+    for name, runs in found.items():
+        parts = {L: [run for run in runs if run["capacity"] == L] for L in sorted({run["capacity"] for run in runs})}
+        shown |= {f"{name}, L = {L}": own for L, own in parts.items()} if name == "default-frames" else {name: runs}
+    return shown
 
 
-def main(*files: Path, seed: int = 0, cpu_s: float = 220.0, out: Path | None = None, split: str = "validation") -> None:
+def page(files: Sequence[Path], split: str, data: str | None) -> list[str]:
+    """Markdown: shares of AFR's regret, family by family, and the first agent's above each rule's."""
+    agents = [policies.load(file) for file in files]
+    rules = [policies.get(name) for name in RULES]
+    heads = ["", *RULES, *(file.stem for file in files)]
+    shares, less, sums = [], [], np.zeros(len(rules) + len(agents))
+    for name, runs in split_up(families(split, FOLDER, data)).items():
+        found = Family(name, runs).against([*rules, *agents])
+        shares.append([name, *(f"{share:.3f}" for share, _ in found)])
+        less.append([name, *(written(interval, "+.3f") for interval in found[len(rules)][1][: len(rules)])])
+        sums += [share for share, _ in found]
+        print(" | ".join(shares[-1]), flush=True)
+    shares.append(["mean", *(f"{total / len(less):.3f}" for total in sums)])
+    return [
+        *(f"Shares of AFR's regret on the {split} links of each family; less is better:", ""),
+        *(
+            *table(heads, shares),
+            "",
+            f"How far {files[0].stem} lies above a rule, with the 95 % interval over links:",
+            "",
+        ),
+        *table(["", *RULES], less),
+    ]
+
+
+def main(
+    *files: Path,
+    seed: int = 0,
+    cpu_s: float = CPU_S,
+    out: Path | None = None,
+    split: str = "validation",
+    data: str | None = None,
+) -> None:
     """Evolve one agent for all links; or, given files, compare agents with the rules.
 
     Args:
-        files: agents to compare.
+        files: agents to compare, the one to ship first.
         seed: of the search, and of the choice of training runs.
         cpu_s: processor time for the search.
-        out: the agent's file; by default runs/joint/seed-SEED.safetensors.
+        out: the agent's file, by default runs/joint/seed-SEED.safetensors; or the Markdown file of the comparison.
         split: validation or test, of the links to compare on.
+        data: folder of recordings, to compare on recorded uplinks as well.
     """
     if files:
-        show(files, split)
+        publish("\n".join(page(files, split, data)) + "\n", out)
     else:
         train(seed, cpu_s, out or FOLDER / f"seed-{seed}.safetensors")
 

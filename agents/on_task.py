@@ -2,9 +2,9 @@
 
     python -m agents.on_task
 
-Evolution makes a small slot scorer under each of three rewards. The first is the information that arrives, by the
+Evolution finds the numbers of a rule under each of three rewards. The first is the information that arrives, by the
 motion of the camera, which is every environment's default. The others are `covered` and `followed`, which stands in for
-`tracked` as that takes seconds an episode. All begin as the rule `min-motion-gap`. Tests use links that none has seen,
+`tracked` as that takes seconds an episode. All begin as the plain rule `gap-price`. Tests use links that none has seen,
 and measure real tracking and coverage.
 """
 
@@ -20,24 +20,19 @@ from numpy.typing import NDArray
 
 from agents.cma_es import Evolution, evaluation_here
 from agents.objectives.objective import Objective, policy_of
-from agents.objectives.queue import start
 from agents.page import command, publish, table
-from agents.settings import MOTION
 from bufgym import policies
 from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.papers.perception import worth
 from bufgym.policies import Policy
-from bufgym.policies.learned import Weights
 from bufgym.sim import Senders
 
 TEST_LINKS = 2
 """Number of shipped links for tests alone, the last ones."""
 PARTS, PART_EPISODES = 8, 24
 """Parts of the training episodes, one a generation in turn, and episodes in each."""
-HIDDEN, SIGMA = 4, 0.3
-"""Hidden units of the scorer, and the search's first step size."""
-RIVALS = ("afr", "drop-oldest", "min-motion-gap", "learned-motion")
+RIVALS = ("afr", "drop-oldest", "min-motion-gap", "gap-price", "learned")
 RESAMPLES, CONFIDENCE = 2000, 0.95
 
 Frames = NDArray[np.int64]
@@ -94,10 +89,6 @@ class Task(Objective):
             [Episodes([(k % links, int(rng.integers(10**6))) for k in range(PART_EPISODES)], L)] for _ in range(PARTS)
         ]
 
-    def start(self) -> Weights:
-        """The rule "smallest merged motion gap"."""
-        return start(MOTION, HIDDEN, np.random.default_rng(0))
-
     def measure(self, policy: Policy, episodes: Any, part: int | None = None) -> float:
         return float(np.mean([self.reward(frames) for each in episodes for frames in each.arrived(policy)]))
 
@@ -105,7 +96,7 @@ class Task(Objective):
 def evolved(reward: str, L: int, seed: int, generations: int) -> Policy:
     """The agent after so many generations."""
     task = Task(reward, L, seed)
-    state = Evolution.around(task.start(), SIGMA, seed)
+    state = Evolution.around(task.start(), task.sigma, seed)
     for _ in range(generations):
         state.generation(evaluation_here(task))
     return policy_of(task.name, state.agent)

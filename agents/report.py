@@ -42,8 +42,32 @@ COLUMNS = (
 """(heading, Outcome field, unit factor, format)"""
 
 
-def report(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
-    """Evaluate the agents of all seeds; print and save the results, and keep the best agent with its notes."""
+def lines_to_beat(settings: Settings) -> dict[str, float]:
+    """The validation scores of Drop Oldest, AFR and the best rule written by hand in an environment, as printed."""
+    if settings.kind != "environment":
+        return {}
+    episodes = FixedEpisodes(settings, "validation")
+    scores = {name: episodes.score(episodes.run(name)) for name in by_hand()}
+    best = max(scores, key=lambda name: scores[name])
+    lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "afr", best))}
+    told = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
+    print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {told}", flush=True)
+    return lines
+
+
+def by_hand() -> list[str]:
+    """Names of the ranked rules written by hand."""
+    learned = shipped("agents", "agents/pretrained", "*.safetensors")
+    return [name for name in registry.names(for_topics=False) if name not in learned and registry.get(name).ranked]
+
+
+def report(
+    settings: Settings, folder: Path, runs: Sequence[Run], beside: Sequence[Run], lines: Mapping[str, float]
+) -> None:
+    """Evaluate the agents of all seeds; print and save the results, and keep the best agent with its notes.
+
+    ``beside`` are PPO's agents on the same actions, and ``lines`` the validation scores to beat.
+    """
     # Chosen by validation or training episodes: choosing by the reported ones would flatter it.
     best = max(runs, key=lambda run: run.merit)
     shutil.copyfile(best.model, folder / best.model.name)
@@ -54,7 +78,7 @@ def report(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
         report_rows(settings, folder, runs)
         contents = f"best on validation: seed {best.seed}; model and rows"
     elif settings.kind == "environment":
-        notes = report_environment(settings, folder, runs, best)
+        notes = report_environment(settings, folder, runs, best, beside, lines)
         contents = "model, figure and numbers"
     elif len(settings.suites) == 1:
         notes = report_suite(settings, settings.suite, folder, folder, runs, best)[0]
@@ -66,7 +90,7 @@ def report(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
             if math.isfinite(score.value):
                 notes[suite] = {"score": score.value, "interval": [score.low, score.high]}
     write_notes(folder, settings, seeds, notes)
-    seconds = ", ".join(f"{run.seconds:.0f}" for run in runs)
+    seconds = ", ".join(f"{run.seconds:.0f}" for run in (*runs, *beside))
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
 
 
@@ -110,14 +134,21 @@ def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
 # --- on one environment ----------------------------------------------------------------------------------------------
 
 
-def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], best: Run) -> dict[str, Any]:
+def report_environment(
+    settings: Settings,
+    folder: Path,
+    runs: Sequence[Run],
+    best: Run,
+    beside: Sequence[Run],
+    lines: Mapping[str, float],
+) -> dict[str, Any]:
     """Evaluate all agents and fixed policies on the held-out episodes; return the best agent's notes."""
-    test, validation = FixedEpisodes(settings, "test"), FixedEpisodes(settings, "validation")
+    test = FixedEpisodes(settings, "test")
     outcomes = test.run_fixed()
-    for run in runs:
-        outcomes[agent_name(run)] = (
-            test.run(load(run.model)) if settings.evolves else test.play(training.load(settings, run))
-        )
+    names = {agent_name(run): run for run in runs} | {f"agent by PPO (seed {run.seed})": run for run in beside}
+    for name, run in names.items():
+        compiled = run.model.suffix == ".safetensors"
+        outcomes[name] = test.run(load(run.model)) if compiled else test.play(training.load(settings, run))
     rows = test.rows(outcomes)
     entries, alike = summarise(outcomes, rows, agent_name(best)), same(rows)
     print(table(entries, agent_name(best), alike))
@@ -128,37 +159,30 @@ def report_environment(settings: Settings, folder: Path, runs: Sequence[Run], be
     apart = unranked(rows)
     bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in apart}
     bars, twins = _drawn(bars, alike)
-    curves = [np.array(run.validation)[:, [0, 2]] for run in runs]
     draw(
         folder / "figure.png",
-        runs,
-        curves,
-        f"score on {len(validation.episodes)} validation episodes",
+        {name: np.array(run.validation)[:, [1, 2]] for name, run in names.items()},
+        ("training, s", f"score on {settings.validation_episodes} validation episodes"),
         bars,
         f"{len(test.episodes)} episodes on held-out links" if traces else f"{len(test.episodes)} held-out episodes",
-        lines=rules(validation),
+        lines=lines,
         notes=twins,
     )
     return notes
 
 
 def verdict(entries: Sequence[dict[str, Any]], agent: str) -> str:
-    """One sentence: whether the agent beats the best rule written by hand, and by how much."""
-    learned = shipped("agents", "agents/pretrained", "*.safetensors")
-    rules = (e for e in entries if e["policy"] not in learned and not e["policy"].startswith("agent"))
-    rule = next(e for e in rules if registry.get(e["policy"]).ranked)
-    low, high = sorted(-bound for bound in rule["minus_agent_95"])
-    won = "beats" if low > 0 else "loses to" if high < 0 else "cannot be told from"
-    return f"{agent} {won} the best rule, {rule['policy']}: QoI {-rule['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
-
-
-def rules(episodes: FixedEpisodes) -> dict[str, float]:
-    """The scores of Drop Oldest, AFR and the best fixed rule."""
-    apart = [name for name in registry.names(for_topics=False) if not registry.get(name).ranked]
-    fixed = {name: episodes.score(outcomes) for name, outcomes in episodes.run_fixed().items() if name not in apart}
-    learned = shipped("agents", "agents/pretrained", "*.safetensors")
-    best = max((name for name in fixed if name not in learned), key=lambda name: fixed[name])
-    return {name: fixed[name] for name in dict.fromkeys((BASELINE, "afr", best))}
+    """One sentence: whether the agent beats the best rule written by hand, and PPO's agent, and by how much."""
+    known, rules = {entry["policy"]: entry for entry in entries}, by_hand()
+    best = next(entry for entry in entries if entry["policy"] in rules)
+    rivals = {f"the best rule, {best['policy']}": best}
+    rivals |= {name: entry for name, entry in known.items() if name.startswith("agent by PPO")}
+    told = []
+    for name, entry in rivals.items():
+        low, high = sorted(-bound for bound in entry["minus_agent_95"])
+        won = "beats" if low > 0 else "loses to" if high < 0 else "cannot be told from"
+        told.append(f"{won} {name}: QoI {-entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]")
+    return f"{agent} {', and '.join(told)}"
 
 
 def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:
@@ -230,11 +254,10 @@ def report_suite(
     # Without a discriminative cell, there are no scores to draw.
     ranked = {s.policy: s["score"] for s in result.standings if s.ranked and math.isfinite(s["score"].value)}
     bars, twins = _drawn(ranked, same(rows))
-    rival = "that of AFR or Drop Oldest" if settings.algo == "evolution" else "AFR's"
     # By the last column the agent was chosen.
-    curves = [np.array(run.validation)[:, [0, -1]] for run in runs]
-    measure = f"regret over {rival}, on validation"
-    draw(home / "figure.png", runs, curves, measure, bars, "Test split", notes=twins)
+    curves = {agent_name(run): np.array(run.validation)[:, [1, -1]] for run in runs}
+    labels = ("training, s", "regret over AFR's, on validation")
+    draw(home / "figure.png", curves, labels, bars, "Test split", notes=twins)
     return notes, next(s["score"] for s in result.standings if s.policy == f"agent ({settings.algo})")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 from cyclopts import Parameter
@@ -12,29 +12,14 @@ from cyclopts.validators import Number
 
 from bufgym import ENVIRONMENTS
 from bufgym.ground.errors import BufgymError
-from bufgym.policies.learned import NAMES
 from bufgym.policies.weights import MAX_WIDTH
 from bufgym.scenario import Uplink, suites
 from bufgym.scenario.uplink import RGBD_BYTES
 
-TIME = ("rank", "index_before", "index_merged", "occupancy", "stalled", "service_ratio")
-"""Fields from a queue and a clock, as AFR's."""
-
-MOTION = (
-    *("rank", "motion_before", "motion_merged", "loss", "relative_loss"),
-    *("occupancy", "stalled", "service_ratio", "even_value", "bend"),
-)
-"""Fields with odometry and V."""
-
-LINK = (*MOTION, "rate_short", "rate_medium", "rate_long", "rate_trend", "time_to_free")
-"""Fields of ``MOTION``, and the link's rate as the socket shows it."""
-
-SEES = {"time": TIME, "motion": MOTION, "link": LINK}
-
 Kind = Literal["environment", "queue", "topics", "fleet"]
 """The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
 
-_ALONE = {"topics": ("a scheduler", ("evolution",)), "fleet": ("a fleet's agent", ("evolution", "maskable-ppo"))}
+_ALONE = {"topics": ("a scheduler", ("guided",)), "fleet": ("a fleet's agent", ("guided", "maskable-ppo"))}
 """Kinds for one suite alone, with the trained agent and its algorithms."""
 
 
@@ -64,18 +49,11 @@ class Settings:
     """Folder of recordings, for suites that need one."""
     capacities: str = ""
     """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
-    algo: Literal["maskable-ppo", "ppo", "dqn", "evolution", "guided"] = "maskable-ppo"
-    """PPO with action masks, PPO without, double DQN with masks, or CMA-ES over whole episodes (suites only). guided:
-    CMA-ES on the numbers of the rule gap-price (without a suite), where 40 million steps take about 30 s."""
-    sees: Literal["motion", "time", "link"] = "motion"
-    """What an evolved agent sees: odometry as well, or the clock alone; link: odometry and the link's rate."""
-    fields: str = ""
-    """Fields that an evolved agent reads, such as rank,motion_merged,stalled; by default those of --sees."""
-    start: str = ""
-    """Go on from the agent in this file (.safetensors), which then reads --fields besides its own: these count nothing
-    at first. With evolution of one queue's suites."""
-    hidden: Units = 0
-    """Hidden units of an evolved agent; with none, its scores are linear in what the context makes of the slots."""
+    algo: Literal["guided", "guided-ppo", "maskable-ppo", "ppo", "dqn"] = "guided"
+    """guided: CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue). guided-ppo: PPO on the
+    same numbers, in an environment. On slots: PPO with action masks, PPO without, and double DQN with masks."""
+    beside: bool = True
+    """With guided, in an environment: then train guided-ppo for as many seconds, to compare."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
@@ -83,14 +61,14 @@ class Settings:
     seeds: Count = 1
     """Train this many agents, each in a process of its own."""
     backend: Literal["local", "ray", "dask"] = "local"
-    """Where an evolution's candidates are evaluated: in the seed's process, or on a Ray or Dask cluster, with the same
-    result. Its workers must be able to import bufgym and agents."""
+    """Where the candidates of --algo guided are evaluated: in the seed's process, or on a Ray or Dask cluster, with
+    the same result. Its workers must be able to import bufgym and agents."""
     address: str = ""
     """Of the cluster's head, such as tcp://host:8786; by default a cluster on this machine is begun and ended."""
     seed: Annotated[int, _number(gte=0, lt=2**31)] = 0
     """The first seed."""
-    steps: Count = 1_500_000
-    """Decisions to learn from, for each seed."""
+    steps: Natural = 0
+    """Decisions to learn from, for each seed; 0: 40 million for guided, otherwise 1.5 million."""
     capacity: Count = 8
     """L, messages (without a suite)."""
     size_bytes: Count = RGBD_BYTES
@@ -119,8 +97,8 @@ class Settings:
     """Weight of the entropy bonus."""
     checkpoint_every: Count = 250_000
     """Steps."""
-    validate_every: Count = 250_000
-    """Steps."""
+    validate_every: Natural = 0
+    """Steps; 0: a sixth of them."""
     validation_episodes: Count = 300
     """About so many in each validation, with a suite over all scenarios and capacities."""
     test_seeds: Annotated[int, _number(gte=0, lte=1000)] = 0
@@ -142,14 +120,9 @@ class Settings:
         return "topics" if "topics" in kinds else "fleet" if "fleet" in kinds else "queue"
 
     @property
-    def objective(self) -> str:
-        """Name of the objective of evolution."""
-        return "guided" if self.algo == "guided" else self.kind
-
-    @property
     def evolves(self) -> bool:
         """Whether CMA-ES trains the agent."""
-        return self.algo in ("evolution", "guided")
+        return self.algo == "guided"
 
     def capacities_of(self, suite: str) -> tuple[int, ...]:
         """L to train for and to test at: the given ones, or the suite's."""
@@ -164,11 +137,6 @@ class Settings:
         return capacities
 
     @property
-    def observed(self) -> tuple[str, ...]:
-        """Fields that an evolved agent reads."""
-        return tuple(self.fields.split(",")) if self.fields else SEES[self.sees]
-
-    @property
     def command(self) -> str:
         """The command that trains it again, with all settings that differ from the defaults."""
         defaults = asdict(Settings())
@@ -178,6 +146,11 @@ class Settings:
             if name not in ("name", "resume", "backend", "address") and value != defaults[name]
         ]
         return " ".join(["python train.py", *words])
+
+    def resolved(self) -> Settings:
+        """These settings with the steps that suit the algorithm, where they are left open."""
+        steps = self.steps or (40_000_000 if self.evolves else 1_500_000)
+        return replace(self, steps=steps, validate_every=self.validate_every or -(-steps // 6))
 
     def checked(self) -> Settings:
         """Check these settings and return them; a BufgymError names the first that breaks a rule, and the rule."""
@@ -191,18 +164,14 @@ class Settings:
                         self._refuse(name, str(broken).replace("Must", "must").rstrip("."))
             if get_origin(hint) is Literal and value not in get_args(hint):
                 self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
-        if self.start and (self.kind != "queue" or self.algo != "evolution"):
-            self._refuse("start", "evolution of one queue's suites alone begins from a file")
         if self.kind == "environment" and self.env not in ENVIRONMENTS:
             self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
         if self.kind == "environment" and self.env == "bufgym/Topics-v0":
-            self._refuse("env", "a scheduler learns from a suite of topics (--suite topics-v1 --algo evolution)")
-        if self.kind == "environment" and self.algo == "evolution":
-            raise BufgymError("--algo evolution learns from a suite's episodes: name one (--suite)")
-        if self.algo == "guided" and self.kind != "environment":
-            self._refuse("algo", "an agent that guides a rule learns in an environment, without --suite")
+            self._refuse("env", "a scheduler learns from a suite of topics (--suite topics-v1 --algo guided)")
+        if self.algo == "guided-ppo" and self.kind != "environment":
+            self._refuse("algo", "PPO on the numbers of a rule learns in an environment, without --suite")
         if self.backend != "local" and not self.evolves:
-            self._refuse("backend", "a cluster evaluates the candidates of --algo evolution alone")
+            self._refuse("backend", "a cluster evaluates the candidates of --algo guided alone")
         if self.address and self.backend == "local":
             self._refuse("address", "is that of a cluster: name its kind (--backend ray or dask)")
         if self.kind in _ALONE:
@@ -219,19 +188,7 @@ class Settings:
             self._check_suites()
         if self.capacities:
             self.capacities_of("")
-        if self.algo == "evolution" or self.fields:
-            self._check_fields()
         return self
-
-    def _check_fields(self) -> None:
-        """Check the fields that an evolved agent reads."""
-        known = [name for name in self.observed if name in NAMES]
-        merged = {"motion_merged", "time_merged", "index_merged"} & set(known)
-        if len(set(known)) < len(self.observed) or not merged or "rank" not in known:
-            rule = (
-                "must be rank, motion_merged, time_merged or index_merged, and others of the observation's, each once"
-            )
-            self._refuse("fields", f"{rule} (bufgym list observations)")
 
     def _check_suites(self) -> None:
         """Check the rules of suites of one queue."""

@@ -7,9 +7,10 @@ torch thread.
 
 from __future__ import annotations
 
+import functools
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents import cma_es
+from agents import cma_es, guided_ppo
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.cluster import begun
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
@@ -30,7 +31,7 @@ from agents.evaluation import EvaluationSet, ValidationSets, Verdict
 from agents.held_out import FixedEpisodes, split_scenario
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.fleet import FleetObjective, fleet_of
-from agents.objectives.objective import policy_of as slot_policy_of
+from agents.objectives.objective import policy_of as policy_of_weights
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
 from agents.settings import Settings
 from bufgym.benchmark.rows import Row
@@ -52,8 +53,23 @@ def train_all(settings: Settings, folder: Path) -> list[Run]:
         return each_seed(cma_es.train, replace(settings, address=address), folder)
 
 
-def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
-    """Train one seed to the end, from its latest checkpoint if any; ``line`` is the line of its progress bar."""
+def train_beside(settings: Settings, folder: Path, runs: Sequence[Run]) -> list[Run]:
+    """With ``settings.beside``: PPO on the same actions, for as long as the longest of the runs."""
+    if not (settings.beside and settings.algo == "guided" and settings.kind == "environment"):
+        return []
+    home, seconds = folder / "ppo", max(run.seconds for run in runs)
+    home.mkdir(exist_ok=True)
+    print(f"PPO on the same actions, for {seconds:.0f} s")
+    # So many steps that time ends it.
+    other = replace(settings, algo="guided-ppo", validate_every=guided_ppo.ENVS * guided_ppo.N_STEPS * 5)
+    return each_seed(functools.partial(train_seed, seconds=seconds), other, home)
+
+
+def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, seconds: float = math.inf) -> Run:
+    """Train one seed for its steps or so many seconds, from its latest checkpoint if any.
+
+    ``line`` is the line of its progress bar.
+    """
     torch.set_num_threads(1)
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
@@ -71,22 +87,25 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0) -> Ru
     left = settings.steps - model.num_timesteps
     if left > 0:
         callbacks = [Checkpoints(home, settings.checkpoint_every), curve, validation, progress]
+        if settings.algo == "guided-ppo":
+            callbacks.append(guided_ppo.Budget(seconds, curve, settings.steps))
         # The library counts ``total_timesteps`` from here on when the count is not reset.
         model.learn(left, callbacks, reset_num_timesteps=False)
         save(model, home)
-    validation.validate(model)
+    validation.validate(model, last=True)
     rows, best = validation.validations.rows, validation.validations.choose
     kept = checkpoint(home, int(validation.validations.best[0]))
     model.logger.close()
     env.close()
     shutil.copyfile(kept, home / "model.zip")
-    seconds = curve.record.rows[-1][1] if curve.record.rows else 0.0
+    spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
     file = "model.zip"
-    if settings.kind == "fleet":
-        file = MODEL
-        notes = {"name": FleetObjective.name, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
-        weights.save(home / MODEL, weights_of(algorithm.load(kept, device="cpu")), notes)
-    return Run(seed, home, seconds, curve.record.rows, rows, file, best)
+    if settings.kind == "fleet" or settings.algo == "guided-ppo":
+        file, learned = MODEL, algorithm.load(kept, device="cpu")
+        found = weights_of(learned) if settings.kind == "fleet" else guided_ppo.weights_of(learned)
+        notes = {"name": settings.algo, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
+        weights.save(home / MODEL, found, notes)
+    return Run(seed, home, spent, curve.record.rows, rows, file, best)
 
 
 def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, steps: int) -> Validation:
@@ -95,7 +114,10 @@ def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, st
         episodes = FixedEpisodes(settings, "validation")
 
         def score(model: Any) -> Numbers:
-            outcomes = episodes.play(model)
+            if settings.algo == "guided-ppo":
+                outcomes = episodes.run(policy_of_weights("ppo", guided_ppo.weights_of(model)))
+            else:
+                outcomes = episodes.play(model)
             return episodes.score(outcomes), float(np.mean([result.qoi for result in outcomes]))
 
         # By QoI, which orders agents like the score, and is known even if nothing can be gained.
@@ -105,7 +127,7 @@ def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, st
         objective = FleetObjective(settings, folder, settings.seed)
 
         def gain(model: Any) -> Numbers:
-            return objective.validate(slot_policy_of(objective.name, weights_of(model)))
+            return objective.validate(policy_of_weights(objective.name, weights_of(model)))
 
         validations = Validations(home, objective.columns, objective.best, settings, steps)
         return Validation(home, validations, gain, lambda measures: objective.message.format(measures[-1]), curve)
@@ -147,6 +169,8 @@ def training_env(settings: Settings) -> VecEnv:
         ]
         size = math.ceil(settings.num_envs / len(mixed))
         return GymVecEnv(MixedEnv(mixed, [size] * len(mixed), reward=settings.reward))
+    if settings.algo == "guided-ppo":
+        return guided_ppo.training_env(settings)
     return make_vec_env(
         settings.env,
         settings.num_envs,
@@ -223,13 +247,14 @@ def new_dqn(settings: Settings, env: VecEnv) -> MaskedDQN:
 
 
 LEARNERS: dict[str, tuple[Any, Callable[[Settings, VecEnv], Any]]] = {
+    "guided-ppo": (PPO, guided_ppo.new),
     "maskable-ppo": (MaskablePPO, new_ppo),
     "ppo": (PPO, new_ppo),
     "dqn": (MaskedDQN, new_dqn),
 }
 """Algorithm -> (its class, function that makes an untrained one)."""
 
-ALGORITHMS = (*LEARNERS, "evolution", "guided")
+ALGORITHMS = (*LEARNERS, "guided")
 """Values of ``--algo``."""
 
 
@@ -241,7 +266,7 @@ def load(settings: Settings, run: Run) -> Any:
 
 def test_rows(settings: Settings, run: Run, evaluation: EvaluationSet) -> list[Row]:
     """The kept agent's rows on a suite's test split."""
-    if settings.algo == "evolution":
+    if settings.evolves:
         outcomes = evaluation.run(load_policy(run.model))
     else:
         outcomes = evaluation.play(load(settings, run), padded_slots_of(settings))

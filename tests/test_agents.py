@@ -1,7 +1,6 @@
 """The parts of training on a suite: padded rows, the slot network, double DQN, evaluation sets."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,13 +12,12 @@ import torch
 from stable_baselines3.common.logger import Logger
 from train_cases import DropOldest
 
-from agents import goals, mixed_env, runs, training
+from agents import mixed_env, runs, training
 from agents.dqn import INVALID, valid_actions
 from agents.evaluation import EvaluationSet, sweep_for
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.score import scores
 from bufgym.model.qoi import exponential
 from bufgym.sb3 import GymVecEnv
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
@@ -223,29 +221,3 @@ def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
     best = [validations.add(steps, 0.0, (regret,)) for steps, regret in ((0, 0.5), (20, 0.4), (30, 0.4))]
     assert best == [True, True, False] and validations.best[0] == 20
     assert [validations.due(steps) for steps in (30, 40, 49, 50)] == [False, True, True, True]
-
-
-def test_the_page_of_goals_by_hand() -> None:
-    """Two seeds that lose 1 and 3 where AFR loses 4 of 10, on both links and at both L; at L = 9 nothing is lost."""
-    rows = []
-    for name, lost in (("drop-oldest", 5), ("afr", 4), ("min-gap", 3), ("seed 0", 1), ("seed 1", 3)):
-        for capacity, trace in itertools.product((4, 8, 9), "ab"):
-            h = 10.0 - (lost if capacity < 9 else 0)
-            row = {"scenario": "s", "capacity": capacity, "trace": trace, "seed": 0, "policy": name, "qoi": h}
-            rows.append({**row, "clairvoyant": 10.0, "training_seed": None})
-            if name.startswith("seed"):
-                rows.append({**rows[-1], "policy": goals.AGENTS, "training_seed": int(name[-1])})
-    page = goals.section(goals.SuiteResults("suite", rows, ["seed 0", "seed 1"], scores(rows)))
-    assert page[2:8] == [
-        "| L | all seeds | seed 0 | seed 1 | min-gap |",
-        "|---|---|---|---|---|",
-        "| 4 | 0.50 [0.25, 0.75] | 0.25 | 0.75 | 0.75 |",
-        "| 8 | 0.50 [0.25, 0.75] | 0.25 | 0.75 | 0.75 |",
-        "| 9 | – | – | – | – |",
-        "| all, 2 of 3 cells | 0.50 [0.25, 0.75] | 0.25 | 0.75 | 0.75 |",
-    ]
-    assert "The share by scenario is: s 0.50 [0.25, 0.75]." in page
-    assert "In no cell the agents' mean H is below afr or drop-oldest or min-gap by more than the interval." in page
-    worse = [{**row, "qoi": row["qoi"] - 9 * (row["policy"] == goals.AGENTS)} for row in rows]
-    page = goals.section(goals.SuiteResults("suite", worse, ["seed 0", "seed 1"], scores(worse)))
-    assert "- s, L = 8: H is below min-gap's by 80.00% of the clairvoyant's" in page

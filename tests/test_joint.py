@@ -33,15 +33,17 @@ def test_shares_are_sums_over_the_links_drawn() -> None:
     assert family.share(rule) == pytest.approx((family.best - h).sum() / (family.best - family.afr).sum())
     only_b = family.shares(h, np.array([[0.0, 1.0]]))  # the last four runs
     assert only_b == pytest.approx((family.best - h)[4:].sum() / (family.best - family.afr)[4:].sum())
-    assert family.against(rule, rule)[1] == (0, 0, 0)
+    (_, (alike, above)), (one, (below, _)) = family.against([rule, afr])
+    assert alike == (0, 0, 0) and one == 1
+    assert (above.value, above.low, above.high) == pytest.approx((-below.value, -below.high, -below.low))
     ratios = (1 - h / family.best + 0.01) / (1 - family.afr / family.best + 0.01)
     assert Family("random", runs()).share(rule) == pytest.approx(ratios.mean())
 
 
 def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     few = runs()
-    monkeypatch.setattr(joint, "families", lambda split, folder: {"task": few, "random": few})
-    monkeypatch.setattr(joint, "RUNS", {"task": 4, "random": 4})
+    monkeypatch.setattr(joint, "families", lambda split, folder, data=None: {"task": few, "default-frames": few})
+    monkeypatch.setattr(joint, "RUNS", {"task": 4, "default-frames": 4})
     monkeypatch.setattr(joint, "POPULATION", 4)
     family = Family("task", few)
     assert family.share(joint.agent(np.zeros(160))) == family.share(policies.get("gap-price"))
@@ -50,11 +52,17 @@ def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeyp
     found, notes = weights.read_any(file)
     assert isinstance(found, guided.GuidedWeights) and 0 < np.abs(found.weight).max() < 1
     assert notes["training"] == "python -m agents.joint --seed 3 --cpu-s 0.3"
-    joint.main(file)
-    lines = capsys.readouterr().out.splitlines()
-    assert f"agents {family.share(policies.load(file)):.3f} [" in next(
-        line for line in lines if line.startswith("task: ")
-    )
+    joint.main(file, out=tmp_path / "page.md")
+    page = (tmp_path / "page.md").read_text().splitlines()
+    own, rule = (family.share(each) for each in (policies.load(file), policies.get("gap-price")))
+    assert next(line for line in page if line.startswith("| task |")).split(" | ")[3:] == [
+        f"{rule:.3f}",
+        f"{own:.3f} |",
+    ]
+    assert [line.split(" |")[0] for line in page if "L = " in line] == [
+        "| default-frames, L = 4",
+        "| default-frames, L = 8",
+    ] * 2
 
 
 def test_every_family_is_drawn_anew_for_each_split(tmp_path: Path, monkeypatch: Patch) -> None:

@@ -28,7 +28,7 @@ from bufgym.sim import run
 from bufgym.sim.metrics import topic_outcomes
 from bufgym.traces import Trace
 
-TINY = Settings(suite="topics-v1", algo="evolution", name="tiny", steps=4_000, validate_every=1_500, test_seeds=1)
+TINY = Settings(suite="topics-v1", algo="guided", name="tiny", steps=4_000, validate_every=1_500, test_seeds=1)
 
 
 def client(**more: Any) -> Client:
@@ -164,7 +164,7 @@ def test_a_run_leaves_an_agent_and_a_table(short_episodes: None, monkeypatch: Pa
     assert (home / "model.safetensors").read_bytes() == (home / "seed-0" / "model.safetensors").read_bytes()
     made, noted = weights.read_any(home / "model.safetensors")
     assert isinstance(made, learned_topics.TopicWeights) and made.fields == topics.FIELDS
-    assert (noted["suite"], noted["algo"], noted["seeds"]) == (suite.name, "evolution", [0])
+    assert (noted["suite"], noted["algo"], noted["seeds"]) == (suite.name, "guided", [0])
     with (home / "rows.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert {row["policy"] for row in rows} >= {"agent (seed 0)", "robofleet", "fifo"}

@@ -11,7 +11,7 @@ from cli_cases import Capsys, Patch
 from train_cases import DropOldest, KilledError, columns, in_a_folder_of_its_own  # noqa: F401
 
 import train
-from agents import held_out, runs, training
+from agents import guided_ppo, held_out, runs, training
 from agents.callbacks import Curve, checkpoints
 from agents.held_out import FixedEpisodes
 from agents.objectives import guided
@@ -23,7 +23,17 @@ from bufgym.policies import registry
 from bufgym.scenario import suites
 
 TINY = Settings(
-    **{"name": "tiny", "steps": 512, "capacity": 3, "duration_s": 1.0, "width": 8, "num_envs": 4, "n_steps": 32},
+    **{
+        "name": "tiny",
+        "algo": "maskable-ppo",
+        "steps": 512,
+        "validate_every": 250_000,
+        "capacity": 3,
+        "duration_s": 1.0,
+        "width": 8,
+        "num_envs": 4,
+        "n_steps": 32,
+    },
     **{"batch_size": 64, "epochs": 1, "checkpoint_every": 128, "validation_episodes": 2, "episodes": 3},
 )
 ON_SUITE = {"suite": "interruption-v1", "capacities": "4,6", "num_envs": 12, "n_steps": 32, "batch_size": 96}
@@ -61,16 +71,21 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
 def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.setattr(guided, "PARTS", 2)
     monkeypatch.setattr(guided, "EPISODES", 2)
+    monkeypatch.setattr(guided_ppo, "ENVS", 4)
     settings = dataclasses.replace(TINY, algo="guided", capacity=8, duration_s=3.0, steps=3_000, validate_every=3_000)
     train.main(settings)
     folder = Path("runs/tiny")
+    # PPO begins there as well, and is given as much time.
+    (_, ppo), *_ = columns(folder / "ppo" / "seed-0" / "validation.csv", "steps", "qoi")
+    found = policies.load(folder / "ppo" / "seed-0" / runs.MODEL)
     (_, first), *_ = columns(folder / "seed-0" / "validation.csv", "steps", "qoi")
     judges = FixedEpisodes(settings, "validation")
-    assert first == np.mean([outcome.qoi for outcome in judges.run("gap-price")])
+    assert first == ppo == np.mean([outcome.qoi for outcome in judges.run("gap-price")])
     agent = policies.load(folder / "model.safetensors")
     rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["scores"]
     told = {row["policy"]: row["qoi"] for row in rows}
     assert told["agent (seed 0)"] == np.mean([o.qoi for o in FixedEpisodes(settings, "test").run(agent)])
+    assert told["agent by PPO (seed 0)"] == np.mean([o.qoi for o in FixedEpisodes(settings, "test").run(found)])
     assert "the best rule, " in capsys.readouterr().out
 
 
@@ -146,7 +161,7 @@ def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("algo", [name for name in training.ALGORITHMS if name != "guided"])
+@pytest.mark.parametrize("algo", training.ALGORITHMS)
 def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -> None:
     train.main(dataclasses.replace(SUITE, algo=algo))
     folder = Path("runs/tiny")
@@ -161,11 +176,11 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     assert {(row["policy"] == agent, row["training_seed"]) for row in rows} == {(True, 0), (False, None)}
     assert {row["scenario"] for row in rows} == set(suites.get("interruption-v1").settings("test"))
     assert algo == "ppo" or not any(row["invalid"] for row in rows if row["policy"] == agent)
-    # Validated before the first update, every 384 steps (evolution: a generation), and at the end; the best is kept.
+    # Validated before the first update, every 384 steps (CMA-ES: a generation), and at the end; the best is kept.
     home = folder / "seed-0"
     merit = (home / "validation.csv").read_text(encoding="utf-8").splitlines()[0].split(",")[-1]
     validation = {int(steps): value for steps, value in columns(home / "validation.csv", "steps", merit)}
-    model = runs.MODEL if algo == "evolution" else "model.zip"
+    model = runs.MODEL if algo == "guided" else "model.zip"
     assert (folder / model).read_bytes() == (home / model).read_bytes()
     if algo in training.LEARNERS:
         assert list(validation) == [0, 384, 768, 1152]
@@ -214,11 +229,11 @@ def test_batches_divide_the_experience() -> None:
 
 
 NOT_POSITIVE = (
-    *("seeds", "steps", "capacity", "size_bytes", "duration_s", "width", "num_envs", "n_steps", "batch_size", "epochs"),
-    *("learning_rate", "checkpoint_every", "validate_every", "validation_episodes", "episodes"),
+    *("seeds", "capacity", "size_bytes", "duration_s", "width", "num_envs", "n_steps", "batch_size", "epochs"),
+    *("learning_rate", "checkpoint_every", "validation_episodes", "episodes"),
 )
-NEGATIVE = ("seed", "hidden", "gamma", "gae_lambda", "entropy", "test_seeds")
-EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
+NEGATIVE = ("seed", "steps", "validate_every", "gamma", "gae_lambda", "entropy", "test_seeds")
+GUIDED = {"algo": "guided", "suite": "interruption-v1"}
 
 
 @pytest.mark.parametrize(
@@ -237,13 +252,11 @@ EVOLUTION = {"algo": "evolution", "suite": "interruption-v1"}
         ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),
         ({"suite": "lte-v1,topics-v1"}, "suite lte-v1,topics-v1: a scheduler learns from one suite alone"),
         ({"suite": "fleet-v1,lte-v1"}, "suite fleet-v1,lte-v1: a fleet's agent learns from one suite alone"),
-        ({"suite": "fleet-v1", "algo": "dqn"}, "one suite alone, by --algo evolution or maskable-ppo"),
+        ({"suite": "fleet-v1", "algo": "dqn"}, "one suite alone, by --algo guided or maskable-ppo"),
         ({"suite": "fleet-v1", "network": "plain"}, "network = 'plain': a fleet's agent scores slots"),
-        ({"algo": "evolution"}, "learns from a suite's episodes: name one"),
-        ({**EVOLUTION, "fields": "rank"}, "fields = 'rank': must be rank, motion_merged, time_merged or index_merged"),
         ({"backend": "no-such"}, "backend = 'no-such': must be one of local, ray, dask"),
-        ({"backend": "dask"}, "backend = 'dask': a cluster evaluates the candidates of --algo evolution alone"),
-        ({**EVOLUTION, "address": "host:1"}, "address = 'host:1': is that of a cluster: name its kind"),
+        ({"backend": "dask"}, "backend = 'dask': a cluster evaluates the candidates of --algo guided alone"),
+        ({**GUIDED, "address": "host:1"}, "address = 'host:1': is that of a cluster: name its kind"),
         ({"resume": True}, "there is no run in"),
     ],
 )

@@ -16,7 +16,6 @@ from agents.held_out import FixedEpisodes, split_scenario
 from agents.objectives.objective import Objective
 from bufgym.benchmark.run import draw
 from bufgym.policies import Policy
-from bufgym.policies.guided import N_INPUTS, N_OUTPUTS, GuidedWeights
 from bufgym.scenario import Episode
 from bufgym.sim import Senders
 
@@ -45,7 +44,6 @@ class GuidedObjective(Objective):
     columns = ("score", "qoi")
     best = max
     message = "mean QoI {:.3f} on validation"
-    sigma = 0.02  # 0.1 diverges
 
     @functools.cached_property
     def training(self) -> list[list[Played]]:
@@ -59,10 +57,6 @@ class GuidedObjective(Objective):
     def judges(self) -> FixedEpisodes:
         """Other episodes on the training links."""
         return FixedEpisodes(self.settings, "validation")
-
-    def start(self) -> GuidedWeights:
-        """The plain rule."""
-        return GuidedWeights(np.zeros((N_OUTPUTS, N_INPUTS), np.float32))
 
     def measure(self, policy: Policy, episodes: Sequence[Played]) -> float:
         """Mean H over all episodes of a part."""

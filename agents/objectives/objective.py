@@ -40,8 +40,8 @@ class Objective(ABC):
     """``min`` or ``max``, the better direction of that last measure."""
     message: str
     """Format of that measure in words."""
-    sigma: float
-    """First step size."""
+    sigma = 0.02
+    """First step size; 0.1 diverges."""
     training: Any
     """Training episodes by part; each set has ``decisions``, the approximate number per candidate."""
     judges: Any
@@ -50,9 +50,9 @@ class Objective(ABC):
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         self.settings, self.folder, self.seed = settings, folder, seed
 
-    @abstractmethod
     def start(self) -> AnyWeights:
-        """The weights at which the search begins."""
+        """The weights at which the search begins: zeros, the plain rule."""
+        return GuidedWeights(np.zeros((guided.N_OUTPUTS, guided.N_INPUTS), np.float32))
 
     @abstractmethod
     def measure(self, policy: Policy, episodes: Any) -> float:

@@ -1,0 +1,54 @@
+"""Suites of one queue, for an agent that sets the numbers of a rule: the less of AFR's regret is left, the better."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from agents.evaluation import ValidationSets, Verdict
+from agents.families import Family, merged, of_suite
+from agents.objectives.objective import Objective
+from bufgym.ground.errors import BufgymError
+from bufgym.policies import Policy
+
+PARTS, RUNS = 8, 60
+"""Parts of the training runs, and runs of each suite in a part."""
+
+
+class SuitesObjective(Objective):
+    """All suites of a run; a run is an episode at one L."""
+
+    name = "guided"
+    columns = Verdict._fields
+    best = min
+    message = "{:.3f} of AFR's regret on validation"
+
+    @functools.cached_property
+    def training(self) -> list[list[Family]]:
+        """A family of runs of each suite, in parts."""
+        settings, rng = self.settings, np.random.default_rng(self.seed)
+        parts: list[list[Family]] = [[] for _ in range(PARTS)]
+        for suite in settings.suites:
+            capacities = settings.capacities_of(suite) if settings.capacities else ()
+            runs = merged(of_suite(suite, "train", capacities, data=settings.data or None))
+            order = rng.permutation(len(runs))
+            for p, part in enumerate(parts):
+                chosen = [order[(p * RUNS + k) % len(runs)] for k in range(min(RUNS, len(runs)))]
+                part.append(Family(suite, [runs[k] for k in chosen]))
+                if not (part[-1].best > part[-1].afr).any():
+                    raise BufgymError(f"suite {suite}: AFR loses nothing there, so nothing can be learned")
+        return parts
+
+    @functools.cached_property
+    def judges(self) -> ValidationSets:
+        """The suites' validation splits, made at first use: a worker that evaluates candidates needs none."""
+        return ValidationSets(self.settings, self.folder)
+
+    def measure(self, policy: Policy, episodes: list[Family]) -> float:
+        """Share of AFR's regret, mean over the suites."""
+        return float(np.mean([family.share(policy) for family in episodes]))
+
+    def validate(self, policy: Policy) -> tuple[float, ...]:
+        """The verdict on the validation splits."""
+        return self.judges.run(policy)
