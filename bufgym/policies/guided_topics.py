@@ -67,9 +67,8 @@ LEAST = 1e-3
 
 
 @kernel
-def set_numbers(buffer: Buffer, memory: Memory) -> NDArray[Any]:
-    """The rule's numbers at this moment."""
-    c, numbers = memory[:N_INPUTS], memory[N_INPUTS : N_INPUTS + N_OUTPUTS]
+def set_numbers(buffer: Buffer, numbers: NDArray[Any], c: NDArray[Any]) -> None:
+    """Write the rule's numbers at this moment; ``c`` is room for the inputs."""
     rate = buffer.long_rate_bytes_per_s
     c[0] = 1.0
     c[1] = 2 * fill(buffer) - 1
@@ -85,7 +84,6 @@ def set_numbers(buffer: Buffer, memory: Memory) -> NDArray[Any]:
         numbers[o] = base[o]
         for i in range(N_INPUTS):
             numbers[o] += weights[o * N_INPUTS + i] * c[i]
-    return numbers
 
 
 @kernel
@@ -108,7 +106,8 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A scheduler that weighs gain, bytes, priority and time, by numbers linear in what the client sees."""
     if len(buffer.topics) == 1:
         return make_room(buffer, arrival)  # a single queue has no topics to tell apart
-    numbers, weight, s = set_numbers(buffer, memory), largest(buffer)[1], len(buffer.slots)
+    numbers, weight, s = memory[:N_OUTPUTS], largest(buffer)[1], len(buffer.slots)
+    set_numbers(buffer, numbers, memory[N_OUTPUTS:])
     drops = numbers[DROPS:ROOM]
     best, decision, room = -np.inf, REJECT, fits(buffer, arrival)
     for k in range(s):
@@ -130,7 +129,8 @@ def on_send(buffer: Buffer, memory: Memory) -> int:
     choice = next_no_drop(buffer, 0)
     if choice != HOLD:
         return choice
-    numbers, weight, best = set_numbers(buffer, memory), largest(buffer)[1], -np.inf
+    numbers, weight, best = memory[:N_OUTPUTS], largest(buffer)[1], -np.inf
+    set_numbers(buffer, numbers, memory[N_OUTPUTS:])
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
             sent = weighed(buffer, buffer.slots[k], k, buffer.slots[k].gain / weight, numbers)
