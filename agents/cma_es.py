@@ -25,13 +25,13 @@ import numpy as np
 
 from agents.cluster import connected
 from agents.objectives import OBJECTIVES
-from agents.objectives.objective import Objective, Vector, policy_of, to_vector, with_vector
+from agents.objectives.objective import Objective, Vector, to_vector, with_vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Settings
 from bufgym.ground.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.guided import GuidedWeights
-from bufgym.policies.weights import AnyWeights
+from bufgym.policies.weights import AnyWeights, policy_of
 
 POPULATION = 16
 """Candidates per generation."""

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cma_es import Evolution, evaluation_here
-from agents.objectives.objective import Objective, policy_of
+from agents.objectives.objective import Objective
 from agents.objectives.queue import start
 from agents.page import command, publish, table
 from agents.settings import MOTION
@@ -29,6 +29,7 @@ from bufgym.benchmark.run import by_trace, draw
 from bufgym.papers.perception import worth
 from bufgym.policies import Policy
 from bufgym.policies.learned import Weights
+from bufgym.policies.weights import policy_of
 from bufgym.sim import Senders
 
 TEST_LINKS = 2

@@ -30,7 +30,6 @@ from agents.evaluation import EvaluationSet, ValidationSets, Verdict
 from agents.held_out import FixedEpisodes, split_scenario
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.fleet import FleetObjective, fleet_of
-from agents.objectives.objective import policy_of as slot_policy_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
 from agents.settings import Settings
 from bufgym.benchmark.rows import Row
@@ -38,6 +37,7 @@ from bufgym.envs import FleetVecEnv
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import load as load_policy
 from bufgym.policies import weights
+from bufgym.policies.weights import policy_of as slot_policy_of
 from bufgym.sb3 import GymVecEnv, make_vec_env, weights_of
 from bufgym.sb3.networks import policy_of
 

@@ -16,7 +16,7 @@ from agents.held_out import FixedEpisodes, split_scenario
 from agents.objectives.objective import Objective
 from bufgym.benchmark.run import draw
 from bufgym.policies import Policy
-from bufgym.policies.guided import N_INPUTS, N_OUTPUTS, GuidedWeights
+from bufgym.policies.guided import GuidedWeights
 from bufgym.scenario import Episode
 from bufgym.sim import Senders
 
@@ -62,7 +62,7 @@ class GuidedObjective(Objective):
 
     def start(self) -> GuidedWeights:
         """The plain rule."""
-        return GuidedWeights(np.zeros((N_OUTPUTS, N_INPUTS), np.float32))
+        return GuidedWeights.plain()
 
     def measure(self, policy: Policy, episodes: Sequence[Played]) -> float:
         """Mean H over all episodes of a part."""

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.settings import Settings
-from bufgym.policies import Policy, guided, learned, learned_topics
+from bufgym.policies import Policy, learned
 from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.weights import AnyWeights
 
 Vector = NDArray[np.float64]
@@ -72,15 +71,6 @@ class Objective(ABC):
         return (self.measure(policy, self.judges),)
 
 
-def policy_of(name: str, weights: AnyWeights) -> Policy:
-    """Make the policy of these weights."""
-    if isinstance(weights, GuidedWeights):
-        return guided.linear(name, weights.weight)
-    if isinstance(weights, TopicWeights):
-        return learned_topics.policy(name, weights)
-    return learned.policy(name, weights)
-
-
 # --- weights as a vector ---------------------------------------------------------------------------------------------
 
 
@@ -98,40 +88,34 @@ def to_vector(weights: AnyWeights) -> Vector:
 def with_vector(weights: AnyWeights, vector: Vector) -> Any:
     """These weights with the searched numbers replaced."""
     if isinstance(weights, GuidedWeights):
-        return GuidedWeights(vector.reshape(weights.weight.shape).astype(np.float32))
+        return type(weights)(vector.reshape(weights.weight.shape).astype(np.float32))
     parts, searched = _numbers(weights)
     numbers = np.concatenate(parts)
     numbers[np.concatenate(searched)] = vector
     *networks, mix = np.split(numbers, np.cumsum([len(part) for part in parts[:-1]]))
     changes: dict[str, Any] = {
-        name: _network(getattr(weights, name), flat) for name, flat in zip(_networks(weights), networks, strict=True)
+        name: _network(getattr(weights, name), flat) for name, flat in zip(weights.NETWORKS, networks, strict=True)
     }
-    if isinstance(weights, Weights) and weights.mix is not None:
+    if weights.mix is not None:
         changes["mix"] = mix.reshape(weights.mix.shape).astype(np.float32)
     return replace(weights, **changes)
 
 
-def _networks(weights: Weights | TopicWeights) -> tuple[str, ...]:
-    return ("drop", "accept", "send") if isinstance(weights, TopicWeights) else ("drop", "accept")
-
-
-def _numbers(weights: Weights | TopicWeights) -> tuple[list[Vector], list[NDArray[np.bool_]]]:
+def _numbers(weights: Weights) -> tuple[list[Vector], list[NDArray[np.bool_]]]:
     """(numbers, whether each is searched) of every network and, last, of the mixing."""
-    table = learned_topics if isinstance(weights, TopicWeights) else learned
     inputs = len(weights.fields)
     numbers, searched = [], []
-    for name in _networks(weights):
+    for name in weights.NETWORKS:
         flat = getattr(weights, name).flat()
         if name == "accept":
             mask = np.arange(len(flat)) <= inputs
         else:
             mask = np.ones(len(flat), np.bool_)
-            mask[:inputs] = [table.NAMES.index(field) < table.SLOTS for field in weights.fields]
+            mask[:inputs] = [learned.NAMES.index(field) < learned.SLOTS for field in weights.fields]
             mask[inputs] = False
         numbers.append(flat)
         searched.append(mask)
-    mix = getattr(weights, "mix", None)
-    numbers.append(np.zeros(0) if mix is None else mix.reshape(-1))
+    numbers.append(np.zeros(0) if weights.mix is None else weights.mix.reshape(-1))
     searched.append(np.ones(len(numbers[-1]), np.bool_))
     return numbers, searched
 

@@ -23,7 +23,7 @@ from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import FOREVER
 from bufgym.policies import Policy
-from bufgym.policies.guided_topics import N_INPUTS, N_OUTPUTS, SchedulerWeights
+from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.scenario import Client, suites
 from bufgym.sim import Senders
 from bufgym.sim.rules import age_until
@@ -35,9 +35,9 @@ RULES = ("robofleet", "strict-priority", "age-greedy", "edf", "ros-native")
 
 PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
 """Parts of the training episodes, one a generation in turn; episodes per setting of the suite; their length, s."""
-SIGMA = 1.0
+SIGMA = 0.3
 """First step size."""
-AGE_SHARE, AGE_PENALTY = 0.9, 3.0
+AGE_SHARE, AGE_PENALTY = 0.9, 5.0
 """Target for the age of the first topics, as a share of the rival's, and the price of an excess."""
 OTHERS_SHARE, OTHERS_PENALTY = 3.0, 0.25
 """The same for all other topics. Without it, topics of little weight would never be sent."""
@@ -170,7 +170,7 @@ class TopicsObjective(Objective):
 
     def start(self) -> SchedulerWeights:
         """The plain rule."""
-        return SchedulerWeights(np.zeros((N_OUTPUTS, N_INPUTS), np.float32))
+        return SchedulerWeights.plain()
 
     def measure(self, policy: Policy, episodes: Sequence[ClientEpisodes]) -> float:
         """Compute ``mean_fitness``."""

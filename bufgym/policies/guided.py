@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -228,6 +228,7 @@ class GuidedWeights:
     CONTEXT_NAMES: ClassVar[tuple[str, ...]] = tuple(INPUTS)
     NETWORKS: ClassVar[tuple[str, ...]] = ("guided",)
     LAYERS: ClassVar[int] = 0
+    SHAPE: ClassVar[tuple[int, int]] = (N_OUTPUTS, N_INPUTS)
     TABLE: ClassVar[list[Any]] = [list(INPUTS.items()), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
     """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
 
@@ -236,22 +237,36 @@ class GuidedWeights:
         """Names of the inputs."""
         return self.CONTEXT_NAMES
 
+    @classmethod
+    def plain(cls) -> Self:
+        """Weights of 0: the plain rule."""
+        return cls(np.zeros(cls.SHAPE, np.float32))
+
     @property
-    def guided(self) -> GuidedWeights:
+    def guided(self) -> Self:
         """The one network."""
         return self
+
+    def policy(self, name: str, about: str = "", source: str = "") -> Policy:
+        """Make the policy of these weights."""
+        return linear(name, self.weight, about, source)
 
     def tensors(self) -> dict[str, NDArray[np.float32]]:
         """The numbers by name."""
         return {"weight": self.weight}
 
 
+def numbers_of(name: str, base: Numbers, weights: NDArray[Any], shape: tuple[int, int]) -> tuple[float, ...]:
+    """The rule's numbers and W, which must have this shape, as a policy's weights."""
+    W = np.asarray(weights, np.float64)
+    if W.shape != shape or not np.isfinite(W).all():
+        rule = f"must be {shape[0]} x {shape[1]} finite numbers"
+        raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")
+    return tuple(np.concatenate([base, W.reshape(-1)]).tolist())
+
+
 def linear(name: str, weights: NDArray[np.floating[Any]], about: str = "", source: str = "") -> Policy:
     """Make the policy with outputs W c for the inputs c; ``weights`` is W [outputs, inputs]. W = 0 is gap-price."""
-    W = np.asarray(weights, np.float64)
-    if W.shape != (N_OUTPUTS, N_INPUTS) or not np.isfinite(W).all():
-        rule = f"must be {N_OUTPUTS} x {N_INPUTS} finite numbers"
-        raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")
-    numbers = tuple(np.concatenate([BASE, W.reshape(-1)]).tolist())
+    numbers = numbers_of(name, BASE, weights, (N_OUTPUTS, N_INPUTS))
     policy = Policy(name, on_arrival, weights=numbers, memory=REMEMBERED, work=WORK, compile=True, reads_rate=True)
     return replace(policy, about=about, source=source)

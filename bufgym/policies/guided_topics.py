@@ -2,8 +2,9 @@
 
 The rule weighs what is known of a message. With ``FEATURES`` f, it sends the oldest message of the topic with the
 largest n f, and drops the message with the largest m f, once that exceeds the threshold ``room`` or nothing fits.
-Robofleet's order is n = 1 for ``priority`` and ``wait`` alone, strict priority is n = 1 for ``priority``. ``BASE`` is
-the plain rule: the most QoI a byte goes first, and the message that loses the least goes.
+Robofleet's order is n = 1 for ``priority`` and ``wait`` alone, strict priority is n = 1 for ``priority``. ``PLAIN``
+are the plain rule's numbers: high priorities first, then much QoI a byte and long waits; large, old messages of topics
+with a low priority, or sent a moment ago, make room.
 
 The numbers are base + W c, linear in the inputs c (``INPUTS``), so W = 0 is the plain rule; compare ``guided``.
 
@@ -15,17 +16,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, fill, is_first, loss
 from bufgym.model.observe.topics import largest
 from bufgym.model.topics import NO_DEADLINE_US
-from bufgym.policies.guided import GuidedWeights, lg
+from bufgym.policies.guided import GuidedWeights, lg, numbers_of
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.robofleet import next_no_drop
 from bufgym.policies.schedulers import fits, make_room, makes_room, topic_of
@@ -39,7 +39,6 @@ FEATURES = {
     "age": "log of the time since its arrival, s",
     "late": "its age over its topic's deadline, at most 2; 0 without a deadline",
     "queued": "log of 1 + the messages of its topic in the queue",
-    "rank": "its place in the queue: 0 is the oldest, 1 the newcomer",
 }
 """Names and meanings of what is weighed."""
 INPUTS = {
@@ -59,7 +58,11 @@ SENDS, DROPS, ROOM = 0, N_FEATURES, 2 * N_FEATURES
 OUTPUTS = (*(f"send_{name}" for name in FEATURES), *(f"drop_{name}" for name in FEATURES), "room")
 """Names of the numbers."""
 N_OUTPUTS = len(OUTPUTS)
-PLAIN = {"send_gain": 1.0, "send_size": -1.0, "drop_gain": -1.0, "room": 20.0}
+PLAIN = {
+    **{"send_priority": 10.0, "send_gain": 2.0, "send_size": -3.0, "send_wait": 2.0},
+    **{"drop_priority": -8.0, "drop_gain": -2.5, "drop_size": 5.0, "drop_wait": -8.0, "drop_age": 5.0},
+    **{"drop_queued": 3.0, "room": 8.0},
+}
 BASE = np.array([PLAIN.get(name, 0.0) for name in OUTPUTS])
 """The plain rule's numbers."""
 LEAST = 1e-3
@@ -87,8 +90,8 @@ def set_numbers(buffer: Buffer, numbers: NDArray[Any], c: NDArray[Any]) -> None:
 
 
 @kernel
-def weighed(buffer: Buffer, message: Arrival, k: int, worth: float, numbers: NDArray[Any]) -> float:
-    """The weighted sum of a message's features; k is its slot, ``worth`` its gain or loss in units of the weight."""
+def weighed(buffer: Buffer, message: Arrival, worth: float, numbers: NDArray[Any]) -> float:
+    """The weighted sum of a message's features; ``worth`` is its gain or loss in units of the weight."""
     topic, priority = topic_of(buffer, message), largest(buffer)[0]
     age_s = (buffer.now_us - message.arrival_us) / 1e6
     last_us = topic.dequeued_arrival_us if topic.dequeued > 0 else 0
@@ -99,7 +102,7 @@ def weighed(buffer: Buffer, message: Arrival, k: int, worth: float, numbers: NDA
     total += numbers[5] * math.log(max(age_s, 0.0) + LEAST)
     if topic.deadline_us < NO_DEADLINE_US:
         total += numbers[6] * min(1e6 * age_s / topic.deadline_us, 2.0)
-    return float(total + numbers[7] * math.log(1.0 + topic.queued) + numbers[8] * k / max(len(buffer.slots), 1))
+    return float(total + numbers[7] * math.log(1.0 + topic.queued))
 
 
 def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -112,11 +115,11 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     best, decision, room = -np.inf, REJECT, fits(buffer, arrival)
     for k in range(s):
         if makes_room(buffer, arrival, k):
-            dropped = weighed(buffer, buffer.slots[k], k, loss(buffer, arrival, k) / weight, drops)
+            dropped = weighed(buffer, buffer.slots[k], loss(buffer, arrival, k) / weight, drops)
             if dropped > best:
                 best, decision = dropped, k
     if buffer.topics[arrival.topic].no_drop == 0:
-        dropped = weighed(buffer, arrival, s, loss(buffer, arrival, s) / weight, drops)
+        dropped = weighed(buffer, arrival, loss(buffer, arrival, s) / weight, drops)
         if dropped > best:
             best, decision = dropped, REJECT
     return ACCEPT if room and best <= numbers[ROOM] else decision
@@ -133,7 +136,7 @@ def on_send(buffer: Buffer, memory: Memory) -> int:
     set_numbers(buffer, numbers, memory[N_OUTPUTS:])
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
-            sent = weighed(buffer, buffer.slots[k], k, buffer.slots[k].gain / weight, numbers)
+            sent = weighed(buffer, buffer.slots[k], buffer.slots[k].gain / weight, numbers)
             if sent > best:
                 best, choice = sent, k
     return choice
@@ -145,10 +148,16 @@ class SchedulerWeights(GuidedWeights):
 
     CONTEXT_NAMES = tuple(INPUTS)
     NETWORKS = ("scheduler",)
+    SHAPE = (N_OUTPUTS, N_INPUTS)
+    TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), list(INPUTS.items()), OUTPUTS, PLAIN]
 
+    @property
+    def scheduler(self) -> SchedulerWeights:
+        """The one network."""
+        return self
 
-def linear(name: str, weights: NDArray[np.floating[Any]], about: str = "", source: str = "", base: Any = BASE) -> Policy:
-    W = np.asarray(weights, np.float64)
-    numbers = tuple(np.concatenate([base, W.reshape(-1)]).tolist())
-    policy = Policy(name, on_arrival, on_send=on_send, weights=numbers, work=(N_INPUTS + N_OUTPUTS, 0), compile=True)
-    return replace(policy, about=about, source=source, for_topics=True, reads_rate=True)
+    def policy(self, name: str, about: str = "", source: str = "") -> Policy:
+        """Make the policy of these weights, for any topics and every L."""
+        numbers, work = numbers_of(name, BASE, self.weight, self.SHAPE), (N_OUTPUTS + N_INPUTS, 0)
+        policy = Policy(name, on_arrival, on_send=on_send, weights=numbers, work=work, compile=True, reads_rate=True)
+        return replace(policy, about=about, source=source, for_topics=True)

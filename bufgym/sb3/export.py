@@ -15,11 +15,10 @@ from torch import nn
 
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength
-from bufgym.policies import Policy, guided, learned, learned_topics
+from bufgym.policies import Policy
 from bufgym.policies import weights as files
-from bufgym.policies.guided import GuidedWeights
+from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 from bufgym.scenario import Streams, suites
@@ -47,11 +46,9 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
     path = Path(model)
     weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
     notes = {"name": name, "about": about, **run_notes(path)}
-    if isinstance(weights, TopicWeights):
-        return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
-    policy = (
-        guided.linear(name, weights.weight) if isinstance(weights, GuidedWeights) else learned.policy(name, weights)
-    )
+    policy = files.policy_of(name, weights)
+    if isinstance(weights, SchedulerWeights):
+        return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(policy)})
     return files.save(out, weights, {**notes, "regret": regrets(policy)})
 
 
