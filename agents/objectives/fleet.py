@@ -1,8 +1,7 @@
 """A fleet: one agent decides on every robot's buffer. Its objective is team QoI (mean H over robots) minus AFR's.
 
 The robots of a cell share its capacity, so bytes that one sends another cannot; each still sees its own buffer alone.
-The search begins with the agent that ships with bufgym, which learned on a link of its own. The new agent may read more
-of the link (``MORE``) and learn to spare it (``THRIFT``).
+The search begins at the rule ``gap-price`` and moves its numbers (``bufgym.policies.guided``).
 """
 
 from __future__ import annotations
@@ -13,15 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from agents.objectives import queue
 from agents.objectives.objective import Objective
 from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.sweep import Sweep
-from bufgym.ground.files import shipped
-from bufgym.policies import Policy, weights
-from bufgym.policies.learned import Weights
+from bufgym.policies import Policy
+from bufgym.policies.guided import GuidedWeights
 from bufgym.scenario import FleetEpisode, FleetScenario, suites
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
@@ -31,13 +28,6 @@ PARTS, EPISODES, EPISODE_S = 12, 2, 30.0
 s. Each of fleet-v1's training links comes once."""
 VALIDATION_EPISODES = 4
 """Validation episodes per link, of the suite's own length."""
-LINK = ("busy", "left", "departures")
-MORE = {"motion": ("time_before", "time_merged", *LINK, "arrival_motion_gap"), "time": LINK}
-"""Fields that evolution reads besides those of the shipped agents: how the shared link changes between messages."""
-THRIFT = 7.0
-"""Amount that evolution takes off the shipped agents' score of accepting while there is room. Their margin is so wide
-that small changes have no effect, and a search from there stays in place. With this off, the agent with odometry
-drops while there is still room, and its gain on training episodes is near its largest (docs/fleet.md)."""
 
 
 def fleet_of(suite: str, split: str) -> FleetScenario:
@@ -45,12 +35,6 @@ def fleet_of(suite: str, split: str) -> FleetScenario:
     (setting,) = suites.get(suite).settings(split).values()
     fleet: FleetScenario = setting.scenario
     return fleet
-
-
-def widened(agent: Weights, more: tuple[str, ...]) -> Weights:
-    """The agent with scorers that also read these fields, at weight 0, and may mix all."""
-    mix = np.zeros((len(agent.context), len(agent.slot)), np.float32) if agent.mix is None else agent.mix
-    return queue.reading(replace(agent, mix=mix), more)
 
 
 # --- episodes --------------------------------------------------------------------------------------------------------
@@ -115,7 +99,7 @@ class FleetObjective(Objective):
     columns = ("gain",)
     best = max
     message = "team QoI {:+.4f} over AFR's on validation"
-    sigma = queue.SIGMA
+    sigma = 0.05
 
     @property
     def _capacities(self) -> tuple[int, ...]:
@@ -131,15 +115,9 @@ class FleetObjective(Objective):
         """Episodes of ``validation_episodes``."""
         return validation_episodes(self.settings.suite, self._capacities)
 
-    def start(self) -> Weights:
-        """The shipped agent, less ready to accept; or greed, if fields or hidden units are asked for."""
-        settings = self.settings
-        if settings.fields or settings.hidden:
-            return queue.start(settings.observed, settings.hidden, np.random.default_rng(self.seed))
-        agents = shipped("agents", "agents/pretrained", "*.safetensors")
-        agent = widened(weights.read(agents[f"learned-{settings.sees}"])[0], MORE[settings.sees])
-        agent.accept.bias[:] -= THRIFT
-        return agent
+    def start(self) -> GuidedWeights:
+        """The plain rule."""
+        return GuidedWeights.plain()
 
     def measure(self, policy: Policy, episodes: Sequence[FleetEpisodes]) -> float:
         """Compute ``mean_gain``."""
