@@ -37,7 +37,7 @@ PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
 """Parts of the training episodes, one a generation in turn; episodes per setting of the suite; their length, s."""
 SIGMA = 0.3
 """First step size."""
-AGE_SHARE, AGE_PENALTY = 0.9, 5.0
+AGE_SHARE, AGE_PENALTY = 0.9, 4.0
 """Target for the age of the first topics, as a share of the rival's, and the price of an excess."""
 OTHERS_SHARE, OTHERS_PENALTY = 3.0, 0.25
 """The same for all other topics. Without it, topics of little weight would never be sent."""

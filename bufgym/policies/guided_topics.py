@@ -90,12 +90,12 @@ def set_numbers(buffer: Buffer, numbers: NDArray[Any], c: NDArray[Any]) -> None:
 
 
 @kernel
-def weighed(buffer: Buffer, message: Arrival, worth: float, numbers: NDArray[Any]) -> float:
-    """The weighted sum of a message's features; ``worth`` is its gain or loss in units of the weight."""
-    topic, priority = topic_of(buffer, message), largest(buffer)[0]
+def weighed(buffer: Buffer, message: Arrival, worth: float, most: tuple[float, float], numbers: NDArray[Any]) -> float:
+    """The weighted sum of a message's features; ``worth`` is its gain or loss, ``most`` what ``largest`` says."""
+    topic = topic_of(buffer, message)
     age_s = (buffer.now_us - message.arrival_us) / 1e6
     last_us = topic.dequeued_arrival_us if topic.dequeued > 0 else 0
-    total = numbers[0] * lg(topic.priority, priority) + numbers[1] * math.log(worth + LEAST)
+    total = numbers[0] * lg(topic.priority, most[0]) + numbers[1] * math.log(worth / most[1] + LEAST)
     total += numbers[2] * math.log(message.size_bytes / max(buffer.arrival_bytes, 1.0))
     total += numbers[3] * math.log(max(buffer.now_us - topic.last_dequeue_us, 0) / 1e6 + LEAST)
     total += numbers[4] * math.log(max(buffer.now_us - last_us, 0) / 1e6 + LEAST)
@@ -109,17 +109,17 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A scheduler that weighs gain, bytes, priority and time, by numbers linear in what the client sees."""
     if len(buffer.topics) == 1:
         return make_room(buffer, arrival)  # a single queue has no topics to tell apart
-    numbers, weight, s = memory[:N_OUTPUTS], largest(buffer)[1], len(buffer.slots)
+    numbers, most, s = memory[:N_OUTPUTS], largest(buffer), len(buffer.slots)
     set_numbers(buffer, numbers, memory[N_OUTPUTS:])
     drops = numbers[DROPS:ROOM]
     best, decision, room = -np.inf, REJECT, fits(buffer, arrival)
     for k in range(s):
         if makes_room(buffer, arrival, k):
-            dropped = weighed(buffer, buffer.slots[k], loss(buffer, arrival, k) / weight, drops)
+            dropped = weighed(buffer, buffer.slots[k], loss(buffer, arrival, k), most, drops)
             if dropped > best:
                 best, decision = dropped, k
     if buffer.topics[arrival.topic].no_drop == 0:
-        dropped = weighed(buffer, arrival, loss(buffer, arrival, s) / weight, drops)
+        dropped = weighed(buffer, arrival, loss(buffer, arrival, s), most, drops)
         if dropped > best:
             best, decision = dropped, REJECT
     return ACCEPT if room and best <= numbers[ROOM] else decision
@@ -132,11 +132,11 @@ def on_send(buffer: Buffer, memory: Memory) -> int:
     choice = next_no_drop(buffer, 0)
     if choice != HOLD:
         return choice
-    numbers, weight, best = memory[:N_OUTPUTS], largest(buffer)[1], -np.inf
+    numbers, most, best = memory[:N_OUTPUTS], largest(buffer), -np.inf
     set_numbers(buffer, numbers, memory[N_OUTPUTS:])
     for k in range(len(buffer.slots)):
         if is_first(buffer, k):
-            sent = weighed(buffer, buffer.slots[k], buffer.slots[k].gain / weight, numbers)
+            sent = weighed(buffer, buffer.slots[k], buffer.slots[k].gain, most, numbers)
             if sent > best:
                 best, choice = sent, k
     return choice
