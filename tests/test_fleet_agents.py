@@ -10,13 +10,12 @@ import train_cases  # noqa: F401  (it skips without the extra)
 import train
 from agents import training
 from agents.objectives import fleet
-from agents.objectives.objective import to_vector
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import by_trace, draw, run
 from bufgym.benchmark.tasks import TASKS, FleetTask
-from bufgym.policies import learned, weights
+from bufgym.policies import weights
 from bufgym.scenario import suites
 from bufgym.scenario.suites import Setting
 
@@ -61,26 +60,10 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     assert cell.decisions == 2 * 2 * 60
 
 
-def start_of(**changes: str) -> weights.Weights:
-    return fleet.FleetObjective(dataclasses.replace(TINY, **changes), Path(), 0).start()  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("sees", ["motion", "time"])
-def test_the_shipped_agents_scorers_read_more_and_decide_the_same(sees: str) -> None:
-    file = Path(__file__).parents[1] / f"agents/pretrained/learned-{sees}.safetensors"
-    shipped = weights.read(file)[0]
-    made = fleet.widened(shipped, fleet.MORE[sees])
-    assert made.fields == (*shipped.fields, *fleet.MORE[sees])
+def test_evolution_begins_at_the_rule() -> None:
     cells = fleet.training_parts("fleet-v1", SUITE.capacities, seed=0)[0]
-    mine, theirs = learned.policy("mine", made), learned.policy("shipped", shipped)
-    assert [cell.team_qoi(mine) for cell in cells] == [cell.team_qoi(theirs) for cell in cells]
-    assert sees == "motion" or not [name for name in made.fields if "motion" in name]
-    # What it reads now can be searched. Evolution begins there, but less ready to accept.
-    assert len(to_vector(made)) > len(to_vector(shipped))
-    first = start_of(sees=sees)
-    assert first.accept.bias[0] == made.accept.bias[0] - fleet.THRIFT
-    first.accept.bias[:] = made.accept.bias
-    assert (first.parameters() == made.parameters()).all()
+    mine, rule = fleet.FleetObjective(TINY, Path(), 0).start().policy("mine"), policies.get("gap-price")
+    assert [cell.team_qoi(mine) for cell in cells] == [cell.team_qoi(rule) for cell in cells]
 
 
 @pytest.mark.nightly
