@@ -23,7 +23,7 @@ from bufgym.scenario import FleetEpisode, FleetScenario, suites
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
-PARTS, EPISODES, EPISODE_S = 12, 2, 30.0
+PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
 """Parts of the training episodes, one a generation in turn; episodes of each link and capacity in a part; their length,
 s. Each of fleet-v1's training links comes once."""
 VALIDATION_EPISODES = 4
