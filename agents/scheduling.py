@@ -19,7 +19,7 @@ PAGE = """# Learned scheduling on topics-v1
 
 Eight topics of Robofleet's example client share an uplink. It is slower than the client publishes, and it drops out
 now and then (`bufgym list suites`). The agents set the numbers of one rule (`bufgym.policies.guided_topics`): 17
-weights and thresholds, linear in nine inputs such as the link's rate and the messages in flight. At every arrival the rule
+weights and thresholds, linear in nine inputs such as the link's rate and the messages in flight. At every arrival it
 chooses the message to drop, and at every free socket the message to send. Training begins at the plain rule. There
 links are 0.7 to 10 times as fast, and topics are left out by chance. The page shows all training seeds.
 

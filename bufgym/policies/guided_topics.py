@@ -6,10 +6,8 @@ Robofleet's order is n = 1 for ``priority`` and ``wait`` alone, strict priority 
 are the plain rule's numbers: high priorities first, then much QoI a byte and long waits; large, old messages of topics
 with a low priority, or sent a moment ago, make room.
 
-The numbers are base + W c, linear in the inputs c (``INPUTS``), so W = 0 is the plain rule; compare ``guided``.
-
-One thing is not moved: ``no_drop`` messages go first, as in Robofleet. They are lost only if the queue holds nothing
-else.
+The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``; lg is that of ``guided``), so W = 0 is the plain
+rule. ``no_drop`` messages go first in any case, as in Robofleet, and are lost only if the queue holds nothing else.
 """
 
 from __future__ import annotations
@@ -40,7 +38,6 @@ FEATURES = {
     "late": "its age over its topic's deadline, at most 2; 0 without a deadline",
     "queued": "log of 1 + the messages of its topic in the queue",
 }
-"""Names and meanings of what is weighed."""
 INPUTS = {
     "one": "always 1",
     "fill": "2 fill level - 1",
@@ -52,19 +49,15 @@ INPUTS = {
     "in_flight": "2 in_flight / n_T - 1",
     "window": "1 - 2 / n_T",
 }
-"""Names and meanings of the inputs; lg is ``guided.lg``."""
 N_FEATURES, N_INPUTS = len(FEATURES), len(INPUTS)
 SENDS, DROPS, ROOM = 0, N_FEATURES, 2 * N_FEATURES
 OUTPUTS = (*(f"send_{name}" for name in FEATURES), *(f"drop_{name}" for name in FEATURES), "room")
-"""Names of the numbers."""
 N_OUTPUTS = len(OUTPUTS)
 PLAIN = {
-    **{"send_priority": 10.0, "send_gain": 2.0, "send_size": -3.0, "send_wait": 2.0},
-    **{"drop_priority": -8.0, "drop_gain": -2.5, "drop_size": 5.0, "drop_wait": -8.0, "drop_age": 5.0},
-    **{"drop_queued": 3.0, "room": 8.0},
+    **{"send_priority": 10.0, "send_gain": 2.0, "send_size": -3.0, "send_wait": 2.0, "drop_priority": -8.0},
+    **{"drop_gain": -2.5, "drop_size": 5.0, "drop_wait": -8.0, "drop_age": 5.0, "drop_queued": 3.0, "room": 8.0},
 }
 BASE = np.array([PLAIN.get(name, 0.0) for name in OUTPUTS])
-"""The plain rule's numbers."""
 LEAST = 1e-3
 """Added to a gain, a loss, and a time in s, before their logarithm."""
 
@@ -158,6 +151,6 @@ class SchedulerWeights(GuidedWeights):
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights, for any topics and every L."""
-        numbers, work = numbers_of(name, BASE, self.weight, self.SHAPE), (N_OUTPUTS + N_INPUTS, 0)
-        policy = Policy(name, on_arrival, on_send=on_send, weights=numbers, work=work, compile=True, reads_rate=True)
-        return replace(policy, about=about, source=source, for_topics=True)
+        numbers = numbers_of(name, BASE, self.weight, self.SHAPE)
+        policy = Policy(name, on_arrival, on_send=on_send, weights=numbers, compile=True, reads_rate=True)
+        return replace(policy, about=about, source=source, for_topics=True, work=(N_OUTPUTS + N_INPUTS, 0))
