@@ -49,7 +49,7 @@ def episodes_of(count: int = 2, **more: Any) -> topics.ClientEpisodes:
 
 
 def test_weights_are_a_vector_and_back() -> None:
-    begin = SchedulerWeights.plain()
+    begin = SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32))
     vector = np.arange(len(to_vector(begin)), dtype=float)
     assert with_vector(begin, vector).weight.shape == begin.weight.shape
     assert (to_vector(with_vector(begin, vector)) == vector).all()
@@ -72,7 +72,10 @@ def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[floa
 
 
 def test_reached_is_what_the_metrics_say() -> None:
-    for policy in (policies.get("fifo"), SchedulerWeights.plain().policy("plain")):
+    for policy in (
+        policies.get("fifo"),
+        SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32)).policy("plain"),
+    ):
         of = episodes_of()
         assert of.reached(policy) == pytest.approx(by_metrics(policy, of), rel=1e-9)
         assert of.reached(policy) == of.reached(policy)

@@ -117,7 +117,7 @@ class FleetObjective(Objective):
 
     def start(self) -> GuidedWeights:
         """The plain rule."""
-        return GuidedWeights.plain()
+        return GuidedWeights(np.zeros(GuidedWeights.SHAPE, np.float32))
 
     def measure(self, policy: Policy, episodes: Sequence[FleetEpisodes]) -> float:
         """Compute ``mean_gain``."""

@@ -62,7 +62,7 @@ class GuidedObjective(Objective):
 
     def start(self) -> GuidedWeights:
         """The plain rule."""
-        return GuidedWeights.plain()
+        return GuidedWeights(np.zeros(GuidedWeights.SHAPE, np.float32))
 
     def measure(self, policy: Policy, episodes: Sequence[Played]) -> float:
         """Mean H over all episodes of a part."""

@@ -237,11 +237,6 @@ class GuidedWeights:
         """Names of the inputs."""
         return self.CONTEXT_NAMES
 
-    @classmethod
-    def plain(cls) -> Self:
-        """Weights of 0: the plain rule."""
-        return cls(np.zeros(cls.SHAPE, np.float32))
-
     @property
     def guided(self) -> Self:
         """The one network."""

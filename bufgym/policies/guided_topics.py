@@ -58,8 +58,7 @@ PLAIN = {
     **{"drop_gain": -2.5, "drop_size": 5.0, "drop_wait": -8.0, "drop_age": 5.0, "drop_queued": 3.0, "room": 8.0},
 }
 BASE = np.array([PLAIN.get(name, 0.0) for name in OUTPUTS])
-LEAST = 1e-3
-"""Added to a gain, a loss, and a time in s, before their logarithm."""
+LEAST = 1e-3  # added to a gain, a loss, and a time in s, before their logarithm
 
 
 @kernel
@@ -101,7 +100,7 @@ def weighed(buffer: Buffer, message: Arrival, worth: float, most: tuple[float, f
 def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A scheduler that weighs gain, bytes, priority and time, by numbers linear in what the client sees."""
     if len(buffer.topics) == 1:
-        return make_room(buffer, arrival)  # a single queue has no topics to tell apart
+        return make_room(buffer, arrival)  # no topics to tell apart
     numbers, most, s = memory[:N_OUTPUTS], largest(buffer), len(buffer.slots)
     set_numbers(buffer, numbers, memory[N_OUTPUTS:])
     drops = numbers[DROPS:ROOM]

@@ -140,7 +140,7 @@ def test_on_one_queue_it_drops_its_oldest_first_in_first_out(case, v):
 
 def by_priority(sign):
     """Numbers that see priorities alone: sent as ``sign`` says, the lowest dropped."""
-    W = SchedulerWeights.plain()
+    W = SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32))
     wanted = {"send_priority": sign, "drop_priority": -1.0, "room": 100.0}
     W.weight[:, 0] = [wanted.get(name, 0.0) - PLAIN.get(name, 0.0) for name in OUTPUTS]
     return W.policy("by-priority")
