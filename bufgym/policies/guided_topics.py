@@ -74,11 +74,10 @@ def set_numbers(buffer: Buffer, numbers: NDArray[Any], c: NDArray[Any]) -> None:
     c[6] = 2 * buffer.service_ratio - 1
     c[7] = 2 * buffer.in_flight / buffer.window - 1
     c[8] = 1 - 2 / buffer.window
-    base, weights = buffer.parameters[:N_OUTPUTS], buffer.parameters[N_OUTPUTS:]
     for o in range(N_OUTPUTS):
-        numbers[o] = base[o]
+        numbers[o] = buffer.parameters[o]
         for i in range(N_INPUTS):
-            numbers[o] += weights[o * N_INPUTS + i] * c[i]
+            numbers[o] += buffer.parameters[N_OUTPUTS + o * N_INPUTS + i] * c[i]
 
 
 @kernel
