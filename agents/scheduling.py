@@ -8,10 +8,9 @@ from pathlib import Path
 from agents.page import command, publish, written
 from agents.runs import MODEL, read_settings
 from bufgym import policies
-from bufgym.benchmark.rows import read_rows
+from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.score import Standing
 from bufgym.benchmark.summary import Summary, plain
-from bufgym.benchmark.table import Rows
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.errors import BufgymError
 
@@ -98,7 +97,7 @@ def main(run: Path, out: Path | None = None) -> None:
     publish(text, out)
 
 
-def _against_rules(rows: Rows, results: Summary, best: str, unbounded: set[str]) -> Iterator[str]:
+def _against_rules(rows: list[Row], results: Summary, best: str, unbounded: set[str]) -> Iterator[str]:
     """Rows of the table of the best rules, two a setting where they differ."""
     for (scenario, L), standings in results.cells.items():
         rules = [s for s in standings if not s.policy.startswith("agent") and s.policy not in unbounded]
