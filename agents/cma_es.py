@@ -1,4 +1,4 @@
-"""Evolution: a scorer's weights by CMA-ES over whole episodes, rolled out in compiled code.
+"""Evolution: an agent's weights by CMA-ES over whole episodes, rolled out in compiled code.
 
 PPO learns from single decisions by costly updates. Here a candidate is a vector of weights, and its fitness comes from
 whole episodes (``objectives``). A rollout decides two million times a second, so a few minutes suffice. All candidates
@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,34 +25,31 @@ import numpy as np
 
 from agents.cluster import connected
 from agents.objectives import OBJECTIVES
-from agents.objectives.objective import Objective, Vector, policy_of, to_vector, with_vector
+from agents.objectives.objective import Objective, Vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Settings
 from bufgym.ground.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.guided import GuidedWeights
-from bufgym.policies.weights import AnyWeights
 
 POPULATION = 16
 """Candidates per generation."""
 MEMORY = 10
 """Generations over which the strategy's mean is averaged, exponentially."""
-DIAGONAL = 100
+DIAGONAL = 400
 """Number of weights from which a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
-FULL = 400
-"""The same for agents that guide a rule, whose weights work together."""
 
 
 # --- how candidates are evaluated ------------------------------------------------------------------------------------
 
-Evaluate = Callable[[Sequence[AnyWeights], int], list[tuple[float, int]]]
+Evaluate = Callable[[Sequence[GuidedWeights], int], list[tuple[float, int]]]
 """(candidates, part of the training episodes) -> (fitness, decisions) of each, in their order."""
 
 
 def evaluation_here(objective: Objective) -> Evaluate:
     """Evaluate candidates in this process, one after the other."""
 
-    def evaluate(candidates: Sequence[AnyWeights], part: int) -> list[tuple[float, int]]:
+    def evaluate(candidates: Sequence[GuidedWeights], part: int) -> list[tuple[float, int]]:
         return [_evaluated(objective, candidate, part) for candidate in candidates]
 
     return evaluate
@@ -66,7 +63,7 @@ def evaluation(settings: Settings, folder: Path, seed: int, objective: Objective
         return
     with connected(settings.backend, settings.address or None) as call_each:
 
-        def evaluate(candidates: Sequence[AnyWeights], part: int) -> list[tuple[float, int]]:
+        def evaluate(candidates: Sequence[GuidedWeights], part: int) -> list[tuple[float, int]]:
             calls = [(settings, folder, seed, candidate, part) for candidate in candidates]
             return call_each(evaluated_on_a_worker, calls)
 
@@ -78,7 +75,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def evaluated_on_a_worker(
-    settings: Settings, folder: Path, seed: int, candidate: AnyWeights, part: int
+    settings: Settings, folder: Path, seed: int, candidate: GuidedWeights, part: int
 ) -> tuple[float, int]:
     """The fitness and the decisions of one candidate. Each process draws and bounds the episodes once."""
     with _ONE_AT_A_TIME:
@@ -90,8 +87,8 @@ def _objective(settings: Settings, folder: Path, seed: int) -> Objective:
     return OBJECTIVES[settings.kind](settings, folder, seed)
 
 
-def _evaluated(objective: Objective, candidate: AnyWeights, part: int) -> tuple[float, int]:
-    fitness = objective.fitness(policy_of(objective.name, candidate), part)
+def _evaluated(objective: Objective, candidate: GuidedWeights, part: int) -> tuple[float, int]:
+    fitness = objective.fitness(candidate.policy(objective.name), part)
     return fitness, objective.decisions(part)
 
 
@@ -102,7 +99,7 @@ def _evaluated(objective: Objective, candidate: AnyWeights, part: int) -> tuple[
 class Evolution:
     """The state of one seed's evolution, as in a checkpoint."""
 
-    like: AnyWeights
+    like: GuidedWeights
     """Weights with the numbers that are not searched."""
     strategy: Any
     """pycma's strategy."""
@@ -116,20 +113,18 @@ class Evolution:
     """Time spent training, s."""
 
     @staticmethod
-    def around(like: AnyWeights, sigma: float, seed: int) -> Evolution:
+    def around(like: GuidedWeights, sigma: float, seed: int) -> Evolution:
         """A new search around these weights."""
-        begin = to_vector(like)
-        diagonal = FULL if isinstance(like, GuidedWeights) else DIAGONAL
-        options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > diagonal}
+        begin = like.weight.reshape(-1).astype(np.float64)
+        options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
         return Evolution(like, cma.CMAEvolutionStrategy(begin, sigma, options), begin)
 
-    def weights(self, vector: Vector) -> AnyWeights:
+    def weights(self, vector: Vector) -> GuidedWeights:
         """The agent with these numbers."""
-        weights: AnyWeights = with_vector(self.like, vector)
-        return weights
+        return replace(self.like, weight=vector.reshape(self.like.weight.shape).astype(np.float32))
 
     @property
-    def agent(self) -> AnyWeights:
+    def agent(self) -> GuidedWeights:
         """The agent so far."""
         return self.weights(self.average)
 
@@ -165,7 +160,7 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
     with evaluation(settings, folder, seed, objective) as evaluate:
         while True:
             if validations.due(state.steps):
-                measures = objective.validate(policy_of(objective.name, state.agent))
+                measures = objective.validate(state.agent.policy(objective.name))
                 if validations.add(state.steps, state.seconds, measures):
                     notes = {"name": objective.name, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
                     weights.save(home / MODEL, state.agent, notes)

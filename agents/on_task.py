@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cma_es import Evolution, evaluation_here
-from agents.objectives.objective import Objective, policy_of
+from agents.objectives.objective import Objective
 from agents.page import command, publish, table
 from bufgym import policies
 from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
@@ -99,7 +99,7 @@ def evolved(reward: str, L: int, seed: int, generations: int) -> Policy:
     state = Evolution.around(task.start(), task.sigma, seed)
     for _ in range(generations):
         state.generation(evaluation_here(task))
-    return policy_of(task.name, state.agent)
+    return state.agent.policy(task.name)
 
 
 def tested(policy: Policy, episodes: Episodes) -> dict[str, NDArray[np.float64]]:

@@ -31,14 +31,13 @@ from agents.evaluation import EvaluationSet, ValidationSets, Verdict
 from agents.held_out import FixedEpisodes, split_scenario
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.fleet import FleetObjective, fleet_of
-from agents.objectives.objective import policy_of as policy_of_weights
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
 from agents.settings import Settings
 from bufgym.benchmark.rows import Row
 from bufgym.envs import FleetVecEnv
 from bufgym.ground.errors import BufgymError
+from bufgym.policies import learned, weights
 from bufgym.policies import load as load_policy
-from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv, make_vec_env, weights_of
 from bufgym.sb3.networks import policy_of
 
@@ -101,8 +100,8 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, secon
     spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
     file = "model.zip"
     if settings.kind == "fleet" or settings.algo == "guided-ppo":
-        file, learned = MODEL, algorithm.load(kept, device="cpu")
-        found = weights_of(learned) if settings.kind == "fleet" else guided_ppo.weights_of(learned)
+        file, kept_model = MODEL, algorithm.load(kept, device="cpu")
+        found = weights_of(kept_model) if settings.kind == "fleet" else guided_ppo.weights_of(kept_model)
         notes = {"name": settings.algo, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
         weights.save(home / MODEL, found, notes)
     return Run(seed, home, spent, curve.record.rows, rows, file, best)
@@ -115,7 +114,7 @@ def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, st
 
         def score(model: Any) -> Numbers:
             if settings.algo == "guided-ppo":
-                outcomes = episodes.run(policy_of_weights("ppo", guided_ppo.weights_of(model)))
+                outcomes = episodes.run(guided_ppo.weights_of(model).policy("ppo"))
             else:
                 outcomes = episodes.play(model)
             return episodes.score(outcomes), float(np.mean([result.qoi for result in outcomes]))
@@ -127,7 +126,7 @@ def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, st
         objective = FleetObjective(settings, folder, settings.seed)
 
         def gain(model: Any) -> Numbers:
-            return objective.validate(policy_of_weights(objective.name, weights_of(model)))
+            return objective.validate(learned.policy(objective.name, weights_of(model)))
 
         validations = Validations(home, objective.columns, objective.best, settings, steps)
         return Validation(home, validations, gain, lambda measures: objective.message.format(measures[-1]), curve)

@@ -10,7 +10,6 @@ import train_cases  # noqa: F401  (it skips without the extra)
 import train
 from agents import training
 from agents.objectives import fleet
-from agents.objectives.objective import policy_of
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
@@ -61,11 +60,10 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     assert cell.decisions == 2 * 2 * 60
 
 
-def test_the_search_begins_at_the_rule() -> None:
-    begun = fleet.FleetObjective(TINY, Path(), 0).start()
+def test_evolution_begins_at_the_rule() -> None:
     cells = fleet.training_parts("fleet-v1", SUITE.capacities, seed=0)[0]
-    rule, first = policies.get("gap-price"), policy_of("first", begun)
-    assert [cell.team_qoi(first) for cell in cells] == [cell.team_qoi(rule) for cell in cells]
+    mine, rule = fleet.FleetObjective(TINY, Path(), 0).start().policy("mine"), policies.get("gap-price")
+    assert [cell.team_qoi(mine) for cell in cells] == [cell.team_qoi(rule) for cell in cells]
 
 
 @pytest.mark.nightly

@@ -14,14 +14,15 @@ from train_cases import KilledError, columns, in_a_folder_of_its_own  # noqa: F4
 
 import train
 from agents import cma_es
+from agents.cma_es import Evolution
 from agents.objectives import topics
-from agents.objectives.objective import policy_of, to_vector, with_vector
 from agents.runs import MODEL, prepare
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
-from bufgym.policies import learned_topics, weights
+from bufgym.policies import weights
+from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.scenario import Client, Stream, suites
 from bufgym.scenario.suites import Setting
 from bufgym.sim import run
@@ -48,18 +49,10 @@ def episodes_of(count: int = 2, **more: Any) -> topics.ClientEpisodes:
 
 
 def test_weights_are_a_vector_and_back() -> None:
-    c, n = len(topics.CONTEXT), len(topics.FIELDS)
-    begin = topics.start()
-    vector = to_vector(begin)
-    assert len(vector) == (n - c) + n + 1 + (n - c)
-    assert with_vector(begin, vector).parameters().tobytes() == begin.parameters().tobytes()
-    counted = np.arange(len(vector), dtype=float)
-    made = with_vector(begin, counted)
-    assert (to_vector(made) == counted).all()
-    # What the context adds to every candidate alike decides nothing, and stays 0.
-    assert made.drop.skip.tolist() == [0] * c + list(range(n - c))
-    assert made.send.skip.tolist() == [0] * c + list(range(len(vector) - n + c, len(vector)))
-    assert made.accept.bias.tolist() == [2 * n - c]
+    search = Evolution.around(SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32)), 0.1, 0)
+    vector = np.arange(len(search.average), dtype=float)
+    found = search.weights(vector)
+    assert isinstance(found, SchedulerWeights) and (found.weight.reshape(-1) == vector).all()
 
 
 def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[float, float, float, int]:
@@ -79,7 +72,10 @@ def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[floa
 
 
 def test_reached_is_what_the_metrics_say() -> None:
-    for policy in (policies.get("fifo"), policy_of("greedy", topics.start())):
+    for policy in (
+        policies.get("fifo"),
+        SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32)).policy("plain"),
+    ):
         of = episodes_of()
         assert of.reached(policy) == pytest.approx(by_metrics(policy, of), rel=1e-9)
         assert of.reached(policy) == of.reached(policy)
@@ -89,19 +85,20 @@ def test_reached_is_what_the_metrics_say() -> None:
 @pytest.mark.parametrize(
     ("reached", "expected"),
     [
-        ((50.0, 18.0, 30.0, 0), -0.5 + 3 * 0.5),  # half the QoI, and so much below the rival; ages as they may be
+        # Half the QoI, where 1.2 times the rival's is the best rule's; ages as they may be.
+        ((50.0, 18.0, 30.0, 0), -0.5 + 3 * (1.02 * 1.2 - 0.5)),
         ((150.0, 10.0, 10.0, 0), -1.5),  # less age than asked for pays nothing
-        ((100.0, 24.0, 30.0, 0), -1 + 3 * 0.3),  # 1.2 - 0.9
-        ((100.0, 18.0, 40.0, 0), -1 + 0.25 * 0.5),  # 2 - 1.5
-        ((100.0, 18.0, 30.0, 3), -1 + 3.0),  # three no_drop messages
-        ((0.0, 40.0, 60.0, 1), 1 + 3 * 1.1 + 0.25 * 1.5 + 3),
+        ((150.0, 24.0, 30.0, 0), -1.5 + 4 * 0.3),  # 1.2 - 0.9
+        ((150.0, 18.0, 70.0, 0), -1.5 + 0.25 * 0.5),  # 3.5 - 3
+        ((150.0, 18.0, 30.0, 3), -1.5 + 3.0),  # three no_drop messages
+        ((0.0, 40.0, 80.0, 1), 1 + 4 * 1.1 + 0.25 + 3 * 1.02 * 1.2),
     ],
 )
 def test_fitness_by_hand(reached: tuple[float, float, float, int], expected: float) -> None:
     result = topics.Reached(*reached)
-    of: Any = SimpleNamespace(rival=topics.Reached(100.0, 20.0, 20.0, 0), reached=lambda policy: result)
+    of: Any = SimpleNamespace(rival=topics.Reached(100.0, 20.0, 20.0, 0), best_qoi=120.0, reached=lambda policy: result)
     best = topics.Reached(2.0, 0.0, 1.0, 0)
-    free: Any = SimpleNamespace(rival=topics.Reached(1.0, 1.0, 1.0, 0), reached=lambda policy: best)
+    free: Any = SimpleNamespace(rival=topics.Reached(1.0, 1.0, 1.0, 0), best_qoi=1.0, reached=lambda policy: best)
     policy = policies.get("fifo")
     assert topics.mean_fitness(policy, [of]) == pytest.approx(expected)
     assert topics.mean_fitness(policy, [of, free]) == pytest.approx((expected - 2) / 2)
@@ -163,7 +160,7 @@ def test_a_run_leaves_an_agent_and_a_table(short_episodes: None, monkeypatch: Pa
     assert "agent (seed 0)" in printed and "robofleet" in printed and "best on validation: seed 0" in printed
     assert (home / "model.safetensors").read_bytes() == (home / "seed-0" / "model.safetensors").read_bytes()
     made, noted = weights.read_any(home / "model.safetensors")
-    assert isinstance(made, learned_topics.TopicWeights) and made.fields == topics.FIELDS
+    assert isinstance(made, SchedulerWeights)
     assert (noted["suite"], noted["algo"], noted["seeds"]) == (suite.name, "guided", [0])
     with (home / "rows.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -45,9 +45,9 @@ CARDS = {
     "learned-scheduler": Card(
         results="topics.md",
         decides="what to drop and what to send next, of many topics",
-        sees="each queued message and its topic: priority, age, limits, size, window",
+        sees="the link, and each queued message and its topic: priority, gain, age, size, window",
         limits="trained on the topics of Robofleet's example client",
-        fails="Where the link is ample it is only level with Robofleet's published client.",
+        fails="Where n_T is 1 the first topics are older than under `strict-priority`, which loses messages.",
     ),
 }
 

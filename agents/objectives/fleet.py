@@ -1,7 +1,7 @@
 """A fleet: one agent decides on every robot's buffer. Its objective is team QoI (mean H over robots) minus AFR's.
 
 The robots of a cell share its capacity, so bytes that one sends another cannot; each still sees its own buffer alone.
-The agent guides the rule of one queue, and may learn to spare the link.
+The search begins at the rule ``gap-price`` and moves its numbers (``bufgym.policies.guided``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bufgym.scenario import FleetEpisode, FleetScenario, suites
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
-PARTS, EPISODES, EPISODE_S = 12, 2, 30.0
+PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
 """Parts of the training episodes, one a generation in turn; episodes of each link and capacity in a part; their length,
 s. Each of fleet-v1's training links comes once."""
 VALIDATION_EPISODES = 4
@@ -98,6 +98,7 @@ class FleetObjective(Objective):
     columns = ("gain",)
     best = max
     message = "team QoI {:+.4f} over AFR's on validation"
+    sigma = 0.05
 
     @property
     def _capacities(self) -> tuple[int, ...]:

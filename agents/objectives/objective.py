@@ -1,10 +1,9 @@
-"""The objective of the evolution loop, and weights as the vector that is searched."""
+"""The objective of the evolution loop."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.settings import Settings
-from bufgym.policies import Policy, guided, learned, learned_topics
-from bufgym.policies.guided import GuidedWeights
-from bufgym.policies.learned import Network, Weights
-from bufgym.policies.learned_topics import TopicWeights
-from bufgym.policies.weights import AnyWeights
+from bufgym.policies import Policy
+from bufgym.policies.guided import N_INPUTS, N_OUTPUTS, GuidedWeights
 
 Vector = NDArray[np.float64]
 
@@ -50,9 +46,9 @@ class Objective(ABC):
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         self.settings, self.folder, self.seed = settings, folder, seed
 
-    def start(self) -> AnyWeights:
+    def start(self) -> GuidedWeights:
         """The weights at which the search begins: zeros, the plain rule."""
-        return GuidedWeights(np.zeros((guided.N_OUTPUTS, guided.N_INPUTS), np.float32))
+        return GuidedWeights(np.zeros((N_OUTPUTS, N_INPUTS), np.float32))
 
     @abstractmethod
     def measure(self, policy: Policy, episodes: Any) -> float:
@@ -70,77 +66,3 @@ class Objective(ABC):
     def validate(self, policy: Policy) -> tuple[float, ...]:
         """The measures of an agent on the validation episodes."""
         return (self.measure(policy, self.judges),)
-
-
-def policy_of(name: str, weights: AnyWeights) -> Policy:
-    """Make the policy of these weights."""
-    if isinstance(weights, GuidedWeights):
-        return guided.linear(name, weights.weight)
-    if isinstance(weights, TopicWeights):
-        return learned_topics.policy(name, weights)
-    return learned.policy(name, weights)
-
-
-# --- weights as a vector ---------------------------------------------------------------------------------------------
-
-
-def to_vector(weights: AnyWeights) -> Vector:
-    """The searched numbers, float64[n]: networks one after the other, then the mixing.
-
-    Context and bias add the same to every candidate's score, so they matter in ``accept`` alone, which stays linear.
-    """
-    if isinstance(weights, GuidedWeights):
-        return weights.weight.reshape(-1).astype(np.float64)
-    numbers, searched = _numbers(weights)
-    return np.concatenate(numbers)[np.concatenate(searched)]
-
-
-def with_vector(weights: AnyWeights, vector: Vector) -> Any:
-    """These weights with the searched numbers replaced."""
-    if isinstance(weights, GuidedWeights):
-        return GuidedWeights(vector.reshape(weights.weight.shape).astype(np.float32))
-    parts, searched = _numbers(weights)
-    numbers = np.concatenate(parts)
-    numbers[np.concatenate(searched)] = vector
-    *networks, mix = np.split(numbers, np.cumsum([len(part) for part in parts[:-1]]))
-    changes: dict[str, Any] = {
-        name: _network(getattr(weights, name), flat) for name, flat in zip(_networks(weights), networks, strict=True)
-    }
-    if isinstance(weights, Weights) and weights.mix is not None:
-        changes["mix"] = mix.reshape(weights.mix.shape).astype(np.float32)
-    return replace(weights, **changes)
-
-
-def _networks(weights: Weights | TopicWeights) -> tuple[str, ...]:
-    return ("drop", "accept", "send") if isinstance(weights, TopicWeights) else ("drop", "accept")
-
-
-def _numbers(weights: Weights | TopicWeights) -> tuple[list[Vector], list[NDArray[np.bool_]]]:
-    """(numbers, whether each is searched) of every network and, last, of the mixing."""
-    table = learned_topics if isinstance(weights, TopicWeights) else learned
-    inputs = len(weights.fields)
-    numbers, searched = [], []
-    for name in _networks(weights):
-        flat = getattr(weights, name).flat()
-        if name == "accept":
-            mask = np.arange(len(flat)) <= inputs
-        else:
-            mask = np.ones(len(flat), np.bool_)
-            mask[:inputs] = [table.NAMES.index(field) < table.SLOTS for field in weights.fields]
-            mask[inputs] = False
-        numbers.append(flat)
-        searched.append(mask)
-    mix = getattr(weights, "mix", None)
-    numbers.append(np.zeros(0) if mix is None else mix.reshape(-1))
-    searched.append(np.ones(len(numbers[-1]), np.bool_))
-    return numbers, searched
-
-
-def _network(like: Network, flat: Vector) -> Network:
-    """The network of that shape with these numbers."""
-    shapes = [like.skip.shape, (1,), *(array.shape for layer in like.layers for array in layer), like.out.shape]
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-    skip, bias, *layers, out = (
-        part.reshape(shape).astype(np.float32) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)
-    )
-    return Network(skip, bias, tuple(zip(layers[::2], layers[1::2], strict=True)), out)

@@ -10,15 +10,19 @@ residual policy learning does [silver2018residual; johannink2019residual]. ``OUT
     r <- the rule's link rate;  size <- mean bytes of the queue and the newcomer
     come <- x_new - x_dequeued;  g <- the target gap, or come / (s + 1) where it is unknown
 
-``linear`` is the policy whose outputs are linear in the inputs, times 1 - ``plain``: the plain rule stays on a measured
-steady link, and until the link has carried anything.
+``linear`` is the policy whose outputs are linear in the inputs, by one set of weights under a light load and by another
+under a heavy one, mixed by h. They are multiplied by 1 - ``plain``: the plain rule stays on a measured steady link, and
+until the link has carried anything.
+
+    h <- (log(size / (mean rate over 20 s x arrival period)) - 0.7) / 1.5, at least 0 and at most 1
+    outputs <- (1 - plain) (W_light + h W_heavy) inputs
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,11 +88,17 @@ MOST = 3.0
 """Largest input and output, either way."""
 SPREAD_US = 10e6
 """Time over which the spread of the link's rate is measured, us."""
+SLOW_US = 20e6
+"""Time over which the mean rate says how heavy the load is, us. A shorter one opens the gate in every outage."""
+HEAVY, HEAVIER = 0.7, 1.5
+"""Logarithm of messages that come for one that the link carries: where h begins to rise, and how much more makes it
+1."""
 
-LOG_RATE, LOG_RATE_VARIANCE, RULE = range(3)
+LOG_RATE, LOG_RATE_VARIANCE, SLOW_RATE, RULE = range(4)
 """Own entries of the memory, before those of the rule."""
-REMEMBERED = {"log_rate": 0.0, "log_rate_variance": 0.0, **price_dp.REMEMBERED}
-"""Memory: mean and variance of the logarithm of the link's rate; and what the rule remembers."""
+REMEMBERED = {"log_rate": 0.0, "log_rate_variance": 0.0, "slow_rate": 0.0, **price_dp.REMEMBERED}
+"""Memory: mean and variance of the logarithm of the link's rate, bytes/s; its mean over ``SLOW_US``; and what the rule
+remembers."""
 BASE = np.array(list(price_dp.PARAMETERS.values()))
 """The rule's numbers as they stand."""
 NUMBERS, N_INPUTS, N_OUTPUTS = len(BASE), len(INPUTS), len(OUTPUTS)
@@ -115,6 +125,8 @@ def recall(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -
     us, rate = float(arrival.arrival_us - buffer.previous_us), buffer.medium_rate_bytes_per_s
     if buffer.evictions > 0 or us <= 0 or rate <= 0:
         return
+    slow = us / min(us + SLOW_US, rule[SEEN_US]) if memory[SLOW_RATE] > 0 else 1.0
+    memory[SLOW_RATE] += slow * (rate - memory[SLOW_RATE])
     level = math.log(max(rate, 1.0))
     weight = us / min(us + SPREAD_US, rule[SEEN_US]) if memory[LOG_RATE] > 0 else 1.0
     off = level - memory[LOG_RATE]
@@ -202,6 +214,15 @@ def follow(buffer: Buffer, arrival: Arrival, memory: Memory, base: Numbers, outp
 # --- an agent whose outputs are linear in the inputs -----------------------------------------------------------------
 
 
+@kernel
+def heaviness(buffer: Buffer, arrival: Arrival, memory: Memory) -> float:
+    """h of the module's text; 0 until the link has carried anything."""
+    carried = memory[SLOW_RATE] * 1e-6 * buffer.period_us
+    if carried <= 0:
+        return 0.0
+    return min(max((math.log(mean_bytes(buffer, arrival) / carried) - HEAVY) / HEAVIER, 0.0), 1.0)
+
+
 def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The rule gap-price, its numbers linear in what the robot sees."""
     base, weights = buffer.parameters[:NUMBERS], buffer.parameters[NUMBERS:]
@@ -209,10 +230,12 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     outputs = memory[len(memory) - NUMBERS - N_OUTPUTS :]
     recall(buffer, arrival, memory, base)
     inputs(buffer, arrival, memory, base, seen)
+    h = heaviness(buffer, arrival, memory)
     for o in range(N_OUTPUTS):
         total = 0.0
         for i in range(N_INPUTS):
-            total += weights[o * N_INPUTS + i] * seen[i]
+            k = o * N_INPUTS + i
+            total += (weights[k] + h * weights[N_OUTPUTS * N_INPUTS + k]) * seen[i]
         outputs[o] = total * (1 - seen[N_INPUTS - 1])
     return follow(buffer, arrival, memory, base, outputs)
 
@@ -222,12 +245,13 @@ class GuidedWeights:
     """Weights of an agent whose outputs are linear in the inputs, as in a file."""
 
     weight: NDArray[np.float32]
-    """float32[outputs, inputs], W."""
+    """float32[2 x outputs, inputs], W_light above W_heavy; or W_light alone, where W_heavy is 0."""
 
     SLOT_NAMES: ClassVar[tuple[str, ...]] = ()
     CONTEXT_NAMES: ClassVar[tuple[str, ...]] = tuple(INPUTS)
     NETWORKS: ClassVar[tuple[str, ...]] = ("guided",)
     LAYERS: ClassVar[int] = 0
+    SHAPE: ClassVar[tuple[int, int]] = (2 * N_OUTPUTS, N_INPUTS)
     TABLE: ClassVar[list[Any]] = [list(INPUTS.items()), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
     """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
 
@@ -237,21 +261,36 @@ class GuidedWeights:
         return self.CONTEXT_NAMES
 
     @property
-    def guided(self) -> GuidedWeights:
+    def guided(self) -> Self:
         """The one network."""
         return self
 
+    def policy(self, name: str, about: str = "", source: str = "") -> Policy:
+        """Make the policy of these weights."""
+        return linear(name, self.weight, about, source)
+
     def tensors(self) -> dict[str, NDArray[np.float32]]:
         """The numbers by name."""
-        return {"weight": self.weight}
+        return {"weight": whole(self.weight, self.SHAPE)}
+
+
+def whole(weights: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """The weights; those for a light load alone get zeros for a heavy one."""
+    alone = weights.shape == (N_OUTPUTS, N_INPUTS) != shape
+    return np.concatenate([weights, np.zeros_like(weights)]) if alone else weights
+
+
+def numbers_of(name: str, base: Numbers, weights: NDArray[Any], shape: tuple[int, int]) -> tuple[float, ...]:
+    """The rule's numbers and W, which must have this shape, as a policy's weights."""
+    W = whole(np.asarray(weights, np.float64), shape)
+    if W.shape != shape or not np.isfinite(W).all():
+        rule = f"must be {shape[0]} x {shape[1]} finite numbers"
+        raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")
+    return tuple(np.concatenate([base, W.reshape(-1)]).tolist())
 
 
 def linear(name: str, weights: NDArray[np.floating[Any]], about: str = "", source: str = "") -> Policy:
     """Make the policy with outputs W c for the inputs c; ``weights`` is W [outputs, inputs]. W = 0 is gap-price."""
-    W = np.asarray(weights, np.float64)
-    if W.shape != (N_OUTPUTS, N_INPUTS) or not np.isfinite(W).all():
-        rule = f"must be {N_OUTPUTS} x {N_INPUTS} finite numbers"
-        raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")
-    numbers = tuple(np.concatenate([BASE, W.reshape(-1)]).tolist())
+    numbers = numbers_of(name, BASE, weights, (N_OUTPUTS, N_INPUTS))
     policy = Policy(name, on_arrival, weights=numbers, memory=REMEMBERED, work=WORK, compile=True, reads_rate=True)
     return replace(policy, about=about, source=source)

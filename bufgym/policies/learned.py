@@ -17,7 +17,8 @@ The file is safetensors with JSON metadata: reading it runs nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ from bufgym.model.observe import (
     observe_slots,
 )
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.scoring import DROP, KEEP, Network, ScorerWeights, begin, divide, read_context, score, unpack
+from bufgym.policies.scoring import DROP, KEEP, Network, begin, divide, read_context, score, unpack
 
 __all__ = ["NAMES", "Network", "Weights", "policy"]
 
@@ -50,7 +51,7 @@ TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 @kernel
 def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """The decision with the highest score."""
-    scorer = unpack(buffer.parameters, 2)
+    scorer = unpack(buffer.parameters)
     s, L = len(buffer.slots), buffer.capacity
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
     observe_context(buffer, arrival, scratch.context[:TABLE])
@@ -90,20 +91,54 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 
 @dataclass(frozen=True)
-class Weights(ScorerWeights):
-    """A slot scorer for one queue."""
+class Weights:
+    """A slot scorer for one queue: the fields that it reads, and its networks."""
 
-    SLOT_NAMES = SLOT_NAMES
-    CONTEXT_NAMES = CONTEXT_NAMES
-    NETWORKS = ("drop", "accept")
-    LAYERS = 2
+    SLOT_NAMES: ClassVar[tuple[str, ...]] = SLOT_NAMES
+    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = CONTEXT_NAMES
+    NETWORKS: ClassVar[tuple[str, ...]] = ("drop", "accept")
+    LAYERS: ClassVar[int] = 2
 
+    fields: tuple[str, ...]
+    """Names of the fields read, in the order of the networks' inputs."""
+    drop: Network
+    """Scores dropping a candidate."""
+    accept: Network
+    """Scores accepting the newcomer, where there is room."""
     mix: NDArray[np.float32] | None = None
     """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
+
+    @property
+    def context(self) -> tuple[str, ...]:
+        """The context's fields."""
+        return tuple(name for name in self.fields if name in self.CONTEXT_NAMES)
+
+    @property
+    def slot(self) -> tuple[str, ...]:
+        """The candidate's own fields."""
+        return tuple(name for name in self.fields if name in self.SLOT_NAMES)
+
+    @property
+    def widths(self) -> tuple[int, int]:
+        """Widths of the two hidden layers; 0 for none."""
+        first, second, *_ = *self.drop.widths, 0, 0
+        return first, second
+
+    def parameters(self) -> NDArray[np.float64]:
+        """The scorer as parameters for ``unpack``."""
+        order = [self.fields.index(name) for name in (*self.context, *self.slot)]
+        places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
+        networks = [getattr(self, name).flat(order) for name in self.NETWORKS]
+        mixing = np.zeros(0) if self.mix is None else self.mix.reshape(-1)
+        header = [len(self.fields), len(self.context), *self.widths, len(networks[0]), len(mixing)]
+        return np.concatenate([header, places, *networks, mixing])
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
     """Make the policy of these weights; it works for every L."""
     on_link = {field.name for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.group == "link"}
+    numbers, (first, second) = tuple(weights.parameters().tolist()), weights.widths
+    work = 2 * len(weights.fields) - len(weights.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
     reads_rate = not on_link.isdisjoint(weights.fields)
-    return weights.policy(name, on_arrival, source=source, about=summary, reads_rate=reads_rate)
+    policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_rate=reads_rate)
+    return replace(policy, about=summary, source=source)

@@ -6,8 +6,7 @@ it as
     h = relu(W1 f + b1), then once more if there is a second layer;  score = w h + skip f + b
 
 The parameters of a scorer are one row of numbers: a header, the fields that it reads, its networks one after another,
-and the mixing weights if it has any. ``ScorerWeights.parameters`` writes this layout and ``unpack`` reads it; no other
-code depends on it.
+and the mixing weights if it has any. ``learned.Weights.parameters`` writes this layout, ``unpack`` reads it.
 """
 
 from __future__ import annotations
@@ -15,19 +14,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.policies.registry import OnArrival, Policy
 
 HEADER = 6
 """Numbers before the fields: fields read, the context's share of them, widths of both layers, numbers of one network,
 mixing weights."""
-DROP, KEEP, SEND = range(3)
-"""Networks of a scorer, in the order of its parameters: they score dropping, accepting and sending a candidate."""
+DROP, KEEP = range(2)
+"""Networks of a scorer, in the order of its parameters: they score dropping and accepting a candidate."""
 OF_INPUTS = {"skip", "0.weight"}
 """Tensors of a network whose first axis is the inputs."""
 
@@ -68,12 +66,12 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def unpack(parameters: NDArray[np.float64], networks: int) -> Scorer:
-    """The scorer of so many networks."""
+def unpack(parameters: NDArray[np.float64]) -> Scorer:
+    """The scorer of these parameters."""
     inputs, context = int(parameters[0]), int(parameters[1])
     first, second, size = int(parameters[2]), int(parameters[3]), int(parameters[4])
     nets = HEADER + inputs
-    mix = nets + networks * size
+    mix = nets + 2 * size
     return Scorer(context, first, second, parameters[HEADER:nets], parameters[nets:mix], size, parameters[mix:])
 
 
@@ -200,61 +198,3 @@ class Network:
         for k, shape in enumerate(itertools.pairwise([inputs, *widths])):
             shapes |= {f"{k}.weight": shape, f"{k}.bias": shape[1:]}
         return shapes | {"out": (widths[-1] if widths else 0,)}
-
-
-@dataclass(frozen=True)
-class ScorerWeights:
-    """The fields that a scorer reads, and its networks."""
-
-    SLOT_NAMES: ClassVar[tuple[str, ...]]
-    """All fields of a candidate, in the order of the observation."""
-    CONTEXT_NAMES: ClassVar[tuple[str, ...]]
-    """All fields of the context."""
-    NETWORKS: ClassVar[tuple[str, ...]]
-    """The fields here that are networks, in the order of the parameters."""
-    LAYERS: ClassVar[int]
-    """Most hidden layers."""
-
-    fields: tuple[str, ...]
-    """Names of the fields read, in the order of the networks' inputs."""
-    drop: Network
-    """Scores dropping a candidate."""
-    accept: Network
-    """Scores accepting the newcomer, where there is room."""
-
-    @property
-    def context(self) -> tuple[str, ...]:
-        """The context's fields."""
-        return tuple(name for name in self.fields if name in self.CONTEXT_NAMES)
-
-    @property
-    def slot(self) -> tuple[str, ...]:
-        """The candidate's own fields."""
-        return tuple(name for name in self.fields if name in self.SLOT_NAMES)
-
-    @property
-    def widths(self) -> tuple[int, int]:
-        """Widths of the two hidden layers; 0 for none."""
-        first, second, *_ = *self.drop.widths, 0, 0
-        return first, second
-
-    @property
-    def scratch(self) -> int:
-        """Numbers of working memory for a decision, apart from the observed slots; see ``divide``."""
-        first, second = self.widths
-        return 2 * len(self.fields) - len(self.context) + 2 * first + second + len(self.CONTEXT_NAMES)
-
-    def parameters(self) -> NDArray[np.float64]:
-        """The scorer as parameters for ``unpack``."""
-        mix: NDArray[np.float32] | None = getattr(self, "mix", None)
-        order = [self.fields.index(name) for name in (*self.context, *self.slot)]
-        places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
-        networks = [getattr(self, name).flat(order) for name in self.NETWORKS]
-        mixing = np.zeros(0) if mix is None else mix.reshape(-1)
-        header = [len(self.fields), len(self.context), *self.widths, len(networks[0]), len(mixing)]
-        return np.concatenate([header, places, *networks, mixing])
-
-    def policy(self, name: str, on_arrival: OnArrival, **fields: Any) -> Policy:
-        """Make the policy ``name`` of these weights; it works for every L."""
-        weights, work = tuple(self.parameters().tolist()), (self.scratch, len(self.SLOT_NAMES))
-        return Policy(name, on_arrival, weights=weights, work=work, compile=True, **fields)

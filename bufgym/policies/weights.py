@@ -2,8 +2,8 @@
 
 The file has the float32 tensors of ``learned.Weights`` by name. ``drop.skip`` is [inputs] and ``drop.bias`` [1]. Each
 hidden layer has ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs]. ``drop.out`` is [outputs of the last
-layer]. The names ``accept.*`` follow, and in a scheduler's file (``learned_topics``) ``send.*``. An agent that guides a
-rule (``guided``) has the one tensor ``guided.weight`` [outputs, inputs]. The header's metadata has one entry,
+layer]. The names ``accept.*`` follow. An agent that guides a rule has the one tensor ``guided.weight``
+(``guided``) or ``scheduler.weight`` (``guided_topics``) [outputs, inputs]. The header's metadata has one entry,
 ``bufgym``, a JSON object that describes the file:
 
     format        number of this format
@@ -34,18 +34,18 @@ from safetensors.numpy import save as serialized
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_whole, replaced
-from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, TOPIC_FIELDS
-from bufgym.policies import guided, learned, learned_topics
+from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS
+from bufgym.policies import learned
 from bufgym.policies.guided import GuidedWeights
+from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Weights
-from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.registry import Policy
 from bufgym.policies.scoring import Network
 
 StrPath = str | os.PathLike[str]
 Tensors = dict[str, NDArray[np.float32]]
-AnyWeights = Weights | TopicWeights | GuidedWeights
-Kind = type[Weights] | type[TopicWeights] | type[GuidedWeights]
+AnyWeights = Weights | GuidedWeights
+Kind = type[Weights] | type[GuidedWeights]
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
@@ -60,22 +60,22 @@ MIX = "drop.mix"
 """An optional tensor."""
 
 
-def observation_hash(topics: bool = False, names: Sequence[str] = ()) -> str:
+def observation_hash(names: Sequence[str] = ()) -> str:
     """SHA-256 of the fields' definitions: weights trained on other definitions would decide nonsense.
 
-    ``topics`` adds the fields of several topics. Fields beside the tables count only if they are in ``names``.
+    Fields beside the table count only if they are in ``names``.
     """
     beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.name in names]
-    fields = [*FIELDS, *(TOPIC_FIELDS if topics else ()), *beside]
+    fields = [*FIELDS, *beside]
     table = [(field.name, field.per, field.unit, field.meaning) for field in fields]
     return hashlib.sha256(json.dumps(table).encode()).hexdigest()
 
 
 def _definition(kind: Kind, names: Sequence[str]) -> str:
     """The ``observation`` of a file of this kind."""
-    if kind is GuidedWeights:
-        return hashlib.sha256(json.dumps(GuidedWeights.TABLE).encode()).hexdigest()
-    return observation_hash(kind is TopicWeights, names)
+    if issubclass(kind, GuidedWeights):
+        return hashlib.sha256(json.dumps(kind.TABLE).encode()).hexdigest()
+    return observation_hash(names)
 
 
 def load(path: StrPath) -> Policy:
@@ -87,10 +87,13 @@ def load(path: StrPath) -> Policy:
     weights, metadata = read_any(path)
     name, about = metadata["name"], metadata.get("about", "")
     source = f"{Path(path).name}, sha256 {metadata['sha256'][:12]}"
-    if isinstance(weights, TopicWeights):
-        return learned_topics.policy(name, weights, about, source)
+    return policy_of(name, weights, about, source)
+
+
+def policy_of(name: str, weights: AnyWeights, about: str = "", source: str = "") -> Policy:
+    """Make the policy of these weights."""
     if isinstance(weights, GuidedWeights):
-        return guided.linear(name, weights.weight, about, source)
+        return weights.policy(name, about, source)
     return learned.policy(name, weights, about, source)
 
 
@@ -175,7 +178,7 @@ def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:
     weights, metadata = read_any(path)
     if isinstance(weights, Weights):
         return weights, metadata
-    what = "a scheduler for several topics" if isinstance(weights, TopicWeights) else "an agent that guides a rule"
+    what = "a scheduler for several topics" if isinstance(weights, SchedulerWeights) else "an agent that guides a rule"
     raise BufgymError(f"{path}: {what}, not a slot scorer for one queue")
 
 
@@ -192,14 +195,15 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     except safetensors.SafetensorError as error:
         raise BufgymError(f"{path}: no safetensors file, or a broken one: {error}") from None
     prefixes = {name.partition(".")[0] for name in entries}
-    kind: Kind = GuidedWeights if "guided" in prefixes else TopicWeights if "send" in prefixes else Weights
+    kinds: tuple[Kind, ...] = (GuidedWeights, SchedulerWeights)
+    kind = next((kind for kind in kinds if kind.NETWORKS[0] in prefixes), Weights)
     metadata = _metadata(path, data, kind)
     tensors = _checked_tensors(path, entries, metadata["fields"], kind)
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
-    if kind is GuidedWeights:
-        return GuidedWeights(tensors["guided.weight"]), metadata
+    if issubclass(kind, GuidedWeights):
+        return kind(*tensors.values()), metadata
     mix = {"mix": tensors.pop(MIX)} if MIX in tensors else {}
     networks = [
         Network.of({name.removeprefix(f"{n}."): tensors[name] for name in tensors if name.startswith(f"{n}.")})
@@ -294,8 +298,8 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
         for network in kind.NETWORKS
         for name, shape in Network.shapes(len(fields), widths).items()
     }
-    if kind is GuidedWeights:
-        required = {"guided.weight": (guided.N_OUTPUTS, len(guided.INPUTS))}
+    if issubclass(kind, GuidedWeights):
+        required = {f"{kind.NETWORKS[0]}.weight": kind.SHAPE}
     if MIX in shapes and kind is Weights:
         slots = sum(name in kind.SLOT_NAMES for name in fields)
         required[MIX] = (len(fields) - slots, slots)

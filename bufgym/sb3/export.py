@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +14,12 @@ from torch import nn
 
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength
-from bufgym.policies import Policy, guided, learned, learned_topics
+from bufgym.policies import Policy
 from bufgym.policies import weights as files
-from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.learned_topics import TopicWeights
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
-from bufgym.scenario import Streams, suites
-from bufgym.sim import run
-from bufgym.sim.metrics import received, weighted_qoi
+from bufgym.scenario import suites
 
 CHECKED = (4, 8, 16, 32)
 """Values of L for the regrets noted in the file."""
@@ -47,12 +42,8 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
     path = Path(model)
     weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
     notes = {"name": name, "about": about, **run_notes(path)}
-    if isinstance(weights, TopicWeights):
-        return files.save(out, weights, {**notes, "weighted_qoi": topics_qoi(learned_topics.policy(name, weights))})
-    policy = (
-        guided.linear(name, weights.weight) if isinstance(weights, GuidedWeights) else learned.policy(name, weights)
-    )
-    return files.save(out, weights, {**notes, "regret": regrets(policy)})
+    policy = files.policy_of(name, weights)
+    return files.save(out, weights, notes if policy.for_topics else {**notes, "regret": regrets(policy)})
 
 
 # --- weights ---------------------------------------------------------------------------------------------------------
@@ -114,20 +105,6 @@ def regrets(policy: Policy) -> dict[str, float]:
     for label, setting in suites.get("interruption-v1").settings("test").items():
         for L, regret in zip(CHECKED, EveryLength(setting.scenario, CHECKED).regrets(policy), strict=True):
             rounded[f"{label}, L = {L}"] = round(regret, 9)
-    return rounded
-
-
-def topics_qoi(policy: Policy) -> dict[str, float]:
-    """A scheduler's weighted QoI on the first test episode of each setting of topics-v1, as a test value."""
-    suite = suites.get("topics-v1")
-    rounded = {}
-    for label, setting in suite.settings("test").items():
-        scenario: Any = setting.scenario
-        client = replace(scenario, traces=scenario.traces[:1])
-        streams = Streams.seeded(0)
-        episode = client.draw(streams).with_uniforms(streams.policy)
-        senders = run(policy, [episode], suite.capacities[0], client.value, topics=client.topics)
-        rounded[label] = round(weighted_qoi(senders, 0, received(senders, 0)), 6)
     return rounded
 
 

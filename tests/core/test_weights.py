@@ -30,7 +30,6 @@ def path(tmp_path):
     "before",
     [
         *(made(*widths) for widths in [(), (1,), (16, 4), (256,)]),
-        *(made(*widths, kind=TOPICS) for widths in [(), (8,), (256,)]),
         replace(made(3), mix=np.float32([[-1.5]])),
     ],
     ids=str,
@@ -87,21 +86,22 @@ def test_reading_a_policy_needs_no_torch(path):
 
 
 def test_a_scheduler_is_no_policy_for_one_queue(path):
-    weights.save(path, made(4, kind=TOPICS), ABOUT)
+    weights.save(path, made(kind=TOPICS), ABOUT)
     policy = policies.load(path)
     assert policy.schedules and policy.for_topics and policy.ranked
     with pytest.raises(BufgymError, match=r"a scheduler for several topics, not a slot scorer for one"):
         weights.read(path)
-    # Nor is it one without its third network.
-    tensors, metadata = parts_of(path)
-    put(path, {name: tensor for name, tensor in tensors.items() if not name.startswith("send.")}, metadata)
+    before = made(kind=TOPICS)
+    assert weights.read_any(path)[0].weight.tobytes() == before.weight.tobytes()
+    # Nor is it one whose network has another name.
+    put(path, {"guided.weight": before.weight}, parts_of(path)[1])
     refused(path, "trained on other observations")
 
 
 def test_a_policy_for_one_queue_may_not_read_what_only_topics_have(path):
     with pytest.raises(BufgymError, match="field = waited: unknown"):
-        weights.save(path, random_weights(QUEUE, ["waited"]), ABOUT)
-    weights.save(path, random_weights(QUEUE, ["service_ratio"]), ABOUT)
+        weights.save(path, random_weights(["waited"]), ABOUT)
+    weights.save(path, random_weights(["service_ratio"]), ABOUT)
     assert isinstance(weights.read_any(path)[0], QUEUE)
     assert not policies.load(path).schedules
 
@@ -126,13 +126,13 @@ def test_metadata_that_could_not_be_read_are_not_written(path, about, rule):
 
 
 def test_weights_that_could_not_be_read_are_not_written(path):
-    good, send = made(3), made(4, kind=TOPICS)
+    good, nan = made(3), np.full(TOPICS.SHAPE, np.nan, np.float32)
     for bad, rule in (
         (replace(good, drop=replace(good.drop, bias=np.float32([np.nan]))), r"tensor drop\.bias must hold"),
         (replace(good, accept=made(4).accept), r"accept\.0\.weight = .*must be \[2, 3\]"),
         (made(3, 3, 3), "2 at most"),
         (made(257), "1 to 256 hidden units"),
-        (replace(send, send=made(5, kind=TOPICS).send), r"send\.0\.weight = .*must be \[3, 4\]"),
+        (TOPICS(nan), r"tensor scheduler\.weight must hold"),
         (made(3, fields=("speed", "service_ratio")), "field = speed: unknown"),
     ):
         with pytest.raises(BufgymError, match=rule):
@@ -172,12 +172,12 @@ def test_fields_beside_the_tables_are_read_by_name(path):
     # What weights were trained on before these fields came is still what it was.
     assert weights.observation_hash(names=("rank",)) == weights.observation_hash()
     fields = ("rank", "rate_short", "rate_long", "time_to_free")
-    weights.save(path, random_weights(QUEUE, fields), ABOUT)
+    weights.save(path, random_weights(fields), ABOUT)
     read, metadata = weights.read(path)
     assert read.context == fields[1:]
     assert metadata["observation"] == weights.observation_hash(names=fields) != weights.observation_hash()
     assert policies.load(path).measures
-    weights.save(path, random_weights(QUEUE, ["rank"]), ABOUT)
+    weights.save(path, random_weights(["rank"]), ABOUT)
     assert not policies.load(path).measures
 
 
@@ -240,8 +240,8 @@ def test_metadata_that_are_no_json_object_are_refused(path, text, rule):
         (QUEUE, "fields", ["time_merged", ["service_ratio"]], "unknown; known: occupied, rank"),
         (QUEUE, "fields", ["service_ratio", "service_ratio"], "field = service_ratio: given more than once"),
         (QUEUE, "fields", ["service_ratio"], "must be [1] for 1 fields and hidden layers of [3]"),
-        (TOPICS, "fields", ["waited", "service_ratio", "speed"], "field = speed: unknown; known: occupied"),
-        (TOPICS, "fields", ["service_ratio", "waited", "gain"], "the file was changed"),
+        (TOPICS, "fields", ["one", "speed"], "field = speed: unknown; known: one, fill"),
+        (TOPICS, "fields", ["fill", "one"], "the file was changed"),
         *((QUEUE, key, "absent", key) for key in ("format", "name", "fields", "observation", "bufgym", "sha256")),
     ],
 )
@@ -287,11 +287,8 @@ def numbers(*shape, kind=np.float32):
         (QUEUE, "drop.out", np.float32([0, np.nan, 0]), "tensor drop.out must hold finite numbers alone"),
         (QUEUE, "accept.out", np.float32([0, 0, -np.inf]), "tensor accept.out must hold finite numbers alone"),
         (QUEUE, "still.drop.out", numbers(3), "tensor still.drop.out has no place"),
-        (TOPICS, "send.skip", None, "tensor send.skip is missing"),
-        (TOPICS, "send.0.weight", numbers(3, 5), "tensor send.0.weight = '[3, 5]': must be [3, 3]"),
-        (TOPICS, "drop.1.bias", numbers(2), "no place in networks of 1 hidden layers (1 at most)"),
+        (TOPICS, "scheduler.weight", numbers(3, 5), "tensor scheduler.weight = '[3, 5]': must be [17, 9]"),
         (TOPICS, "drop.mix", numbers(1, 2), "tensor drop.mix has no place"),
-        (TOPICS, "send.bias", np.float32([np.nan]), "tensor send.bias must hold finite numbers alone"),
     ],
 )
 def test_tensors_that_break_a_rule_are_refused(path, kind, name, tensor, rule):

@@ -12,8 +12,8 @@ from safetensors.numpy import save as safetensors
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import weights
+from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.learned_topics import TopicWeights
 
 
 def network(rng, inputs, *widths):
@@ -36,20 +36,22 @@ def score(net, f):
     return out + math.fsum(float(s) * each for s, each in zip(net.skip, f, strict=True)) + float(net.bias[0])
 
 
-def random_weights(kind, fields, *widths, seed=0):
-    """``kind``: Weights or TopicWeights."""
+def random_weights(fields, *widths, seed=0):
+    """Of a slot scorer."""
     rng = np.random.default_rng(seed)
-    return kind(tuple(fields), *(network(rng, len(fields), *widths) for _ in kind.NETWORKS))
+    return Weights(tuple(fields), *(network(rng, len(fields), *widths) for _ in Weights.NETWORKS))
 
 
-KINDS = QUEUE, TOPICS = Weights, TopicWeights
-FIELDS = {QUEUE: ("time_merged", "service_ratio"), TOPICS: ("waited", "service_ratio", "gain")}
+KINDS = QUEUE, TOPICS = Weights, SchedulerWeights
+FIELDS = ("time_merged", "service_ratio")
 ABOUT = {"name": "small", "about": "Drops what is in its way.", "seeds": [0, 1], "scores": {"regret": 0.25}}
 
 
-def made(*widths, kind=QUEUE, fields=None, seed=0):
-    """Weights over the ``FIELDS`` of their kind."""
-    return random_weights(kind, fields or FIELDS[kind], *widths, seed=seed)
+def made(*widths, kind=QUEUE, fields=FIELDS, seed=0):
+    """Weights of either kind."""
+    if kind is TOPICS:
+        return TOPICS(np.random.default_rng(seed).normal(size=TOPICS.SHAPE).astype(np.float32))
+    return random_weights(fields, *widths, seed=seed)
 
 
 def parts_of(path):

@@ -122,7 +122,7 @@ def _rule(policy: Policy) -> str:
 
 def _scorer(policy: Policy) -> dict[str, Any]:
     """Collect the values for a learned policy's C: its scorer, the scratch and the fields."""
-    scorer = getattr(unpack, "py_func", unpack)(np.array(policy.weights), len(learned.Weights.NETWORKS))
+    scorer = getattr(unpack, "py_func", unpack)(np.array(policy.weights))
     inputs, units = len(scorer.fields), max(1, 2 * scorer.first + scorer.second)
     text = _array("int", "bufgym_fields", scorer.fields.astype(int))
     text += _array("double", "bufgym_networks", scorer.networks)
