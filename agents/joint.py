@@ -26,9 +26,9 @@ from bufgym.policies import weights
 from bufgym.policies.guided import GuidedWeights
 
 FOLDER = Path("runs/joint")
-SIGMA, LEAST, POPULATION, MEMORY, GENERATIONS = 0.03, 0.02, 16, 20, 110
+SIGMA, LEAST, POPULATION, MEMORY, GENERATIONS = 0.03, 0.02, 16, 40, 110
 """First and least step size (0.1 diverges), candidates a generation, means in the average, and generations."""
-PARTS, WORSE, PULL = 5, 0.4, 1e-5
+PARTS, WORSE, PULL = 8, 0.4, 1e-5
 RUNS = {
     **{"task": 16, "default-frames": 18, "lte": 16, "generated": 24, "outage": 10, "sustained": 10},
     **{"interruption": 24, "random": 20, "unequal-heavy": 14, "unequal-light": 14, "equal-heavy": 8, "equal-light": 8},
