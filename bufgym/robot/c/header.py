@@ -39,9 +39,14 @@ _HELPERS = {
 """Parts that rules share, each before its callers."""
 _LEARNED = ("features.h", "scorer.h")
 """Parts of a learned agent."""
-_CHAIN = """    /* scratch of the policy: coordinates and costs of places, the best chains from, to and without each, and steps */
-    struct { double x, cost, from, to, without, step[@SPAN@]; } chain[BUFGYM_CAPACITY + 3];
-"""
+_CONSTANTS = {
+    thinning: "WAITING SOON_US STEADY",
+    target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
+    price_dp: "LEAST_SHARE SIZES_WEIGHT",
+    chains: "SPAN",
+    guided: "MOST SPREAD_US",
+}
+"""Constants that the parts name, by the module that has them."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
 """Seed, episodes and messages of the calls in the header."""
@@ -90,30 +95,17 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "PARAMETERS": _array("double", "bufgym_parameters", policy.parameters.values()) if policy.parameters else "",
         "VALUE": _comment(value.name),
         "VALUE_PART": _array("double", "bufgym_v", value.array) + _part(f"value_{_VALUES[int(value.array[0])]}.h"),
-        "SCRATCH": _CHAIN if "bufgym_weigh(" in body else "",
+        "SCRATCH": _part("places.h") if "bufgym_weigh(" in body else "",
         "POLICY": body,
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
-        "WAITING": thinning.WAITING,
-        "SOON_US": repr(thinning.SOON_US),
-        **{
-            name: getattr(target_gap, name)
-            for name in ("LEAST", "SHORT_QUEUE", "SHORT_RUN_US", "SLOWEST", "BURSTY", "LATE", "TOLD")
-        },
+        **{name: repr(getattr(module, name)) for module, names in _CONSTANTS.items() for name in names.split()},
         "STRAIGHT": repr(straight(value.array)),
-        "WITHIN": repr(target_gap.WITHIN),
         **{name.upper(): repr(float(number)) for name, number in parameters.items()},
-        "SPAN": chains.SPAN,
-        "LEAST_SHARE": repr(price_dp.LEAST_SHARE),
-        "SIZES_WEIGHT": repr(price_dp.SIZES_WEIGHT),
-        "LEAST_UNIT": repr(price_dp.TINY),
-        "MOST": repr(guided.MOST),
-        "SPREAD_US": repr(guided.SPREAD_US),
         "INPUTS": _lines(f"BUFGYM_IN_{name.upper()}" for name in guided.INPUTS),
         "OUTPUTS": _lines(f"BUFGYM_OUT_{output.name.upper()}" for output in guided.OUTPUTS),
         "WEIGHTS": _array("double", "bufgym_weights", policy.weights[guided.NUMBERS :]) if guides else "",
         "STEADY_US": repr(thinning.HORIZON_US),
-        "STEADY": repr(thinning.STEADY),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
     }
     if learns:

@@ -50,12 +50,12 @@ static inline int bufgym_priced(
     known = g > 0.0 && !bufgym_steady(q);
     if (g <= 0.0)
         g = come / (s + 1);
-    per_gap = (1.0 - a) / (g > @LEAST_UNIT@ ? g : @LEAST_UNIT@);
+    per_gap = (1.0 - a) / (g > @TINY@ ? g : @TINY@);
     longest = numbers->threshold * g;
     discount = numbers->discount;
     if (!known) {
         const double each_us = bufgym_spare_us(q, arrival);
-        longest = a > 0.0 ? -g : -(g > @LEAST_UNIT@ ? g : @LEAST_UNIT@);
+        longest = a > 0.0 ? -g : -(g > @TINY@ ? g : @TINY@);
         discount = numbers->spare_discount;
         if (each_us > 0.0 && !bufgym_bursty(q))
             longest = numbers->spare * (come * each_us / elapsed_us);
@@ -63,7 +63,7 @@ static inline int bufgym_priced(
     if (a > 0.0) {
         const double even = bufgym_value(g), unit = numbers->kappa * bufgym_merging_loss(g, even, g, even);
         bufgym_weigh(q, arrival, unit / bufgym_mean_bytes(q, arrival), arrival->x + numbers->tail * g);
-        per_unit = a / (unit > @LEAST_UNIT@ ? unit : @LEAST_UNIT@);
+        per_unit = a / (unit > @TINY@ ? unit : @TINY@);
     }
     if (s > 0 && bufgym_free_soon(q, numbers->near_soon + a * (numbers->price_near - numbers->near_soon))) {
         double gain = a > 0.0 ? per_unit * bufgym_advantage(q, 0) : 0.0;
