@@ -36,7 +36,7 @@ bufgym_weigh(struct bufgym_queue *q, const struct bufgym_message *arrival, doubl
     }
 }
 
-/* The advantage of dropping slot k, or the newcomer, slot s: the best chain without it less the best through it, QoI. */
+/* The advantage of dropping slot k, or the newcomer, slot s, in QoI: the best chain without it less that through it. */
 static inline double bufgym_advantage(const struct bufgym_queue *q, int k)
 {
     return q->chain[k + 1].without - q->chain[k + 1].to - q->chain[k + 1].from;

@@ -44,8 +44,8 @@ static inline double bufgym_within(const struct bufgym_queue *q, double horizon_
     return left_us > 0.0 && left_us < horizon_us ? left_us : horizon_us;
 }
 
-/* Time between messages that the link sends, and that fill the room that is left by the horizon, us; 0 where none may be
-   spared: too few wait for the link, or a full queue would not soon be sent. */
+/* Time between messages that the link sends while the room that is left fills up by the horizon, us; 0 where none may
+   be spared: too few wait for the link, or a full queue would not soon be sent. */
 static inline double bufgym_spare_us(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const int s = q->occupancy, L = bufgym_places(q, arrival);
