@@ -39,6 +39,7 @@ import numpy as np
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, stays
+from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import merging_loss, value
 from bufgym.policies import chains, target_gap
@@ -96,10 +97,6 @@ def share(memory: Memory, numbers: Numbers) -> float:
     """The share of price-dp, a."""
     a = 1 / (1 + math.exp(numbers[SHARE_LOW] - numbers[SHARE_STEEP] * math.sqrt(memory[VARIANCE])))
     return a if a >= LEAST_SHARE else 0.0
-
-
-TINY = 1e-30
-"""Least g and unit to divide by."""
 
 
 @kernel

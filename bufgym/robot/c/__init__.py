@@ -1,6 +1,6 @@
 """A policy as one C99 header for programs without Python, made by ``bufgym export AGENT --to c --out policy.h``.
 
-``parts/`` holds the queue, V, the features and the scorer in C, and ``rules/`` a file for each exportable rule.
+``parts/`` holds the queue, V and what policies share in C, and ``rules/`` a file for each exportable rule.
 ``header`` puts them together with the policy's numbers. ``calls`` records an episode's calls and Python's decisions.
 Some of them go into the header as ``bufgym_parity``, and the tests compare millions.
 """

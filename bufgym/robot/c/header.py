@@ -19,7 +19,7 @@ from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
-from bufgym.policies import Policy, learned, target_gap, thinning
+from bufgym.policies import Policy, chains, guided, learned, price_dp, target_gap, thinning
 from bufgym.policies.scoring import unpack
 from bufgym.policies.target_gap import straight
 from bufgym.robot.c.calls import random_episode, recorded
@@ -31,12 +31,22 @@ _HELPERS = {
     "bufgym_gaps_of(": "gaps.h",
     "bufgym_smallest_gap(": "gaps.h",
     "bufgym_spare(": "thinning.h",
-    "bufgym_approach(": "target_gap.h",
+    "bufgym_remember(": "target_gap.h",
+    "bufgym_weigh(": "chains.h",
+    "bufgym_priced(": "price_dp.h",
     "bufgym_thin(": "thin.h",
 }
 """Parts that rules share, each before its callers."""
 _LEARNED = ("features.h", "scorer.h")
 """Parts of a learned agent."""
+_CONSTANTS = {
+    thinning: "WAITING SOON_US STEADY",
+    target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
+    price_dp: "LEAST_SHARE SIZES_WEIGHT",
+    chains: "SPAN",
+    guided: "MOST SPREAD_US",
+}
+"""Constants that the parts name, by the module that has them."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
 """Seed, episodes and messages of the calls in the header."""
@@ -64,8 +74,9 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         BufgymError: the policy has no C, or a limit is invalid.
     """
     check_limits(capacity, max_bytes)
-    learns = policy.on_arrival is learned.on_arrival
-    body = "".join(map(_part, _LEARNED)) if learns else _rule(policy)
+    learns, guides = policy.on_arrival is learned.on_arrival, policy.on_arrival is guided.on_arrival
+    body = "".join(map(_part, _LEARNED)) if learns else _rule(policy, guides)
+    parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False)) if guides else policy.parameters
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
     unlimited = max_bytes is None
@@ -84,21 +95,17 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "PARAMETERS": _array("double", "bufgym_parameters", policy.parameters.values()) if policy.parameters else "",
         "VALUE": _comment(value.name),
         "VALUE_PART": _array("double", "bufgym_v", value.array) + _part(f"value_{_VALUES[int(value.array[0])]}.h"),
-        "SCRATCH": "",
+        "SCRATCH": _part("places.h") if "bufgym_weigh(" in body else "",
         "POLICY": body,
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
-        "WAITING": thinning.WAITING,
-        "SOON_US": repr(thinning.SOON_US),
-        **{
-            name: getattr(target_gap, name)
-            for name in ("LEAST", "SHORT_QUEUE", "SHORT_RUN_US", "SLOWEST", "BURSTY", "LATE", "TOLD")
-        },
+        **{name: repr(getattr(module, name)) for module, names in _CONSTANTS.items() for name in names.split()},
         "STRAIGHT": repr(straight(value.array)),
-        "WITHIN": repr(target_gap.WITHIN),
-        **{name.upper(): repr(number) for name, number in policy.parameters.items()},
+        **{name.upper(): repr(float(number)) for name, number in parameters.items()},
+        "INPUTS": _lines(f"BUFGYM_IN_{name.upper()}" for name in guided.INPUTS),
+        "OUTPUTS": _lines(f"BUFGYM_OUT_{output.name.upper()}" for output in guided.OUTPUTS),
+        "WEIGHTS": _array("double", "bufgym_weights", policy.weights[guided.NUMBERS :]) if guides else "",
         "STEADY_US": repr(thinning.HORIZON_US),
-        "STEADY": repr(thinning.STEADY),
         "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
     }
     if learns:
@@ -106,13 +113,13 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
 
 
-def _rule(policy: Policy) -> str:
-    """Write the C of a rule after the parts that it shares."""
+def _rule(policy: Policy, guides: bool) -> str:
+    """Write the C of a rule, or of an agent that guides one, after the parts that it shares."""
     name = policy.name.partition(":")[0]
-    if name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival:
+    if not guides and (name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival):
         known = ", ".join(SUPPORTED)
         raise BufgymError(f"policy {policy.name}: has no C; known: {known}, and learned agents for one queue")
-    rule = (_RULES / f"{name}.h").read_text(encoding="utf-8")
+    rule = _part("guided.h") if guides else (_RULES / f"{name}.h").read_text(encoding="utf-8")
     helpers = ""
     for call, part in reversed(_HELPERS.items()):  # a helper may call the one before it
         if call in helpers + rule and _part(part) not in helpers:

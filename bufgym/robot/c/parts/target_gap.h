@@ -30,6 +30,13 @@ static inline int bufgym_bursty(const struct bufgym_queue *q)
     return q->memory[BUFGYM_SQUARE] > @BURSTY@ * q->memory[BUFGYM_PERIOD] * q->memory[BUFGYM_PERIOD];
 }
 
+/* The link's rate by its three means, bytes/us. */
+static inline double bufgym_link_rate(const struct bufgym_queue *q)
+{
+    const double recent = @SHORT@ * (1e6 * q->short_rate) + @LONG@ * (1e6 * q->long_rate);
+    return recent / 1e6 + (1 - @SHORT@ - @LONG@) * q->memory[BUFGYM_RATE];
+}
+
 /* The gap at which the link and the room that is left carry what comes within the horizon; 0 where it cannot be told. */
 static inline double
 bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival)
@@ -38,7 +45,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     const int L = bufgym_places(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
     const double horizon_us = bufgym_within(q, 1e6 * @HORIZON_S@);
-    double recent, r, m;
+    double r, m;
     /* The first test is for compilers, which leave out then what a short queue never does. */
     if (BUFGYM_CAPACITY < @LEAST@ || L < @LEAST@ || elapsed_us <= 0.0)
         return 0.0;
@@ -46,8 +53,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
         return 0.0;
     if (bufgym_bursty(q) || (L <= @SHORT_QUEUE@ && memory[BUFGYM_SEEN_US] < @SHORT_RUN_US@))
         return 0.0;
-    recent = @SHORT@ * (1e6 * q->short_rate) + @LONG@ * (1e6 * q->long_rate);
-    r = (recent / 1e6 + (1 - @SHORT@ - @LONG@) * memory[BUFGYM_RATE]) / bufgym_mean_bytes(q, arrival);
+    r = bufgym_link_rate(q) / bufgym_mean_bytes(q, arrival);
     if (L > (q->ends_us < BUFGYM_FOREVER ? @TOLD@ : 1.0) * r * memory[BUFGYM_SEEN_US])
         return 0.0;
     m = (1 - @PACED@) * (arrival->x - q->dequeued_x) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
@@ -106,3 +112,22 @@ static inline int bufgym_approach(
         return BUFGYM_ACCEPT;
     return victim;
 }
+
+/* The rule, once what is remembered is new. */
+static inline int bufgym_follow_gap(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    double g;
+    int victim = bufgym_needless(q, arrival);
+    if (victim >= 0)
+        return victim;
+    if (bufgym_last_chance(q, arrival))
+        return 0;
+    g = bufgym_target(q, arrival);
+    if (g > 0.0 && !bufgym_steady(q))
+        return bufgym_approach(q, arrival, g);
+    victim = bufgym_smallest_gap(q, arrival, 0, q->occupancy + 1, 0.0);
+    if (bufgym_has_space(q, arrival) && (bufgym_bursty(q) || !bufgym_spare(q, arrival, victim)))
+        return BUFGYM_ACCEPT;
+    return victim;
+}
+

@@ -44,22 +44,26 @@ static inline double bufgym_within(const struct bufgym_queue *q, double horizon_
     return left_us > 0.0 && left_us < horizon_us ? left_us : horizon_us;
 }
 
-/* Whether a queue with room can spare `victim`: enough wait for the link, a full queue would soon be sent, and the
-   victim's neighbours then lie no farther apart than the link sends. */
-static inline int bufgym_spare(
-    const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim)
+/* Time between messages that the link sends while the room that is left fills up by the horizon, us; 0 where none may
+   be spared: too few wait for the link, or a full queue would not soon be sent. */
+static inline double bufgym_spare_us(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const int s = q->occupancy, L = bufgym_places(q, arrival);
-    const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
-    const double horizon_us = bufgym_within(q, @STEADY_US@);
-    double each_us = bufgym_send_us(q, arrival);
+    const double horizon_us = bufgym_within(q, @STEADY_US@), each_us = bufgym_send_us(q, arrival);
     /* The first test is for compilers, which see then that no such queue has room here. */
-    if (BUFGYM_CAPACITY <= @WAITING@ || s < @WAITING@ || q->busy == 0 || elapsed_us <= 0.0 || each_us <= 0.0)
-        return 0;
-    if (L * each_us > @SOON_US@)
-        return 0;
-    each_us = horizon_us / (horizon_us / each_us + L - s);
-    return bufgym_gap_left(q, arrival, victim) * elapsed_us
-        <= (arrival->x - q->dequeued_x) * each_us;
+    if (BUFGYM_CAPACITY <= @WAITING@ || s < @WAITING@ || q->busy == 0 || each_us <= 0.0)
+        return 0.0;
+    if (arrival->arrival_us <= q->dequeued_arrival_us || L * each_us > @SOON_US@)
+        return 0.0;
+    return horizon_us / (horizon_us / each_us + L - s);
+}
+
+/* Whether a queue with room can spare `victim`: its neighbours then lie no farther apart than the link sends. */
+static inline int bufgym_spare(const struct bufgym_queue *q, const struct bufgym_message *arrival, int victim)
+{
+    const double each_us = bufgym_spare_us(q, arrival);
+    const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
+    return each_us > 0.0
+        && bufgym_gap_left(q, arrival, victim) * elapsed_us <= (arrival->x - q->dequeued_x) * each_us;
 }
 
