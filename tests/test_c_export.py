@@ -104,7 +104,7 @@ def every_field() -> Policy:
 
 def every_output() -> Policy:
     """A random agent that changes every number of the rule it guides."""
-    W = np.random.default_rng(4).normal(size=(guided.N_OUTPUTS, guided.N_INPUTS))
+    W = np.random.default_rng(4).normal(size=guided.GuidedWeights.SHAPE)
     return guided.linear("every-output", 0.4 * W)
 
 

@@ -198,14 +198,14 @@ def reached(policy: Any) -> list[Any]:
     return ours
 
 
-def reached_in_env(model: Any, form: str, fields: Any = None) -> list[Any]:
-    envs = SenderVectorEnv(4, SCENARIO, L, decide_at="arrival", fields=fields, observation=form)
+def reached_in_env(model: Any, form: str, fields: Any = None, acts: str = "slots") -> list[Any]:
+    envs = SenderVectorEnv(4, SCENARIO, L, decide_at="arrival", actions=acts, fields=fields, observation=form)
     envs.reset(options={"episodes": EPISODES})
     rows = envs.rows
     while not rows.output.terminated.all():
         observation: Any = rows.observation()
         masks = {"action_masks": rows.output.action_mask} if isinstance(model, MaskablePPO) else {}
-        rows.step(np.asarray(model.predict(observation, deterministic=True, **masks)[0], np.int64))
+        rows.step(rows.actions(model.predict(observation, deterministic=True, **masks)[0]))
     return [outcome(rows.senders, i) for i in range(4)]
 
 
@@ -280,3 +280,4 @@ def test_guided_actions_are_those_of_any_continuous_agent(algorithm: Any) -> Non
     model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **settings).learn(2_000)
     action, _ = model.predict(envs.reset(), deterministic=True)
     assert model.num_timesteps >= 2_000 and action.shape == (8, 10) and np.abs(action).max() <= 1
+    assert repr(reached(as_policy(model))) == repr(reached_in_env(model, "flat", "guided", "guided"))

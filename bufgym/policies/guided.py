@@ -252,6 +252,7 @@ class GuidedWeights:
     NETWORKS: ClassVar[tuple[str, ...]] = ("guided",)
     LAYERS: ClassVar[int] = 0
     SHAPE: ClassVar[tuple[int, int]] = (2 * N_OUTPUTS, N_INPUTS)
+    LIGHT: ClassVar[tuple[int, int]] = (N_OUTPUTS, N_INPUTS)
     TABLE: ClassVar[list[Any]] = [list(INPUTS.items()), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
     """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
 
@@ -271,12 +272,12 @@ class GuidedWeights:
 
     def tensors(self) -> dict[str, NDArray[np.float32]]:
         """The numbers by name."""
-        return {"weight": whole(self.weight, self.SHAPE)}
+        return {"weight": self.weight}
 
 
 def whole(weights: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
     """The weights; those for a light load alone get zeros for a heavy one."""
-    alone = weights.shape == (N_OUTPUTS, N_INPUTS) != shape
+    alone = weights.shape == GuidedWeights.LIGHT != shape
     return np.concatenate([weights, np.zeros_like(weights)]) if alone else weights
 
 
@@ -291,6 +292,6 @@ def numbers_of(name: str, base: Numbers, weights: NDArray[Any], shape: tuple[int
 
 def linear(name: str, weights: NDArray[np.floating[Any]], about: str = "", source: str = "") -> Policy:
     """Make the policy with outputs W c for the inputs c; ``weights`` is W [outputs, inputs]. W = 0 is gap-price."""
-    numbers = numbers_of(name, BASE, weights, (N_OUTPUTS, N_INPUTS))
+    numbers = numbers_of(name, BASE, weights, GuidedWeights.SHAPE)
     policy = Policy(name, on_arrival, weights=numbers, memory=REMEMBERED, work=WORK, compile=True, reads_rate=True)
     return replace(policy, about=about, source=source)

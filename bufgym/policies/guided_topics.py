@@ -139,7 +139,7 @@ class SchedulerWeights(GuidedWeights):
 
     CONTEXT_NAMES = tuple(INPUTS)
     NETWORKS = ("scheduler",)
-    SHAPE = (N_OUTPUTS, N_INPUTS)
+    SHAPE = LIGHT = (N_OUTPUTS, N_INPUTS)
     TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), list(INPUTS.items()), OUTPUTS, PLAIN]
 
     @property

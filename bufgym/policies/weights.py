@@ -299,7 +299,8 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
         for name, shape in Network.shapes(len(fields), widths).items()
     }
     if issubclass(kind, GuidedWeights):
-        required = {f"{kind.NETWORKS[0]}.weight": kind.SHAPE}
+        name = f"{kind.NETWORKS[0]}.weight"
+        required = {name: shapes[name] if shapes.get(name) in (kind.SHAPE, kind.LIGHT) else kind.SHAPE}
     if MIX in shapes and kind is Weights:
         slots = sum(name in kind.SLOT_NAMES for name in fields)
         required[MIX] = (len(fields) - slots, slots)

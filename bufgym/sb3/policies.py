@@ -16,21 +16,10 @@ from stable_baselines3.common.policies import BasePolicy
 from bufgym.envs.observation import ObservationForm
 from bufgym.envs.own import write_in_python
 from bufgym.ground.errors import BufgymError
+from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.model.observe import (
-    CONTEXT_FIELDS,
-    SLOT_FIELDS,
-    TOPIC_CONTEXT_FIELDS,
-    TOPIC_FIELDS,
-    TOPIC_SLOT_FIELDS,
-    OwnField,
-    observe_context,
-    observe_slots,
-    observe_topic_context,
-    observe_topic_slots,
-    own_field,
-)
 from bufgym.policies import Policy
+from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, REMEMBERED, SCALES, WORK, follow, inputs, recall
 from bufgym.policies.learned import policy as slot_policy
 from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
@@ -42,9 +31,9 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     """Make a bufgym policy of a trained model; it takes the model's most likely or most valued action.
 
     A network that scores slots with masks (``SlotPolicy`` under MaskablePPO) runs compiled and serves every L. Any
-    other network runs in torch, one decision at a time, and serves the L it was trained for. Algorithms that take
-    action masks get them. For others, an invalid action does the same as in the environment. An observation "flat" or
-    "slots" must be of every field; a "dict" names its fields.
+    other network runs in torch, one decision at a time, and serves the L it was trained for; every L if its actions and
+    its observation, "flat", are guided. Algorithms that take action masks get them. For others, an invalid action does
+    the same as in the environment. An observation "flat" or "slots" must be of every field; a "dict" names its fields.
 
         policy = as_policy("model.zip", "mine")
         bufgym.benchmark.run.run([policy, policies.get("afr")], scenario, capacities=[8], seeds=10)
@@ -64,6 +53,9 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     if getattr(network, "lstm_actor", None) is not None:
         raise BufgymError(f"model {name}: has a recurrent network, whose state a policy cannot keep")
     about = f"A trained {type(agent).__name__}."
+    guided = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)
+    if agent.action_space == guided and agent.observation_space.shape == (N_INPUTS,):
+        return _guided(name, agent, about)
     masked = takes_masks(agent) and getattr(network, "masked", True)
     decisions = _Decisions(name, agent, masked)
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
@@ -78,6 +70,18 @@ def takes_masks(agent: Any) -> bool:
     return "action_masks" in inspect.signature(agent.predict).parameters
 
 
+def _guided(name: str, agent: Any, about: str) -> Policy:
+    """Make the policy of a model whose actions set the numbers of gap-price."""
+
+    def on_arrival(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
+        seen = np.zeros(N_INPUTS, np.float32)
+        recall(buffer, arrival, memory, BASE)
+        inputs(buffer, arrival, memory, BASE, seen)
+        return follow(buffer, arrival, memory, BASE, agent.predict(seen, deterministic=True)[0] * SCALES)
+
+    return Policy(name, on_arrival, memory=REMEMBERED, work=WORK, about=about, reads_rate=True)
+
+
 class _Decisions:
     """Decisions of a model from a robot's view, one at a time."""
 
@@ -86,23 +90,26 @@ class _Decisions:
         space, actions = agent.observation_space, agent.action_space
         self.capacity = int(getattr(actions, "n", 0)) - 2
         if self.capacity < 1:
-            raise BufgymError(f"model {name}: action space {actions}: must be Discrete(L + 2), as bufgym's are")
+            raise BufgymError(f"model {name}: action space {actions}: must be Discrete(L + 2), or guided and seen flat")
         form = "dict" if isinstance(space, spaces.Dict) else "flat"
         if form == "dict" and {"slots", "context"} & set(space):
             form = "slots"
         names, numbers = list(space) if form == "dict" else None, spaces.flatdim(space)
-        all_fields = SLOT_FIELDS + TOPIC_SLOT_FIELDS, CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS
+        all_fields = (
+            observe.SLOT_FIELDS + observe.TOPIC_SLOT_FIELDS,
+            observe.CONTEXT_FIELDS + observe.TOPIC_CONTEXT_FIELDS,
+        )
         if names is None:
             self.for_topics = numbers == ObservationForm(form, *all_fields, self.capacity).numbers
         else:
-            self.for_topics = any(field.name in names for field in TOPIC_FIELDS)
-        per_slot, context = all_fields if self.for_topics else (SLOT_FIELDS, CONTEXT_FIELDS)
+            self.for_topics = any(field.name in names for field in observe.TOPIC_FIELDS)
+        per_slot, context = all_fields if self.for_topics else (observe.SLOT_FIELDS, observe.CONTEXT_FIELDS)
         known = [field.name for field in per_slot + context]
         for field in names or ():
-            if field not in known and own_field(field) is None:
+            if field not in known and observe.own_field(field) is None:
                 raise BufgymError(f"model {name}: observes {field!r}, which is no field (bufgym list observations)")
         self.form = ObservationForm(form, per_slot, context, self.capacity, names)
-        self.own = [place for place in self.form.places if isinstance(place.field, OwnField)]
+        self.own = [place for place in self.form.places if isinstance(place.field, observe.OwnField)]
         if self.own and self.for_topics:
             raise BufgymError(f"model {name}: observes fields of one's own; with several topics no policy can")
         expected = spaces.flatdim(self.form.space)
@@ -136,17 +143,15 @@ class _Decisions:
         row = np.zeros(self.form.numbers, np.float32)
         slots, context = self.form.split(row)
         if self.for_topics:
-            observe_topic_slots(buffer, arrival, arriving, slots)
-            observe_topic_context(buffer, arrival, arriving, context)
+            observe.observe_topic_slots(buffer, arrival, arriving, slots)
+            observe.observe_topic_context(buffer, arrival, arriving, context)
         else:
-            observe_slots(buffer, arrival, slots)
-            observe_context(buffer, arrival, context)
+            observe.observe_slots(buffer, arrival, slots)
+            observe.observe_context(buffer, arrival, context)
         for place in self.own:
             write_in_python(place, buffer, arrival, arriving, row)
-        masks = {}
-        if self.masked:
-            mask = np.zeros(L + 2, np.bool_)
-            mask[: len(buffer.slots)], mask[L:] = valid[:-2], valid[-2:]
-            masks = {"action_masks": mask}
+        mask = np.zeros(L + 2, np.bool_)
+        mask[: len(buffer.slots)], mask[L:] = valid[:-2], valid[-2:]
+        masks = {"action_masks": mask} if self.masked else {}
         action, _ = self.agent.predict(self.form.of(row), deterministic=True, **masks)
         return int(action)

@@ -44,7 +44,7 @@ _CONSTANTS = {
     target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
     price_dp: "LEAST_SHARE SIZES_WEIGHT",
     chains: "SPAN",
-    guided: "MOST SPREAD_US",
+    guided: "MOST SPREAD_US SLOW_US HEAVY HEAVIER",
 }
 """Constants that the parts name, by the module that has them."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}

@@ -1,6 +1,6 @@
 @WEIGHTS@
-/* What is remembered besides: mean and variance of the logarithm of the link's rate. */
-enum { BUFGYM_LOG_RATE = BUFGYM_SIZES + 1, BUFGYM_LOG_RATE_VARIANCE };
+/* What is remembered besides: mean and variance of the logarithm of the link's rate, and its mean over a longer time. */
+enum { BUFGYM_LOG_RATE = BUFGYM_SIZES + 1, BUFGYM_LOG_RATE_VARIANCE, BUFGYM_SLOW_RATE };
 /* The outputs, which change numbers of the rule gap-price. */
 enum {
     @OUTPUTS@,
@@ -35,6 +35,9 @@ static inline void bufgym_recall(struct bufgym_queue *q, const struct bufgym_mes
     bufgym_remember_sizes(q, arrival);
     if (q->evictions > 0 || us <= 0.0 || rate <= 0.0)
         return;
+    seen_us = memory[BUFGYM_SEEN_US] < us + @SLOW_US@ ? memory[BUFGYM_SEEN_US] : us + @SLOW_US@;
+    weight = memory[BUFGYM_SLOW_RATE] > 0.0 ? us / seen_us : 1.0;
+    memory[BUFGYM_SLOW_RATE] += weight * (rate - memory[BUFGYM_SLOW_RATE]);
     seen_us = memory[BUFGYM_SEEN_US] < us + @SPREAD_US@ ? memory[BUFGYM_SEEN_US] : us + @SPREAD_US@;
     weight = memory[BUFGYM_LOG_RATE] > 0.0 ? us / seen_us : 1.0;
     off = log(rate > 1.0 ? rate : 1.0) - memory[BUFGYM_LOG_RATE];
@@ -101,18 +104,29 @@ static inline int bufgym_set_numbers(const double *outputs, struct bufgym_number
     return 1;
 }
 
+/* How heavy the load is, from 0 to 1. */
+static inline double bufgym_heaviness(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    const double carried = q->memory[BUFGYM_SLOW_RATE] * 1e-6 * q->period_us;
+    const double h = carried > 0.0 ? (log(bufgym_mean_bytes(q, arrival) / carried) - @HEAVY@) / @HEAVIER@ : 0.0;
+    return h < 0.0 ? 0.0 : h < 1.0 ? h : 1.0;
+}
+
 /* The rule gap-price, its numbers linear in what the robot sees. */
 static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     struct bufgym_numbers numbers;
-    double seen[BUFGYM_INPUTS], outputs[BUFGYM_OUTPUTS], a;
-    int i, o, changed;
+    double seen[BUFGYM_INPUTS], outputs[BUFGYM_OUTPUTS], a, h;
+    int i, k, o, changed;
     bufgym_recall(q, arrival);
     bufgym_look(q, arrival, seen);
+    h = bufgym_heaviness(q, arrival);
     for (o = 0; o < BUFGYM_OUTPUTS; o++) {
         double total = 0.0;
-        for (i = 0; i < BUFGYM_INPUTS; i++)
-            total += bufgym_weights[o * BUFGYM_INPUTS + i] * seen[i];
+        for (i = 0; i < BUFGYM_INPUTS; i++) {
+            k = o * BUFGYM_INPUTS + i;
+            total += (bufgym_weights[k] + h * bufgym_weights[BUFGYM_OUTPUTS * BUFGYM_INPUTS + k]) * seen[i];
+        }
         outputs[o] = total * (1.0 - seen[BUFGYM_IN_PLAIN]);
     }
     changed = bufgym_set_numbers(outputs, &numbers);
