@@ -36,7 +36,7 @@ def check() -> None:
     while not ended:
         _, _, ended, _, info = env.step(env.action_space.sample(info["action_mask"]))
     assert info["arrived"] == info["delivered"] + info["dropped"] == 150, info
-    assert main(["bench", "--policies", "learned-motion,afr,drop-oldest", "--seconds", "5", "--seeds", "1"]) == 0
+    assert main(["bench", "--policies", "learned,afr,drop-oldest", "--seconds", "5", "--seeds", "1"]) == 0
     assert main(["report", "nowhere"]) == 2
     print(f"bufgym {bufgym.__version__} on Python {sys.version.split()[0]}")
 

@@ -1,6 +1,6 @@
 // A robot's send queue without Python: one loop, no threads, no allocation. The policy is a header:
 //
-//     bufgym export learned-motion --to c --out policy.h --capacity 8
+//     bufgym export learned --to c --out policy.h --capacity 8
 //     g++ -O2 -ffp-contract=off -I. robot.cpp -o robot
 //     ./robot                # 30 frames a second for 12 s; the link stands still from second 4 to 8
 //     ./robot - < arrivals   # the same link, with arrivals as lines of "microseconds bytes x"

@@ -30,7 +30,7 @@ def missed(x: NDArray[np.float64], arrived: NDArray[np.bool_], overlap: float) -
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    known = "clairvoyant,learned-motion,min-motion-gap,orbbuf,afr,keyframe,drop-oldest,random"
+    known = "clairvoyant,learned,min-motion-gap,orbbuf,afr,keyframe,drop-oldest,random"
     parser.add_argument("--policies", default=known, help="(%(default)s)")
     parser.add_argument("--seeds", type=int, default=20, help="episodes on each trace (%(default)s)")
     parser.add_argument("--capacity", type=int, default=8, help="L (%(default)s)")

@@ -108,7 +108,7 @@ def every_output() -> Policy:
     return guided.linear("every-output", 0.4 * W)
 
 
-AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-motion", "learned-time")}}
+AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
 AGENTS |= {"every-field": every_field(), "every-output": every_output()}
 
 
@@ -151,7 +151,7 @@ def test_with_a_window_several_messages_are_in_the_socket(tmp_path):
     ("name", "number", "other"),
     [
         ("afr", "<= 2.0 / 3.0", "<= 0.2"),
-        ("learned-motion", "bufgym_v[] = {\n    0.0, -0.48", "bufgym_v[] = {\n    0.0, -0.08"),
+        ("learned", "bufgym_v[] = {\n    0.0, -0.48", "bufgym_v[] = {\n    0.0, -0.08"),
         ("min-motion-gap", ": gaps.before_x + gaps.after_x;", ": gaps.before_x;"),
     ],
 )
@@ -162,7 +162,7 @@ def test_parity_finds_another_number(name, number, other, tmp_path):
     assert not output(driver(tmp_path, text.replace(number, other))).startswith("0 ")
 
 
-@pytest.mark.parametrize("name", ["afr", "learned-motion"])
+@pytest.mark.parametrize("name", ["afr", "learned"])
 def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
     """8 MB/s but for a standstill from second 4 to 8; 230 kB frames at 30 Hz."""
     policy = policies.get(name)
@@ -184,14 +184,14 @@ def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
 
 
 def test_the_command_writes_the_header(tmp_path, capsys):
-    out, agent = tmp_path / "policy.h", REPO / "agents" / "pretrained" / "learned-time.safetensors"
+    out, agent = tmp_path / "policy.h", REPO / "agents" / "pretrained" / "learned.safetensors"
     words = ["even-reject:beta=1.25", "--to", "c", "--out", out, "--capacity", 6, "--value", "saturating:4"]
     assert shown(["export", *words], capsys) == f"wrote {out}\n"
     text = out.read_text(encoding="utf-8")
     assert_equal(text, header(policies.get("even-reject:beta=1.25"), 6, qoi.saturating(4)))
     assert "#define BUFGYM_CAPACITY 6 " in text and "bufgym_parameters[] = {\n    1.25\n}" in text and "@" not in text
     shown(["export", agent, out, "--to", "c"], capsys)
-    assert_equal(out.read_text(encoding="utf-8"), header(policies.get("learned-time"), 16, EXPONENTIAL))
+    assert_equal(out.read_text(encoding="utf-8"), header(policies.get("learned"), 16, EXPONENTIAL))
 
 
 @pytest.mark.parametrize(

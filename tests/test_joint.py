@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_cases import Capsys, Patch
+from cli_cases import Patch
 from train_cases import in_a_folder_of_its_own  # noqa: F401
 
 from agents import families, joint
@@ -40,18 +40,18 @@ def test_shares_are_sums_over_the_links_drawn() -> None:
     assert Family("random", runs()).share(rule) == pytest.approx(ratios.mean())
 
 
-def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
+def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeypatch: Patch) -> None:
     few = runs()
     monkeypatch.setattr(joint, "families", lambda split, folder, data=None: {"task": few, "default-frames": few})
     monkeypatch.setattr(joint, "RUNS", {"task": 4, "default-frames": 4})
     monkeypatch.setattr(joint, "POPULATION", 4)
     family = Family("task", few)
-    assert family.share(joint.agent(np.zeros(160))) == family.share(policies.get("gap-price"))
+    assert family.share(joint.agent(np.zeros(320)).policy("plain")) == family.share(policies.get("gap-price"))
     file = tmp_path / "agent.safetensors"
-    joint.main(seed=3, cpu_s=0.3, out=file)
+    joint.main(seed=3, generations=2, out=file)
     found, notes = weights.read_any(file)
     assert isinstance(found, guided.GuidedWeights) and 0 < np.abs(found.weight).max() < 1
-    assert notes["training"] == "python -m agents.joint --seed 3 --cpu-s 0.3"
+    assert notes["training"] == "python -m agents.joint --seed 3 --generations 2"
     joint.main(file, out=tmp_path / "page.md")
     page = (tmp_path / "page.md").read_text().splitlines()
     own, rule = (family.share(each) for each in (policies.load(file), policies.get("gap-price")))
@@ -59,7 +59,7 @@ def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeyp
         f"{rule:.3f}",
         f"{own:.3f} |",
     ]
-    assert [line.split(" |")[0] for line in page if "L = " in line] == [
+    assert [line.split(" |")[0] for line in page if line.startswith("| default")] == [
         "| default-frames, L = 4",
         "| default-frames, L = 8",
     ] * 2

@@ -148,7 +148,7 @@ def test_links_and_pictures_lead_somewhere() -> None:
 
 
 RUN = {
-    r"bufgym bench --policies learned-motion,afr": "--seconds 2 --seeds 1",
+    r"bufgym bench --policies learned,afr": "--seconds 2 --seeds 1",
     r"bufgym bench --policy-file mine\.py --policies every-other.*": "--seconds 2 --seeds 1",
     r"bufgym bench --scenario-file .*": "--seeds 1",
     r"bufgym topics --policy-file .*": "--config examples/client.toml --trace lte-synthetic-0 --seeds 1",
@@ -290,8 +290,8 @@ def test_pages_have_all_of_their_registry(monkeypatch: pytest.MonkeyPatch) -> No
     lines = commands.page()
     headings = re.findall(r"^###? (bufgym .*)$", lines, re.MULTILINE)
     assert len(headings) > 40 and all(f"```console\n{name}" in lines for name in headings)
-    assert {name for name in policies.names() if name.startswith("learned-")} == set(cards.CARDS)
-    shipped = {suite: numbers for suite, *numbers in cards.board("learned-motion")}
+    assert {name for name in policies.names() if name.startswith("learned")} == set(cards.CARDS)
+    shipped = {suite: numbers for suite, *numbers in cards.board("learned")}
     assert shipped and all(f"| {suite} | {' | '.join(numbers)} |" in cards.page() for suite, numbers in shipped.items())
     monkeypatch.setattr(policy_page, "picture", lambda policy: "")
     names = [*policies.names(), *policies.names(named_only=True)]

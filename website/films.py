@@ -36,7 +36,7 @@ _COLOURS = 48
 """The films are line art: so many colours are enough."""
 _COUNT = 24
 """Images of a film that an environment renders."""
-QUEUE = ("drop-oldest", "afr", "min-motion-gap", "learned-motion")
+QUEUE = ("drop-oldest", "afr", "min-motion-gap", "learned")
 """The policies that are shown on one queue."""
 
 
@@ -85,7 +85,7 @@ def _compared(names: Sequence[str], episode: Episode, scenario: Scenario, title:
 def _readme() -> Frames:
     scenario = fading()
     title = "The link fades; the send buffer holds 8 messages. What does the server see?"
-    return _compared(("drop-oldest", "learned-motion"), draw(scenario, 0), scenario, title)
+    return _compared(("drop-oldest", "learned"), draw(scenario, 0), scenario, title)
 
 
 def _uplink() -> Frames:
@@ -133,7 +133,7 @@ def _mapping() -> Frames:
 
 
 def _fleet() -> Frames:
-    titles, films = zip(*map(_rendered_cell, ("drop-oldest", "learned-motion")), strict=True)
+    titles, films = zip(*map(_rendered_cell, ("drop-oldest", "learned")), strict=True)
     return _stacked(titles, films)
 
 

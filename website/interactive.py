@@ -18,7 +18,7 @@ from bufgym.scenario import Interruption, Scenario, get
 from bufgym.sim import metrics
 from website.picture import fading, play
 
-POLICIES = ("drop-oldest", "afr", "min-gap", "learned-motion")
+POLICIES = ("drop-oldest", "afr", "min-gap", "learned")
 CAPACITIES = (4, 8, 16)
 LONGEST = 120
 """Messages: the longest interruption on the page."""

@@ -32,7 +32,7 @@ def validate(
 
     Args:
         trace: Bandwidth traces, files or shipped names.
-        policies: As in bench (default: drop-oldest,afr,min-motion-gap,learned-motion).
+        policies: As in bench (default: drop-oldest,afr,min-motion-gap,learned).
         capacity: L, messages.
         seeds: Episodes on each trace.
         duration: Of each, s.
@@ -50,7 +50,7 @@ def validate(
     from bufgym.scenario import Uplink
 
     load_policies(policy_file)
-    names = loaded(policies)[0] or ["drop-oldest", "afr", "min-motion-gap", "learned-motion"]
+    names = loaded(policies)[0] or ["drop-oldest", "afr", "min-motion-gap", "learned"]
     scenario = Uplink(
         traces=tuple(traces.load(name) for name in trace),
         motion=tuple(traces.load_motion(name) for name in traces.shipped() if name.startswith("drive-")),

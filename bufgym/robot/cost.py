@@ -15,7 +15,7 @@ from bufgym.benchmark.table import Table
 from bufgym.cli.options import Positive
 from bufgym.robot.queue import PolicyQueue
 
-POLICIES = ("drop-oldest", "afr", "learned-motion")
+POLICIES = ("drop-oldest", "afr", "learned")
 RATE_HZ, SIZE_BYTES, CAPACITY = 30.0, 230_000, 16
 """Frames that the camera puts, and the queue's L."""
 LINK_HZ = 12.0

@@ -49,7 +49,7 @@ model.learn(65_536)
 from bufgym.scenario import Interruption
 
 mine = as_policy(model, "my-agent")
-compared = bufgym.compare([mine, "learned-motion", "afr", "drop-oldest"], Interruption(t_max=200), seeds=20)
+compared = bufgym.compare([mine, "learned", "afr", "drop-oldest"], Interruption(t_max=200), seeds=20)
 print(compared)
 
 # %% [markdown]

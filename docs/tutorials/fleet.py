@@ -34,7 +34,7 @@ import bufgym
 from bufgym.scenario import FleetScenario
 
 cell = FleetScenario.of(8, "lte", duration_s=10.0)
-names = ["learned-motion", "afr", "drop-oldest"]
+names = ["learned", "afr", "drop-oldest"]
 rows = bufgym.compare(names, cell, seeds=2).rows
 
 # %% [markdown]

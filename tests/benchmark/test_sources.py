@@ -46,7 +46,7 @@ def boom(buffer, arrival, memory):
 number = 3
 """
 LINES = MODULE.split("\n")
-SHIPPED = Path(policies.__file__).parents[2] / "agents" / "pretrained" / "learned-time.safetensors"
+SHIPPED = Path(policies.__file__).parents[2] / "agents" / "pretrained" / "learned.safetensors"
 ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "--seeds", "1"]
 
 
@@ -81,8 +81,8 @@ def test_functions_makers_and_policies_of_a_module(module: str, capsys: Capsys) 
 
 def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: Capsys) -> None:
     shutil.copy(SHIPPED, "own.safetensors")
-    table = rows_of(shown(["bench", *ONE, "--policies", "own.safetensors,learned-time"], capsys))
-    assert table["own"] == table["learned-time"]
+    table = rows_of(shown(["bench", *ONE, "--policies", "own.safetensors,learned"], capsys))
+    assert table["own"] == table["learned"]
     Path("a").mkdir()
     shutil.copy(SHIPPED, "a/own.safetensors")
     told = "own.safetensors: there is a policy named 'own' already"

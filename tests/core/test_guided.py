@@ -120,5 +120,5 @@ def test_a_ratio_is_never_endless(a, b, ratio):
 
 def test_weights_of_another_shape_are_refused():
     for weights in (np.zeros((16, 10)), np.full(ZERO.shape, np.nan)):
-        with pytest.raises(BufgymError, match=r"policy 'mine': weights of shape \[.*: must be 10 x 16 finite numbers"):
+        with pytest.raises(BufgymError, match=r"policy 'mine': weights of shape \[.*: must be 20 x 16 finite numbers"):
             guided.linear("mine", weights)

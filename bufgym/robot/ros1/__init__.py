@@ -7,7 +7,7 @@
 
 or, for an unmodified node,
 
-    python -m bufgym.robot.ros1 --policy learned-motion --odom /odom NODE.py ARGS
+    python -m bufgym.robot.ros1 --policy learned --odom /odom NODE.py ARGS
 
 ``queue_size`` is L, and each subscriber has a queue of its own. Publishers without ``queue_size`` send at once in
 ``publish``, and ``queue_size=0`` is unbounded. Both, and the topics of ``UNTOUCHED``, stay rospy's.
