@@ -23,8 +23,7 @@ from bufgym.model.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_REWARD_TERMS,
     TOPIC_SLOT_FIELDS,
-    observe_context,
-    observe_slots,
+    observe,
     observe_topic_context,
     observe_topic_slots,
 )
@@ -167,8 +166,9 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
         observe_topic_context(buffer, arrival, arriving, stretch(output.flat, i, first, _ALL_CONTEXT_FIELDS))
     else:
         arrival = arrival_of(batch, i)
-        observe_slots(buffer, arrival, table(output.flat, i, 0, _SLOT_FIELDS, entries))
-        observe_context(buffer, arrival, stretch(output.flat, i, _SLOT_FIELDS * entries, _CONTEXT_FIELDS))
+        first = _SLOT_FIELDS * entries
+        rows, context = table(output.flat, i, 0, _SLOT_FIELDS, entries), stretch(output.flat, i, first, _CONTEXT_FIELDS)
+        observe(buffer, arrival, rows, context)
 
 
 @kernel

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps_among  # noqa: F401 (in generated lines)
+from bufgym.ground.kernel import item, kernel
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain  # noqa: F401 (in generated lines)
 from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
-from bufgym.model.qoi import merging_loss, value
+from bufgym.model.qoi import EXPONENTIAL, merging_loss, value
 
 # Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
 ROUNDING = 1e-12
@@ -60,7 +60,7 @@ SLOT_FIELDS = (
     Field("relative_loss", "slot", "value", "l/(l+r), r = that of an even gap", "the same loss, free of V's scale",
           number="slot.lost", reference="slot.even_lost"),
 )  # fmt: skip
-_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
+_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], len(buffer.slots), {r})"
 _OF_SLOT, _OF_ROWS = "buffer, arrival, slot, column, rows", "buffer, arrival, slot, rows"
 _write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH)
 _squash_rows = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", _SQUASHED, _SQUASHED)
@@ -78,36 +78,61 @@ def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
 
 
 @kernel
+def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], context: NDArray[np.floating[Any]]) -> None:
+    """Write what ``observe_slots`` and ``observe_context`` write."""
+    even = even_gap(buffer, arrival)
+    slot = _write_slots(buffer, arrival, even, rows)
+    _write_context(buffer, arrival, even, context)  # meanwhile the slots' numbers reach the cache
+    _squash_rows(buffer, arrival, slot, rows)
+
+
+@kernel
 def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
     """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1]; empty slots are 0, the newcomer is last.
 
     Losses equal ``buffer.loss``, from the gains that the messages carry. Lengths are squashed row by row afterwards.
     """
+    slot = _write_slots(buffer, arrival, even_gap(buffer, arrival), rows)
+    _squash_rows(buffer, arrival, slot, rows)
+
+
+@kernel
+def _write_slots(buffer: Buffer, arrival: Any, even_gap: tuple[float, float], rows: NDArray[np.floating[Any]]) -> Slot:
+    """Write every SLOT_FIELDS value with the given ``even_gap``, lengths not yet squashed; return the newcomer."""
     s, last = len(buffer.slots), buffer.capacity
     per_rank, even = 1 / (s + 1), 1 / (buffer.capacity + 1)
-    rows[:, s:last] = 0.0
+    rows[:, :] = 0.0
     even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
-    even_lost = max(even_gap(buffer, arrival)[1], ROUNDING)
+    even_lost = max(even_gap[1], ROUNDING)
     mean_bytes = (buffer.backlog_bytes + arrival.size_bytes) * per_rank
-    gain = buffer.slots[0].gain if s > 0 else arrival_gain(buffer, arrival)
+    newest = arrival_gain(buffer, arrival)
+    gain = item(buffer.slots, 0).gain if s > 0 else newest
+    is_exponential = buffer.v[0] == EXPONENTIAL
+    from_us, from_x = buffer.dequeued_arrival_us, buffer.dequeued_x
     for k in range(s + 1):
-        message, column = (buffer.slots[k], k) if k < s else (arrival, last)
-        back_us, on_us, back_x, on_x, merged_x = gaps_among(buffer, arrival, True, k, False)
-        if k == s:
-            next_gain = value(buffer.v, on_x)
-        else:
-            next_gain = buffer.slots[k + 1].gain if k + 1 < s else arrival_gain(buffer, arrival)
+        message, column, place = (item(buffer.slots, k), k, (k + 1) * per_rank) if k < s else (arrival, last, 1.0)
+        at_us, x, size_bytes = message.arrival_us, message.x, message.size_bytes
+        back_us, back_x = at_us - from_us, x - from_x
+        if k < s:
+            behind, next_gain = arrival, newest
+            if k + 1 < s:
+                behind = item(buffer.slots, k + 1)
+                next_gain = behind.gain
+            merged_us, on_x, merged_x = behind.arrival_us - from_us, behind.x - x, behind.x - from_x
+        else:  # the next step is expected to be as long as the last one
+            on_x = x - buffer.previous_x
+            merged_us, merged_x = back_us + at_us - buffer.previous_us, back_x + on_x
+            next_gain = newest if s > 0 and on_x == back_x else value(buffer.v, on_x)
         # Rounding may make a loss negative. A first message has no gap before it to merge, so nothing is lost with it.
-        lost = max(merging_loss(buffer.v, back_x, gain, on_x, next_gain), 0.0)
-        place = (k + 1) * per_rank if k < s else 1.0
-        size_bytes, merged_us = message.size_bytes, float(back_us + on_us)
+        lost = gain * next_gain if is_exponential else merging_loss(buffer.v, back_x, gain, on_x, next_gain)
+        lost = max(lost, 0.0)
         slot = Slot(
-            place, float(back_us), merged_us, back_x, merged_x, lost, lost, size_bytes,
+            place, float(back_us), float(merged_us), back_x, merged_x, lost, lost, size_bytes,
             even_us, even_x, even_lost, mean_bytes,
         )  # fmt: skip
-        _write(buffer, arrival, slot, column, rows)
-        gain = next_gain
-    _squash_rows(buffer, arrival, slot, rows)
+        _write(buffer, arrival, slot, np.uint64(column), rows)
+        gain, from_us, from_x = next_gain, at_us, x
+    return slot
 
 
 # --- context ---------------------------------------------------------------------------------------------------------
@@ -153,10 +178,18 @@ write_context = writer(globals(), CONTEXT_FIELDS, "buffer, arrival, newcomer, co
 @kernel
 def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
     """Write every CONTEXT_FIELDS value into ``context`` (float[fields])."""
+    _write_context(buffer, arrival, even_gap(buffer, arrival), context)
+
+
+@kernel
+def _write_context(
+    buffer: Buffer, arrival: Any, even_gap: tuple[float, float], context: NDArray[np.floating[Any]]
+) -> None:
+    """Do what ``observe_context`` says, with the given ``even_gap``."""
     spread = buffer.capacity + 1
     even_us = (arrival.arrival_us - buffer.dequeued_arrival_us) / spread
     even_x = (arrival.x - buffer.dequeued_x) / spread
     gap_us, gap_x = float(arrival.arrival_us - buffer.previous_us), arrival.x - buffer.previous_x
-    gain, lost = even_gap(buffer, arrival)
+    gain, lost = even_gap
     newcomer = Newcomer(gap_us, gap_x, even_us, even_x, kept(gain, context), gain, lost)
     write_context(buffer, arrival, newcomer, context)
