@@ -88,6 +88,13 @@ def squash(g: float, reference: float) -> float:
 
 
 @kernel
+def squash_kept(g: float, reference: float, numbers: NDArray[np.floating[Any]]) -> float:
+    """Apply ``squash`` to ``g`` as the array keeps it, in single precision."""
+    length, r = numbers.dtype.type(g), np.float32(max(reference, TINY))
+    return length / (length + r)
+
+
+@kernel
 def squash_row(row: NDArray[np.floating[Any]], filled: int, reference: float) -> None:
     """Apply ``squash`` to the first ``filled`` entries and the last, in place and in single precision; others are 0."""
     r, last = np.float32(max(reference, TINY)), len(row) - 1

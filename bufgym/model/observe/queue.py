@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import item, kernel
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain  # noqa: F401 (in generated lines)
-from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
+from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_kept, squash_row, writer  # noqa: F401 (in generated lines)
 from bufgym.model.qoi import EXPONENTIAL, merging_loss, value
 
 # Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
@@ -61,9 +61,9 @@ SLOT_FIELDS = (
           number="slot.lost", reference="slot.even_lost"),
 )  # fmt: skip
 _LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], len(buffer.slots), {r})"
+_AT_ONCE = "rows[{i}, column] = squash_kept({n}, {r}, rows)"
 _OF_SLOT, _OF_ROWS = "buffer, arrival, slot, column, rows", "buffer, arrival, slot, rows"
-_write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH)
-_squash_rows = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", _SQUASHED, _SQUASHED)
+_write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, _AT_ONCE, _AT_ONCE)
 # With references of its own for each slot.
 write_by_slot = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, "rows[{i}, column] = squash({n}, {r})")
 squash_means = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", "", _SQUASHED)
@@ -81,24 +81,22 @@ def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
 def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], context: NDArray[np.floating[Any]]) -> None:
     """Write what ``observe_slots`` and ``observe_context`` write."""
     even = even_gap(buffer, arrival)
-    slot = _write_slots(buffer, arrival, even, rows)
-    _write_context(buffer, arrival, even, context)  # meanwhile the slots' numbers reach the cache
-    _squash_rows(buffer, arrival, slot, rows)
+    _write_slots(buffer, arrival, even, rows)
+    _write_context(buffer, arrival, even, context)
 
 
 @kernel
 def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
     """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1]; empty slots are 0, the newcomer is last.
 
-    Losses equal ``buffer.loss``, from the gains that the messages carry. Lengths are squashed row by row afterwards.
+    Losses equal ``buffer.loss``, from the gains that the messages carry.
     """
-    slot = _write_slots(buffer, arrival, even_gap(buffer, arrival), rows)
-    _squash_rows(buffer, arrival, slot, rows)
+    _write_slots(buffer, arrival, even_gap(buffer, arrival), rows)
 
 
 @kernel
-def _write_slots(buffer: Buffer, arrival: Any, even_gap: tuple[float, float], rows: NDArray[np.floating[Any]]) -> Slot:
-    """Write every SLOT_FIELDS value with the given ``even_gap``, lengths not yet squashed; return the newcomer."""
+def _write_slots(buffer: Buffer, arrival: Any, even_gap: tuple[float, float], rows: NDArray[np.floating[Any]]) -> None:
+    """Do what ``observe_slots`` says, with the given ``even_gap``."""
     s, last = len(buffer.slots), buffer.capacity
     per_rank, even = 1 / (s + 1), 1 / (buffer.capacity + 1)
     rows[:, :] = 0.0
@@ -132,7 +130,6 @@ def _write_slots(buffer: Buffer, arrival: Any, even_gap: tuple[float, float], ro
         )  # fmt: skip
         _write(buffer, arrival, slot, np.uint64(column), rows)
         gain, from_us, from_x = next_gain, at_us, x
-    return slot
 
 
 # --- context ---------------------------------------------------------------------------------------------------------
