@@ -46,7 +46,7 @@ class ObservationForm:
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
-    your own come last. With all of the tables nothing is copied. ``space`` is the Gymnasium space of one observation,
+    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views. ``space`` is the Gymnasium space of one observation,
     ``numbers`` the length of a row.
     """
 
@@ -92,6 +92,7 @@ class ObservationForm:
         self._tables_only = not own
         self._arrays = [(name, k) for k, name in enumerate(known) if name in names]
         everything = self._tables_only and len(self.places) == len(known)
+        self.is_view = form == "dict" or (form == "slots" and everything)
         self._numbers = None if everything else self._numbers_of("slot", "context")
         self._parts = None if everything else (self._numbers_of("slot"), self._numbers_of("context"))
         self.space = self._space([place.field for place in self.places])
@@ -146,32 +147,33 @@ class ObservationForm:
         return spaces.Dict(parts)
 
 
-Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
+Thing = TypeVar("Thing")
 
 
-class Reused(Generic[Arrays]):
-    """Makes tuples of arrays. One is taken again once nobody outside holds an array of it or a view of one.
+class Reused(Generic[Thing]):
+    """Makes things out of arrays. One is taken again once nobody outside holds an array of it or a view of one.
 
     So what a caller still holds is never written again.
     """
 
-    def __init__(self, make: Callable[[], Arrays]) -> None:
+    def __init__(self, make: Callable[[], tuple[Thing, Sequence[NDArray[Any]]]]) -> None:
+        """``make`` returns a new thing, and its arrays with all views of them that it hands out."""
         self._make = make
-        self._made: list[tuple[Arrays, list[int]]] = []
+        self._made: list[tuple[Thing, Sequence[NDArray[Any]], list[int]]] = []
 
-    def take(self) -> Arrays:
-        """A tuple of arrays that nobody holds, with any content."""
-        for arrays, free in self._made:
+    def take(self) -> Thing:
+        """A thing that nobody holds, with any content."""
+        for thing, arrays, free in self._made:
             if list(map(sys.getrefcount, arrays)) == free:
-                return arrays
-        arrays = self._make()
+                return thing
+        thing, arrays = self._make()
         # A caller that collects them holds them all.
-        self._made = [*self._made[1 - _KEPT :], (arrays, list(map(sys.getrefcount, arrays)))]
-        return arrays
+        self._made = [*self._made[1 - _KEPT :], (thing, arrays, list(map(sys.getrefcount, arrays)))]
+        return thing
 
 
 _KEPT = 4
-"""Most tuples to keep."""
+"""Most things to keep."""
 
 
 class Handed:
@@ -185,14 +187,15 @@ class Handed:
         """The observation of this row of numbers, which is copied."""
         if self._form.form != "dict":
             return self._form.of(row.copy())
-        numbers, *views = self._reused.take()
+        numbers, views = self._reused.take()
         numbers[:] = row
-        return dict(zip(self._form.space, views, strict=True))
+        return views.copy()
 
-    def _new(self) -> tuple[NDArray[np.float32], ...]:
+    def _new(self) -> Any:
         """A row of numbers and the views of it."""
         numbers = np.empty(self._form.numbers, np.float32)
-        return numbers, *self._form.of(numbers).values()
+        views = self._form.of(numbers)
+        return (numbers, views), [numbers, *views.values()]
 
 
 def _box(fields: Sequence[Field], entries: int) -> spaces.Box:

@@ -31,6 +31,7 @@ from bufgym.model.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_SLOT_FIELDS,
     OwnTerm,
+    own_field,
     own_term,
     terms_for,
 )
@@ -43,6 +44,10 @@ from bufgym.sim.senders import Begun
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all of it, all plus the summary so far (so every step has the same entries), the action mask
 alone, or nothing. At an episode's end the summary is always there."""
+
+
+COMPACT = "compact"
+"""In place of names of fields: the context fields, which no slot need be computed for."""
 
 
 def reward_weights(
@@ -108,9 +113,6 @@ class Threads:
 
     def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
         """Call ``work`` on every part; return when all are done."""
-        if len(self.parts) == 1:
-            work(self.parts[0])
-            return
         if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
             self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
         running = [self._pool.submit(work, part) for part in self.parts[1:]]
@@ -125,6 +127,9 @@ class Rows:
     ``output``, a ``StepOutput``, has the results of the last step. ``rewarded``, float64[n, reward terms], sums each
     reward term over the episode so far. ``weights``, float64[reward terms], are the terms' factors in the reward.
     """
+
+    keeps_slots = False
+    """Whether slot fields are computed even where none is observed."""
 
     def __init__(
         self,
@@ -174,6 +179,11 @@ class Rows:
         self._acts = self.guiding if self.guiding and self.guiding.acts else None
         if self.guiding and self.guiding.sees:
             slot_fields, context_fields, fields = (), INPUT_FIELDS, None
+        elif isinstance(fields, str) and fields == COMPACT:
+            fields = [field.name for field in context_fields]
+        known = [field.name for field in context_fields]
+        self._has_slots = self.keeps_slots or not all(name in known or own_field(name) for name in fields or [""])
+        slot_fields = slot_fields if self._has_slots else ()
         self.form = ObservationForm(observation, slot_fields, context_fields, self.capacity, fields)
         self._handed = Handed(self.form)
         self.observation_space = self.form.space
@@ -199,7 +209,9 @@ class Rows:
             np.zeros((n, L + 2), np.int8),
             np.zeros((n, len(self.terms))),
             np.zeros(n),
+            np.zeros(n, np.int64),
             np.zeros(n, np.bool_),
+            np.full(1, self._has_slots, np.int64),
         )
 
     def from_pool(self, draw: Callable[[Streams], Any]) -> Callable[[Streams], Any]:
@@ -221,7 +233,10 @@ class Rows:
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """Take one decision in every row; the result is in ``self.output``."""
-        self._threads.each(lambda numbers: self._run(numbers, actions))
+        if len(self._threads.parts) == 1:
+            self._run(self._threads.parts[0], actions)
+        else:
+            self._threads.each(lambda numbers: self._run(numbers, actions))
         if self._has_own:
             self._own_terms.write(self.senders.batch, self.output)
             self._own_fields.write(self.senders.batch, self.output)
@@ -269,7 +284,7 @@ class Rows:
             "arrived": senders["next"][i],
             "delivered": senders["transmitted"][i],
             "dropped": senders["rejected"][i] + senders["evicted"][i],
-            "invalid": senders["invalid"][i],
+            "invalid": self.output.invalid[i],
         }
 
     def info(self, i: int, terms: Sequence[float], ended: bool) -> dict[str, Any]:
@@ -283,7 +298,7 @@ class Rows:
             info["action_mask"] = self.output.action_mask[i].copy()
         if self.shows_all:
             info["qoi"] = self.output.qoi.item(i)
-            info["invalid"] = self.senders.batch.senders["invalid"].item(i)
+            info["invalid"] = self.output.invalid.item(i)
             info["reward_terms"] = dict(zip(self._term_names, terms, strict=True))
         if ended or self.is_steady:
             info |= {name: number.item() for name, number in self.summary(i).items()}
@@ -321,7 +336,7 @@ class Rows:
         numbers = np.ascontiguousarray(numbers, np.int64)
         if numbers.shape != (len(self),):
             raise BufgymError(f"actions have shape {numbers.shape}: must be ({len(self)},)")
-        if numbers.min() < 0 or numbers.max() >= self.capacity + 2:
+        if np.maximum.reduce(numbers.view(np.uint64)) >= self.capacity + 2:  # negative ones are large there
             wrong = int(np.argmax((numbers < 0) | (numbers >= self.capacity + 2)))
             raise self.bad_action(f"actions[{wrong}]", numbers[wrong])
         return numbers

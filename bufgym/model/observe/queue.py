@@ -79,9 +79,10 @@ def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
 
 @kernel
 def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], context: NDArray[np.floating[Any]]) -> None:
-    """Write what ``observe_slots`` and ``observe_context`` write."""
+    """Write what ``observe_slots`` and ``observe_context`` write; no slots into ``rows`` without columns."""
     even = even_gap(buffer, arrival)
-    _write_slots(buffer, arrival, even, rows)
+    if rows.shape[1] > 0:
+        _write_slots(buffer, arrival, even, rows)
     _write_context(buffer, arrival, even, context)
 
 
