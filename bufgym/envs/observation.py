@@ -46,8 +46,8 @@ class ObservationForm:
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
-    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views. ``space`` is the Gymnasium space of one observation,
-    ``numbers`` the length of a row.
+    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views.
+    ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
     """
 
     def __init__(
@@ -89,9 +89,7 @@ class ObservationForm:
                 if field.per == per:
                     self.places.append(Place(field, self.numbers, entries))
                     self.numbers += entries
-        self._tables_only = not own
-        self._arrays = [(name, k) for k, name in enumerate(known) if name in names]
-        everything = self._tables_only and len(self.places) == len(known)
+        everything = not own and len(self.places) == len(known)
         self.is_view = form == "dict" or (form == "slots" and everything)
         self._numbers = None if everything else self._numbers_of("slot", "context")
         self._parts = None if everything else (self._numbers_of("slot"), self._numbers_of("context"))
@@ -105,9 +103,7 @@ class ObservationForm:
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
         first, end, fields, width = self._first_context, self.table_numbers, self._slot_fields, self._width
-        if rows.ndim == 1:
-            return rows[:first].reshape(fields, width), rows[first:end]
-        return rows[:, :first].reshape(len(rows), fields, width), rows[:, first:end]
+        return rows[..., :first].reshape(*rows.shape[:-1], fields, width), rows[..., first:end]
 
     def of(self, rows: NDArray[np.float32]) -> Observation:
         """The observation of ``rows``, one row of numbers or n, in this form."""
@@ -121,14 +117,7 @@ class ObservationForm:
                 slots = slots.reshape(*rows.shape[:-1], -1, self._width)
             parts = {"slots": slots.swapaxes(-1, -2), "context": context}
             return {name: parts[name] for name in self.space}
-        if not self._tables_only:
-            return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
-        slots, context = self.split(rows)
-        # With the fields' axis first, iterating over a view costs half as much as indexing.
-        if rows.ndim > 1:
-            slots, context = slots.swapaxes(0, 1), context.T
-        arrays = [*slots, *context[..., np.newaxis]]
-        return {name: arrays[k] for name, k in self._arrays}
+        return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
 
     def _space(self, fields: Sequence[Field]) -> Any:
         boxes = [_box([field], self._width if field.per == "slot" else 1) for field in fields]

@@ -113,6 +113,9 @@ class Threads:
 
     def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
         """Call ``work`` on every part; return when all are done."""
+        if len(self.parts) == 1:
+            work(self.parts[0])
+            return
         if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
             self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
         running = [self._pool.submit(work, part) for part in self.parts[1:]]
@@ -233,10 +236,7 @@ class Rows:
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """Take one decision in every row; the result is in ``self.output``."""
-        if len(self._threads.parts) == 1:
-            self._run(self._threads.parts[0], actions)
-        else:
-            self._threads.each(lambda numbers: self._run(numbers, actions))
+        self._threads.each(lambda numbers: self._run(numbers, actions))
         if self._has_own:
             self._own_terms.write(self.senders.batch, self.output)
             self._own_fields.write(self.senders.batch, self.output)

@@ -79,8 +79,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._done, self._any_done = np.zeros(self.num_envs, np.bool_), False
         self._every_row = np.ones(self.num_envs, np.bool_)
         self._handed = Reused(self._new_handed)
-        self._views: dict[str, Any] = {}
-        self._shown: dict[str, Any] = {}
+        self._renew_output()
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
 
@@ -151,7 +150,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if self.max_episode_steps is not None:
             truncated = self._steps >= self.max_episode_steps  # like Gymnasium's TimeLimit, even if the episode ends
         self._done = terminated | truncated
-        self._any_done = np.count_nonzero(self._done) > 0
+        self._any_done = bool(np.count_nonzero(self._done))
         info = self._end(self._done) | self._info() if self._any_done else self._info()
         return self._observed(), rewards, terminated, truncated, info
 
@@ -203,7 +202,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _new_handed(self) -> Any:
         """(New arrays for a step, the views that are its observation, its info), and all of these arrays."""
         rows, output = self.rows, self.rows.new_output()
-        shown = {"action_mask": output.action_mask} if rows.shows_mask else {}
+        shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.shows_mask else {}
         terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(rows.terms)}
         if rows.shows_all:
             shown |= {"qoi": output.qoi, "invalid": output.invalid, "reward_terms": self._marked(terms)}
@@ -212,10 +211,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _marked(self, columns: dict[str, Any]) -> dict[str, Any]:
         """``columns`` with Gymnasium's marks: every row has each of them."""
-        return {key: entry for name, column in columns.items() for key, entry in self._pair(name, column)}
-
-    def _pair(self, name: str, column: Any) -> tuple[tuple[str, Any], tuple[str, Any]]:
-        return (name, column), (f"_{name}", self._every_row)
+        marked = [((name, column), (f"_{name}", self._every_row)) for name, column in columns.items()]
+        return dict(pair for pairs in marked for pair in pairs)
 
     def _seed(self, i: int, seed: int | None) -> None:
         """Give row ``i`` streams of its own, from ``seed``, or from chance if that is None."""

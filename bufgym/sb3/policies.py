@@ -24,8 +24,7 @@ from bufgym.model.observe import (
     TOPIC_FIELDS,
     TOPIC_SLOT_FIELDS,
     OwnField,
-    observe_context,
-    observe_slots,
+    observe,
     observe_topic_context,
     observe_topic_slots,
     own_field,
@@ -139,8 +138,7 @@ class _Decisions:
             observe_topic_slots(buffer, arrival, arriving, slots)
             observe_topic_context(buffer, arrival, arriving, context)
         else:
-            observe_slots(buffer, arrival, slots)
-            observe_context(buffer, arrival, context)
+            observe(buffer, arrival, slots, context)
         for place in self.own:
             write_in_python(place, buffer, arrival, arriving, row)
         masks = {}

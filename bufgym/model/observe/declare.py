@@ -17,7 +17,6 @@ from bufgym.ground.kernel import kernel
 
 # So that 0 / (0 + reference) is 0 where nothing moved at all.
 TINY = 1e-30
-_1, _2, _3 = np.uint64(1), np.uint64(2), np.uint64(3)
 
 Function = Callable[..., float]
 
@@ -95,17 +94,10 @@ def squash_kept(g: float, reference: float, numbers: NDArray[np.floating[Any]]) 
 
 
 @kernel
-def squash_row(row: NDArray[np.floating[Any]], filled: int, reference: float) -> None:
-    """Apply ``squash`` to the first ``filled`` entries and the last, in place and in single precision; others are 0."""
-    r, last = np.float32(max(reference, TINY)), len(row) - 1
-    # Four at once: unsigned indices need no check of their sign, and all are read before one is written.
-    ahead = np.uint64(min(filled + 3, last) // 4 * 4)
-    for k in range(np.uint64(0), ahead, np.uint64(4)):
-        a, b, c, d = row[k], row[k + _1], row[k + _2], row[k + _3]
-        row[k], row[k + _1], row[k + _2], row[k + _3] = a / (a + r), b / (b + r), c / (c + r), d / (d + r)
-    for k in range(ahead, np.uint64(filled)):
-        row[k] = row[k] / (row[k] + r)
-    row[last] = row[last] / (row[last] + r)
+def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
+    """Apply ``squash_kept`` to every entry, in place."""
+    for k in range(np.uint64(len(row))):  # an unsigned index is not checked, so many entries are divided at once
+        row[k] = squash_kept(row[k], reference, row)
 
 
 @kernel

@@ -60,7 +60,7 @@ SLOT_FIELDS = (
     Field("relative_loss", "slot", "value", "l/(l+r), r = that of an even gap", "the same loss, free of V's scale",
           number="slot.lost", reference="slot.even_lost"),
 )  # fmt: skip
-_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], len(buffer.slots), {r})"
+_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
 _AT_ONCE = "rows[{i}, column] = squash_kept({n}, {r}, rows)"
 _OF_SLOT, _OF_ROWS = "buffer, arrival, slot, column, rows", "buffer, arrival, slot, rows"
 _write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, _AT_ONCE, _AT_ONCE)
@@ -70,39 +70,13 @@ squash_means = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", "", _SQUASHED)
 
 
 @kernel
-def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
-    """V of the even motion spacing, and the QoI lost by merging two such gaps."""
-    even = (arrival.x - buffer.dequeued_x) / (buffer.capacity + 1)
-    gain = value(buffer.v, even)
-    return gain, merging_loss(buffer.v, even, gain, even, gain)
-
-
-@kernel
-def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], context: NDArray[np.floating[Any]]) -> None:
-    """Write what ``observe_slots`` and ``observe_context`` write; no slots into ``rows`` without columns."""
-    even = even_gap(buffer, arrival)
-    if rows.shape[1] > 0:
-        _write_slots(buffer, arrival, even, rows)
-    _write_context(buffer, arrival, even, context)
-
-
-@kernel
-def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
-    """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1]; empty slots are 0, the newcomer is last.
-
-    Losses equal ``buffer.loss``, from the gains that the messages carry.
-    """
-    _write_slots(buffer, arrival, even_gap(buffer, arrival), rows)
-
-
-@kernel
-def _write_slots(buffer: Buffer, arrival: Any, even_gap: tuple[float, float], rows: NDArray[np.floating[Any]]) -> None:
-    """Do what ``observe_slots`` says, with the given ``even_gap``."""
+def _write_slots(buffer: Buffer, arrival: Any, even_lost: float, rows: NDArray[np.floating[Any]]) -> None:
+    """Write every SLOT_FIELDS value; losses equal ``buffer.loss``, from the gains that the messages carry."""
     s, last = len(buffer.slots), buffer.capacity
     per_rank, even = 1 / (s + 1), 1 / (buffer.capacity + 1)
     rows[:, :] = 0.0
     even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
-    even_lost = max(even_gap[1], ROUNDING)
+    even_lost = max(even_lost, ROUNDING)
     mean_bytes = (buffer.backlog_bytes + arrival.size_bytes) * per_rank
     newest = arrival_gain(buffer, arrival)
     gain = item(buffer.slots, 0).gain if s > 0 else newest
@@ -174,20 +148,18 @@ write_context = writer(globals(), CONTEXT_FIELDS, "buffer, arrival, newcomer, co
 
 
 @kernel
-def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
-    """Write every CONTEXT_FIELDS value into ``context`` (float[fields])."""
-    _write_context(buffer, arrival, even_gap(buffer, arrival), context)
+def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], context: NDArray[np.floating[Any]]) -> None:
+    """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1], every CONTEXT_FIELDS value into ``context``.
 
-
-@kernel
-def _write_context(
-    buffer: Buffer, arrival: Any, even_gap: tuple[float, float], context: NDArray[np.floating[Any]]
-) -> None:
-    """Do what ``observe_context`` says, with the given ``even_gap``."""
+    Empty slots are 0, the newcomer is last. ``rows`` without columns is left out.
+    """
     spread = buffer.capacity + 1
     even_us = (arrival.arrival_us - buffer.dequeued_arrival_us) / spread
     even_x = (arrival.x - buffer.dequeued_x) / spread
+    gain = value(buffer.v, even_x)
+    lost = merging_loss(buffer.v, even_x, gain, even_x, gain)
+    if rows.shape[1] > 0:
+        _write_slots(buffer, arrival, lost, rows)
     gap_us, gap_x = float(arrival.arrival_us - buffer.previous_us), arrival.x - buffer.previous_x
-    gain, lost = even_gap
     newcomer = Newcomer(gap_us, gap_x, even_us, even_x, kept(gain, context), gain, lost)
     write_context(buffer, arrival, newcomer, context)

@@ -70,7 +70,7 @@ TOPIC_CONTEXT_FIELDS = (
           number="squash(buffer.in_flight, buffer.window)"),
 )  # fmt: skip
 _FIRST = len(SLOT_FIELDS)
-_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], len(buffer.slots), {r})"
+_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
 _write = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, column, rows", _LENGTH, first=_FIRST)
 _squash_means = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, rows", "", mean=_SQUASHED, first=_FIRST)
 _write_context = writer(
