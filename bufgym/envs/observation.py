@@ -91,14 +91,10 @@ class ObservationForm:
                     self.numbers += entries
         everything = not own and len(self.places) == len(known)
         self.is_view = form == "dict" or (form == "slots" and everything)
-        self._numbers = None if everything else self._numbers_of("slot", "context")
-        self._parts = None if everything else (self._numbers_of("slot"), self._numbers_of("context"))
+        numbers = [np.arange(place.first, place.first + place.entries) for place in self.places]
+        self._numbers = None if everything else np.concatenate(numbers)
+        self._per_slot = sum(place.field.per == "slot" for place in self.places)
         self.space = self._space([place.field for place in self.places])
-
-    def _numbers_of(self, *kinds: str) -> NDArray[np.int64]:
-        """Indices, in a row, of the numbers of the chosen fields."""
-        ranges = [range(place.first, place.first + place.entries) for place in self.places if place.field.per in kinds]
-        return np.array([number for numbers in ranges for number in numbers], np.int64)
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
@@ -107,17 +103,15 @@ class ObservationForm:
 
     def of(self, rows: NDArray[np.float32]) -> Observation:
         """The observation of ``rows``, one row of numbers or n, in this form."""
+        if self.form == "dict":
+            return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
+        rows = rows if self._numbers is None else rows.take(self._numbers, axis=-1)
         if self.form == "flat":
-            return rows if self._numbers is None else rows.take(self._numbers, axis=-1)
-        if self.form == "slots":
-            if self._parts is None:
-                slots, context = self.split(rows)
-            else:
-                slots, context = (rows.take(numbers, axis=-1) for numbers in self._parts)
-                slots = slots.reshape(*rows.shape[:-1], -1, self._width)
-            parts = {"slots": slots.swapaxes(-1, -2), "context": context}
-            return {name: parts[name] for name in self.space}
-        return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
+            return rows
+        first = self._per_slot * self._width
+        slots = rows[..., :first].reshape(*rows.shape[:-1], self._per_slot, self._width)
+        parts = {"slots": slots.swapaxes(-1, -2), "context": rows[..., first:]}
+        return {name: parts[name] for name in self.space}
 
     def _space(self, fields: Sequence[Field]) -> Any:
         boxes = [_box([field], self._width if field.per == "slot" else 1) for field in fields]

@@ -200,7 +200,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return self._views.copy() if self._views else self.rows.observation()
 
     def _new_handed(self) -> Any:
-        """(New arrays for a step, the views that are its observation, its info), and all of these arrays."""
+        """(New arrays for a step, the views that are its observation, its info), and all these arrays."""
         rows, output = self.rows, self.rows.new_output()
         shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.shows_mask else {}
         terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(rows.terms)}

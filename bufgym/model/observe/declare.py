@@ -87,7 +87,7 @@ def squash(g: float, reference: float) -> float:
 
 
 @kernel
-def squash_kept(g: float, reference: float, numbers: NDArray[np.floating[Any]]) -> float:
+def squash_kept(g: float, reference: float, numbers: NDArray[np.floating[Any]]) -> Any:
     """Apply ``squash`` to ``g`` as the array keeps it, in single precision."""
     length, r = numbers.dtype.type(g), np.float32(max(reference, TINY))
     return length / (length + r)
