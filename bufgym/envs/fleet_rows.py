@@ -24,6 +24,8 @@ class FleetRows(Rows):
     The robots of a cell begin an episode together; it is drawn from the streams of the cell's first row.
     """
 
+    keeps_slots = True  # for a state of all fields
+
     def __init__(
         self,
         cells: int,

@@ -46,8 +46,8 @@ class ObservationForm:
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
-    your own come last. With all of the tables nothing is copied. ``space`` is the Gymnasium space of one observation,
-    ``numbers`` the length of a row.
+    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views.
+    ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
     """
 
     def __init__(
@@ -89,45 +89,29 @@ class ObservationForm:
                 if field.per == per:
                     self.places.append(Place(field, self.numbers, entries))
                     self.numbers += entries
-        self._tables_only = not own
-        self._arrays = [(name, k) for k, name in enumerate(known) if name in names]
-        everything = self._tables_only and len(self.places) == len(known)
-        self._numbers = None if everything else self._numbers_of("slot", "context")
-        self._parts = None if everything else (self._numbers_of("slot"), self._numbers_of("context"))
+        everything = not own and len(self.places) == len(known)
+        self.is_view = form == "dict" or (form == "slots" and everything)
+        numbers = [np.arange(place.first, place.first + place.entries) for place in self.places]
+        self._numbers = None if everything else np.concatenate(numbers)
+        self._per_slot = sum(place.field.per == "slot" for place in self.places)
         self.space = self._space([place.field for place in self.places])
-
-    def _numbers_of(self, *kinds: str) -> NDArray[np.int64]:
-        """Indices, in a row, of the numbers of the chosen fields."""
-        ranges = [range(place.first, place.first + place.entries) for place in self.places if place.field.per in kinds]
-        return np.array([number for numbers in ranges for number in numbers], np.int64)
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
         first, end, fields, width = self._first_context, self.table_numbers, self._slot_fields, self._width
-        if rows.ndim == 1:
-            return rows[:first].reshape(fields, width), rows[first:end]
-        return rows[:, :first].reshape(len(rows), fields, width), rows[:, first:end]
+        return rows[..., :first].reshape(*rows.shape[:-1], fields, width), rows[..., first:end]
 
     def of(self, rows: NDArray[np.float32]) -> Observation:
         """The observation of ``rows``, one row of numbers or n, in this form."""
-        if self.form == "flat":
-            return rows if self._numbers is None else rows.take(self._numbers, axis=-1)
-        if self.form == "slots":
-            if self._parts is None:
-                slots, context = self.split(rows)
-            else:
-                slots, context = (rows.take(numbers, axis=-1) for numbers in self._parts)
-                slots = slots.reshape(*rows.shape[:-1], -1, self._width)
-            parts = {"slots": slots.swapaxes(-1, -2), "context": context}
-            return {name: parts[name] for name in self.space}
-        if not self._tables_only:
+        if self.form == "dict":
             return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
-        slots, context = self.split(rows)
-        # With the fields' axis first, iterating over a view costs half as much as indexing.
-        if rows.ndim > 1:
-            slots, context = slots.swapaxes(0, 1), context.T
-        arrays = [*slots, *context[..., np.newaxis]]
-        return {name: arrays[k] for name, k in self._arrays}
+        rows = rows if self._numbers is None else rows.take(self._numbers, axis=-1)
+        if self.form == "flat":
+            return rows
+        first = self._per_slot * self._width
+        slots = rows[..., :first].reshape(*rows.shape[:-1], self._per_slot, self._width)
+        parts = {"slots": slots.swapaxes(-1, -2), "context": rows[..., first:]}
+        return {name: parts[name] for name in self.space}
 
     def _space(self, fields: Sequence[Field]) -> Any:
         boxes = [_box([field], self._width if field.per == "slot" else 1) for field in fields]
@@ -146,32 +130,33 @@ class ObservationForm:
         return spaces.Dict(parts)
 
 
-Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
+Thing = TypeVar("Thing")
 
 
-class Reused(Generic[Arrays]):
-    """Makes tuples of arrays. One is taken again once nobody outside holds an array of it or a view of one.
+class Reused(Generic[Thing]):
+    """Makes things out of arrays. One is taken again once nobody outside holds an array of it or a view of one.
 
     So what a caller still holds is never written again.
     """
 
-    def __init__(self, make: Callable[[], Arrays]) -> None:
+    def __init__(self, make: Callable[[], tuple[Thing, Sequence[NDArray[Any]]]]) -> None:
+        """``make`` returns a new thing, and its arrays with all views of them that it hands out."""
         self._make = make
-        self._made: list[tuple[Arrays, list[int]]] = []
+        self._made: list[tuple[Thing, Sequence[NDArray[Any]], list[int]]] = []
 
-    def take(self) -> Arrays:
-        """A tuple of arrays that nobody holds, with any content."""
-        for arrays, free in self._made:
+    def take(self) -> Thing:
+        """A thing that nobody holds, with any content."""
+        for thing, arrays, free in self._made:
             if list(map(sys.getrefcount, arrays)) == free:
-                return arrays
-        arrays = self._make()
+                return thing
+        thing, arrays = self._make()
         # A caller that collects them holds them all.
-        self._made = [*self._made[1 - _KEPT :], (arrays, list(map(sys.getrefcount, arrays)))]
-        return arrays
+        self._made = [*self._made[1 - _KEPT :], (thing, arrays, list(map(sys.getrefcount, arrays)))]
+        return thing
 
 
 _KEPT = 4
-"""Most tuples to keep."""
+"""Most things to keep."""
 
 
 class Handed:
@@ -185,14 +170,15 @@ class Handed:
         """The observation of this row of numbers, which is copied."""
         if self._form.form != "dict":
             return self._form.of(row.copy())
-        numbers, *views = self._reused.take()
+        numbers, views = self._reused.take()
         numbers[:] = row
-        return dict(zip(self._form.space, views, strict=True))
+        return views.copy()
 
-    def _new(self) -> tuple[NDArray[np.float32], ...]:
+    def _new(self) -> Any:
         """A row of numbers and the views of it."""
         numbers = np.empty(self._form.numbers, np.float32)
-        return numbers, *self._form.of(numbers).values()
+        views = self._form.of(numbers)
+        return (numbers, views), [numbers, *views.values()]
 
 
 def _box(fields: Sequence[Field], entries: int) -> spaces.Box:

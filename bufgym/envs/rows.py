@@ -31,6 +31,7 @@ from bufgym.model.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_SLOT_FIELDS,
     OwnTerm,
+    own_field,
     own_term,
     terms_for,
 )
@@ -41,8 +42,8 @@ from bufgym.sim import Senders
 from bufgym.sim.senders import Begun
 
 INFOS = ("full", "steady", "mask", "none")
-"""How much ``info`` has: all of it, all plus the summary so far (so every step has the same entries), the action mask
-alone, or nothing. At an episode's end the summary is always there."""
+"""How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
+nothing. At an episode's end the summary is always there."""
 
 
 def reward_weights(
@@ -87,9 +88,8 @@ NUMBERED = ("scenario", "trace", "seed")
 
 
 def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
-    for name in names:
-        if name not in NUMBERED:
-            raise BufgymError(f"episode: {name!r} is unknown; known: {', '.join(NUMBERED)}")
+    if unknown := [name for name in names if name not in NUMBERED]:
+        raise BufgymError(f"episode: {unknown[0]!r} is unknown; known: {', '.join(NUMBERED)}")
     return names
 
 
@@ -125,6 +125,8 @@ class Rows:
     ``output``, a ``StepOutput``, has the results of the last step. ``rewarded``, float64[n, reward terms], sums each
     reward term over the episode so far. ``weights``, float64[reward terms], are the terms' factors in the reward.
     """
+
+    keeps_slots = False  # whether slot fields are computed even where none is observed
 
     def __init__(
         self,
@@ -174,12 +176,14 @@ class Rows:
         self._acts = self.guiding if self.guiding and self.guiding.acts else None
         if self.guiding and self.guiding.sees:
             slot_fields, context_fields, fields = (), INPUT_FIELDS, None
-        self.form = ObservationForm(observation, slot_fields, context_fields, self.capacity, fields)
-        self._handed = Handed(self.form)
-        self.observation_space = self.form.space
+        context = [field.name for field in context_fields]
+        fields = context if isinstance(fields, str) and fields == "compact" else fields
+        self._has_slots = self.keeps_slots or not all(name in context or own_field(name) for name in fields or [""])
+        tables = slot_fields if self._has_slots else (), context_fields
+        self.form = ObservationForm(observation, *tables, self.capacity, fields)
+        self.observation_space, self._handed = self.form.space, Handed(self.form)
         self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.capacity + 2)
-        self.streams: list[Streams | None] = [None] * n
-        self._pool_size = pool
+        self.streams, self._pool_size = cast(list[Streams | None], [None] * n), pool
         self._draw = self.from_pool(self.scenario.draw)
         self.rewarded = np.zeros((n, len(self.terms)))
         self._own_fields = OwnFields(self.form)
@@ -199,7 +203,9 @@ class Rows:
             np.zeros((n, L + 2), np.int8),
             np.zeros((n, len(self.terms))),
             np.zeros(n),
+            np.zeros(n, np.int64),
             np.zeros(n, np.bool_),
+            np.full(1, self._has_slots, np.int64),
         )
 
     def from_pool(self, draw: Callable[[Streams], Any]) -> Callable[[Streams], Any]:
@@ -232,9 +238,7 @@ class Rows:
         An episode may be a dict of arguments for ``numbered``.
         """
         if episodes is not None and (not isinstance(episodes, Sequence) or len(episodes) != len(self)):
-            raise BufgymError(
-                f"episodes = {episodes!r}: must be a list of {len(self)}, one a row; None where one is drawn"
-            )
+            raise BufgymError(f"episodes = {episodes!r}: must be a list of {len(self)}, one a row; None to draw one")
         begun: list[Begun] = []
         for i in rows.tolist():
             given = None if episodes is None else episodes[i]
@@ -256,9 +260,8 @@ class Rows:
         """float64[n]: the weighted sum of the reward terms of the last step."""
         total = np.zeros(len(self))
         # Added term by term, as in the single environment: a matrix product may round differently.
-        for k, weight in enumerate(self.weights.tolist()):
-            if weight:
-                total += weight * self.output.reward_terms[:, k]
+        for k in np.flatnonzero(self.weights):
+            total += self.weights[k] * self.output.reward_terms[:, k]
         return total
 
     def summary(self, i: Any) -> dict[str, Any]:
@@ -269,21 +272,17 @@ class Rows:
             "arrived": senders["next"][i],
             "delivered": senders["transmitted"][i],
             "dropped": senders["rejected"][i] + senders["evicted"][i],
-            "invalid": senders["invalid"][i],
+            "invalid": self.output.invalid[i],
         }
 
     def info(self, i: int, terms: Sequence[float], ended: bool) -> dict[str, Any]:
-        """Gymnasium's info of row ``i`` after a reset or a step with the reward ``terms``, with the entries of
-        ``INFOS``.
-
-        At an episode's end it has the summary.
-        """
+        """Gymnasium's info of row ``i`` after a reset or a step with the reward ``terms``; see ``INFOS``."""
         info: dict[str, Any] = {}
         if self.shows_mask:
             info["action_mask"] = self.output.action_mask[i].copy()
         if self.shows_all:
             info["qoi"] = self.output.qoi.item(i)
-            info["invalid"] = self.senders.batch.senders["invalid"].item(i)
+            info["invalid"] = self.output.invalid.item(i)
             info["reward_terms"] = dict(zip(self._term_names, terms, strict=True))
         if ended or self.is_steady:
             info |= {name: number.item() for name, number in self.summary(i).items()}
@@ -321,8 +320,9 @@ class Rows:
         numbers = np.ascontiguousarray(numbers, np.int64)
         if numbers.shape != (len(self),):
             raise BufgymError(f"actions have shape {numbers.shape}: must be ({len(self)},)")
-        if numbers.min() < 0 or numbers.max() >= self.capacity + 2:
-            wrong = int(np.argmax((numbers < 0) | (numbers >= self.capacity + 2)))
+        unsigned = numbers.view(np.uint64)  # where negative ones are large
+        if np.maximum.reduce(unsigned) >= self.capacity + 2:
+            wrong = int(np.argmax(unsigned >= self.capacity + 2))
             raise self.bad_action(f"actions[{wrong}]", numbers[wrong])
         return numbers
 

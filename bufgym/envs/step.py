@@ -23,8 +23,7 @@ from bufgym.model.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_REWARD_TERMS,
     TOPIC_SLOT_FIELDS,
-    observe_context,
-    observe_slots,
+    observe,
     observe_topic_context,
     observe_topic_slots,
 )
@@ -59,14 +58,18 @@ class StepOutput(NamedTuple):
         action_mask: int8[n, L + 2], 1 for a valid action.
         reward_terms: float64[n, reward terms], gain of each term in this step.
         qoi: float64[n], H of the messages at the server so far.
+        invalid: int64[n], invalid actions of the episode so far.
         terminated: bool[n], whether the episode is over.
+        slots: int64[1], 1 if ``flat`` has the slot fields, 0 if it has the context fields alone.
     """
 
     flat: NDArray[np.float32]
     action_mask: NDArray[np.int8]
     reward_terms: NDArray[np.float64]
     qoi: NDArray[np.float64]
+    invalid: NDArray[np.int64]
     terminated: NDArray[np.bool_]
+    slots: NDArray[np.int64]
 
 
 @kernel
@@ -141,7 +144,7 @@ def write_state(batch: Batch, i: int, ended: bool, output: StepOutput) -> bool:
     Without one, also write an observation of zeros, with L as the one valid action.
     """
     output.terminated[i] = ended
-    output.qoi[i] = delivered_qoi(batch, i)
+    output.qoi[i], output.invalid[i] = delivered_qoi(batch, i), batch.senders[i].invalid
     if batch.senders[i].waiting == NOTHING_WAITS:
         output.flat[i, :] = 0.0
         output.action_mask[i, :] = False
@@ -157,18 +160,20 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
     if not write_state(batch, i, ended, output):
         return
     sender = batch.senders[i]
-    buffer, entries = local(view(batch, i)), sender.capacity + 1
+    buffer, entries = local(view(batch, i)), (sender.capacity + 1) * output.slots[0]
     if batch.several is not None:
         arriving = sender.waiting == ARRIVAL_WAITS
         # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
         arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
         first = _ALL_SLOT_FIELDS * entries
-        observe_topic_slots(buffer, arrival, arriving, table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries))
+        if entries > 0:
+            observe_topic_slots(buffer, arrival, arriving, table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries))
         observe_topic_context(buffer, arrival, arriving, stretch(output.flat, i, first, _ALL_CONTEXT_FIELDS))
     else:
         arrival = arrival_of(batch, i)
-        observe_slots(buffer, arrival, table(output.flat, i, 0, _SLOT_FIELDS, entries))
-        observe_context(buffer, arrival, stretch(output.flat, i, _SLOT_FIELDS * entries, _CONTEXT_FIELDS))
+        first = _SLOT_FIELDS * entries
+        rows, context = table(output.flat, i, 0, _SLOT_FIELDS, entries), stretch(output.flat, i, first, _CONTEXT_FIELDS)
+        observe(buffer, arrival, rows, context)
 
 
 @kernel

@@ -76,9 +76,10 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._steps = np.zeros(self.num_envs, np.int64)
-        self._done = np.zeros(self.num_envs, np.bool_)
+        self._done, self._any_done = np.zeros(self.num_envs, np.bool_), False
         self._every_row = np.ones(self.num_envs, np.bool_)
-        self._outputs = Reused(rows.new_output)
+        self._handed = Reused(self._new_handed)
+        self._renew_output()
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
 
@@ -123,7 +124,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.rows.reset(chosen, options.get("episodes"))
         self._steps[mask] = 0
         self._done = self._done & ~mask  # a new array: the last step may have handed out the old one
-        return self.rows.observation(), self._info()
+        self._any_done = bool(self._done.any())
+        return self._observed(), self._info()
 
     def step(
         self, actions: NDArray[np.int64] | NDArray[np.floating[Any]]
@@ -132,12 +134,13 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         actions = rows.actions(actions)
         if rows.senders.episodes[-1] is None:
             raise gym.error.ResetNeeded("call reset() before step()")
-        if self.autoreset_mode == AutoresetMode.DISABLED and self._done.any():
+        restart = self._any_done and self.autoreset_mode != AutoresetMode.SAME_STEP
+        if restart and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("rows have ended: call reset(options={'reset_mask': done}) first")
-        restart = self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any()
         self._renew_output()
         rows.step(actions)  # rows that have ended stay as they are
-        self._steps += 1
+        if self.max_episode_steps is not None:
+            self._steps += 1
         if restart:
             rows.reset(np.flatnonzero(self._done))
             self._steps[self._done] = 0
@@ -147,9 +150,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if self.max_episode_steps is not None:
             truncated = self._steps >= self.max_episode_steps  # like Gymnasium's TimeLimit, even if the episode ends
         self._done = terminated | truncated
-        info = self._end(self._done) if self._done.any() else {}
-        info |= self._info()
-        return rows.observation(), rewards, terminated, truncated, info
+        self._any_done = bool(np.count_nonzero(self._done))
+        info = self._end(self._done) | self._info() if self._any_done else self._info()
+        return self._observed(), rewards, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[n, L + 2]: the actions valid now in each row."""
@@ -190,23 +193,26 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _info(self) -> dict[str, Any]:
         """Entries of the info of every step, as far as they were asked for."""
-        rows, every_row = self.rows, self._every_row
-        info: dict[str, Any] = {}
-        if rows.shows_mask:
-            info |= {"action_mask": rows.output.action_mask, "_action_mask": every_row}
+        return {name: entry.copy() if name == "reward_terms" else entry for name, entry in self._shown.items()}
+
+    def _observed(self) -> Observation:
+        """The present observation; a dict of its own each time."""
+        return self._views.copy() if self._views else self.rows.observation()
+
+    def _new_handed(self) -> Any:
+        """(New arrays for a step, the views that are its observation, its info), and all these arrays."""
+        rows, output = self.rows, self.rows.new_output()
+        shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.shows_mask else {}
+        terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(rows.terms)}
         if rows.shows_all:
-            terms: dict[str, Any] = {}
-            for k, term in enumerate(rows.terms):
-                terms |= {term.name: rows.output.reward_terms[:, k], f"_{term.name}": every_row}
-            info |= {
-                "qoi": rows.output.qoi,
-                "_qoi": every_row,
-                "invalid": rows.senders.batch.senders["invalid"].copy(),
-                "_invalid": every_row,
-                "reward_terms": terms,
-                "_reward_terms": every_row,
-            }
-        return info
+            shown |= {"qoi": output.qoi, "invalid": output.invalid, "reward_terms": self._marked(terms)}
+        views = rows.form.of(output.flat) if rows.form.is_view else {}
+        return (output, views, self._marked(shown)), [*output, *views.values(), *terms.values()]
+
+    def _marked(self, columns: dict[str, Any]) -> dict[str, Any]:
+        """``columns`` with Gymnasium's marks: every row has each of them."""
+        marked = [((name, column), (f"_{name}", self._every_row)) for name, column in columns.items()]
+        return dict(pair for pairs in marked for pair in pairs)
 
     def _seed(self, i: int, seed: int | None) -> None:
         """Give row ``i`` streams of its own, from ``seed``, or from chance if that is None."""
@@ -222,7 +228,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _renew_output(self, keep: bool = False) -> None:
         """Let the next step write into arrays that nobody outside holds; ``keep`` copies the last step's results."""
         rows, before = self.rows, self.rows.output
-        rows.output = self._outputs.take()
+        rows.output, self._views, self._shown = self._handed.take()
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old

@@ -251,17 +251,7 @@ def is_first(buffer: Buffer, k: int) -> bool:
 
 @kernel
 def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int, float, float, float]:
-    """``gaps_among`` the messages of the slot's topic."""
-    return gaps_among(buffer, arrival, arriving, k, len(buffer.topics) > 1)
-
-
-@kernel
-def gaps_among(
-    buffer: Buffer, arrival: Any, arriving: bool, k: int, by_topic: bool
-) -> tuple[int, int, float, float, float]:
-    """Gaps of slot ``k`` to the messages kept before and after it; the newcomer is ``len(buffer.slots)``.
-
-    ``by_topic`` counts messages of its own topic alone.
+    """Gaps of slot ``k`` to the messages kept before and after it on its topic; the newcomer is ``len(buffer.slots)``.
 
     The successor of the newcomer, and of a topic's last message, is still to come: the next step is expected to be as
     long as the last one. Where the socket asks (not ``arriving``), ``arrival`` follows nothing.
@@ -269,7 +259,7 @@ def gaps_among(
     Returns:
         Time gaps before and after, us; gaps in x before and after; the gap in x left if the message is dropped.
     """
-    s = len(buffer.slots)
+    s, by_topic = len(buffer.slots), len(buffer.topics) > 1
     message = arrival if k == s else item(buffer.slots, k)
     at_us, x, topic = message.arrival_us, message.x, message.topic
     from_us, from_x = at_us, x

@@ -30,10 +30,9 @@ from bufgym.model.observe import (
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,
-    observe_context,
+    observe,
     observe_on_board,
     observe_on_board_slots,
-    observe_slots,
 )
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.scoring import DROP, KEEP, Network, begin, divide, read_context, score, unpack
@@ -54,12 +53,11 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     scorer = unpack(buffer.parameters)
     s, L = len(buffer.slots), buffer.capacity
     scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
-    observe_context(buffer, arrival, scratch.context[:TABLE])
+    observe(buffer, arrival, scratch.rows[:TABLE_SLOTS], scratch.context[:TABLE])
     for i in range(scorer.context):
         if scorer.fields[i] >= TABLE:
             observe_on_board(buffer, arrival, scratch.context[TABLE:])
             break
-    observe_slots(buffer, arrival, scratch.rows[:TABLE_SLOTS])
     for i in range(scorer.context, len(scorer.fields)):
         if scorer.fields[i] >= TABLE_SLOTS:
             observe_on_board_slots(buffer, arrival, scratch.rows[TABLE_SLOTS:])

@@ -146,8 +146,7 @@ class _Decisions:
             observe.observe_topic_slots(buffer, arrival, arriving, slots)
             observe.observe_topic_context(buffer, arrival, arriving, context)
         else:
-            observe.observe_slots(buffer, arrival, slots)
-            observe.observe_context(buffer, arrival, context)
+            observe.observe(buffer, arrival, slots, context)
         for place in self.own:
             write_in_python(place, buffer, arrival, arriving, row)
         mask = np.zeros(L + 2, np.bool_)

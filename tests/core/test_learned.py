@@ -24,10 +24,9 @@ from bufgym.model.observe import (
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,
-    observe_context,
+    observe,
     observe_on_board,
     observe_on_board_slots,
-    observe_slots,
 )
 from bufgym.policies import learned
 from bufgym.policies import weights as weights_file
@@ -61,9 +60,8 @@ def twin(made):
     def on_arrival(buffer, arrival, memory):
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
-        observe_slots(buffer, arrival, slots[: len(SLOT_FIELDS)])
+        observe(buffer, arrival, slots[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)])
         observe_on_board_slots(buffer, arrival, slots[len(SLOT_FIELDS) :])
-        observe_context(buffer, arrival, context[: len(CONTEXT_FIELDS)])
         observe_on_board(buffer, arrival, context[len(CONTEXT_FIELDS) :])
 
         def features(k):

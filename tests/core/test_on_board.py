@@ -12,12 +12,13 @@ from test_sender import MS, V, line
 from bufgym import policies
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.observe import (
+    CONTEXT_FIELDS,
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,
+    observe,
     observe_on_board,
     observe_on_board_slots,
-    observe_slots,
 )
 
 pytestmark = pytest.mark.kernels
@@ -138,7 +139,7 @@ def test_a_coordinate_that_counts_messages_has_the_same_gaps(case):
     def on_arrival(buffer, arrival, memory):
         if arrival.seq > 0:  # the first of all has no step behind it
             slots = np.zeros((len(OTHERS), buffer.capacity + 1))
-            observe_slots(buffer, arrival, slots)
+            observe(buffer, arrival, slots, np.zeros(len(CONTEXT_FIELDS)))
             of_x = [slots[OTHERS.index(name)] for name in ("motion_before", "motion_merged")]
             np.testing.assert_allclose(rows_of(buffer, arrival)[:2], of_x, rtol=1e-6)
         return ANYTHING.on_arrival(buffer, arrival, memory)

@@ -19,8 +19,7 @@ from bufgym.model.observe import (
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,
     TOPIC_SLOT_FIELDS,
-    observe_context,
-    observe_slots,
+    observe,
     observe_topic_context,
     observe_topic_slots,
 )
@@ -160,8 +159,7 @@ def observed(buffer: Any, arrival: Any, arriving: bool) -> dict[str, Any]:
     context = np.full(len(CONTEXT_NAMES), np.nan)
     if len(buffer.topics) == 1:
         slots, context = slots[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)]
-        observe_slots(buffer, arrival, slots)
-        observe_context(buffer, arrival, context)
+        observe(buffer, arrival, slots, context)
     else:
         observe_topic_slots(buffer, arrival, arriving, slots)
         observe_topic_context(buffer, arrival, arriving, context)

@@ -2,7 +2,9 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+import pytest
 
 from bufgym.envs.observation import Handed, ObservationForm
 from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
@@ -46,3 +48,25 @@ def test_a_collector_gets_an_observation_of_its_own_each_time() -> None:
     assert len(handed._reused._made) < 20
     collected[0].clear()  # a dict that its owner changes changes no other
     assert list(handed.of(row(2))) == list(FORM.space)
+
+
+@pytest.mark.parametrize("id", ["bufgym/Uplink-v0", "bufgym/Topics-v0"])
+def test_compact_is_the_context_fields_of_all_fields(id: str) -> None:
+    whole, compact = (gym.make_vec(id, 3, capacity=5, **options) for options in ({}, {"fields": "compact"}))
+    (seen, _), (part, _) = whole.reset(seed=1), compact.reset(seed=1)
+    for action in range(60):
+        context = [name for name, numbers in seen.items() if numbers.shape[1] == 1]
+        assert list(part) == context
+        assert all((part[name] == seen[name]).all() for name in context)
+        (seen, *_), (part, *_) = whole.step(np.full(3, action % 7)), compact.step(np.full(3, action % 7))
+
+
+def test_what_an_owner_does_to_a_batch_s_dicts_changes_no_other() -> None:
+    batch = gym.make_vec("bufgym/Uplink-v0", 2, capacity=3)
+    batch.reset(seed=1)
+    for _ in range(9):
+        seen, *_, info = batch.step(np.zeros(2, np.int64))
+        assert {"rank", "busy"} <= set(seen) and {"qoi", "_qoi"} <= set(info) and "retained" in info["reward_terms"]
+        seen.clear()
+        info["reward_terms"].clear()
+        info.clear()

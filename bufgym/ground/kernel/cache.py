@@ -74,11 +74,6 @@ class Code:
         name = f"{function.__module__}.{function.__qualname__}-{role}"
         self._name = "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in name)[-150:]
 
-    @property
-    def cache_path(self) -> str:
-        """Folder of the files."""
-        return FOLDER
-
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Code compiled for the types of ``signature``, or None if there is none."""
         target.refresh()

@@ -87,11 +87,17 @@ def squash(g: float, reference: float) -> float:
 
 
 @kernel
+def squash_kept(g: float, reference: float, numbers: NDArray[np.floating[Any]]) -> Any:
+    """Apply ``squash`` to ``g`` as the array keeps it, in single precision."""
+    length, r = numbers.dtype.type(g), np.float32(max(reference, TINY))
+    return length / (length + r)
+
+
+@kernel
 def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
-    """Apply ``squash`` to every entry, in place and in single precision."""
-    r = np.float32(max(reference, TINY))
-    for k in range(len(row)):
-        row[k] = row[k] / (row[k] + r)
+    """Apply ``squash_kept`` to every entry, in place."""
+    for k in range(np.uint64(len(row))):  # an unsigned index is not checked, so many entries are divided at once
+        row[k] = squash_kept(row[k], reference, row)
 
 
 @kernel

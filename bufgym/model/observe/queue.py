@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain, gaps_among  # noqa: F401 (in generated lines)
-from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
-from bufgym.model.qoi import merging_loss, value
+from bufgym.ground.kernel import item, kernel
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain  # noqa: F401 (in generated lines)
+from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_kept, squash_row, writer  # noqa: F401 (in generated lines)
+from bufgym.model.qoi import EXPONENTIAL, merging_loss, value
 
 # Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
 ROUNDING = 1e-12
@@ -61,53 +61,50 @@ SLOT_FIELDS = (
           number="slot.lost", reference="slot.even_lost"),
 )  # fmt: skip
 _LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
+_AT_ONCE = "rows[{i}, column] = squash_kept({n}, {r}, rows)"
 _OF_SLOT, _OF_ROWS = "buffer, arrival, slot, column, rows", "buffer, arrival, slot, rows"
-_write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH)
-_squash_rows = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", _SQUASHED, _SQUASHED)
+_write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, _AT_ONCE, _AT_ONCE)
 # With references of its own for each slot.
 write_by_slot = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, "rows[{i}, column] = squash({n}, {r})")
 squash_means = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", "", _SQUASHED)
 
 
 @kernel
-def even_gap(buffer: Buffer, arrival: Any) -> tuple[float, float]:
-    """V of the even motion spacing, and the QoI lost by merging two such gaps."""
-    even = (arrival.x - buffer.dequeued_x) / (buffer.capacity + 1)
-    gain = value(buffer.v, even)
-    return gain, merging_loss(buffer.v, even, gain, even, gain)
-
-
-@kernel
-def observe_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]]) -> None:
-    """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1]; empty slots are 0, the newcomer is last.
-
-    Losses equal ``buffer.loss``, from the gains that the messages carry. Lengths are squashed row by row afterwards.
-    """
+def _write_slots(buffer: Buffer, arrival: Any, even_lost: float, rows: NDArray[np.floating[Any]]) -> None:
+    """Write every SLOT_FIELDS value; losses equal ``buffer.loss``, from the gains that the messages carry."""
     s, last = len(buffer.slots), buffer.capacity
     per_rank, even = 1 / (s + 1), 1 / (buffer.capacity + 1)
-    rows[:, s:last] = 0.0
+    rows[:, :] = 0.0
     even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
-    even_lost = max(even_gap(buffer, arrival)[1], ROUNDING)
+    even_lost = max(even_lost, ROUNDING)
     mean_bytes = (buffer.backlog_bytes + arrival.size_bytes) * per_rank
-    gain = buffer.slots[0].gain if s > 0 else arrival_gain(buffer, arrival)
+    newest = arrival_gain(buffer, arrival)
+    gain = item(buffer.slots, 0).gain if s > 0 else newest
+    is_exponential = buffer.v[0] == EXPONENTIAL
+    from_us, from_x = buffer.dequeued_arrival_us, buffer.dequeued_x
     for k in range(s + 1):
-        message, column = (buffer.slots[k], k) if k < s else (arrival, last)
-        back_us, on_us, back_x, on_x, merged_x = gaps_among(buffer, arrival, True, k, False)
-        if k == s:
-            next_gain = value(buffer.v, on_x)
-        else:
-            next_gain = buffer.slots[k + 1].gain if k + 1 < s else arrival_gain(buffer, arrival)
+        message, column, place = (item(buffer.slots, k), k, (k + 1) * per_rank) if k < s else (arrival, last, 1.0)
+        at_us, x, size_bytes = message.arrival_us, message.x, message.size_bytes
+        back_us, back_x = at_us - from_us, x - from_x
+        if k < s:
+            behind, next_gain = arrival, newest
+            if k + 1 < s:
+                behind = item(buffer.slots, k + 1)
+                next_gain = behind.gain
+            merged_us, on_x, merged_x = behind.arrival_us - from_us, behind.x - x, behind.x - from_x
+        else:  # the next step is expected to be as long as the last one
+            on_x = x - buffer.previous_x
+            merged_us, merged_x = back_us + at_us - buffer.previous_us, back_x + on_x
+            next_gain = newest if s > 0 and on_x == back_x else value(buffer.v, on_x)
         # Rounding may make a loss negative. A first message has no gap before it to merge, so nothing is lost with it.
-        lost = max(merging_loss(buffer.v, back_x, gain, on_x, next_gain), 0.0)
-        place = (k + 1) * per_rank if k < s else 1.0
-        size_bytes, merged_us = message.size_bytes, float(back_us + on_us)
+        lost = gain * next_gain if is_exponential else merging_loss(buffer.v, back_x, gain, on_x, next_gain)
+        lost = max(lost, 0.0)
         slot = Slot(
-            place, float(back_us), merged_us, back_x, merged_x, lost, lost, size_bytes,
+            place, float(back_us), float(merged_us), back_x, merged_x, lost, lost, size_bytes,
             even_us, even_x, even_lost, mean_bytes,
         )  # fmt: skip
-        _write(buffer, arrival, slot, column, rows)
-        gain = next_gain
-    _squash_rows(buffer, arrival, slot, rows)
+        _write(buffer, arrival, slot, np.uint64(column), rows)
+        gain, from_us, from_x = next_gain, at_us, x
 
 
 # --- context ---------------------------------------------------------------------------------------------------------
@@ -151,12 +148,18 @@ write_context = writer(globals(), CONTEXT_FIELDS, "buffer, arrival, newcomer, co
 
 
 @kernel
-def observe_context(buffer: Buffer, arrival: Any, context: NDArray[np.floating[Any]]) -> None:
-    """Write every CONTEXT_FIELDS value into ``context`` (float[fields])."""
+def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], context: NDArray[np.floating[Any]]) -> None:
+    """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1], every CONTEXT_FIELDS value into ``context``.
+
+    Empty slots are 0, the newcomer is last. ``rows`` without columns is left out.
+    """
     spread = buffer.capacity + 1
     even_us = (arrival.arrival_us - buffer.dequeued_arrival_us) / spread
     even_x = (arrival.x - buffer.dequeued_x) / spread
+    gain = value(buffer.v, even_x)
+    lost = merging_loss(buffer.v, even_x, gain, even_x, gain)
+    if rows.shape[1] > 0:
+        _write_slots(buffer, arrival, lost, rows)
     gap_us, gap_x = float(arrival.arrival_us - buffer.previous_us), arrival.x - buffer.previous_x
-    gain, lost = even_gap(buffer, arrival)
     newcomer = Newcomer(gap_us, gap_x, even_us, even_x, kept(gain, context), gain, lost)
     write_context(buffer, arrival, newcomer, context)
