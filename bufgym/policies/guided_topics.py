@@ -6,8 +6,8 @@ Robofleet's order is n = 1 for ``priority`` and ``wait`` alone, strict priority 
 are the plain rule's numbers: high priorities first, then much QoI a byte and long waits; large, old messages of topics
 with a low priority, or sent a moment ago, make room.
 
-The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``; lg is that of ``guided``), so W = 0 is the plain
-rule. ``no_drop`` messages go first in any case, as in Robofleet, and are lost only if the queue holds nothing else.
+The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``; lg is that of ``guided``). W = 0 is the plain rule.
+``no_drop`` messages go first in any case, as in Robofleet, and are lost only if the queue holds nothing else.
 """
 
 from __future__ import annotations
