@@ -71,11 +71,9 @@ def train(seed: int, generations: int, out: Path) -> None:
         if generation % 10 == 9:
             spent = f"{POPULATION} x {decisions:,} decisions, {time.process_time() - began:.0f} s"
             print(f"seed {seed}: {generation + 1} of {generations} generations of {spent}", flush=True)
-    notes = {
-        "name": "learned",
-        "about": ABOUT,
-        "training": f"python -m agents.joint --seed {seed} --generations {generations}",
-    }
+    training = f"python -m agents.joint --seed {seed}"
+    training += f" --generations {generations}" if generations != GENERATIONS else ""
+    notes = {"name": "learned", "about": ABOUT, "training": training}
     print(f"wrote {weights.save(out, agent(np.mean(means[-MEMORY:], axis=0)), {**notes, 'seeds': [seed]})}")
 
 
@@ -90,8 +88,9 @@ def split_up(found: dict[str, list[Run]]) -> dict[str, list[Run]]:
 
 PAGE = """# learned
 
-**Its action space is a rule**, `gap-price`: at every decision `learned` sets the numbers of that rule. It is shipped as
-seed {seed}, the best of the seeds on validation, made by `{command}`.
+**Its action space is a rule**, `gap-price`: at every decision `learned` sets the numbers of that rule. It is seed
+{seed}, made by `{command}`: the best on validation of the seeds that are on no family more than 0.02 above
+the rule.
 
 - *Reads* sixteen numbers: rates of the link, load, the bend of V at the target gap, how much the rate varies, the
   head's age and gap, the newcomer's gap and bytes, the time without a departure, the spread of sizes, the fill level,

@@ -260,7 +260,7 @@ ALGORITHMS = (*LEARNERS, "guided")
 def load(settings: Settings, run: Run) -> Any:
     """The learner that the run kept."""
     torch.set_num_threads(1)  # on batches this small, more threads only wait for one another
-    return LEARNERS[settings.algo][0].load(run.model, device="cpu")
+    return LEARNERS[settings.algo][0].load(run.folder / "model.zip", device="cpu")
 
 
 def test_rows(settings: Settings, run: Run, evaluation: EvaluationSet) -> list[Row]:
