@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
@@ -25,12 +26,16 @@ from bufgym.policies import guided
 from bufgym.policies.guided import GuidedWeights
 from bufgym.sb3 import make_vec_env
 
-ENVS, N_STEPS, MINIBATCH, EPOCHS = 256, 168, 3_584, 4
-"""Batches of 43,000 decisions; 7,000 fail."""
-DISCOUNT, TRACE = 0.99, 0.95
-"""gamma and lambda. With 0.9 and 0.9 it is best within 16 s and then drifts to worse than the rule."""
-RATE, WIDTH = 1e-3, 64
-"""Learning rate, and hidden units of the critic's two layers."""
+STEPS = 1_500_000
+"""Decisions that suffice."""
+ENVS, N_STEPS, MINIBATCH, EPOCHS = 256, 128, 4_096, 4
+"""Batches of 33,000 decisions; 7,000 fail."""
+DISCOUNT, TRACE = 0.9, 0.9
+"""gamma and lambda."""
+RATE, WIDTH = 1e-3, 32
+"""Learning rate, which falls linearly to 0, and hidden units of the critic's two layers."""
+VALIDATE_EVERY = 2 * ENVS * N_STEPS
+"""PPO is best within half a million decisions."""
 PLAIN = list(guided.INPUTS).index("plain")
 SPREADS = (0.3, 0.1)
 """Standard deviation of the actions, at the start and at the end."""
@@ -81,7 +86,7 @@ def new(settings: Settings, env: VecEnv) -> PPO:
     return PPO(
         GuidedPolicy,
         env,
-        learning_rate=RATE,
+        learning_rate=LinearSchedule(RATE, 0.0, 1.0),
         n_steps=steps,
         batch_size=math.gcd(MINIBATCH, steps * env.num_envs),
         n_epochs=EPOCHS,
@@ -109,6 +114,5 @@ class Budget(BetweenUpdates):
         return self.curve.spent() < self.seconds
 
     def _on_rollout_start(self) -> None:
-        done = min(max(self.curve.spent() / self.seconds, self.num_timesteps / self.steps), 1.0)
         policy: Any = self.model.policy
-        nn.init.constant_(policy.log_std, np.log(SPREADS[0]) + done * np.log(SPREADS[1] / SPREADS[0]))
+        nn.init.constant_(policy.log_std, math.log(np.interp(self.num_timesteps / self.steps, (0, 1), SPREADS)))

@@ -53,14 +53,14 @@ def train_all(settings: Settings, folder: Path) -> list[Run]:
 
 
 def train_beside(settings: Settings, folder: Path, runs: Sequence[Run]) -> list[Run]:
-    """With ``settings.beside``: PPO on the same actions, for as long as the longest of the runs."""
+    """With ``settings.beside``: PPO on the same actions, for no longer than the longest of the runs."""
     if not (settings.beside and settings.algo == "guided" and settings.kind == "environment"):
         return []
     home, seconds = folder / "ppo", max(run.seconds for run in runs)
     home.mkdir(exist_ok=True)
-    print(f"PPO on the same actions, for {seconds:.0f} s")
-    # So many steps that time ends it.
-    other = replace(settings, algo="guided-ppo", validate_every=guided_ppo.ENVS * guided_ppo.N_STEPS * 5)
+    print(f"PPO on the same actions, for at most {seconds:.0f} s")
+    steps, every = min(settings.steps, guided_ppo.STEPS), guided_ppo.VALIDATE_EVERY
+    other = replace(settings, algo="guided-ppo", steps=steps, validate_every=every)
     return each_seed(functools.partial(train_seed, seconds=seconds), other, home)
 
 
