@@ -46,7 +46,9 @@ CONTEXT_NAMES = [field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)]
 def weights(draw):
     """Any fields in any order; no, one or two hidden layers."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    fields = tuple(draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True)))
+    on_board = draw(st.sets(st.sampled_from([field.name for field in ON_BOARD_SLOT_FIELDS]), min_size=1))
+    others = draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True))
+    fields = tuple(dict.fromkeys([*others, *(sorted(on_board) if draw(st.booleans()) else [])]))
     widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
     return Weights(fields, network(rng, len(fields), *widths), network(rng, len(fields), *widths))
 
