@@ -6,17 +6,19 @@ Both run senders with links of their own (``shares`` is None) and robots that sh
 from __future__ import annotations
 
 import functools
-from typing import Any
+from contextlib import nullcontext
+from time import perf_counter
+from typing import Any, cast
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import compile_for, interruptible, local, named
+from bufgym.ground.kernel import JIT, NotKeptError, compile_for, interruptible, kernel, local, named, only_kept
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
-from bufgym.policies.registry import Policy, signatures
+from bufgym.policies.registry import Functions, Policy, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.shared_link import Shares, shares_type
 from bufgym.sim.socket import credit
@@ -26,6 +28,12 @@ from bufgym.sim.view import arrival_of, view
 
 _SHORT = 200_000
 """Arrivals times numbers read at each, for a rollout that takes at most some milliseconds."""
+
+
+@kernel
+def cells_of(batch: Batch, shares: Shares | None) -> int:
+    """Cells of the batch; each sender is one if it has a link of its own."""
+    return len(batch.senders) if shares is None else len(shares.cells)
 
 
 def rollout(
@@ -39,7 +47,7 @@ def rollout(
     hears_departures: bool,
 ) -> None:
     """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
-    for c in range(len(batch.senders) if shares is None else len(shares.cells)):
+    for c in range(cells_of(batch, shares)):
         event, again = NOTHING, False
         while event != END:
             if not again:
@@ -77,6 +85,24 @@ def compiled_rollout(shared: bool, several: bool) -> Any:
 
 
 _view = getattr(view, "py_func", view)
+
+
+_inlined: Any = numba.njit(inline="always")(rollout)
+
+
+@functools.cache
+def own_rollout(functions: Functions, hears_departures: bool) -> Any:
+    """``rollout`` of senders with links of their own for one policy, whose functions become part of its code.
+
+    What the policy does not read is not computed: less than half the time at an arrival. It takes seconds to compile.
+    """
+    on_arrival, on_departure, on_dequeue, on_send = map(cast(Any, kernel), functions)
+
+    def rollout_of(batch: Batch, memory: NDArray[np.float64]) -> None:
+        _inlined(batch, None, memory, on_arrival, on_departure, on_dequeue, on_send, hears_departures)
+
+    rollout_of.__qualname__ = f"rollout_of_{functions[0].__qualname__}"  # it names the file of its code
+    return kernel(rollout_of)
 
 
 def python_view(batch: Batch, i: int) -> Buffer:
@@ -135,15 +161,39 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
         credit(batch, i, FOREVER)
 
 
+_seconds: dict[Any, float] = {}
+"""Time that this process has spent in the rollout for all policies, by a policy's functions, s."""
+_KEPT_PAYS_S, _COMPILING_PAYS_S = 0.05, 2.0
+"""The time after which a rollout of the policy's own is used if it is on disk, and after which it is compiled."""
+
+
+def _own(policy: Policy, batch: Batch, memory: NDArray[np.float64]) -> Any:
+    """The policy's own rollout, or None while it would take longer to make than it has cost to do without."""
+    spent = _seconds.get(policy.functions, 0.0)
+    if not JIT or spent < _KEPT_PAYS_S:
+        return None
+    compiled = own_rollout(policy.functions, policy.hears_departures)
+    kinds = batch_type(bool(batch.several)), cast(Any, numba).typeof(memory)
+    try:
+        with only_kept() if spent < _COMPILING_PAYS_S else nullcontext():
+            return compiled.compile(kinds)
+    except NotKeptError:
+        return None
+
+
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
     """Run every sender to its end under ``policy``, compiled if the policy is."""
     if not policy.compile:
         python_rollout(batch, shares, memory, policy)
         return
-    compiled = compiled_rollout(shares is not None, bool(batch.several))
-    arguments = batch, shares, memory, *policy.compiled, policy.hears_departures
+    own = _own(policy, batch, memory) if shares is None else None
+    compiled = own or compiled_rollout(shares is not None, bool(batch.several))
+    arguments = (batch, memory) if own else (batch, shares, memory, *policy.compiled, policy.hears_departures)
+    began = perf_counter()
     # Its work at each arrival grows with its memory and the numbers it reads.
     if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:
         compiled(*arguments)
     else:
         interruptible(lambda: compiled(*arguments))
+    if not own:
+        _seconds[policy.functions] = _seconds.get(policy.functions, 0.0) + perf_counter() - began
