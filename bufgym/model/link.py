@@ -130,9 +130,7 @@ class KnotStore:
 
     def place(self, trace: Trace, sender: int) -> tuple[int, int, int]:
         """Store ``trace`` for ``sender`` and return (first knot, last knot, code of the behaviour after the end)."""
-        left = self._followed.get(sender)
-        if left is not None and left.trace is trace:
-            return left.first, left.first + len(trace.time_us) - 1, _AFTER[trace.after]
+        left = self._followed.pop(sender, None)
         if left is not None:
             left.senders -= 1
             if not left.senders:

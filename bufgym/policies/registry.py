@@ -189,15 +189,10 @@ class Policy:
         label = ",".join(f"{name}={number:g}" for name, number in settings.items())
         return replace(self, name=f"{self.name}:{label}", parameters=parameters)
 
-    @property
-    def functions(self) -> Functions:
-        """Its four functions."""
-        return self.on_arrival, self.on_departure, self.on_dequeue, self.on_send
-
     @functools.cached_property
     def compiled(self) -> Functions:
         """Its functions compiled for one signature each, so that one rollout kernel serves every policy."""
-        return _compiled(*self.functions)
+        return _compiled(self.on_arrival, self.on_departure, self.on_dequeue, self.on_send)
 
 
 @functools.lru_cache(maxsize=256)

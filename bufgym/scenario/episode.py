@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
@@ -90,11 +89,6 @@ class Episode:
                 raise BufgymError(f"encodings[{name!r}]: must be int64[{n}], the bytes of each message")
         pauses = n if self.ack_delay_us else 0
         self.link.check_reach(int(arrivals["arrival_us"][-1]), total_bytes, pauses, self.ack_delay_us)
-
-    @functools.cached_property
-    def words(self) -> NDArray[np.int64]:
-        """The arrivals as whole words."""
-        return self.arrivals.view(np.int64)
 
     def check_one_queue(self) -> None:
         """Raise unless one queue without topics can hold the messages: x must not fall from one to the next."""

@@ -6,7 +6,7 @@ Both run senders with links of their own (``shares`` is None) and robots that sh
 from __future__ import annotations
 
 import functools
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from time import perf_counter
 from typing import Any, cast
 
@@ -18,7 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT, NotKeptError, compile_for, interruptible, kernel, local, named, only_kept
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
-from bufgym.policies.registry import Functions, Policy, signatures
+from bufgym.policies.registry import Policy, signatures
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.shared_link import Shares, shares_type
 from bufgym.sim.socket import credit
@@ -28,12 +28,6 @@ from bufgym.sim.view import arrival_of, view
 
 _SHORT = 200_000
 """Arrivals times numbers read at each, for a rollout that takes at most some milliseconds."""
-
-
-@kernel
-def cells_of(batch: Batch, shares: Shares | None) -> int:
-    """Cells of the batch; each sender is one if it has a link of its own."""
-    return len(batch.senders) if shares is None else len(shares.cells)
 
 
 def rollout(
@@ -47,7 +41,7 @@ def rollout(
     hears_departures: bool,
 ) -> None:
     """Run every sender of the batch to its end under one policy; ``memory`` is float64[n, entries]."""
-    for c in range(cells_of(batch, shares)):
+    for c in range(len(batch.senders) if shares is None else len(shares.cells)):
         event, again = NOTHING, False
         while event != END:
             if not again:
@@ -75,8 +69,7 @@ def rollout(
 def compiled_rollout(shared: bool, several: bool) -> Any:
     """``rollout`` compiled once for every policy, as policies arrive as values of one function type.
 
-    ``shared`` means the cells of a shared link, otherwise senders with links of their own. ``several`` means several
-    topics, otherwise one queue.
+    ``shared``: the cells of a shared link, or senders with a link each. ``several``: several topics, or one queue.
     """
     functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
@@ -85,18 +78,13 @@ def compiled_rollout(shared: bool, several: bool) -> Any:
 
 
 _view = getattr(view, "py_func", view)
-
-
 _inlined: Any = numba.njit(inline="always")(rollout)
 
 
 @functools.cache
-def own_rollout(functions: Functions, hears_departures: bool) -> Any:
-    """``rollout`` of senders with links of their own for one policy, whose functions become part of its code.
-
-    What the policy does not read is not computed: less than half the time at an arrival. It takes seconds to compile.
-    """
-    on_arrival, on_departure, on_dequeue, on_send = map(cast(Any, kernel), functions)
+def own_rollout(functions: Any, hears_departures: bool) -> Any:
+    """``rollout`` with a link each for one policy, of ``compiled`` functions: half the time, but seconds to compile."""
+    on_arrival, on_departure, on_dequeue, on_send = (kernel(function.py_func) for function in functions)
 
     def rollout_of(batch: Batch, memory: NDArray[np.float64]) -> None:
         _inlined(batch, None, memory, on_arrival, on_departure, on_dequeue, on_send, hears_departures)
@@ -161,24 +149,9 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
         credit(batch, i, FOREVER)
 
 
-_seconds: dict[Any, float] = {}
-"""Time that this process has spent in the rollout for all policies, by a policy's functions, s."""
-_KEPT_PAYS_S, _COMPILING_PAYS_S = 0.05, 2.0
-"""The time after which a rollout of the policy's own is used if it is on disk, and after which it is compiled."""
-
-
-def _own(policy: Policy, batch: Batch, memory: NDArray[np.float64]) -> Any:
-    """The policy's own rollout, or None while it would take longer to make than it has cost to do without."""
-    spent = _seconds.get(policy.functions, 0.0)
-    if not JIT or spent < _KEPT_PAYS_S:
-        return None
-    compiled = own_rollout(policy.functions, policy.hears_departures)
-    kinds = batch_type(bool(batch.several)), cast(Any, numba).typeof(memory)
-    try:
-        with only_kept() if spent < _COMPILING_PAYS_S else nullcontext():
-            return compiled.compile(kinds)
-    except NotKeptError:
-        return None
+_PAYS_IF_KEPT_S, _PAYS_S = 0.05, 2.0
+"""Time in the rollout for all, s, after which a policy gets its own: if that is on disk; in any case."""
+_spent_s: dict[Any, float] = {}
 
 
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
@@ -186,14 +159,18 @@ def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], p
     if not policy.compile:
         python_rollout(batch, shares, memory, policy)
         return
-    own = _own(policy, batch, memory) if shares is None else None
-    compiled = own or compiled_rollout(shares is not None, bool(batch.several))
-    arguments = (batch, memory) if own else (batch, shares, memory, *policy.compiled, policy.hears_departures)
-    began = perf_counter()
+    functions, hears, several = policy.compiled, policy.hears_departures, bool(batch.several)
+    spent_s, own = _spent_s.get(functions, 0.0), None
+    if JIT and shares is None and spent_s > _PAYS_IF_KEPT_S:
+        with suppress(NotKeptError), only_kept() if spent_s < _PAYS_S else nullcontext():
+            own = own_rollout(functions, hears).compile((batch_type(several), cast(Any, numba).typeof(memory)))
+    compiled = own or compiled_rollout(shares is not None, several)
+    arguments = (batch, memory) if own else (batch, shares, memory, *functions, hears)
+    began_s = perf_counter()
     # Its work at each arrival grows with its memory and the numbers it reads.
     if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:
         compiled(*arguments)
     else:
         interruptible(lambda: compiled(*arguments))
     if not own:
-        _seconds[policy.functions] = _seconds.get(policy.functions, 0.0) + perf_counter() - began
+        _spent_s[functions] = spent_s + perf_counter() - began_s

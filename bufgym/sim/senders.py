@@ -24,10 +24,9 @@ from bufgym.sim.state import FRESH, SENDER, beginning, new_batch
 Begun = tuple[int, Episode, np.random.Generator | None]
 """Arguments of ``Senders.load``: a sender, the episode it begins, and the generator of its uniform draws."""
 
-_EPISODE = ("arrivals", "first_decision", "last_decision")
-_TRACE = ("first_knot", "last_knot", "after", "segment_now", "segment_finish")
-_DELAYS = ("offset_us", "propagation_us", "window", "ack_delay_us", "v_start", "ends_us")
-_LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in (*_EPISODE, *_TRACE, *_DELAYS)])
+_EPISODE = "arrivals first_decision last_decision window ack_delay_us ends_us v_start offset_us propagation_us"
+_LINK = "first_knot last_knot after segment_now segment_finish"
+_LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in f"{_EPISODE} {_LINK}".split()])
 """Fields of SENDER that differ from episode to episode."""
 
 
@@ -97,15 +96,12 @@ class Senders:
         # NumPy copies records field by field; as whole words it copies them five times as fast.
         arrivals, log = batch.arrivals.view(np.int64), batch.log.view(np.int64)
         for (i, episode, uniforms), v_start in zip(begun, v_starts, strict=True):
-            link, n, words = episode.link, len(episode.arrivals), episode.words
-            first_knot, last_knot, after = self._knots.place(link.trace, i)
-            arrivals[i, : len(words)] = words
-            log[i, : n * len(FRESH)] = self._unlogged[: n * len(FRESH)]
+            link, n, words = episode.link, len(episode.arrivals), episode.arrivals.view(np.int64)
+            place = self._knots.place(link.trace, i)
+            arrivals[i, : len(words)], log[i, : n * len(FRESH)] = words, self._unlogged[: n * len(FRESH)]
+            line = n, episode.first_decision, episode.last_decision, episode.window, episode.ack_delay_us
             ends_us = FOREVER if episode.ends_us is None else episode.ends_us
-            episode_line = n, episode.first_decision, episode.last_decision
-            trace_line = first_knot, last_knot, after, first_knot, first_knot
-            delays_line = link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us, v_start, ends_us
-            lines.append(episode_line + trace_line + delays_line)
+            lines.append((*line, ends_us, v_start, link.offset_us, link.propagation_us, *place, place[0], place[0]))
             self.episodes[i], self._uniforms[i] = episode, uniforms
         self.begun[rows] += 1
         batch.topics.view(np.int64)[rows] = self._rules
