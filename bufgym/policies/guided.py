@@ -231,12 +231,12 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     recall(buffer, arrival, memory, base)
     inputs(buffer, arrival, memory, base, seen)
     h = heaviness(buffer, arrival, memory)
-    outputs[:N_OUTPUTS] = 0.0
-    for i in range(N_INPUTS):  # in the outer loop: sums that do not wait for each other
-        for k in range(i, N_OUTPUTS * N_INPUTS, N_INPUTS):
-            outputs[k // N_INPUTS] += (weights[k] + h * weights[N_OUTPUTS * N_INPUTS + k]) * seen[i]
     for o in range(N_OUTPUTS):
-        outputs[o] *= 1 - seen[N_INPUTS - 1]
+        total = 0.0
+        for i in range(N_INPUTS):
+            k = o * N_INPUTS + i
+            total += (weights[k] + h * weights[N_OUTPUTS * N_INPUTS + k]) * seen[i]
+        outputs[o] = total * (1 - seen[N_INPUTS - 1])
     return follow(buffer, arrival, memory, base, outputs)
 
 
