@@ -142,11 +142,6 @@ class SchedulerWeights(GuidedWeights):
     SHAPE = LIGHT = (N_OUTPUTS, N_INPUTS)
     TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), list(INPUTS.items()), OUTPUTS, PLAIN]
 
-    @property
-    def scheduler(self) -> SchedulerWeights:
-        """The one network."""
-        return self
-
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights, for any topics and every L."""
         numbers = numbers_of(name, BASE, self.weight, self.SHAPE)

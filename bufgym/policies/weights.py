@@ -148,7 +148,7 @@ def _tensors(weights: AnyWeights) -> Tensors:
     return {
         f"{network}.{name}": np.ascontiguousarray(tensor, "<f4")
         for network in weights.NETWORKS
-        for name, tensor in getattr(weights, network).tensors().items()
+        for name, tensor in cast(Any, getattr(weights, network, weights)).tensors().items()
     }
 
 

@@ -149,8 +149,7 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
         credit(batch, i, FOREVER)
 
 
-_PAYS_IF_KEPT_S, _PAYS_S = 0.05, 2.0
-"""Time in the rollout for all, s, after which a policy gets its own: if that is on disk; in any case."""
+_PAYS_IF_KEPT_S, _PAYS_S = 0.05, 2.0  # time in the rollout for all after which a policy gets its own: if kept; always
 _spent_s: dict[Any, float] = {}
 
 
