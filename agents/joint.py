@@ -89,8 +89,8 @@ def split_up(found: dict[str, list[Run]]) -> dict[str, list[Run]]:
 PAGE = """# learned
 
 **Its action space is a rule**, `gap-price`: at every decision `learned` sets the numbers of that rule. It is seed
-{seed}, made by `{command}`. Of five seeds it is the best on validation by the fitness of the search,
-among those that lie on no family more than 0.02 above the rule.
+{seed}, made by `{command}`. The fitness of the search, on validation, chose it among five
+seeds. Seeds that lie more than 0.02 above the rule on a family were left out.
 
 - *Reads* sixteen numbers: rates of the link, load, the bend of V at the target gap, how much the rate varies, the
   head's age and gap, the newcomer's gap and bytes, the time without a departure, the spread of sizes, the fill level,

@@ -1,12 +1,12 @@
-"""Guided scheduling: one rule for several topics, whose numbers an agent moves by what the client sees.
+"""Guided scheduling: an agent moves the numbers of one rule for several topics.
 
-The rule weighs what is known of a message. With ``FEATURES`` f, it sends the oldest message of the topic with the
+The rule weighs messages. With ``FEATURES`` f, it sends the oldest message of the topic with the
 largest n f, and drops the message with the largest m f, once that exceeds the threshold ``room`` or nothing fits.
 Robofleet's order is n = 1 for ``priority`` and ``wait`` alone, strict priority is n = 1 for ``priority``. ``PLAIN``
 are the plain rule's numbers: high priorities first, then much QoI a byte and long waits; large, old messages of topics
 with a low priority, or sent a moment ago, make room.
 
-The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``; lg is that of ``guided``). W = 0 is the plain rule.
+The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``, with lg as in ``guided``). W = 0 is the plain rule.
 ``no_drop`` messages go first in any case, as in Robofleet, and are lost only if the queue holds nothing else.
 """
 
