@@ -26,16 +26,12 @@ from bufgym.policies import guided
 from bufgym.policies.guided import GuidedWeights
 from bufgym.sb3 import make_vec_env
 
-STEPS = 1_500_000
-"""Decisions that suffice."""
 ENVS, N_STEPS, MINIBATCH, EPOCHS = 256, 128, 4_096, 4
 """Batches of 33,000 decisions; 7,000 fail."""
 DISCOUNT, TRACE = 0.9, 0.9
 """gamma and lambda."""
 RATE, WIDTH = 1e-3, 32
 """Learning rate, which falls linearly to 0, and hidden units of the critic's two layers."""
-VALIDATE_EVERY = 2 * ENVS * N_STEPS
-"""PPO is best within half a million decisions."""
 PLAIN = list(guided.INPUTS).index("plain")
 SPREADS = (0.3, 0.1)
 """Standard deviation of the actions, at the start and at the end."""
@@ -104,7 +100,7 @@ def weights_of(model: PPO) -> GuidedWeights:
 
 
 class Budget(BetweenUpdates):
-    """Ends the training after so many seconds, and narrows the actions until then."""
+    """Ends the training after so many seconds, and narrows the actions over its steps."""
 
     def __init__(self, seconds: float, curve: Curve, steps: int) -> None:
         super().__init__()

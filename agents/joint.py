@@ -19,7 +19,7 @@ from pathlib import Path
 import cma
 import numpy as np
 
-from agents.families import Family, Run, families
+from agents.families import Family, Run, divided, families
 from agents.page import command, publish, table, written
 from bufgym import policies
 from bufgym.policies import weights
@@ -47,11 +47,8 @@ def agent(vector: np.ndarray) -> GuidedWeights:
 def train(seed: int, generations: int, out: Path) -> None:
     """Evolve one seed for so many generations, and write its agent."""
     rng, rule = np.random.default_rng(seed), policies.get(RULE)
-    parts: list[list[Family]] = [[] for _ in range(PARTS)]
-    for name, runs in families("train", FOLDER).items():
-        order, n = rng.permutation(len(runs)), RUNS[name]
-        for p, part in enumerate(parts):
-            part.append(Family(name, [runs[order[(p * n + j) % len(runs)]] for j in range(n)]))
+    found = families("train", FOLDER)
+    parts = list(zip(*(divided(name, runs, RUNS[name], PARTS, rng) for name, runs in found.items()), strict=True))
     plain = [np.array([family.share(rule) for family in part]) for part in parts]
     decisions = sum(family.decisions for family in parts[0])
 

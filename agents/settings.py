@@ -19,6 +19,8 @@ from bufgym.scenario.uplink import RGBD_BYTES
 Kind = Literal["environment", "queue", "topics", "fleet"]
 """The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
 
+PPO_VALIDATES = 65_536
+"""Steps between validations of guided-ppo, two of its updates: it is best within half a million decisions."""
 _ALONE = {"topics": ("a scheduler", ("guided",)), "fleet": ("a fleet's agent", ("guided", "maskable-ppo"))}
 """Kinds for one suite alone, with the trained agent and its algorithms."""
 
@@ -29,7 +31,6 @@ def _number(**limits: float) -> Parameter:
 
 Count = Annotated[int, _number(gte=1)]
 Natural = Annotated[int, _number(gte=0)]
-Units = Annotated[int, _number(gte=0, lte=MAX_WIDTH)]
 Share = Annotated[float, _number(gte=0, lte=1)]
 Positive = Annotated[float, _number(gt=0, lt=math.inf)]
 
@@ -150,7 +151,7 @@ class Settings:
     def resolved(self) -> Settings:
         """These settings with the steps that suit the algorithm, where they are left open."""
         steps = self.steps or (40_000_000 if self.evolves else 1_500_000)
-        every = 65_536 if self.algo == "guided-ppo" else -(-steps // 6)
+        every = PPO_VALIDATES if self.algo == "guided-ppo" else -(-steps // 6)
         return replace(self, steps=steps, validate_every=self.validate_every or every)
 
     def checked(self) -> Settings:

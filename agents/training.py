@@ -28,7 +28,7 @@ from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoin
 from agents.cluster import begun
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluation import EvaluationSet, ValidationSets, Verdict
-from agents.held_out import FixedEpisodes, split_scenario
+from agents.held_out import fixed_episodes, split_scenario
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.fleet import FleetObjective, fleet_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
@@ -59,8 +59,8 @@ def train_beside(settings: Settings, folder: Path, runs: Sequence[Run]) -> list[
     home, seconds = folder / "ppo", max(run.seconds for run in runs)
     home.mkdir(exist_ok=True)
     print(f"PPO on the same actions, for at most {seconds:.0f} s")
-    steps, every = min(settings.steps, guided_ppo.STEPS), guided_ppo.VALIDATE_EVERY
-    other = replace(settings, algo="guided-ppo", steps=steps, validate_every=every)
+    usual = replace(settings, algo="guided-ppo", steps=0, validate_every=0).resolved()
+    other = replace(usual, steps=min(settings.steps, usual.steps))
     return each_seed(functools.partial(train_seed, seconds=seconds), other, home)
 
 
@@ -110,7 +110,7 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, secon
 def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, steps: int) -> Validation:
     """The validation of a learner on this kind of task."""
     if settings.kind == "environment":
-        episodes = FixedEpisodes(settings, "validation")
+        episodes = fixed_episodes(settings, "validation")
 
         def score(model: Any) -> Numbers:
             if settings.algo == "guided-ppo":

@@ -1,7 +1,7 @@
 """Guided scheduling: an agent moves the numbers of one rule for several topics.
 
-The rule weighs messages. With ``FEATURES`` f, it sends the oldest message of the topic with the
-largest n f, and drops the message with the largest m f, once that exceeds the threshold ``room`` or nothing fits.
+The rule weighs messages. With ``FEATURES`` f, it sends the oldest message of the topic with the largest n f, and drops
+the message with the largest m f, once that exceeds the threshold ``room`` or nothing fits.
 Robofleet's order is n = 1 for ``priority`` and ``wait`` alone, strict priority is n = 1 for ``priority``. ``PLAIN``
 are the plain rule's numbers: high priorities first, then much QoI a byte and long waits; large, old messages of topics
 with a low priority, or sent a moment ago, make room.
@@ -50,7 +50,7 @@ INPUTS = {
     "window": "1 - 2 / n_T",
 }
 N_FEATURES, N_INPUTS = len(FEATURES), len(INPUTS)
-SENDS, DROPS, ROOM = 0, N_FEATURES, 2 * N_FEATURES
+DROPS, ROOM = N_FEATURES, 2 * N_FEATURES
 OUTPUTS = (*(f"send_{name}" for name in FEATURES), *(f"drop_{name}" for name in FEATURES), "room")
 N_OUTPUTS = len(OUTPUTS)
 PLAIN = {
