@@ -186,8 +186,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         return observations
 
     def _infos(self, terminated: bool) -> Infos:
-        terms = self.rows.output.reward_terms.tolist()
-        return {agent: self.rows.info(i, terms[i], terminated) for i, agent in enumerate(self.possible_agents)}
+        return {agent: self.rows.info(i, terminated) for i, agent in enumerate(self.possible_agents)}
 
 
 parallel_env = FleetEnv

@@ -46,7 +46,8 @@ class ObservationForm:
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
-    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views.
+    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views; where
+    ``is_row``, the row itself.
     ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
     """
 
@@ -91,6 +92,7 @@ class ObservationForm:
                     self.numbers += entries
         everything = not own and len(self.places) == len(known)
         self.is_view = form == "dict" or (form == "slots" and everything)
+        self.is_row = form == "flat" and everything
         numbers = [np.arange(place.first, place.first + place.entries) for place in self.places]
         self._numbers = None if everything else np.concatenate(numbers)
         self._per_slot = sum(place.field.per == "slot" for place in self.places)
@@ -169,7 +171,7 @@ class Handed:
     def of(self, row: NDArray[np.float32]) -> Observation:
         """The observation of this row of numbers, which is copied."""
         if self._form.form != "dict":
-            return self._form.of(row.copy())
+            return row.copy() if self._form.is_row else self._form.of(row.copy())
         numbers, views = self._reused.take()
         numbers[:] = row
         return views.copy()

@@ -23,6 +23,7 @@ from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import StepOutput, step_rows
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import code_for
 from bufgym.model.checks import is_number, whole
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
@@ -103,14 +104,12 @@ class Threads:
         """``numbers``, int64[n], are rows or cells. They are split into at most ``num_threads`` parts."""
         parts = np.array_split(numbers, min(whole("num_threads", num_threads, 1), len(numbers)))
         self.parts = [np.ascontiguousarray(part) for part in parts]
+        self.all = self.parts[0] if len(self.parts) == 1 else None
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
 
     def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
         """Call ``work`` on every part; return when all are done."""
-        if len(self.parts) == 1:
-            work(self.parts[0])
-            return
         if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
             self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
         running = [self._pool.submit(work, part) for part in self.parts[1:]]
@@ -173,6 +172,7 @@ class Rows:
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
         self.guiding = guiding(n, self.capacity, actions, fields, "several topics" if topics else "")
+        self._step: Any = self.guiding.step if self.guiding else step_rows
         self._acts = self.guiding if self.guiding and self.guiding.acts else None
         if self.guiding and self.guiding.sees:
             slot_fields, context_fields, fields = (), INPUT_FIELDS, None
@@ -181,14 +181,15 @@ class Rows:
         self._has_slots = self.keeps_slots or not all(name in context or own_field(name) for name in fields or [""])
         tables = slot_fields if self._has_slots else (), context_fields
         self.form = ObservationForm(observation, *tables, self.capacity, fields)
-        self.observation_space, self._handed = self.form.space, Handed(self.form)
+        self.observation_space, self.handed = self.form.space, Handed(self.form)
         self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.capacity + 2)
         self.streams, self._pool_size = cast(list[Streams | None], [None] * n), pool
         self._draw = self.from_pool(self.scenario.draw)
         self.rewarded = np.zeros((n, len(self.terms)))
         self._own_fields = OwnFields(self.form)
         self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
-        self._has_own = bool(self._own_fields) or bool(self._own_terms)
+        self._sums_here = bool(self._own_terms)
+        self._has_own = bool(self._own_fields) or self._sums_here
         self.output = self.new_output()
         self._threads = Threads(np.arange(n), num_threads)
 
@@ -202,6 +203,8 @@ class Rows:
             np.zeros((n, self.form.numbers), np.float32),
             np.zeros((n, L + 2), np.int8),
             np.zeros((n, len(self.terms))),
+            self.weights.copy(),
+            np.zeros(n),
             np.zeros(n),
             np.zeros(n, np.int64),
             np.zeros(n, np.bool_),
@@ -221,13 +224,17 @@ class Rows:
         if self.guiding:
             self.guiding.begin(rows)
         self._run(self._load(rows, episodes), NO_ACTIONS)
+        self._step = code_for(self._step, self.senders.batch)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
             self._own_fields.write(self.senders.batch, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """Take one decision in every row; the result is in ``self.output``."""
-        self._threads.each(lambda numbers: self._run(numbers, actions))
+        if (rows := self._threads.all) is not None:
+            self._run(rows, actions)
+        else:
+            self._threads.each(lambda numbers: self._run(numbers, actions))
         if self._has_own:
             self._own_terms.write(self.senders.batch, self.output)
             self._own_fields.write(self.senders.batch, self.output)
@@ -253,16 +260,17 @@ class Rows:
         return rows
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        step = self.guiding.step if self.guiding else step_rows
-        step(self.senders.batch, rows, actions, self.rewarded, self.output)
+        self._step(self.senders.batch, rows, actions, self.rewarded, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
-        """float64[n]: the weighted sum of the reward terms of the last step."""
-        total = np.zeros(len(self))
-        # Added term by term, as in the single environment: a matrix product may round differently.
-        for k in np.flatnonzero(self.weights):
-            total += self.weights[k] * self.output.reward_terms[:, k]
-        return total
+        """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""
+        rewards = self.output.rewards
+        if self._sums_here:
+            rewards[:] = 0.0
+            # Term by term, as the kernels add them: a matrix product may round differently.
+            for weight, terms in zip(self.weights, self.output.reward_terms.T, strict=True):
+                rewards += weight * terms
+        return rewards
 
     def summary(self, i: Any) -> dict[str, Any]:
         """QoI and message counts so far in row(s) ``i``, an index or several."""
@@ -275,15 +283,15 @@ class Rows:
             "invalid": self.output.invalid[i],
         }
 
-    def info(self, i: int, terms: Sequence[float], ended: bool) -> dict[str, Any]:
-        """Gymnasium's info of row ``i`` after a reset or a step with the reward ``terms``; see ``INFOS``."""
-        info: dict[str, Any] = {}
-        if self.shows_mask:
-            info["action_mask"] = self.output.action_mask[i].copy()
+    def info(self, i: int, ended: bool) -> dict[str, Any]:
+        """Gymnasium's info of row ``i`` after a reset or a step; see ``INFOS``."""
+        info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self.shows_mask else {}
+        if not (self.shows_all or ended):
+            return info
         if self.shows_all:
             info["qoi"] = self.output.qoi.item(i)
             info["invalid"] = self.output.invalid.item(i)
-            info["reward_terms"] = dict(zip(self._term_names, terms, strict=True))
+            info["reward_terms"] = dict(zip(self._term_names, self.output.reward_terms[i].tolist(), strict=True))
         if ended or self.is_steady:
             info |= {name: number.item() for name, number in self.summary(i).items()}
         if self.bound and ended:
@@ -294,7 +302,7 @@ class Rows:
 
     def observation(self, i: int | None = None) -> Observation:
         """The present observation of all rows, as views of ``output``; of row ``i`` alone, as a copy."""
-        return self.form.of(self.output.flat) if i is None else self._handed.of(self.output.flat[i])
+        return self.form.of(self.output.flat) if i is None else self.handed.of(self.output.flat[i])
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""
@@ -344,7 +352,7 @@ class Rows:
 
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
         """The next episode of row ``i``'s streams, and the generator of its uniform draws."""
-        if self.streams[i] is None:
+        if (streams := self.streams[i]) is None:
             self.seed(i, seeding.np_random()[0])
-        streams = cast(Streams, self.streams[i])
+            return self._next_episode(i)
         return self._draw(streams), streams.policy

@@ -96,9 +96,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self.rows = Rows(1, scenario, capacity, **options)
         self.observation_space = self.rows.observation_space
         self.action_space = self.rows.action_space
-        self._action = np.zeros(1, np.int64)
-        self._weights = self.rows.weights.tolist()
-        self._no_terms = [0.0] * len(self._weights)
+        self._action, self._row = np.zeros(1, np.int64), self.rows.output.flat[0]
         self.rows.output.terminated[0] = True  # kept with the other arrays, so a snapshot of them has it
 
     def reset(
@@ -115,23 +113,19 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
         self.rows.reset(_ROW, [options.get("episode", options or None)])
         self.rows.output.terminated[0] = False  # also if no arrival asks: the first step then ends the episode
-        return self.rows.observation(0), self.rows.info(0, self._no_terms, False)
+        return self.rows.observation(0), self.rows.info(0, False)
 
     def step(
         self, action: np.int64 | int | NDArray[np.floating[Any]]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        rows = self.rows
-        if rows.output.terminated.item():
+        rows, terminated = self.rows, self.rows.output.terminated
+        if terminated.item():
             why = "" if rows.senders.episodes[0] is None else "the episode has ended: "
             raise gym.error.ResetNeeded(f"{why}call reset() before step()")
         self._action[0] = rows.action("action", action)
         rows.step(self._action)
-        terminated = rows.output.terminated.item()
-        terms = rows.output.reward_terms[0].tolist()
-        reward = 0.0
-        for weight, term in zip(self._weights, terms, strict=True):
-            reward += weight * term
-        return rows.observation(0), reward, terminated, False, rows.info(0, terms, terminated)
+        ended = terminated.item()
+        return rows.handed.of(self._row), rows.rewards().item(), ended, False, rows.info(0, ended)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[L + 2]: the actions valid now, under the name that sb3-contrib looks for."""

@@ -57,6 +57,8 @@ class StepOutput(NamedTuple):
             ``TOPIC_SLOT_FIELDS``; then ``CONTEXT_FIELDS`` (one number each), likewise with ``TOPIC_CONTEXT_FIELDS``.
         action_mask: int8[n, L + 2], 1 for a valid action.
         reward_terms: float64[n, reward terms], gain of each term in this step.
+        weights: float64[reward terms], read by the kernels.
+        rewards: float64[n], sum of the terms times their weights; without terms of your own.
         qoi: float64[n], H of the messages at the server so far.
         invalid: int64[n], invalid actions of the episode so far.
         terminated: bool[n], whether the episode is over.
@@ -66,6 +68,8 @@ class StepOutput(NamedTuple):
     flat: NDArray[np.float32]
     action_mask: NDArray[np.int8]
     reward_terms: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    rewards: NDArray[np.float64]
     qoi: NDArray[np.float64]
     invalid: NDArray[np.int64]
     terminated: NDArray[np.bool_]
@@ -104,6 +108,7 @@ def write_rewards(batch: Batch, i: int, begins: bool, rewarded: NDArray[np.float
     An episode that ``begins`` has gained nothing.
     """
     sender, terms = batch.senders[i], output.reward_terms
+    output.rewards[i] = 0.0
     if begins:
         rewarded[i, :] = 0.0
         terms[i, :] = 0.0
@@ -121,6 +126,8 @@ def write_rewards(batch: Batch, i: int, begins: bool, rewarded: NDArray[np.float
         terms[i, AGE] = (rewarded[i, AGE] - sender.aged) / weight
         terms[i, LATE] = (rewarded[i, LATE] - sender.late) / weight
         rewarded[i, AGE], rewarded[i, LATE] = sender.aged, sender.late
+    for k in range(len(output.weights)):
+        output.rewards[i] += output.weights[k] * terms[i, k]
 
 
 @kernel
@@ -181,19 +188,19 @@ def write_mask(batch: Batch, i: int, action_mask: NDArray[np.int8]) -> None:
     """Write the valid actions of row ``i``, which waits for a decision."""
     sender = batch.senders[i]
     capacity = sender.capacity
+    action_mask[i, sender.occupancy : capacity] = False
     if batch.several is None:
         # The same as below, only faster.
         action_mask[i, : sender.occupancy] = True
-        action_mask[i, sender.occupancy : capacity] = False
         action_mask[i, capacity] = True
     else:
         if sender.waiting == SOCKET_WAITS:
-            for k in range(capacity):
+            for k in range(sender.occupancy):
                 action_mask[i, k] = can_send(batch, i, k)
             action_mask[i, capacity] = can_hold(batch, i)
             action_mask[i, capacity + 1] = False
             return
-        for k in range(capacity):
+        for k in range(sender.occupancy):
             action_mask[i, k] = can_evict(batch, i, k)
         action_mask[i, capacity] = can_reject(batch, i)
     action_mask[i, capacity + 1] = has_room(batch, i)

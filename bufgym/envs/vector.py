@@ -151,6 +151,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             truncated = self._steps >= self.max_episode_steps  # like Gymnasium's TimeLimit, even if the episode ends
         self._done = terminated | truncated
         self._any_done = bool(np.count_nonzero(self._done))
+        if self._any_done and self.autoreset_mode == AutoresetMode.SAME_STEP:
+            rewards = rewards.copy()  # the rows that ended begin anew
         info = self._end(self._done) | self._info() if self._any_done else self._info()
         return self._observed(), rewards, terminated, truncated, info
 

@@ -112,6 +112,10 @@ class _Place:
     room: int
     senders: int = 0
 
+    def __post_init__(self) -> None:
+        first, last = self.first, self.first + len(self.trace.time_us) - 1
+        self.words = np.array([first, last, _AFTER[self.trace.after], first, first], np.int64)
+
 
 class KnotStore:
     """The knots of several traces in two flat arrays, which kernels read; each trace is stored once.
@@ -128,8 +132,8 @@ class KnotStore:
         self._followed: dict[int, _Place] = {}
         self._idle: dict[int, _Place] = {}
 
-    def place(self, trace: Trace, sender: int) -> tuple[int, int, int]:
-        """Store ``trace`` for ``sender`` and return (first knot, last knot, code of the behaviour after the end)."""
+    def place(self, trace: Trace, sender: int) -> NDArray[np.int64]:
+        """Store ``trace`` for ``sender``; int64[5], its knots, what follows its end, and twice the first segment."""
         left = self._followed.pop(sender, None)
         if left is not None:
             left.senders -= 1
@@ -139,7 +143,7 @@ class KnotStore:
         place.senders += 1
         self._idle.pop(id(trace), None)
         self._followed[sender] = place
-        return place.first, place.first + len(trace.time_us) - 1, _AFTER[trace.after]
+        return place.words
 
     def _stored(self, trace: Trace) -> _Place:
         knots = len(trace.time_us)

@@ -125,7 +125,7 @@ class EveryLength:
         self._senders.load_all([(row, longest, None) for row in range(len(capacities))])
         batch = self._senders.batch
         batch.senders["capacity"] = capacities
-        self._loaded = batch.senders.copy(), batch.log.copy()
+        self._loaded = batch.senders.copy()
         lengths = range(scenario.t_max + 1)
         self._best = [
             float(self._law @ [1 + integer(capacity, T, scenario.value) for T in lengths]) for capacity in capacities
@@ -139,7 +139,7 @@ class EveryLength:
     def qoi(self, policy: Policy) -> NDArray[np.float64]:
         """H for each row and T, float64[capacities, t_max + 1]."""
         batch = self._senders.batch
-        batch.senders[:], batch.log[:] = self._loaded
+        batch.senders[:] = self._loaded
         self._senders.run(policy)
         dropped_us = batch.log["dropped_us"]
         arrival_number = np.rint(dropped_us / self.scenario.period_us).astype(np.int64)

@@ -28,7 +28,7 @@ from bufgym.policies.registry import Policy, signatures
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
 from bufgym.sim.rollout import compiled_rollout, python_rollout
-from bufgym.sim.state import CARRIES, NEVER, NOT_YET, Batch
+from bufgym.sim.state import CARRIES, NOT_YET, Batch
 from bufgym.traces import Trace
 
 ROOM = 2**16
@@ -85,9 +85,6 @@ class LiveRow:
         place = int(sender["next"])
         seq = place + int(sender["first_seq"])
         self.batch.arrivals[0, place] = (seq, now_us, size_bytes, topic, x, uniform, 0.0)
-        entry = self.batch.log[0, place]
-        entry["dequeued_us"] = entry["transmitted_us"] = entry["dropped_us"] = NEVER
-        entry["limited"] = 0
         self._advance()
         return seq
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import item, kernel, records
+from bufgym.ground.kernel import JIT, item, kernel, records
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import MAX_TIME_US
 from bufgym.model.topics import MAX_TOPICS
@@ -40,6 +40,29 @@ def messages(
     arrivals["arrival_us"], arrivals["size_bytes"] = arrival_us, size_bytes
     arrivals["x"] = arrivals["seq"] if x is None else x
     return arrivals
+
+
+def even(n: int, period_us: float, jitter: float, draws: NDArray[np.float64], size_bytes: int) -> NDArray[Any]:
+    """MESSAGE[n] of one size, one a period from time 0 on; x is the frame index.
+
+    ``draws``, uniform in [0, 1), shift each message by that share of ``jitter`` periods; empty for no shift.
+    """
+    arrivals = np.empty(n, MESSAGE) if JIT else records(n, MESSAGE)
+    _fill(arrivals, period_us, jitter, draws, size_bytes)
+    return arrivals
+
+
+@kernel
+def _fill(arrivals: NDArray[Any], period_us: float, jitter: float, draws: NDArray[np.float64], size_bytes: int) -> None:
+    first_us = 0
+    for k in range(len(arrivals)):
+        shift = jitter * draws[k] if len(draws) > 0 else 0.0
+        arrival_us = int((k + shift) * period_us)
+        if k == 0:
+            first_us = arrival_us
+        message = item(arrivals, k)
+        message.seq, message.arrival_us, message.size_bytes, message.topic = k, arrival_us - first_us, size_bytes, 0
+        message.x, message.uniform, message.gain = float(k), 0.0, 0.0
 
 
 def read_only(arrivals: NDArray[Any]) -> NDArray[Any]:

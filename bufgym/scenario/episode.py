@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import check_window, whole
-from bufgym.model.link import MAX_TIME_US, Link
+from bufgym.model.link import FOREVER, MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_ack_delay
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
@@ -70,6 +70,8 @@ class Episode:
     """Time at which the robot was told that its stream ends, us, right or wrong; None if it was not told."""
     one_scene: bool = field(init=False, repr=False)
     """Whether x never falls, even across topics: only then can all messages share one queue."""
+    words: NDArray[np.int64] = field(init=False, repr=False)
+    """int64[8]: the part of ``bufgym.sim.state.SENDER`` that an episode gives."""
 
     def __post_init__(self) -> None:
         check_window(self.window)
@@ -89,6 +91,10 @@ class Episode:
                 raise BufgymError(f"encodings[{name!r}]: must be int64[{n}], the bytes of each message")
         pauses = n if self.ack_delay_us else 0
         self.link.check_reach(int(arrivals["arrival_us"][-1]), total_bytes, pauses, self.ack_delay_us)
+        ends_us = FOREVER if self.ends_us is None else self.ends_us
+        asked = self.first_decision, self.last_decision
+        link = self.window, self.ack_delay_us, ends_us, self.link.offset_us, self.link.propagation_us
+        object.__setattr__(self, "words", np.array([n, *asked, *link], np.int64))
 
     def check_one_queue(self) -> None:
         """Raise unless one queue without topics can hold the messages: x must not fall from one to the next."""

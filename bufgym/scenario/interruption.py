@@ -99,10 +99,10 @@ class Interruption:
 
     def draw_length(self, rng: np.random.Generator) -> int:
         """T, messages."""
-        while True:
+        T = self._draw_once(rng)
+        while self.lengths and T not in self._allowed:
             T = self._draw_once(rng)
-            if not self.lengths or T in self._allowed:
-                return T
+        return T
 
     def _draw_once(self, rng: np.random.Generator) -> int:
         if self.law == "fixed":
@@ -116,10 +116,11 @@ class Interruption:
 
     def episode(self, T: int) -> Episode:
         """The interruption of exactly T messages, 1 <= T <= t_max, all of ``size_bytes``."""
+        if (known := self._episodes.get(T)) is not None:
+            return known
         if not 1 <= T <= self.t_max:
             raise BufgymError(f"T = {T}: must lie between 1 and t_max = {self.t_max}")
-        if T not in self._episodes:
-            self._episodes[T] = self._of(self._table[: T + 2], T, self.max_messages * self.size_bytes)
+        self._episodes[T] = self._of(self._table[: T + 2], T, self.max_messages * self.size_bytes)
         return self._episodes[T]
 
     def _of(self, arrivals: NDArray[Any], T: int, total_bytes: int) -> Episode:

@@ -16,7 +16,7 @@ from bufgym.model.checks import whole
 from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.scenario.arrivals import messages, read_only
+from bufgym.scenario.arrivals import even, messages, read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
 from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
@@ -139,7 +139,10 @@ class Uplink:
     ) -> NDArray[Any]:
         """MESSAGE[n] of the camera, or of a fleet's robot; at these times if they are given."""
         own = beside(rng, SIZES + robot) if self.size_cv or self.sizes != EQUAL else rng
-        arrivals = messages(self._times(rng) if arrival_us is None else arrival_us, int(self.size_bytes))
+        if arrival_us is None:
+            arrivals = even(self.max_messages, 1e6 / self.rate_hz, self.jitter, self._jitter(rng), int(self.size_bytes))
+        else:
+            arrivals = messages(arrival_us, int(self.size_bytes))
         moving = self._move(arrivals, rng)
         if self.sizes != EQUAL:
             arrivals["size_bytes"] = drawn(self.sizes, len(arrivals), self.size_bytes, own, moving)
@@ -157,19 +160,14 @@ class Uplink:
         arrivals["x"] = x - x[0]
         return Moving(motion, time_us)
 
-    def _times(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        """int64[n], arrival times of the frames, us."""
-        n, period_us = self.max_messages, 1e6 / self.rate_hz
-        periods, jitter_draws = np.arange(n, dtype=np.float64), round(_JITTER_HZ * self.duration_s)
+    def _jitter(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """float64[n], uniform draws for the jitter of the frames; empty without jitter."""
+        n, jitter_draws = self.max_messages, round(_JITTER_HZ * self.duration_s)
         if self.jitter and n == jitter_draws:
-            periods += self.jitter * rng.random(n)
-        else:
-            if self.jitter:
-                periods += self.jitter * beside(rng, _TIMES).random(n)
-            skip(rng, jitter_draws)
-        arrival_us = (periods * period_us).astype(np.int64)
-        arrival_us -= arrival_us[0]
-        return arrival_us
+            return rng.random(n)
+        draws = beside(rng, _TIMES).random(n) if self.jitter else np.zeros(0)
+        skip(rng, jitter_draws)
+        return draws
 
 
 def _replayed(workload: Workload) -> NDArray[Any]:

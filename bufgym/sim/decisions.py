@@ -13,6 +13,7 @@ from bufgym.sim.state import (
     CLEARED,
     DECISION,
     HELD,
+    NEVER,
     NOTHING,
     NOTHING_WAITS,
     UNASKED,
@@ -36,6 +37,8 @@ def arrive(batch: Batch, i: int) -> int:
     arrives_us = arrival.arrival_us
     sender.now_us = arrives_us
     sender.socket = UNASKED
+    entry = at(batch.log, i, sender.next)
+    entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited, entry.gain = NEVER, NEVER, NEVER, 0, 0.0
     if sender.next > 0:
         gap_us = arrives_us - sender.previous_us
         if sender.next == 1:
@@ -49,7 +52,7 @@ def arrive(batch: Batch, i: int) -> int:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
         sender.arrival_bytes = float(arrival.size_bytes)
     if batch.several is not None and sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
-        at(batch.log, i, sender.next).limited = 1
+        entry.limited = 1
         decision = REJECT
     else:
         asked = sender.first_decision <= sender.next <= sender.last_decision

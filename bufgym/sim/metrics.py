@@ -76,7 +76,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
         qoi=weighted_qoi(senders, i, messages) if senders.topics else senders.value_of(i).information(messages["x"]),
         arrived=int(sender["next"]),
         delivered=len(messages),
-        dropped=int((log["dropped_us"] != NEVER).sum()),
+        dropped=int(sender["rejected"] + sender["evicted"]),
         in_transmission=int(sender["busy"]),
         buffered=int(sender["occupancy"]),
         longest_gap=float(np.diff(messages["x"]).max(initial=0)),

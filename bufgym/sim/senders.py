@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
-from bufgym.model.link import FOREVER, KnotStore
+from bufgym.model.link import KnotStore
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy
@@ -19,15 +19,15 @@ from bufgym.scenario import Episode
 from bufgym.sim.audit import touched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
-from bufgym.sim.state import FRESH, SENDER, beginning, new_batch
+from bufgym.sim.state import SENDER, beginning, new_batch
 
 Begun = tuple[int, Episode, np.random.Generator | None]
 """Arguments of ``Senders.load``: a sender, the episode it begins, and the generator of its uniform draws."""
 
-_EPISODE = "arrivals first_decision last_decision window ack_delay_us ends_us v_start offset_us propagation_us"
-_LINK = "first_knot last_knot after segment_now segment_finish"
-_LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in f"{_EPISODE} {_LINK}".split()])
-"""Fields of SENDER that differ from episode to episode."""
+_NAMES = list(cast(Any, SENDER.names))
+_V = _NAMES.index("v_start")
+_EPISODE, _PLACE = slice(_NAMES.index("arrivals"), _V), slice(_NAMES.index("first_knot"), _NAMES.index("first_seq"))
+"""Fields of SENDER that differ from episode to episode: ``Episode.words``, the place of V and of the link's knots."""
 
 
 class Senders:
@@ -69,7 +69,6 @@ class Senders:
         self._knots = KnotStore()
         self.batch = new_batch(n, self.capacity, max_messages, len(self.topic_table), values)
         self._rules = self.topic_table.view(np.int64)
-        self._unlogged = np.tile(FRESH, max_messages)
         when_full = int(decide_at == "overflow")
         self._beginning = beginning(
             capacity=self.capacity,
@@ -92,22 +91,21 @@ class Senders:
     def load_all(self, begun: Sequence[Begun]) -> None:
         """Call ``load`` for each of ``begun`` at once."""
         v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any sender is changed
-        batch, rows, lines = self.batch, [i for i, _, _ in begun], []
+        batch, rows, episodes, places = self.batch, np.array([i for i, _, _ in begun]), [], []
         # NumPy copies records field by field; as whole words it copies them five times as fast.
-        arrivals, log = batch.arrivals.view(np.int64), batch.log.view(np.int64)
-        for (i, episode, uniforms), v_start in zip(begun, v_starts, strict=True):
-            link, n, words = episode.link, len(episode.arrivals), episode.arrivals.view(np.int64)
-            place = self._knots.place(link.trace, i)
-            arrivals[i, : len(words)], log[i, : n * len(FRESH)] = words, self._unlogged[: n * len(FRESH)]
-            line = n, episode.first_decision, episode.last_decision, episode.window, episode.ack_delay_us
-            ends_us = FOREVER if episode.ends_us is None else episode.ends_us
-            lines.append((*line, ends_us, v_start, link.offset_us, link.propagation_us, *place, place[0], place[0]))
+        arrivals, topics, senders = (array.view(np.int64) for array in (batch.arrivals, batch.topics, batch.senders))
+        for i, episode, uniforms in begun:
+            words = episode.arrivals.view(np.int64)
+            arrivals[i, : len(words)] = words
+            episodes.append(episode.words)
+            places.append(self._knots.place(episode.link.trace, i))
             self.episodes[i], self._uniforms[i] = episode, uniforms
         self.begun[rows] += 1
-        batch.topics.view(np.int64)[rows] = self._rules
+        topics[rows] = self._rules
         beginnings = np.repeat(self._beginning[None], len(rows), 0)
-        beginnings[:, _LOADED] = np.reshape(np.array(lines, np.int64), (-1, len(_LOADED)))
-        batch.senders.view(np.int64).reshape(len(self), -1)[rows] = beginnings
+        beginnings[:, _EPISODE], beginnings[:, _V] = episodes, v_starts
+        beginnings[:, _PLACE] = places
+        senders.reshape(len(self), -1)[rows] = beginnings
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
 

@@ -43,24 +43,28 @@ SENDER = np.dtype(
         ("shows_left", np.int64),  # 1: the bytes left in the socket are shown; 0: nobody reads them
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
-        ("window", np.int64),  # n_T: most messages sent and not yet acked
-        ("ack_delay_us", np.int64),  # from the end of a message's transmission to its ack
         ("limit_at_send", np.int64),  # 1: rate limits hold back at the socket, 0: they drop at arrival
         ("limit_since_sent", np.int64),  # 1: at arrival they count from the message sent last, 0: kept last
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
-        ("v_start", np.int64),  # for one queue: where its V begins in the array of all V
-        # episode
+        # episode, as ``Episode.words`` has it
         ("arrivals", np.int64),  # messages in all
         ("first_decision", np.int64),  # arrivals from this one to
         ("last_decision", np.int64),  # this one ask for a decision
-        ("first_seq", np.int64),  # ``seq`` in the first column; 0 except in a live row, which forgets
-        ("forgotten", np.int64),  # messages dequeued before those in ``order``; 0 except in a live row
-        ("first_knot", np.int64),  # first knot of its trace, in the batch's knots
-        ("last_knot", np.int64),
-        ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
+        ("window", np.int64),  # n_T: most messages sent and not yet acked
+        ("ack_delay_us", np.int64),  # from the end of a message's transmission to its ack
+        ("ends_us", np.int64),  # when the stream ends, as far as it was told; FOREVER if it was not
         ("offset_us", np.int64),
         ("propagation_us", np.int64),
-        ("ends_us", np.int64),  # when the stream ends, as far as it was told; FOREVER if it was not
+        ("v_start", np.int64),  # for one queue: where its V begins in the array of all V
+        # its place in the batch's knots
+        ("first_knot", np.int64),  # first knot of its trace
+        ("last_knot", np.int64),
+        ("after", np.int64),  # what follows the trace's end: LOOP, HOLD or STOP
+        ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up
+        ("segment_finish", np.int64),
+        # what a live row has forgotten; 0 elsewhere
+        ("first_seq", np.int64),  # ``seq`` in the first column
+        ("forgotten", np.int64),  # messages dequeued before those in ``order``
         # clock
         ("now_us", np.int64),
         ("next", np.int64),  # the next arrival, or the one that waits for a decision
@@ -81,8 +85,6 @@ SENDER = np.dtype(
         ("finish_us", np.int64),  # time of this end; FOREVER while the link is idle
         ("began_us", np.int64),  # when the link began with the message in transmission
         ("carried_us", np.int64),  # time that the link took for all messages before it
-        ("segment_now", np.int64),  # where on the trace the clock and the socket were last looked up
-        ("segment_finish", np.int64),
         # counts
         ("dequeued", np.int64),  # messages the socket dequeued
         ("dequeued_bytes", np.int64),
@@ -146,7 +148,7 @@ class Batch(NamedTuple):
     arrivals: NDArray[Any]
     """MESSAGE[n, messages]: the episode, in order of arrival."""
     log: NDArray[Any]
-    """LOG_ENTRY[n, messages]: the fate of each message."""
+    """LOG_ENTRY[n, messages]: the fate of each message that has arrived."""
     order: NDArray[np.int64]
     """int64[n, messages]: sequence numbers in the order in which the socket dequeued them."""
     knot_us: NDArray[np.int64]
@@ -205,7 +207,3 @@ def words(dtype: np.dtype[Any], **values: float) -> NDArray[np.int64]:
 def beginning(**settings: int) -> NDArray[np.int64]:
     """int64[fields]: SENDER at the beginning of an episode: empty buffer, idle socket, nothing arrived."""
     return words(SENDER, first=1, finish_us=FOREVER, measures=1, shows_left=1, **settings)
-
-
-FRESH = words(LOG_ENTRY, dequeued_us=NEVER, transmitted_us=NEVER, dropped_us=NEVER)
-"""int64[fields]: LOG_ENTRY of a message that has not arrived yet."""

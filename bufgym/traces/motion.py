@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import kernel
 from bufgym.traces.poses import Poses, angles, longest_s, unit
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array, first_true, freeze
 
@@ -93,14 +94,31 @@ class Motion:
 
         Past the end the recording begins again and its total is carried on, so the coordinate never decreases.
         """
-        times = np.asarray(time_us, dtype=np.int64)
-        first_us, last_us = times.min(initial=0), times.max(initial=0)
-        if first_us < 0:
-            raise self._broken(f"time_us = {first_us}: must be >= 0")
-        if last_us < self.duration_us:  # the first lap: nearly always, and half the work
-            return np.asarray(np.interp(times, self.time_us, self.coordinate), dtype=np.float64)
-        laps, inside = np.divmod(times, self.duration_us)
-        return np.asarray(laps * self.total + np.interp(inside, self.time_us, self.coordinate), dtype=np.float64)
+        times = np.ascontiguousarray(time_us, np.int64)
+        coordinate = np.empty(times.shape)
+        if (negative := _coordinates(self.time_us, self.coordinate, times.ravel(), coordinate.ravel())) < 0:
+            raise self._broken(f"time_us = {negative}: must be >= 0")
+        return coordinate
+
+
+@kernel
+def _coordinates(knot_us: Int64Array, y: Float64Array, time_us: Int64Array, coordinate: Float64Array) -> int:
+    """Write ``Motion.at`` of each time into ``coordinate``; return the first negative time, or 0."""
+    duration_us, j = knot_us[-1], 0
+    for k in range(len(time_us)):
+        t, gone = time_us[k], 0.0
+        if t < 0:
+            return int(t)
+        if t >= duration_us:
+            gone = t // duration_us * y[-1]
+            t %= duration_us
+        if t >= knot_us[j + 1]:
+            j += 1  # the usual case: times in order, about as far apart as the samples
+        if not knot_us[j] <= t < knot_us[j + 1]:
+            j = np.searchsorted(knot_us, t, "right") - 1
+        slope = (y[j + 1] - y[j]) / (knot_us[j + 1] - knot_us[j])
+        coordinate[k] = gone + (slope * (t - knot_us[j]) + y[j])
+    return 0
 
 
 def motion_from_poses(

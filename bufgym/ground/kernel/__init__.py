@@ -9,10 +9,19 @@ from bufgym.ground.kernel.announce import compile_silently
 from bufgym.ground.kernel.arrays import JIT, Floats, Ints, at, item, named, prefetch, records, stretch, table
 from bufgym.ground.kernel.bundle import BundleType, bundle, local
 from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
-from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, interruptible, kernel, located
+from bufgym.ground.kernel.compile import (
+    code_for,
+    compile_for,
+    compile_here,
+    direct,
+    entry,
+    interruptible,
+    kernel,
+    located,
+)
 
 __all__ = [
-    "FOLDER", "JIT", "BundleType", "Floats", "Ints", "NotKeptError", "at", "bundle", "compile_for", "compile_here",
-    "compile_silently", "direct", "entry", "interruptible", "item", "kernel", "local", "located", "named", "only_kept",
-    "prefetch", "records", "stretch", "table",
+    "FOLDER", "JIT", "BundleType", "Floats", "Ints", "NotKeptError", "at", "bundle", "code_for", "compile_for",
+    "compile_here", "compile_silently", "direct", "entry", "interruptible", "item", "kernel", "local", "located",
+    "named", "only_kept", "prefetch", "records", "stretch", "table",
 ]  # fmt: skip

@@ -109,6 +109,10 @@ class _Direct:
         """The code for arguments of these types."""
         return self._compiled.compile(kinds)
 
+    def code(self, batch: Any) -> Any:
+        """The code for batches like this one; this object until it is compiled."""
+        return self._entries.get(batch.several, self)
+
     def _found(self, batch: Any, *arguments: Any) -> Any:
         meanwhile = self._meanwhile.get(batch.several)
         is_small = len(batch[0]) <= FEW and not _compiles_here.is_set()
@@ -136,6 +140,11 @@ def compile_here() -> None:
 def direct(compiled: Function) -> Function:
     """A ``kernel`` over a batch that Python calls for every step, without a look at the types of its arguments."""
     return cast(Function, _Direct(compiled)) if JIT else compiled
+
+
+def code_for(called: Any, batch: Any) -> Any:
+    """What to call in place of a ``direct`` kernel for batches like this one: a fifth of a microsecond less a call."""
+    return called.code(batch) if isinstance(called, _Direct) else called
 
 
 class _Located(types.WrapperAddressProtocol):

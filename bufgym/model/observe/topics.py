@@ -106,7 +106,7 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
     """
     s, capacity = len(buffer.slots), buffer.capacity
     priority, weight = largest(buffer)
-    rows[:, s:] = 0.0
+    rows[:, :] = 0.0
     count = s + 1 if arriving else s
     size_sum, gain_sum = 0.0, 0.0
     for k in range(count):
