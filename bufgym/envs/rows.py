@@ -172,7 +172,7 @@ class Rows:
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
         self.guiding = guiding(n, self.capacity, actions, fields, "several topics" if topics else "")
-        self._step: Any = self.guiding.step if self.guiding else step_rows
+        self._step: Any = None  # found at the next step
         self._acts = self.guiding if self.guiding and self.guiding.acts else None
         if self.guiding and self.guiding.sees:
             slot_fields, context_fields, fields = (), INPUT_FIELDS, None
@@ -181,7 +181,7 @@ class Rows:
         self._has_slots = self.keeps_slots or not all(name in context or own_field(name) for name in fields or [""])
         tables = slot_fields if self._has_slots else (), context_fields
         self.form = ObservationForm(observation, *tables, self.capacity, fields)
-        self.observation_space, self.handed = self.form.space, Handed(self.form)
+        self.observation_space, self._handed = self.form.space, Handed(self.form)
         self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.capacity + 2)
         self.streams, self._pool_size = cast(list[Streams | None], [None] * n), pool
         self._draw = self.from_pool(self.scenario.draw)
@@ -224,7 +224,7 @@ class Rows:
         if self.guiding:
             self.guiding.begin(rows)
         self._run(self._load(rows, episodes), NO_ACTIONS)
-        self._step = code_for(self._step, self.senders.batch)
+        self._step = None
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
             self._own_fields.write(self.senders.batch, self.output)
@@ -260,7 +260,12 @@ class Rows:
         return rows
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
+        if self._step is None:
+            self._step = self.guiding.step if self.guiding else code_for(step_rows, self.senders.batch)
         self._step(self.senders.batch, rows, actions, self.rewarded, self.output)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_step": None}  # compiled code is this process's own
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""
@@ -302,7 +307,7 @@ class Rows:
 
     def observation(self, i: int | None = None) -> Observation:
         """The present observation of all rows, as views of ``output``; of row ``i`` alone, as a copy."""
-        return self.form.of(self.output.flat) if i is None else self.handed.of(self.output.flat[i])
+        return self.form.of(self.output.flat) if i is None else self._handed.of(self.output.flat[i])
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""

@@ -96,7 +96,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self.rows = Rows(1, scenario, capacity, **options)
         self.observation_space = self.rows.observation_space
         self.action_space = self.rows.action_space
-        self._action, self._row = np.zeros(1, np.int64), self.rows.output.flat[0]
+        self._action = np.zeros(1, np.int64)
         self.rows.output.terminated[0] = True  # kept with the other arrays, so a snapshot of them has it
 
     def reset(
@@ -125,7 +125,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self._action[0] = rows.action("action", action)
         rows.step(self._action)
         ended = terminated.item()
-        return rows.handed.of(self._row), rows.rewards().item(), ended, False, rows.info(0, ended)
+        return rows.observation(0), rows.rewards().item(), ended, False, rows.info(0, ended)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[L + 2]: the actions valid now, under the name that sb3-contrib looks for."""

@@ -91,7 +91,7 @@ class Senders:
     def load_all(self, begun: Sequence[Begun]) -> None:
         """Call ``load`` for each of ``begun`` at once."""
         v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any sender is changed
-        batch, rows, episodes, places = self.batch, np.array([i for i, _, _ in begun]), [], []
+        batch, rows, episodes, places = self.batch, np.array([i for i, _, _ in begun], np.int64), [], []
         # NumPy copies records field by field; as whole words it copies them five times as fast.
         arrivals, topics, senders = (array.view(np.int64) for array in (batch.arrivals, batch.topics, batch.senders))
         for i, episode, uniforms in begun:
@@ -103,8 +103,8 @@ class Senders:
         self.begun[rows] += 1
         topics[rows] = self._rules
         beginnings = np.repeat(self._beginning[None], len(rows), 0)
-        beginnings[:, _EPISODE], beginnings[:, _V] = episodes, v_starts
-        beginnings[:, _PLACE] = places
+        if begun:
+            beginnings[:, _EPISODE], beginnings[:, _V], beginnings[:, _PLACE] = episodes, v_starts, places
         senders.reshape(len(self), -1)[rows] = beginnings
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
