@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.model.qoi import information
+from bufgym.ground.kernel import item, kernel
+from bufgym.model.qoi import value
 from bufgym.scenario import Episode
 from bufgym.sim.state import NEVER, Batch
 
@@ -22,49 +23,83 @@ LOG = "not every message was sent, dropped or queued exactly once"
 TOPIC = "a topic's rules are not as they were"
 QOI = "H is not that of the messages that were received"
 
-_MESSAGE = ("seq", "arrival_us", "size_bytes", "topic", "x", "uniform")
-_RULES = ("priority", "weight", "period_us", "limit", "no_drop", "deadline_us", "v_start")
+_FAULTS = ("", ARRIVAL, QUEUED, BYTES, LOG, TOPIC, QOI)
+_ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC, _QOI = range(1, len(_FAULTS))
 _ROUNDING = 1e-9
 """Tolerance: H is added up in another order here."""
 
 
 def touched(batch: Batch, i: int, episode: Episode, topic_table: NDArray[Any]) -> str:
     """What does not agree with the episode or the topics' rules in sender ``i``'s finished run; empty if all does."""
-    sender, arrivals = np.asarray(batch.senders)[i], np.asarray(episode.arrivals)
-    log = np.asarray(batch.log[i])[: len(arrivals)]
-    if not _same(batch.arrivals[i, : len(arrivals)], arrivals, _MESSAGE):
-        return ARRIVAL
-    dequeued, dropped = log["dequeued_us"] != NEVER, log["dropped_us"] != NEVER
-    if (dequeued & (dropped | (log["dequeued_us"] < arrivals["arrival_us"]))).any():
-        return LOG
-    queued = np.asarray(batch.slots[i])[sender["first"] : sender["first"] + sender["occupancy"]]
-    seq = queued["seq"]
-    if not ((np.diff(seq, prepend=-1) > 0) & (seq < len(arrivals))).all():
-        return QUEUED
-    if not _same(queued, arrivals[seq], _MESSAGE) or (dequeued | dropped)[seq].any():
-        return QUEUED
-    if queued["size_bytes"].sum() != sender["backlog_bytes"]:
-        return BYTES
+    rows = batch.slots[i], batch.arrivals[i], batch.log[i], batch.order[i], batch.topics[i]
+    return _FAULTS[_fault(batch.senders[i : i + 1], *rows, batch.v, episode.arrivals, topic_table)]
+
+
+@kernel
+def _fault(
+    senders: NDArray[Any],
+    slots: NDArray[Any],
+    held: NDArray[Any],
+    log: NDArray[Any],
+    order: NDArray[np.int64],
+    topics: NDArray[Any],
+    v: NDArray[np.float64],
+    arrivals: NDArray[Any],
+    rules: NDArray[Any],
+) -> int:
+    """The fault that is found first, as a place in ``_FAULTS``; 0 for none. ``arrivals`` and ``rules`` are as given."""
+    sender, n = item(senders, 0), len(arrivals)
+    sent, dropped = 0, 0
+    for k in range(n):
+        if not _same(item(held, k), item(arrivals, k)):
+            return _ARRIVAL
+        entry = item(log, k)
+        if entry.dequeued_us != NEVER:
+            sent += 1
+            if entry.dropped_us != NEVER or entry.dequeued_us < item(arrivals, k).arrival_us:
+                return _LOG
+        if entry.dropped_us != NEVER:
+            dropped += 1
+    before, queued_bytes = -1, 0
+    for k in range(sender.first, sender.first + sender.occupancy):
+        message = slots[k]
+        if not before < message.seq < n or not _same(message, item(arrivals, message.seq)):
+            return _QUEUED
+        before = message.seq
+        if item(log, before).dequeued_us != NEVER or item(log, before).dropped_us != NEVER:
+            return _QUEUED
+        queued_bytes += message.size_bytes
+    if queued_bytes != sender.backlog_bytes:
+        return _BYTES
     # Each event writes one entry: as many entries as events means that no two were about one message.
-    sent, gone = dequeued.sum(), dropped.sum()
-    counted = sent == sender["dequeued"] and gone == sender["evicted"] + sender["rejected"]
-    if not counted or sent + gone + len(queued) != sender["next"]:
-        return LOG
-    if not _same(batch.topics[i], topic_table, _RULES):
-        return TOPIC
-    gained = _gained(batch, i, arrivals[batch.order[i, : sender["credited"]]])
-    return QOI if abs(gained - sender["delivered_gain"]) > _ROUNDING * max(1.0, gained) else ""
+    if sent != sender.dequeued or dropped != sender.evicted + sender.rejected:
+        return _LOG
+    if sent + dropped + sender.occupancy != sender.next:
+        return _LOG
+    gained = 0.0
+    for t in range(len(topics)):
+        now, given = item(topics, t), item(rules, t)
+        if now.priority != given.priority or now.weight != given.weight or now.no_drop != given.no_drop:
+            return _TOPIC
+        if now.period_us != given.period_us or now.limit != given.limit or now.deadline_us != given.deadline_us:
+            return _TOPIC
+        if now.v_start != given.v_start:
+            return _TOPIC
+        several, received, x = len(topics) > 1, 0, 0.0
+        own_v = v[given.v_start if several else sender.v_start :]
+        for k in range(sender.credited):
+            message = item(arrivals, order[k])
+            if several and message.topic != t:
+                continue
+            if received > 0:
+                gained += (given.weight if several else 1.0) * value(own_v, message.x - x)
+            received, x = received + 1, message.x
+    return _QOI if abs(gained - sender.delivered_gain) > _ROUNDING * max(1.0, gained) else 0
 
 
-def _gained(batch: Batch, i: int, messages: NDArray[Any]) -> float:
-    """Gain of sender ``i`` from the received ``messages``, without the 1 of each topic."""
-    sender, topics, x = np.asarray(batch.senders)[i], np.asarray(batch.topics[i]), messages["x"]
-    parts = [(1.0, sender["v_start"], x)]
-    if len(topics) > 1:
-        parts = [(row["weight"], row["v_start"], x[messages["topic"] == k]) for k, row in enumerate(topics)]
-    return sum(w * max(0.0, information(batch.v[start:], np.ascontiguousarray(x)) - 1) for w, start, x in parts)
-
-
-def _same(a: NDArray[Any], b: NDArray[Any], fields: tuple[str, ...]) -> bool:
-    """Whether the records are equal in these fields."""
-    return all(np.array_equal(a[field], b[field]) for field in fields)
+@kernel
+def _same(a: Any, b: Any) -> bool:
+    """Whether these messages agree in all that an episode gives."""
+    if a.seq != b.seq or a.arrival_us != b.arrival_us or a.size_bytes != b.size_bytes or a.topic != b.topic:
+        return False
+    return bool(a.x == b.x and a.uniform == b.uniform)
