@@ -7,20 +7,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.envs.step import StepOutput, advance, decision_of, write_observation, write_rewards, write_state
+from bufgym.envs.step import Guide
 from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.kernel import bundle, direct, kernel, local, stretch
 from bufgym.model.observe import Field
-from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
-from bufgym.sim.decisions import decide
-from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, Batch
-from bufgym.sim.view import arrival_of, view
+from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, linear
 
 GUIDED = "guided"
 ACTIONS = ("slots", GUIDED)
@@ -29,62 +25,6 @@ INPUT_FIELDS = tuple(
     Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
 )
 """Fields observed with ``fields="guided"``."""
-
-
-@bundle
-class Guide(NamedTuple):
-    """What n rows need for guided steps; the kernel writes the memory in place.
-
-    Fields:
-        memory: float64[n, entries], the rule's memory.
-        base: float64[numbers], the plain rule's.
-        outputs: float64[n, outputs], what the present actions add to them.
-        acts: 1 if actions are guided.
-        sees: 1 if the observation holds the rule's inputs alone.
-    """
-
-    memory: NDArray[np.float64]
-    base: NDArray[np.float64]
-    outputs: NDArray[np.float64]
-    acts: int
-    sees: int
-
-
-@direct
-@kernel
-def step_guided(
-    batch: Batch,
-    rows: NDArray[np.int64],
-    actions: NDArray[np.int64],
-    rewarded: NDArray[np.float64],
-    output: StepOutput,
-    guide: Guide,
-) -> None:
-    """Do what ``step_rows`` does, by the rule with the numbers of ``guide.outputs`` if actions are guided."""
-    begins = len(actions) == 0
-    for i in rows:
-        sender = batch.senders[i]
-        asks = sender.waiting
-        if not begins and asks == ARRIVAL_WAITS:
-            if guide.acts == 1:
-                buffer, arrival = local(view(batch, i)), arrival_of(batch, i)
-                decide(batch, i, follow(buffer, arrival, guide.memory[i], guide.base, guide.outputs[i]))
-            else:
-                decide(batch, i, decision_of(actions[i], sender.capacity))
-        if begins or asks != NOTHING_WAITS:
-            advance(batch, i)
-        write_rewards(batch, i, begins, rewarded, output)
-        waits = sender.waiting == ARRIVAL_WAITS
-        if guide.sees == 0:
-            write_observation(batch, i, not waits, output)
-        else:
-            write_state(batch, i, not waits, output)
-        if waits:
-            buffer, arrival = local(view(batch, i)), arrival_of(batch, i)
-            recall(buffer, arrival, guide.memory[i], guide.base)
-            if guide.sees == 1:
-                row = stretch(output.flat, i, 0, N_INPUTS)
-                inputs(buffer, arrival, guide.memory[i], guide.base, row)
 
 
 def is_guided(actions: str, fields: Any, why_not: str = "") -> bool:
@@ -104,24 +44,20 @@ class Guiding:
     def __init__(self, n: int, capacity: int, actions: str, fields: str | Sequence[str] | None) -> None:
         self.acts, self.sees = actions == GUIDED, fields == GUIDED
         memory = linear(GUIDED, np.zeros((N_OUTPUTS, N_INPUTS))).new_memory(n, capacity)
-        self._guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(self.acts), int(self.sees))
+        self.guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(self.acts), int(self.sees))
         self._nothing = np.zeros(n, np.int64)
         self.action_space = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)
 
     def begin(self, rows: NDArray[np.int64]) -> None:
         """Forget all in ``rows``, where episodes begin."""
-        self._guide.memory[rows] = 0.0
-
-    def step(self, batch: Batch, rows: Any, actions: Any, rewarded: Any, output: StepOutput) -> None:
-        """``step_guided`` with the arguments of ``step_rows``."""
-        step_guided(batch, rows, actions, rewarded, output, self._guide)
+        self.guide.memory[rows] = 0.0
 
     def take(self, name: str, actions: Any) -> NDArray[np.int64]:
         """Keep the actions, float[outputs] of the one row or float[n, outputs], for the next step.
 
         Returns what the kernels take for actions.
         """
-        outputs, numbers = self._guide.outputs, np.asarray(actions)
+        outputs, numbers = self.guide.outputs, np.asarray(actions)
         shape = outputs.shape if name == "actions" else outputs.shape[1:]
         if numbers.dtype.kind not in "iuf" or numbers.shape != shape:
             known = ", ".join(output.name for output in OUTPUTS)

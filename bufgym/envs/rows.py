@@ -172,6 +172,7 @@ class Rows:
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
         self.guiding = guiding(n, self.capacity, actions, fields, "several topics" if topics else "")
+        self._guide = self.guiding and self.guiding.guide
         self._step: Any = None  # found at the next step
         self._acts = self.guiding if self.guiding and self.guiding.acts else None
         if self.guiding and self.guiding.sees:
@@ -261,8 +262,8 @@ class Rows:
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
         if self._step is None:
-            self._step = self.guiding.step if self.guiding else code_for(step_rows, self.senders.batch)
-        self._step(self.senders.batch, rows, actions, self.rewarded, self.output)
+            self._step = code_for(step_rows, self.senders.batch, self._guide)
+        self._step(self.senders.batch, rows, actions, self.rewarded, self.output, self._guide)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_step": None}  # compiled code is this process's own

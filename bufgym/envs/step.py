@@ -27,6 +27,7 @@ from bufgym.model.observe import (
     observe_topic_context,
     observe_topic_slots,
 )
+from bufgym.policies.guided import N_INPUTS, follow, inputs, recall
 from bufgym.sim.decisions import answer_send, can_evict, can_hold, can_reject, can_send, decide, has_room
 from bufgym.sim.rules import age_until
 from bufgym.sim.shared_link import Shares, next_in_cell
@@ -74,6 +75,25 @@ class StepOutput(NamedTuple):
     invalid: NDArray[np.int64]
     terminated: NDArray[np.bool_]
     slots: NDArray[np.int64]
+
+
+@bundle
+class Guide(NamedTuple):
+    """What n rows need for guided steps; the kernel writes the memory in place.
+
+    Fields:
+        memory: float64[n, entries], the rule's memory.
+        base: float64[numbers], the plain rule's.
+        outputs: float64[n, outputs], what the present actions add to them.
+        acts: 1 if actions are guided.
+        sees: 1 if the observation holds the rule's inputs alone.
+    """
+
+    memory: NDArray[np.float64]
+    base: NDArray[np.float64]
+    outputs: NDArray[np.float64]
+    acts: int
+    sees: int
 
 
 @kernel
@@ -206,6 +226,32 @@ def write_mask(batch: Batch, i: int, action_mask: NDArray[np.int8]) -> None:
     action_mask[i, capacity + 1] = has_room(batch, i)
 
 
+# --- guided rows -----------------------------------------------------------------------------------------------------
+
+
+@kernel
+def guided_decision(batch: Batch, i: int, action: int, guide: Guide) -> int:
+    """The decision of the rule with the numbers of ``guide.outputs``, or of ``action`` if actions are not guided."""
+    if guide.acts == 0:
+        return decision_of(action, batch.senders[i].capacity)
+    return follow(local(view(batch, i)), arrival_of(batch, i), guide.memory[i], guide.base, guide.outputs[i])
+
+
+@kernel
+def write_guided(batch: Batch, i: int, ended: bool, output: StepOutput, guide: Guide) -> None:
+    """Let the rule learn of what happened, and write row ``i``'s state and observation, the rule's inputs if seen."""
+    if guide.sees == 0:
+        write_observation(batch, i, ended, output)
+    else:
+        write_state(batch, i, ended, output)
+    if ended:
+        return
+    buffer, arrival = local(view(batch, i)), arrival_of(batch, i)
+    recall(buffer, arrival, guide.memory[i], guide.base)
+    if guide.sees == 1:
+        inputs(buffer, arrival, guide.memory[i], guide.base, stretch(output.flat, i, 0, N_INPUTS))
+
+
 # --- rows with a link each -------------------------------------------------------------------------------------------
 
 
@@ -226,11 +272,13 @@ def step_rows(
     actions: NDArray[np.int64],
     rewarded: NDArray[np.float64],
     output: StepOutput,
+    guide: Guide | None,
 ) -> None:
     """Take one decision in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
-    begins with zeros. A row without a decision due has ended, or asked for none; it reports its end.
+    begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``guide`` is None
+    where nothing is guided; Numba compiles each case separately.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
@@ -243,13 +291,19 @@ def step_rows(
         sender = batch.senders[i]
         asks = sender.waiting
         if not begins and asks == ARRIVAL_WAITS:
-            decide(batch, i, decision_of(actions[i], sender.capacity))
+            if guide is None:
+                decide(batch, i, decision_of(actions[i], sender.capacity))
+            else:
+                decide(batch, i, guided_decision(batch, i, actions[i], guide))
         if batch.several is not None and not begins and asks == SOCKET_WAITS:
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
         if begins or asks != NOTHING_WAITS:
             advance(batch, i)
         write_rewards(batch, i, begins, rewarded, output)
-        write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
+        if guide is None:
+            write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
+        else:
+            write_guided(batch, i, sender.waiting == NOTHING_WAITS, output, guide)
 
 
 # --- rows that share the link of a cell ------------------------------------------------------------------------------
