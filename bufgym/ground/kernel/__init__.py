@@ -6,13 +6,31 @@ check the compiled code against its own text.
 """
 
 from bufgym.ground.kernel.announce import compile_silently
-from bufgym.ground.kernel.arrays import JIT, Floats, Ints, at, item, named, prefetch, records, stretch, table
-from bufgym.ground.kernel.bundle import BundleType, bundle, local
-from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
-from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, interruptible, kernel, located
+from bufgym.ground.kernel.arrays import JIT, Floats, Ints, at, item, local, named, prefetch, records, stretch, table
+from bufgym.ground.kernel.interrupt import interruptible
+from bufgym.ground.kernel.trial import works
+
+if works():
+    from bufgym.ground.kernel.bundle import bundle, bundle_type
+    from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
+    from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, kernel, located
+else:
+    from bufgym.ground.kernel.plain import (  # type: ignore[assignment]
+        FOLDER,
+        NotKeptError,
+        bundle,
+        bundle_type,
+        compile_for,
+        compile_here,
+        direct,
+        entry,
+        kernel,
+        located,
+        only_kept,
+    )
 
 __all__ = [
-    "FOLDER", "JIT", "BundleType", "Floats", "Ints", "NotKeptError", "at", "bundle", "compile_for", "compile_here",
+    "FOLDER", "JIT", "Floats", "Ints", "NotKeptError", "at", "bundle", "bundle_type", "compile_for", "compile_here",
     "compile_silently", "direct", "entry", "interruptible", "item", "kernel", "local", "located", "named", "only_kept",
     "prefetch", "records", "stretch", "table",
 ]  # fmt: skip

@@ -18,10 +18,9 @@ from numba import extending, types
 from numba.core import cgutils, datamodel
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 
-from bufgym.ground.kernel.arrays import JIT
+from bufgym.ground.kernel.arrays import local
 
 Class = TypeVar("Class", bound=type)
-Bundle = TypeVar("Bundle")
 _Type: Any = types.Type
 _Template: Any = AttributeTemplate
 _Model: Any = datamodel.models.PrimitiveModel
@@ -53,9 +52,13 @@ class BundleType(_Type):  # type: ignore[misc]  # Numba has no types
 
 def bundle(named_tuple: Class) -> Class:
     """Class decorator: kernels take this named tuple by its address."""
-    if JIT:
-        _extending.typeof_impl.register(named_tuple)(_type_of)
+    _extending.typeof_impl.register(named_tuple)(_type_of)
     return named_tuple
+
+
+def bundle_type(named_tuple: type, kinds: tuple[Any, ...]) -> Any:
+    """Numba's type of a bundle whose fields have types ``kinds``."""
+    return BundleType(named_tuple, kinds)
 
 
 def _type_of(value: Any, _: Any) -> BundleType:
@@ -89,14 +92,6 @@ def _from_python(kind: BundleType, value: Any, c: Any) -> Any:
     whole = c.unbox(kind.whole, value)
     address = cast(Any, cgutils).alloca_once_value(c.builder, whole.value)
     return _extending.NativeValue(address, is_error=whole.is_error, cleanup=whole.cleanup)
-
-
-def local(given: Bundle) -> Bundle:
-    """Return ``given``; in a compiled kernel, make its fields the kernel's own variables.
-
-    A kernel that makes a bundle passes on ``local(Bundle(...))``.
-    """
-    return given
 
 
 def _local_type(context: Any) -> Any:

@@ -10,11 +10,12 @@ from __future__ import annotations
 from typing import Any, cast
 
 from llvmlite import binding
-from numba import types
-from numba.core import codegen, compiler, ir, ir_utils, untyped_passes
+from numba.core import codegen, compiler, ir
 from numba.core.compiler_machinery import FunctionPass, register_pass
 
-from bufgym.ground.kernel.bundle import BundleType, local
+from bufgym.ground.kernel.arrays import local
+from bufgym.ground.kernel.bundle import BundleType
+from bufgym.ground.kernel.none_fields import NoneFields, with_none_fields
 
 PART = "part"
 """Marks a part among the code that is kept on disk."""
@@ -80,32 +81,6 @@ def set_environments(result: Any) -> None:
         result.codegen.set_env(environment.env_name, environment)
 
 
-@cast(Any, register_pass)(mutates_CFG=True, analysis_only=False)
-class _NoneFields(_Pass):  # type: ignore[misc]
-    """Turns reads of bundles' fields that are None into None."""
-
-    _name = "bufgym_none_fields"
-
-    def __init__(self) -> None:
-        super().__init__()
-
-    def run_pass(self, state: Any) -> bool:
-        """Change the code of one kernel in place; return whether it changed."""
-        changed = False
-        for block in state.func_ir.blocks.values():
-            for statement in block.find_insts(ir.Assign):
-                read = statement.value
-                if not (isinstance(read, ir.Expr) and cast(Any, read).op == "getattr"):
-                    continue
-                source = cast(Any, ir_utils).guard(ir_utils.get_definition, state.func_ir, read.value)
-                kind = state.args[source.index] if isinstance(source, ir.Arg) else None
-                if isinstance(kind, BundleType) and kind.kind_of(read.attr) is types.none:
-                    statement.value = cast(Any, ir).Const(None, statement.loc)
-                    state.func_ir._definitions[statement.target.name] = [statement.value]
-                    changed = True
-        return changed
-
-
 @cast(Any, register_pass)(mutates_CFG=False, analysis_only=False)
 class _LocalBundles(_Pass):  # type: ignore[misc]
     """Puts the fields of bundles that come from Python among the kernel's own variables.
@@ -154,12 +129,12 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
         self.state.library.enable_object_caching()
 
     def define_pipelines(self) -> list[Any]:
-        """Numba's own passes, with ``_NoneFields`` before all that look at types."""
+        """Numba's own passes, and those of this package."""
         (passes,) = super().define_pipelines()
-        passes.add_pass_after(_NoneFields, untyped_passes.IRProcessing)
+        passes = with_none_fields(passes)
         if self.is_whole:
-            passes.add_pass_after(_LocalBundles, _NoneFields)
-        passes.finalize()
+            passes.add_pass_after(_LocalBundles, NoneFields)
+            passes.finalize()
         return [passes]
 
 

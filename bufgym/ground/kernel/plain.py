@@ -1,0 +1,82 @@
+"""Kernels by Numba's ``njit`` alone: where compilation is off, or Numba's private parts are not as ``compile`` needs.
+
+Results are equal bit for bit. Compiling takes longer, and again in each process, as no code is kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+from numba import extending, types
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+
+from bufgym.ground.kernel.arrays import JIT, at, item, local, prefetch, stretch, table
+from bufgym.ground.kernel.none_fields import with_none_fields
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Class = TypeVar("Class", bound=type)
+_Compiler: Any = CompilerBase
+
+FOLDER = ""
+"""No code is kept."""
+
+
+class NotKeptError(Exception):
+    """Never raised here."""
+
+
+only_kept = contextlib.nullcontext
+
+
+class _PlainCompiler(_Compiler):  # type: ignore[misc]
+    def define_pipelines(self) -> list[Any]:
+        return [with_none_fields(cast(Any, DefaultPassBuilder).define_nopython_pipeline(self.state))]
+
+
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "pipeline_class": _PlainCompiler}
+
+if JIT:
+    for _one in (at, item, local, prefetch, stretch, table):
+        cast(Any, extending).register_jitable(_one)
+
+
+def kernel(function: Function) -> Function:
+    """Compile ``function`` on its first call, for the types of its arguments."""
+    return cast(Function, cast(Any, numba).njit(**_OPTIONS)(function))
+
+
+def compile_for(signature: Any, function: Function) -> Function:
+    """Compile ``function`` now for exactly ``signature``, so that it can be passed to other kernels as a value."""
+    return cast(Function, cast(Any, numba).njit(signature, **_OPTIONS)(function) if JIT else function)
+
+
+def direct(compiled: Function) -> Function:
+    """``compiled``."""
+    return compiled
+
+
+def entry(compiled: Any) -> Any:
+    """``compiled``."""
+    return compiled
+
+
+def located(signature: Any, compiled: Any) -> Any:
+    """``compiled``."""
+    return compiled
+
+
+def compile_here() -> None:
+    """Nothing: every call compiles in this process."""
+
+
+def bundle(named_tuple: Class) -> Class:
+    """``named_tuple``, passed by value."""
+    return named_tuple
+
+
+def bundle_type(named_tuple: type, kinds: tuple[Any, ...]) -> Any:
+    """Numba's type of this named tuple, with fields of types ``kinds``."""
+    return cast(Any, types).BaseTuple.from_types(kinds, named_tuple)
