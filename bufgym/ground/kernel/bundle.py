@@ -112,8 +112,10 @@ def _stored(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return cast(Any, cgutils).alloca_once_value(builder, value)
 
 
-_extending.type_callable(local)(_local_type)
-_extending.lower_builtin(local, BundleType)(_copied)
-_extending.lower_builtin(local, cast(Any, types).BaseNamedTuple)(_stored)
-_extending.lower_getattr_generic(BundleType)(_field)
-_extending.unbox(BundleType)(_from_python)
+def teach() -> None:
+    """Tell Numba."""
+    _extending.type_callable(local)(_local_type)
+    _extending.lower_builtin(local, BundleType)(_copied)
+    _extending.lower_builtin(local, cast(Any, types).BaseNamedTuple)(_stored)
+    _extending.lower_getattr_generic(BundleType)(_field)
+    _extending.unbox(BundleType)(_from_python)
