@@ -1,7 +1,7 @@
 """bufgym's own speed: its environments and its rollouts, beside a bare kernel that does the job of one step.
 
 Every figure is the best of several repeats in time of the processor, because other work on the machine can only slow a
-repeat down, and each repeat times the ``yardstick`` too. Their ratio says more than either on a shared machine. Actions are drawn beforehand,
+repeat down. Each repeat times the ``yardstick`` too: their ratio says more than either. Actions are drawn beforehand,
 uniform among the valid ones, by playing the same seeded episodes once. So the timed loop holds only the environment's
 own work and its resets.
 """

@@ -3,6 +3,11 @@
 By default Numba optimises every kernel together with all that it calls, and makes machine code of it. The innermost of
 a hundred nested kernels is then optimised a hundred times. Here the code of a *part*, a kernel inside another, stays as
 the translation made it. The kernel that Python calls links its parts, inlines them and optimises the *whole*, once.
+
+What each part pays, switched off alone (one run each on a busy machine, time of the processor; base 5.6 s to compile
+the step of ``Uplink-v0``, 195 ns a step with n = 1024). Parts neither optimised nor made into machine code: 2.6 s.
+No entry from Python into parts: about 3 s. Bundles by address: about 0.6 to 1.1 s. Bundles as local variables: about 17
+ns, within what such runs differ by. Fetching ahead: about 30 ns. ``njit`` alone, with references counted: 15.5 s.
 """
 
 from __future__ import annotations
@@ -66,15 +71,6 @@ class PartLibrary(_Library):  # type: ignore[misc]
         return library
 
 
-class WholeLibrary(_Library):  # type: ignore[misc]
-    """Code of a kernel that Python calls, with all its parts."""
-
-    def _optimize_final_module(self) -> None:
-        """Optimise once. Numba does so twice, to find pairs of reference counts; kernels count no references."""
-        passes, builder = self._codegen._module_pass_manager()
-        passes.run(self._final_module, builder)
-
-
 def set_environments(result: Any) -> None:
     """Tell the machine code of ``result`` where the Python objects are that its parts use, such as texts to print."""
     for environment in result._find_referenced_environments():
@@ -118,7 +114,7 @@ class _LocalBundles(_Pass):  # type: ignore[misc]
 class WholeCompiler(_Compiler):  # type: ignore[misc]
     """Compiler of the kernels that Python calls."""
 
-    library: Any = WholeLibrary
+    library: Any = _Library
     is_whole = True
 
     def __init__(
