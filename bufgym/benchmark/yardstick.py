@@ -50,7 +50,7 @@ class Bare(NamedTuple):
         state = np.zeros((n, 6), np.int64)
         state[:, SEED] = np.arange(n)
         link = np.random.default_rng(0).integers(100_000, 4_000_000, (n, KNOTS))
-        return cls(*places, np.zeros((n, 3), np.float32), state, link)
+        return cls(places[0], places[1], places[2], places[3], np.zeros((n, 3), np.float32), state, link)
 
 
 @kernel

@@ -6,7 +6,7 @@ the translation made it. The kernel that Python calls links its parts, inlines t
 
 What each part pays, switched off alone (one run each on a busy machine, time of the processor; base 5.6 s to compile
 the step of ``Uplink-v0``, 195 ns a step with n = 1024). Parts neither optimised nor made into machine code: 2.6 s.
-No entry from Python into parts: about 3 s. Bundles by address: about 0.6 to 1.1 s. Bundles as local variables: about 17
+No entry from Python into parts: about 3 s. Bundles by address: 0.6 to 2.0 s. Bundles as local variables: about 17
 ns, within what such runs differ by. Fetching ahead: about 30 ns. ``njit`` alone, with references counted: 15.5 s.
 """
 
