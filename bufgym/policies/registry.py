@@ -122,6 +122,8 @@ class Policy:
     """(episode, L, B, V) -> memory, for policies that know the future, as no robot does."""
     reads_rate: bool = False
     """Whether a built-in policy reads the link's rate, which takes time to measure. Others may always read it."""
+    reads_left: bool = False
+    """The same for the bytes left in the socket."""
     client: ClientSettings = ClientSettings()
     """How the program around it sends."""
     for_topics: bool = False
