@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import Ints, bundle, kernel
+from bufgym.ground.kernel import Ints, kernel
 
 Reals = NDArray[np.float32]
 
@@ -26,7 +26,6 @@ STEEP = np.float32(3)
 SECOND, STRIDE, KEPT = np.float32(1e-6), np.float32(0.01), np.float32(0.95)
 
 
-@bundle
 class Bare(NamedTuple):
     """n queues of L places. Place 0 has the message that left last, then the s queued ones, the newcomer, and the next
     message, which is expected to be as far from the newcomer as the newcomer is from the message before it."""

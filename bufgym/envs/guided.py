@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.step import StepOutput, advance, decision_of, write_observation, write_rewards, write_state
 from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.kernel import bundle, direct, kernel, local, stretch
+from bufgym.ground.kernel import direct, kernel, stretch
 from bufgym.model.observe import Field
 from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
 from bufgym.sim.decisions import decide
@@ -31,7 +31,6 @@ INPUT_FIELDS = tuple(
 """Fields observed with ``fields="guided"``."""
 
 
-@bundle
 class Guide(NamedTuple):
     """What n rows need for guided steps; the kernel writes the memory in place.
 
@@ -67,7 +66,7 @@ def step_guided(
         asks = sender.waiting
         if not begins and asks == ARRIVAL_WAITS:
             if guide.acts == 1:
-                buffer, arrival = local(view(batch, i)), arrival_of(batch, i)
+                buffer, arrival = view(batch, i), arrival_of(batch, i)
                 decide(batch, i, follow(buffer, arrival, guide.memory[i], guide.base, guide.outputs[i]))
             else:
                 decide(batch, i, decision_of(actions[i], sender.capacity))
@@ -80,7 +79,7 @@ def step_guided(
         else:
             write_state(batch, i, not waits, output)
         if waits:
-            buffer, arrival = local(view(batch, i)), arrival_of(batch, i)
+            buffer, arrival = view(batch, i), arrival_of(batch, i)
             recall(buffer, arrival, guide.memory[i], guide.base)
             if guide.sees == 1:
                 row = stretch(output.flat, i, 0, N_INPUTS)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import bundle, direct, kernel, local, prefetch, stretch, table
+from bufgym.ground.kernel import direct, kernel, prefetch, stretch, table
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.link import FOREVER
 from bufgym.model.observe import (
@@ -48,7 +48,6 @@ _AHEAD = 8
 """Rows to prefetch ahead: far enough for memory to answer in time, near enough for the answer to be in cache still."""
 
 
-@bundle
 class StepOutput(NamedTuple):
     """Results of a step of n rows; the kernels write these arrays in place.
 
@@ -160,7 +159,7 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
     if not write_state(batch, i, ended, output):
         return
     sender = batch.senders[i]
-    buffer, entries = local(view(batch, i)), (sender.capacity + 1) * output.slots[0]
+    buffer, entries = view(batch, i), (sender.capacity + 1) * output.slots[0]
     if batch.several is not None:
         arriving = sender.waiting == ARRIVAL_WAITS
         # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.

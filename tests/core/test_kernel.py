@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import announce, bundle, cache, direct, kernel, local
+from bufgym.ground.kernel import announce, cache, direct, kernel
 from tests.conftest import COMPILED
 
 TALE = """
@@ -47,7 +47,6 @@ def run(tmp_path: Path, before: str = "", source: str = TALE, **environment: str
     return done
 
 
-@bundle
 class Numbers(NamedTuple):
     """An array, which may be marked."""
 
@@ -145,9 +144,8 @@ def test_a_direct_call_is_the_call() -> None:
 
 SMALL = """
 from typing import Any, NamedTuple
-from bufgym.ground.kernel import bundle, direct, kernel
+from bufgym.ground.kernel import direct, kernel
 
-@bundle
 class Rows(NamedTuple):
     cells: Any
     several: bool | None = None
@@ -226,7 +224,7 @@ def test_a_bundle_made_in_a_kernel_is_handed_on_by_address() -> None:
 
     @kernel
     def twice(numbers: NDArray[np.float64]) -> float:
-        made = local(Numbers(numbers[1:], None))
+        made = Numbers(numbers[1:], None)
         numbers = numbers[:1]
         return doubled(made) + doubled(made) + numbers[0]
 

@@ -6,20 +6,17 @@ check the compiled code against its own text.
 """
 
 from bufgym.ground.kernel.announce import compile_silently
-from bufgym.ground.kernel.arrays import JIT, Floats, Ints, at, item, local, named, prefetch, records, stretch, table
+from bufgym.ground.kernel.arrays import JIT, Floats, Ints, at, item, named, prefetch, records, stretch, table
 from bufgym.ground.kernel.interrupt import interruptible
 from bufgym.ground.kernel.trial import works
 
 if works():
-    from bufgym.ground.kernel.bundle import bundle, bundle_type
     from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
     from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, kernel, located
 else:
     from bufgym.ground.kernel.plain import (  # type: ignore[assignment]
         FOLDER,
         NotKeptError,
-        bundle,
-        bundle_type,
         compile_for,
         compile_here,
         direct,
@@ -30,7 +27,7 @@ else:
     )
 
 __all__ = [
-    "FOLDER", "JIT", "Floats", "Ints", "NotKeptError", "at", "bundle", "bundle_type", "compile_for", "compile_here",
-    "compile_silently", "direct", "entry", "interruptible", "item", "kernel", "local", "located", "named", "only_kept",
+    "FOLDER", "JIT", "Floats", "Ints", "NotKeptError", "at", "compile_for", "compile_here",
+    "compile_silently", "direct", "entry", "interruptible", "item", "kernel", "located", "named", "only_kept",
     "prefetch", "records", "stretch", "table",
 ]  # fmt: skip

@@ -36,17 +36,6 @@ def named(arrays: Bundle) -> Bundle:
     return made
 
 
-Given = TypeVar("Given")
-
-
-def local(given: Given) -> Given:
-    """Return ``given``; in a compiled kernel, make its fields the kernel's own variables.
-
-    A kernel that makes a bundle passes on ``local(Bundle(...))``.
-    """
-    return given
-
-
 def item(array: NDArray[Any], k: int) -> Any:
     """``array[k]``."""
     return array[k]

@@ -28,7 +28,7 @@ TOOLS = (
     hashlib.sha256(
         b"".join(
             (_HERE / f"{name}.py").read_bytes()
-            for name in ("arrays", "bundle", "compile", "indexing", "none_fields", "pipeline")
+            for name in ("arrays", "compile", "indexing", "none_fields", "pipeline")
         )
     ).hexdigest(),
 )

@@ -12,7 +12,7 @@ from numba.core import types
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
-from bufgym.ground.kernel import bundle, indexing
+from bufgym.ground.kernel import indexing
 from bufgym.ground.kernel.cache import Code, NotKeptError, only_kept
 from bufgym.ground.kernel.meanwhile import FEW, Meanwhile, is_possible
 from bufgym.ground.kernel.pipeline import PartCompiler, WholeCompiler
@@ -155,5 +155,4 @@ def located(signature: Any, compiled: Any) -> Any:
 
 
 # At the end, as Numba must hear nothing of this way where one of its parts is missing.
-bundle.teach()
 indexing.teach()

@@ -15,12 +15,9 @@ from __future__ import annotations
 from typing import Any, cast
 
 from llvmlite import binding
-from numba.core import codegen, compiler, ir
-from numba.core.compiler_machinery import FunctionPass, register_pass
+from numba.core import codegen, compiler
 
-from bufgym.ground.kernel.arrays import local
-from bufgym.ground.kernel.bundle import BundleType
-from bufgym.ground.kernel.none_fields import NoneFields, with_none_fields
+from bufgym.ground.kernel.none_fields import with_none_fields
 
 PART = "part"
 """Marks a part among the code that is kept on disk."""
@@ -28,7 +25,6 @@ PART = "part"
 # Numba has no types.
 _Library: Any = codegen.JITCodeLibrary
 _Compiler: Any = compiler.Compiler
-_Pass: Any = FunctionPass
 
 
 class PartLibrary(_Library):  # type: ignore[misc]
@@ -77,45 +73,10 @@ def set_environments(result: Any) -> None:
         result.codegen.set_env(environment.env_name, environment)
 
 
-@cast(Any, register_pass)(mutates_CFG=False, analysis_only=False)
-class _LocalBundles(_Pass):  # type: ignore[misc]
-    """Puts the fields of bundles that come from Python among the kernel's own variables.
-
-    Otherwise they would be read again after every store, which might have changed them.
-    """
-
-    _name = "bufgym_local_bundles"
-
-    def __init__(self) -> None:
-        super().__init__()
-
-    def run_pass(self, state: Any) -> bool:
-        """Change the code of one kernel in place; return whether it changed."""
-        changed = False
-        block = state.func_ir.blocks[min(state.func_ir.blocks)]
-        for place in reversed(range(len(block.body))):
-            statement = block.body[place]
-            source = getattr(statement, "value", None)
-            if not (isinstance(source, ir.Arg) and isinstance(state.args[source.index], BundleType)):
-                continue
-            loc, scope, made = statement.loc, statement.target.scope, cast(Any, ir)
-            given, function = (made.Var(scope, f"$bundle{source.index}.{k}", loc) for k in range(2))
-            values = source, made.Global("local", local, loc), made.Expr.call(function, [given], (), loc)
-            targets = given, function, statement.target
-            block.body[place : place + 1] = [
-                made.Assign(value, target, loc) for value, target in zip(values, targets, strict=True)
-            ]
-            for value, target in zip(values, targets, strict=True):
-                state.func_ir._definitions[target.name] = [value]
-            changed = True
-        return changed
-
-
 class WholeCompiler(_Compiler):  # type: ignore[misc]
     """Compiler of the kernels that Python calls."""
 
     library: Any = _Library
-    is_whole = True
 
     def __init__(
         self, typing: Any, target: Any, library: Any, arguments: Any, result: Any, flags: Any, names: Any
@@ -127,15 +88,10 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
     def define_pipelines(self) -> list[Any]:
         """Numba's own passes, and those of this package."""
         (passes,) = super().define_pipelines()
-        passes = with_none_fields(passes)
-        if self.is_whole:
-            passes.add_pass_after(_LocalBundles, NoneFields)
-            passes.finalize()
-        return [passes]
+        return [with_none_fields(passes)]
 
 
 class PartCompiler(WholeCompiler):
     """Compiler of the kernels that go into others."""
 
     library = PartLibrary
-    is_whole = False

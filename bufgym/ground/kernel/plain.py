@@ -14,7 +14,7 @@ from numba import extending, types
 from numba.core import options
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
-from bufgym.ground.kernel.arrays import JIT, at, item, local, prefetch, stretch, table
+from bufgym.ground.kernel.arrays import JIT, at, item, prefetch, stretch, table
 from bufgym.ground.kernel.none_fields import with_none_fields
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -42,7 +42,7 @@ if hasattr(options.DefaultOptions, "_nrt"):
     _OPTIONS["_nrt"] = False  # no counting of references: a step is ten times as fast
 
 if JIT:
-    for _one in (at, item, local, prefetch, stretch, table):
+    for _one in (at, item, prefetch, stretch, table):
         cast(Any, extending).register_jitable(_one)
 
 
@@ -73,13 +73,3 @@ def located(signature: Any, compiled: Any) -> Any:
 
 def compile_here() -> None:
     """Nothing: every call compiles in this process."""
-
-
-def bundle(named_tuple: Class) -> Class:
-    """``named_tuple``, passed by value."""
-    return named_tuple
-
-
-def bundle_type(named_tuple: type, kinds: tuple[Any, ...]) -> Any:
-    """Numba's type of this named tuple, with fields of types ``kinds``."""
-    return cast(Any, types).BaseTuple.from_types(kinds, named_tuple)

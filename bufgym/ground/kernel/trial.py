@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from bufgym.ground.kernel.arrays import JIT, at, item, local, stretch
+from bufgym.ground.kernel.arrays import JIT, at, item, stretch
 from bufgym.ground.processes import COMPILES, compiling
 
 TRIED = (0, 68)
@@ -51,17 +51,16 @@ class _Given(NamedTuple):
 
 def attempt() -> None:
     """Compile a kernel that needs every private part, keep it, and load it again."""
-    from bufgym.ground.kernel.bundle import bundle
     from bufgym.ground.kernel.compile import kernel
 
     def inner(given: Any, k: int) -> Any:
         return at(given.rows, 1, k) + (0.0 if given.several is None else given.several.missing)
 
     def outer(given: Any) -> Any:
-        again = local(_Given(given.rows, None))
+        again = _Given(given.rows, None)
         return inner_kernel(again, 1) + item(stretch(given.rows, 0, 1, 2), 1)
 
-    inner_kernel, given = kernel(inner), bundle(_Given)(np.arange(6.0).reshape(2, 3), None)
+    inner_kernel, given = kernel(inner), _Given(np.arange(6.0).reshape(2, 3), None)
     for _ in range(2):
         if kernel(outer)(given) != 6.0:
             raise SystemExit("a wrong result")
