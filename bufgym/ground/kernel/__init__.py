@@ -5,15 +5,26 @@ the machine code on disk; with ``NUMBA_DISABLE_JIT=1`` the same source runs as o
 check the compiled code against its own text.
 """
 
+import sys
+
 from bufgym.ground.kernel.announce import compile_silently
 from bufgym.ground.kernel.arrays import JIT, Floats, Ints, at, item, named, prefetch, records, stretch, table
 from bufgym.ground.kernel.interrupt import interruptible
-from bufgym.ground.kernel.trial import works
 
-if works():
+if JIT:
+    from bufgym.ground.kernel import indexing  # noqa: F401  (teaches Numba)
+
+try:
+    if not JIT:
+        raise ImportError
     from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
-    from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, kernel, located
-else:
+    from bufgym.ground.kernel.compile import compile_for, compile_here, direct, entry, kernel, located, try_out
+
+    try_out()
+except Exception as error:  # whatever another Numba may raise
+    if JIT:
+        told = f"bufgym: this Numba differs ({error}): compiling takes longer, in each process; results are equal"
+        print(told.replace("\n", " "), file=sys.stderr)
     from bufgym.ground.kernel.plain import (  # type: ignore[assignment]
         FOLDER,
         NotKeptError,
@@ -27,7 +38,7 @@ else:
     )
 
 __all__ = [
-    "FOLDER", "JIT", "Floats", "Ints", "NotKeptError", "at", "compile_for", "compile_here",
-    "compile_silently", "direct", "entry", "interruptible", "item", "kernel", "located", "named", "only_kept",
-    "prefetch", "records", "stretch", "table",
+    "FOLDER", "JIT", "Floats", "Ints", "NotKeptError", "at", "compile_for", "compile_here", "compile_silently", "direct",
+    "entry", "interruptible", "item", "kernel", "located", "named", "only_kept", "prefetch", "records", "stretch",
+    "table",
 ]  # fmt: skip

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import types
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
-from bufgym.ground.kernel import indexing
 from bufgym.ground.kernel.cache import Code, NotKeptError, only_kept
 from bufgym.ground.kernel.meanwhile import FEW, Meanwhile, is_possible
 from bufgym.ground.kernel.pipeline import PartCompiler, WholeCompiler
@@ -154,5 +154,14 @@ def located(signature: Any, compiled: Any) -> Any:
     return _Located(compiled, signature)
 
 
-# At the end, as Numba must hear nothing of this way where one of its parts is missing.
-indexing.teach()
+TRIED = (0, 68)
+"""The newest Numba that passed all tests; a later one is tried out."""
+
+
+def try_out() -> None:
+    """With a later Numba, run a kernel inside another. Raises an error where Numba's private parts differ."""
+    if tuple(map(int, str(numba.__version__).split(".")[:2])) > TRIED:
+        inner = kernel(lambda array: array[1])
+        outer = kernel(lambda array: inner(array))
+        if outer(np.arange(3)) != 1:
+            raise ValueError("a wrong result")

@@ -56,10 +56,8 @@ def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: C
     numba_.extending.lower_builtin(function, numba_.types.Array, numba_.types.VarArg(numba_.types.Any))(code)
 
 
-def teach() -> None:
-    """Tell Numba."""
-    _compile_as(item, lambda array, k: array.dtype, _read)
-    _compile_as(at, lambda array, i, k: array.dtype, _read)
-    _compile_as(stretch, lambda array, i, first, length: array.copy(ndim=1), _view)
-    _compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _view)
-    _compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)
+_compile_as(item, lambda array, k: array.dtype, _read)
+_compile_as(at, lambda array, i, k: array.dtype, _read)
+_compile_as(stretch, lambda array, i, first, length: array.copy(ndim=1), _view)
+_compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _view)
+_compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)

@@ -15,7 +15,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 from llvmlite import binding
-from numba.core import codegen, compiler
+from numba import types
+from numba.core import codegen, compiler, datamodel
 
 from bufgym.ground.kernel.none_fields import with_none_fields
 
@@ -25,6 +26,7 @@ PART = "part"
 # Numba has no types.
 _Library: Any = codegen.JITCodeLibrary
 _Compiler: Any = compiler.Compiler
+_Model: Any = datamodel.models.TupleModel
 
 
 class PartLibrary(_Library):  # type: ignore[misc]
@@ -71,6 +73,23 @@ def set_environments(result: Any) -> None:
     """Tell the machine code of ``result`` where the Python objects are that its parts use, such as texts to print."""
     for environment in result._find_referenced_environments():
         result.codegen.set_env(environment.env_name, environment)
+
+
+@cast(Any, datamodel).register_default(cast(Any, types).NamedTuple)
+class _OneArgument(_Model):  # type: ignore[misc]
+    """Hands a named tuple of this package on as one value; Numba hands a tuple of ten arrays on as seventy numbers."""
+
+    def _is_ours(self) -> bool:
+        return str(self.fe_type.instance_class.__module__).startswith("bufgym.")
+
+    def get_argument_type(self) -> Any:
+        return self.get_value_type() if self._is_ours() else super().get_argument_type()
+
+    def as_argument(self, builder: Any, value: Any) -> Any:
+        return value if self._is_ours() else super().as_argument(builder, value)
+
+    def from_argument(self, builder: Any, value: Any) -> Any:
+        return value if self._is_ours() else super().from_argument(builder, value)
 
 
 class WholeCompiler(_Compiler):  # type: ignore[misc]

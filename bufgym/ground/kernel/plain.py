@@ -10,15 +10,12 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
-from numba import extending, types
-from numba.core import options
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
-from bufgym.ground.kernel.arrays import JIT, at, item, prefetch, stretch, table
+from bufgym.ground.kernel.arrays import JIT
 from bufgym.ground.kernel.none_fields import with_none_fields
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-Class = TypeVar("Class", bound=type)
 _Compiler: Any = CompilerBase
 
 FOLDER = ""
@@ -37,13 +34,7 @@ class _PlainCompiler(_Compiler):  # type: ignore[misc]
         return [with_none_fields(cast(Any, DefaultPassBuilder).define_nopython_pipeline(self.state))]
 
 
-_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "pipeline_class": _PlainCompiler}
-if hasattr(options.DefaultOptions, "_nrt"):
-    _OPTIONS["_nrt"] = False  # no counting of references: a step is ten times as fast
-
-if JIT:
-    for _one in (at, item, prefetch, stretch, table):
-        cast(Any, extending).register_jitable(_one)
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "_nrt": False, "pipeline_class": _PlainCompiler}
 
 
 def kernel(function: Function) -> Function:
@@ -57,17 +48,15 @@ def compile_for(signature: Any, function: Function) -> Function:
 
 
 def direct(compiled: Function) -> Function:
-    """``compiled``."""
+    """``compiled``: each call looks at the types of its arguments."""
     return compiled
 
 
-def entry(compiled: Any) -> Any:
-    """``compiled``."""
-    return compiled
+entry: Callable[[Any], Any] = direct
 
 
 def located(signature: Any, compiled: Any) -> Any:
-    """``compiled``."""
+    """``compiled``: Numba looks up its address at each call."""
     return compiled
 
 
