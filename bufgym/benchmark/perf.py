@@ -75,15 +75,13 @@ class Sizes:
 
 
 Clock = Callable[[], float]
+"""By default time of the processor, which other programs add little to."""
 
 
 def best_s(
     repeats: int, prepare: Callable[[], Any], work: Callable[[], Any], clock: Clock = time.process_time
 ) -> float:
-    """Shortest time of ``work`` over the repeats, s. ``prepare`` runs before each, untimed.
-
-    By default time of the processor, which other programs add little to.
-    """
+    """Shortest time of ``work`` over the repeats, s. ``prepare`` runs before each, untimed."""
     times = []
     for _ in range(repeats):
         prepare()
@@ -120,29 +118,18 @@ def record(env: Any, steps: int, single: bool = False) -> tuple[list[Any], int]:
 
 
 class _Meter:
-    """Makes figures, each beside the yardstick."""
+    """Makes figures, each beside the yardstick, which runs between their repeats."""
 
     def __init__(self, sizes: Sizes) -> None:
-        n, width = max(sizes.batches), sizes.capacity + 1
-        rng = np.random.default_rng(SEED)
-        actions = np.where(rng.random(n) < 0.5, width, rng.integers(0, sizes.capacity, n))
-        numbers = yardstick.SLOT_FIELDS * width + yardstick.CONTEXT_FIELDS
-        arrays = actions, np.zeros((n, numbers), np.float32), np.zeros((n, width + 1), np.int8)
-        bare = yardstick.Bare.new(n, sizes.capacity)
-        self._sizes, self._step, self._steps = sizes, partial(yardstick.step, bare, *arrays), 10 * n
-        self._passes()
-        rate = self._steps / best_s(10 * sizes.repeats, lambda: None, self._passes)
-        told = f"steps a second of bufgym.benchmark.yardstick, n = {n}, L = {sizes.capacity}"
-        self.yardstick = Measurement(YARDSTICK, rate, "steps/s", 1.0, told)
-
-    def _passes(self) -> None:
-        for _ in range(10):
-            self._step()
+        self.sizes, (self._work, self._steps) = sizes, yardstick.passes(max(sizes.batches), sizes.capacity)
+        told = f"steps a second of bufgym.benchmark.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
+        self._work()  # compiled, or loaded from disk, before the clock starts
+        self.yardstick = self.figure(YARDSTICK, told, self._steps, "steps", lambda: None, self._work)
 
     def figure(
         self,
         name: str,
-        what: str,
+        told: str,
         count: int,
         unit: str,
         prepare: Callable[[], Any],
@@ -150,64 +137,62 @@ class _Meter:
         clock: Clock = time.process_time,
     ) -> Measurement:
         """``count`` of ``unit`` in the time of ``work``."""
-        times = [
-            (best_s(5, lambda: None, self._passes, clock), best_s(1, prepare, work, clock))
-            for _ in range(self._sizes.repeats)
+        pairs = [
+            (best_s(5, lambda: None, self._work, clock), best_s(1, prepare, work, clock))
+            for _ in range(self.sizes.repeats)
         ]
-        bare_s, work_s = map(min, zip(*times, strict=True))
-        return Measurement(name, count / work_s, f"{unit}/s", count / work_s / (self._steps / bare_s), what)
+        bare_s, work_s = map(min, zip(*pairs, strict=True))
+        return Measurement(name, count / work_s, f"{unit}/s", count / work_s * bare_s / self._steps, told)
 
-    def of_env(
-        self, name: str, what: str, env: Any, steps: int, single: bool = False, clock: Clock = time.process_time
-    ) -> Measurement:
+    def of_env(self, name: str, told: str, env: Any, steps: int, single: bool = False, **options: Any) -> Measurement:
         """Decisions a second."""
         actions, decisions = record(env, steps, single)
         reset, work = partial(env.reset, seed=SEED), partial(play, env, actions, single)
-        found = self.figure(name, f"{what}, resets in the time", decisions, "steps", reset, work, clock)
+        found = self.figure(name, f"{told}, resets in the time", decisions, "steps", reset, work, **options)
         env.close()
         return found
 
 
 def measure(sizes: Sizes | None = None) -> list[Measurement]:
     """Speed of the yardstick, the batches, the single environments and of rollouts."""
-    sizes = sizes or Sizes()
     compile_here()
-    meter = _Meter(sizes)
-    return [meter.yardstick, *_batches(sizes, meter), *_singles(sizes, meter), *_rollouts(sizes, meter)]
+    meter = _Meter(sizes or Sizes())
+    return [meter.yardstick, *_batches(meter), *_singles(meter), *_rollouts(meter)]
 
 
-def _batches(sizes: Sizes, meter: _Meter) -> Iterator[Measurement]:
+def _batches(meter: _Meter) -> Iterator[Measurement]:
+    sizes = meter.sizes
+    told = f"decisions a second of gym.make_vec(vectorization_mode='{NATIVE}'), L = {sizes.capacity}"
+    told += f" ({sizes.topic_slots} for topics, where choices of what to send count too)"
+
     def figure(id: str, n: int, what: str = "", clock: Clock = time.process_time, **options: Any) -> Measurement:
         capacity = sizes.topic_slots if id == TOPICS else sizes.capacity
         vector = gym.make_vec(id, n, vectorization_mode=NATIVE, capacity=capacity, **options)
-        told = f"decisions a second of gym.make_vec(vectorization_mode='{NATIVE}'), L = {sizes.capacity}"
-        told += f" ({sizes.topic_slots} for topics, where choices of what to send count too)"
         return meter.of_env(f"native batch{what}, {id}, n = {n}", told, vector, sizes.steps(n), clock=clock)
 
-    for id in (*ENVIRONMENTS, TOPICS):
-        yield from (figure(id, n) for n in sizes.batches)
-    largest = max(sizes.batches)
-    yield figure(ENVIRONMENTS[0], largest, ' with fields="compact"', fields="compact")
-    yield figure(ENVIRONMENTS[0], largest, " on 2 threads", time.perf_counter, num_threads=2)
+    yield from (figure(id, n) for id in (*ENVIRONMENTS, TOPICS) for n in sizes.batches)
+    yield figure(ENVIRONMENTS[0], max(sizes.batches), ' with fields="compact"', fields="compact")
+    yield figure(ENVIRONMENTS[0], max(sizes.batches), " on 2 threads", time.perf_counter, num_threads=2)
 
 
-def _singles(sizes: Sizes, meter: _Meter) -> Iterator[Measurement]:
-    told = f"calls of Env.step a second, without wrappers, L = {sizes.capacity}"
+def _singles(meter: _Meter) -> Iterator[Measurement]:
+    steps, capacity = meter.sizes.single_steps, meter.sizes.capacity
+    told = f"calls of Env.step a second, without wrappers, L = {capacity}"
     for id in ENVIRONMENTS:
         for form in ("flat", "dict"):
-            env = gym.make(id, capacity=sizes.capacity, observation=form).unwrapped
-            yield meter.of_env(f"single environment, {form}, {id}", told, env, sizes.single_steps, single=True)
-    cart, pushes = gym.make("CartPole-v1").unwrapped, np.random.default_rng(SEED).integers(2, size=sizes.single_steps)
-    work, reset = partial(play, cart, pushes, True), partial(cart.reset, seed=SEED)
-    yield meter.figure("single CartPole-v1", "the same of Gymnasium's", sizes.single_steps, "steps", reset, work)
+            env = gym.make(id, capacity=capacity, observation=form).unwrapped
+            yield meter.of_env(f"single environment, {form}, {id}", told, env, steps, single=True)
+    cart, pushes = gym.make("CartPole-v1").unwrapped, np.random.default_rng(SEED).integers(2, size=steps)
+    reset, work = partial(cart.reset, seed=SEED), partial(play, cart, pushes, True)
+    yield meter.figure("single CartPole-v1", "the same of Gymnasium's", steps, "steps", reset, work)
 
 
-def _rollouts(sizes: Sizes, meter: _Meter) -> Iterator[Measurement]:
-    scenario = scenarios.get("lte")
-    episodes = [draw(scenario, seed) for seed in range(sizes.episodes)]
+def _rollouts(meter: _Meter) -> Iterator[Measurement]:
+    scenario, capacity = scenarios.get("lte"), meter.sizes.capacity
+    episodes = [draw(scenario, seed) for seed in range(meter.sizes.episodes)]
     arrivals = sum(len(episode.arrivals) for episode in episodes)
-    senders = Senders(len(episodes), sizes.capacity, scenario.value, max_messages=scenario.max_messages)
-    told = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {sizes.capacity};"
+    senders = Senders(len(episodes), capacity, scenario.value, max_messages=scenario.max_messages)
+    told = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {capacity};"
     told += " drawing, loading and scoring them not in the time"
     load = partial(senders.load_all, [(i, episode, None) for i, episode in enumerate(episodes)])
     for name in POLICIES:
@@ -243,7 +228,6 @@ def write_json(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> None
         "versions": {name: version(name) for name in ("bufgym", "numpy", "numba", "gymnasium")},
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "processor": processor(),
         "processors": os.cpu_count(),
         "compiled": JIT,
         "sizes": asdict(sizes),
@@ -253,37 +237,26 @@ def write_json(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> None
         temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
 
 
-def processor() -> str:
-    """The processor's name, as far as the system tells it."""
-    try:
-        told = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-    except OSError:  # only Linux has it
-        told = ""
-    names = [line.partition(":")[2].strip() for line in told.splitlines() if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
 def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
-    """Add a line of JSON to the file ``path``: date, version, processor, ratios. Return what fell, in a line.
+    """Add a line of JSON to the file ``path``: date, version, sizes, ratios. Return what fell, in a line.
 
-    Ratios are compared with those of the last runs of the same sizes on the same kind of processor.
+    Ratios are compared with those of the last runs of the same sizes.
     """
-    alike = {"processor": processor(), "sizes": json.loads(json.dumps(asdict(sizes)))}
+    told = json.loads(json.dumps(asdict(sizes)))
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
-        before = [line["ratios"] for line in lines if {key: line[key] for key in alike} == alike][-BEFORE:]
+        before = [line["ratios"] for line in lines if line["sizes"] == told][-BEFORE:]
     except (ValueError, KeyError, TypeError) as error:
         raise BufgymError(f"{path}: not a history that bufgym perf wrote ({type(error).__name__}: {error})") from None
     ratios = {figure.name: figure.ratio for figure in figures if figure.ratio}
-    line = {"date": date.today().isoformat(), "version": version("bufgym"), **alike, "ratios": ratios}
+    line = {"date": date.today().isoformat(), "version": version("bufgym"), "sizes": told, "ratios": ratios}
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
     fallen = []
     for name, ratio in ratios.items():
-        known = [ratios[name] for ratios in before if name in ratios]
-        if known and ratio < (1 - FELL) * median(known):
-            fallen.append(f"{name}: {ratio:.3g} after {median(known):.3g}")
-    if not fallen:
-        return f"no ratio fell by more than {FELL:.0%} below the median of the last {len(before)} runs"
-    return f"fell by more than {FELL:.0%} below the median of the last {len(before)} runs: {'; '.join(fallen)}"
+        known = median([ratios[name] for ratios in before if name in ratios] or [0.0])
+        if ratio < (1 - FELL) * known:
+            fallen.append(f"{name}: {ratio:.3g} after {known:.3g}")
+    what = f"fell by more than {FELL:.0%} below the median of the last {len(before)} runs"
+    return f"{what}: {'; '.join(fallen)}" if fallen else f"no ratio {what}"

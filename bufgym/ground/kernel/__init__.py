@@ -23,8 +23,8 @@ try:
     try_out()
 except Exception as error:  # whatever another Numba may raise
     if JIT:
-        told = f"bufgym: this Numba differs ({error}): compiling takes longer, in each process; results are equal"
-        print(told.replace("\n", " "), file=sys.stderr)
+        why = " ".join(str(error).split())
+        print(f"bufgym: this Numba's private parts differ ({why}): slower to compile, equal results", file=sys.stderr)
     from bufgym.ground.kernel.plain import (  # type: ignore[assignment]
         FOLDER,
         NotKeptError,
@@ -38,7 +38,7 @@ except Exception as error:  # whatever another Numba may raise
     )
 
 __all__ = [
-    "FOLDER", "JIT", "Floats", "Ints", "NotKeptError", "at", "compile_for", "compile_here", "compile_silently", "direct",
-    "entry", "interruptible", "item", "kernel", "located", "named", "only_kept", "prefetch", "records", "stretch",
-    "table",
+    "FOLDER", "JIT", "Floats", "Ints", "NotKeptError", "at", "compile_for", "compile_here", "compile_silently",
+    "direct", "entry", "interruptible", "item", "kernel", "located", "named", "only_kept", "prefetch", "records",
+    "stretch", "table",
 ]  # fmt: skip

@@ -27,8 +27,7 @@ TOOLS = (
     np.__version__,
     hashlib.sha256(
         b"".join(
-            (_HERE / f"{name}.py").read_bytes()
-            for name in ("arrays", "compile", "indexing", "none_fields", "pipeline")
+            (_HERE / f"{name}.py").read_bytes() for name in ("arrays", "compile", "indexing", "none_fields", "pipeline")
         )
     ).hexdigest(),
 )
