@@ -29,7 +29,7 @@ from bufgym.benchmark.perf import (
     record,
     report,
 )
-from bufgym.envs.step import StepOutput, write_mask, write_observation
+from bufgym.envs.output import StepOutput, write_mask, write_observation
 from bufgym.ground.kernel import compile_here, kernel
 from bufgym.sim.state import NOTHING_WAITS, Batch
 
@@ -52,18 +52,19 @@ def _peer(package: str, n: int) -> Any:
 
 def measure_peers(sizes: Sizes, figures: Sequence[Measurement]) -> tuple[list[Measurement], list[str]]:
     """(speeds of the PEERS and ratios of the native batches among ``figures`` to them; packages not here, and why)."""
-    ours = [figure for figure in figures if figure.name in [f"native batch, {id}" for id in ENVIRONMENTS]]
-    actions = np.random.default_rng(SEED).integers(2, size=(sizes.steps, sizes.batch)).astype(np.int32)
+    n = max(sizes.batches)
+    ours = [figure for figure in figures if figure.name in [f"native batch, {id}, n = {n}" for id in ENVIRONMENTS]]
+    actions = np.random.default_rng(SEED).integers(2, size=(sizes.steps(n), n)).astype(np.int32)
     found, absent = [], []
     for package, call in PEERS.items():
         try:
-            envs = _peer(package, sizes.batch)
+            envs = _peer(package, n)
         except (ImportError, OSError) as error:
             absent.append(f"{package} ({error})")
             continue
         rate = actions.size / best_s(sizes.repeats, envs.reset, partial(play, envs, actions))
         envs.close()
-        call += f", {package} {version(package)}, n = {sizes.batch}, random actions, resets in the time"
+        call += f", {package} {version(package)}, n = {n}, random actions, resets in the time"
         found.append(Measurement(f"CartPole, {package}", rate, "steps/s", None, f"steps a second of {call}"))
         ratios = [(f"{figure.name} / {package}", figure.value / rate) for figure in ours]
         found += [Measurement(name, ratio, "times", None, "the ratio of these two") for name, ratio in ratios]
@@ -120,8 +121,9 @@ def profile(sizes: Sizes) -> str:
 
 
 def _profile_batch(id: str, capacity: int, sizes: Sizes) -> str:
-    vector: Any = gym.make_vec(id, sizes.batch, vectorization_mode=NATIVE, capacity=capacity)
-    actions, decisions = record(vector, sizes.steps)
+    n = max(sizes.batches)
+    vector: Any = gym.make_vec(id, n, vectorization_mode=NATIVE, capacity=capacity)
+    actions, decisions = record(vector, sizes.steps(n))
     rows = vector.unwrapped.rows
     best = _parts_s(sizes.repeats, rows, ("step", "reset"), vector.reset, lambda: play(vector, actions))
     whole, in_kernel, in_reset = (seconds / decisions * 1e9 for seconds in best)
@@ -148,7 +150,7 @@ def _profile_batch(id: str, capacity: int, sizes: Sizes) -> str:
         "episodes drawn and begun": in_reset,
         "Python around the kernel": whole - in_kernel - in_reset,
     }
-    return _shares(f"native batch of {sizes.batch}, {id}, L = {capacity}", whole, parts)
+    return _shares(f"native batch of {n}, {id}, L = {capacity}", whole, parts)
 
 
 def _profile_single(id: str, sizes: Sizes) -> str:

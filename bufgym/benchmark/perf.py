@@ -1,8 +1,9 @@
-"""bufgym's own speed: its environments and its rollouts.
+"""bufgym's own speed: its environments and its rollouts, beside a bare kernel that does the job of one step.
 
-Every figure is the best of several repeats, because other work on the machine can only slow a repeat down. Everything
-runs in one thread. Actions are drawn beforehand, uniform among the valid ones, by playing the same seeded episodes
-once. So the timed loop holds only the environment's own work and its resets.
+Every figure is the best of several repeats in time of the processor, because other work on the machine can only slow a
+repeat down. Each repeat times the ``yardstick`` too: their ratio says more than either. Actions are drawn beforehand,
+uniform among the valid ones, by playing the same seeded episodes once. So the timed loop holds only the environment's
+own work and its resets.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from datetime import date
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -23,52 +26,68 @@ import numpy as np
 
 from bufgym import policies
 from bufgym import scenario as scenarios
+from bufgym.benchmark import yardstick
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.table import Table
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT, compile_here
 from bufgym.sim import Senders
 
-ENVIRONMENTS = {"bufgym/Uplink-v0": 10e6, "bufgym/Interruption-v0": 8e6}
-"""Decisions a second that their native batches aim at."""
+ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"
-POLICIES = ("afr", "drop-oldest", "random", "min-gap")
+POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")
 NATIVE = "vector_entry_point"
 SEED = 1
+YARDSTICK = "yardstick"
+FELL, BEFORE = 0.15, 5
+"""A ratio fell if it is lower by more than this share than the median of so many runs before."""
 
 
 class Measurement(NamedTuple):
-    """One measured figure. ``value`` and ``target`` are in ``unit``; ``definition`` says how it was measured."""
+    """One measured figure in ``unit``. ``definition`` says how it was measured.
+
+    ``ratio`` is to the yardstick's steps a second, in the same repeats.
+    """
 
     name: str
     value: float
     unit: str
-    target: float | None
+    ratio: float | None
     definition: str
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured. The defaults take about half a minute."""
+    """How much is measured. The defaults take about a minute."""
 
     capacity: int = 16  # L, messages
-    batch: int = 1024  # environments in a batch
-    steps: int = 1000  # of the native batch
-    sync_steps: int = 30  # of Gymnasium's SyncVectorEnv
+    batches: tuple[int, ...] = (1024, 64, 16)  # environments in a batch
+    decisions: int = 300_000  # of each batch
     single_steps: int = 20_000  # of the single environment
     episodes: int = 1000  # of a fixed-policy rollout
     repeats: int = 3  # of each figure; the best one counts
-    topic_slots: int = 32  # L of the batch with several topics
+    topic_slots: int = 32  # L of the batches with several topics
+
+    def steps(self, n: int) -> int:
+        """Steps of a batch of ``n``."""
+        return max(1, self.decisions // n)
 
 
-def best_s(repeats: int, prepare: Callable[[], Any], work: Callable[[], Any]) -> float:
+Clock = Callable[[], float]
+"""By default time of the processor, which other programs add little to."""
+
+
+def best_s(
+    repeats: int, prepare: Callable[[], Any], work: Callable[[], Any], clock: Clock = time.process_time
+) -> float:
     """Shortest time of ``work`` over the repeats, s. ``prepare`` runs before each, untimed."""
     times = []
     for _ in range(repeats):
         prepare()
-        begin = time.perf_counter()
+        begin = clock()
         work()
-        times.append(time.perf_counter() - begin)
+        times.append(clock() - begin)
     return min(times)
 
 
@@ -98,72 +117,101 @@ def record(env: Any, steps: int, single: bool = False) -> tuple[list[Any], int]:
     return actions, decisions
 
 
-def _rate(env: Any, steps: int, repeats: int, single: bool = False) -> float:
-    """Decisions a second."""
-    actions, decisions = record(env, steps, single)
-    best = best_s(repeats, partial(env.reset, seed=SEED), partial(play, env, actions, single))
-    env.close()
-    return decisions / best
+class _Meter:
+    """Makes figures, each beside the yardstick, which runs between their repeats."""
+
+    def __init__(self, sizes: Sizes) -> None:
+        self.sizes, (self._work, self._steps) = sizes, yardstick.passes(max(sizes.batches), sizes.capacity)
+        told = f"steps a second of bufgym.benchmark.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
+        self._work()  # compiled, or loaded from disk, before the clock starts
+        self.yardstick = self.figure(YARDSTICK, told, self._steps, "steps", lambda: None, self._work)
+
+    def figure(
+        self,
+        name: str,
+        told: str,
+        count: int,
+        unit: str,
+        prepare: Callable[[], Any],
+        work: Callable[[], Any],
+        clock: Clock = time.process_time,
+    ) -> Measurement:
+        """``count`` of ``unit`` in the time of ``work``."""
+        pairs = [
+            (best_s(5, lambda: None, self._work, clock), best_s(1, prepare, work, clock))
+            for _ in range(self.sizes.repeats)
+        ]
+        bare_s, work_s = map(min, zip(*pairs, strict=True))
+        return Measurement(name, count / work_s, f"{unit}/s", count / work_s * bare_s / self._steps, told)
+
+    def of_env(self, name: str, told: str, env: Any, steps: int, single: bool = False, **options: Any) -> Measurement:
+        """Decisions a second."""
+        actions, decisions = record(env, steps, single)
+        reset, work = partial(env.reset, seed=SEED), partial(play, env, actions, single)
+        found = self.figure(name, f"{told}, resets in the time", decisions, "steps", reset, work, **options)
+        env.close()
+        return found
 
 
 def measure(sizes: Sizes | None = None) -> list[Measurement]:
-    """Speed of the batches, of the single environments and of rollouts."""
-    sizes = sizes or Sizes()
+    """Speed of the yardstick, the batches, the single environments and of rollouts."""
     compile_here()
-    return [*_batches(sizes), *_singles(sizes), *_rollouts(sizes)]
+    meter = _Meter(sizes or Sizes())
+    return [meter.yardstick, *_batches(meter), *_singles(meter), *_rollouts(meter)]
 
 
-def _batches(sizes: Sizes) -> Iterator[Measurement]:
-    def figure(of: str, id: str, mode: str, steps: int, capacity: int, goal: float | None, what: str) -> Measurement:
-        vector = gym.make_vec(id, sizes.batch, vectorization_mode=mode, capacity=capacity)
-        definition = f"{what} a second of gym.make_vec(vectorization_mode='{mode}'), n = {sizes.batch}, L = {capacity}"
-        definition += ", all observation fields, resets in the time"
-        return Measurement(f"{of}, {id}", _rate(vector, steps, sizes.repeats), "steps/s", goal, definition)
+def _batches(meter: _Meter) -> Iterator[Measurement]:
+    sizes = meter.sizes
+    told = f"decisions a second of gym.make_vec(vectorization_mode='{NATIVE}'), L = {sizes.capacity}"
+    told += f" ({sizes.topic_slots} for topics, where choices of what to send count too)"
 
-    for id, goal in ENVIRONMENTS.items():
-        native = figure("native batch", id, NATIVE, sizes.steps, sizes.capacity, goal, "decisions")
-        sync = figure("SyncVectorEnv", id, "sync", sizes.sync_steps, sizes.capacity, None, "decisions")
-        yield from (native, sync)
-        ratio = native.value / sync.value
-        yield Measurement(f"native / SyncVectorEnv, {id}", ratio, "times", 50.0, "the ratio of these two")
-    of, what = f"native batch of {len(scenarios.get('topics').topics)} topics", "decisions and choices of what to send"
-    yield figure(of, TOPICS, NATIVE, sizes.steps, sizes.topic_slots, 5e6, what)
+    def figure(id: str, n: int, what: str = "", clock: Clock = time.process_time, **options: Any) -> Measurement:
+        capacity = sizes.topic_slots if id == TOPICS else sizes.capacity
+        vector = gym.make_vec(id, n, vectorization_mode=NATIVE, capacity=capacity, **options)
+        return meter.of_env(f"native batch{what}, {id}, n = {n}", told, vector, sizes.steps(n), clock=clock)
+
+    yield from (figure(id, n) for id in (*ENVIRONMENTS, TOPICS) for n in sizes.batches)
+    yield figure(ENVIRONMENTS[0], max(sizes.batches), ' with fields="compact"', fields="compact")
+    yield figure(ENVIRONMENTS[0], max(sizes.batches), " on 2 threads", time.perf_counter, num_threads=2)
 
 
-def _singles(sizes: Sizes) -> Iterator[Measurement]:
-    definition = f"calls of Env.step a second, without wrappers, L = {sizes.capacity}, all observation fields, "
-    definition += "resets in the time"
+def _singles(meter: _Meter) -> Iterator[Measurement]:
+    steps, capacity = meter.sizes.single_steps, meter.sizes.capacity
+    told = f"calls of Env.step a second, without wrappers, L = {capacity}"
     for id in ENVIRONMENTS:
-        rate = _rate(gym.make(id, capacity=sizes.capacity).unwrapped, sizes.single_steps, sizes.repeats, single=True)
-        yield Measurement(f"single environment, {id}", rate, "steps/s", 3e5, definition)
+        for form in ("flat", "dict"):
+            env = gym.make(id, capacity=capacity, observation=form).unwrapped
+            yield meter.of_env(f"single environment, {form}, {id}", told, env, steps, single=True)
+    cart, pushes = gym.make("CartPole-v1").unwrapped, np.random.default_rng(SEED).integers(2, size=steps)
+    reset, work = partial(cart.reset, seed=SEED), partial(play, cart, pushes, True)
+    yield meter.figure("single CartPole-v1", "the same of Gymnasium's", steps, "steps", reset, work)
 
 
-def _rollouts(sizes: Sizes) -> Iterator[Measurement]:
-    scenario = scenarios.get("lte")
-    episodes = [draw(scenario, seed) for seed in range(sizes.episodes)]
+def _rollouts(meter: _Meter) -> Iterator[Measurement]:
+    scenario, capacity = scenarios.get("lte"), meter.sizes.capacity
+    episodes = [draw(scenario, seed) for seed in range(meter.sizes.episodes)]
     arrivals = sum(len(episode.arrivals) for episode in episodes)
-    senders = Senders(len(episodes), sizes.capacity, scenario.value, max_messages=scenario.max_messages)
-    definition = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {sizes.capacity};"
-    definition += " drawing, loading and scoring them not in the time"
+    senders = Senders(len(episodes), capacity, scenario.value, max_messages=scenario.max_messages)
+    told = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {capacity};"
+    told += " drawing, loading and scoring them not in the time"
     load = partial(senders.load_all, [(i, episode, None) for i, episode in enumerate(episodes)])
     for name in POLICIES:
         run = partial(senders.run, policies.get(name))
         load()
         run()  # compiled, or loaded from disk, before the clock starts
-        rate = arrivals / best_s(sizes.repeats, load, run)
-        yield Measurement(f"rollout, {name}", rate, "arrivals/s", 4e7, definition)
+        yield meter.figure(f"rollout, {name}", told, arrivals, "arrivals", load, run)
 
 
 def report(figures: Sequence[Measurement], repeats: int) -> str:
-    """Figures beside their targets, then their definitions."""
-    measured = [
-        [f.name, f"{_human(f.value)} {f.unit}", f"{_human(f.target)} {f.unit}" if f.target else ""] for f in figures
-    ]
-    lines = [Table(["", "measured", "target"], [("", measured)]).plain()]
-    lines += ["", f"Best of {repeats} repeats each, one thread. Actions drawn beforehand among the valid ones."]
+    """Figures beside their ratios to the yardstick, then their definitions."""
+    rows = [[f.name, f"{_human(f.value)} {f.unit}", f"{f.ratio:.3g}" if f.ratio else ""] for f in figures]
+    lines = [Table(["", "measured", "yardsticks"], [("", rows)]).plain()]
+    lines += ["", f"Best of {repeats} repeats each, in time of the processor (2 threads: in time that passed)."]
+    lines.append("Actions drawn beforehand among the valid ones.")
     if not JIT:
         lines.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
-    return "\n".join([*lines, *dict.fromkeys(f"- {f.name.split(',')[0]}: {f.definition}" for f in figures)])
+    told = {f.definition: f"- {f.name.split(',')[0]}: {f.definition}" for f in reversed(figures)}
+    return "\n".join([*lines, *reversed(told.values())])
 
 
 def _human(number: float) -> str:
@@ -187,3 +235,28 @@ def write_json(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> None
     }
     with replaced(path) as temporary:
         temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+
+
+def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
+    """Add a line of JSON to the file ``path``: date, version, sizes, ratios. Return what fell, in a line.
+
+    Ratios are compared with those of the last runs of the same sizes.
+    """
+    told = json.loads(json.dumps(asdict(sizes)))
+    try:
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+        before = [line["ratios"] for line in lines if line["sizes"] == told][-BEFORE:]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BufgymError(f"{path}: not a history that bufgym perf wrote ({type(error).__name__}: {error})") from None
+    ratios = {figure.name: figure.ratio for figure in figures if figure.ratio}
+    line = {"date": date.today().isoformat(), "version": version("bufgym"), "sizes": told, "ratios": ratios}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+    fallen = []
+    for name, ratio in ratios.items():
+        known = median([ratios[name] for ratios in before if name in ratios] or [0.0])
+        if ratio < (1 - FELL) * known:
+            fallen.append(f"{name}: {ratio:.3g} after {known:.3g}")
+    what = f"fell by more than {FELL:.0%} below the median of the last {len(before)} runs"
+    return f"{what}: {'; '.join(fallen)}" if fallen else f"no ratio {what}"

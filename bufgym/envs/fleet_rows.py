@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.guided import is_guided
-from bufgym.envs.rows import Rows, Threads
+from bufgym.envs.rows import Rows
 from bufgym.envs.step import step_cells
 from bufgym.envs.vector import SenderVectorEnv
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.threads import Threads
 from bufgym.model.checks import whole
 from bufgym.scenario import FleetScenario, Uplink
 from bufgym.sim.cell import Fleet
@@ -48,7 +49,7 @@ class FleetRows(Rows):
         self._draw = self.from_pool(scenario.draw)
         self.robots = scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
-        self._threads = Threads(np.arange(cells), options.get("num_threads", 1))
+        self._threads = Threads(np.arange(cells), whole("num_threads", options.get("num_threads", 1), 1))
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
         """Give row ``i`` streams of its own if it is the first of its cell; other rows need none."""

@@ -7,16 +7,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.envs.step import Guide
+from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
 from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.kernel import kernel, stretch
 from bufgym.model.observe import Field
-from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, linear
+from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
+from bufgym.sim.state import Batch
+from bufgym.sim.view import arrival_of, view
 
 GUIDED = "guided"
 ACTIONS = ("slots", GUIDED)
@@ -25,6 +28,47 @@ INPUT_FIELDS = tuple(
     Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
 )
 """Fields observed with ``fields="guided"``."""
+
+
+class Guide(NamedTuple):
+    """What n rows need for guided steps; the kernel writes the memory in place.
+
+    Fields:
+        memory: float64[n, entries], the rule's memory.
+        base: float64[numbers], the plain rule's.
+        outputs: float64[n, outputs], what the present actions add to them.
+        acts: 1 if actions are guided.
+        sees: 1 if the observation holds the rule's inputs alone.
+    """
+
+    memory: NDArray[np.float64]
+    base: NDArray[np.float64]
+    outputs: NDArray[np.float64]
+    acts: int
+    sees: int
+
+
+@kernel
+def guided_decision(batch: Batch, i: int, action: int, guide: Guide) -> int:
+    """The decision of the rule with the numbers of ``guide.outputs``, or of ``action`` if actions are not guided."""
+    if guide.acts == 0:
+        return decision_of(action, batch.senders[i].capacity)
+    return follow(view(batch, i), arrival_of(batch, i), guide.memory[i], guide.base, guide.outputs[i])
+
+
+@kernel
+def write_guided(batch: Batch, i: int, ended: bool, output: StepOutput, guide: Guide) -> None:
+    """Let the rule learn of what happened, and write row ``i``'s state and observation, the rule's inputs if seen."""
+    if guide.sees == 0:
+        write_observation(batch, i, ended, output)
+    else:
+        write_state(batch, i, ended, output)
+    if ended:
+        return
+    buffer, arrival = view(batch, i), arrival_of(batch, i)
+    recall(buffer, arrival, guide.memory[i], guide.base)
+    if guide.sees == 1:
+        inputs(buffer, arrival, guide.memory[i], guide.base, stretch(output.flat, i, 0, N_INPUTS))
 
 
 def is_guided(actions: str, fields: Any, why_not: str = "") -> bool:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import ObservationForm, Place
-from bufgym.envs.step import StepOutput
+from bufgym.envs.output import StepOutput
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import at, compile_for, kernel, local, named, stretch
+from bufgym.ground.kernel import at, compile_for, kernel, named, stretch
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.model.observe import OwnField, OwnTerm
@@ -82,7 +82,7 @@ def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float3
     for i in range(len(batch.senders)):
         sender = batch.senders[i]
         if sender.waiting != NOTHING_WAITS:
-            buffer, arrival = local(view(batch, i)), last_arrival(batch, i)
+            buffer, arrival = view(batch, i), last_arrival(batch, i)
             for k in range(sender.occupancy):
                 flat[i, first + k] = function(buffer, arrival, k)
             flat[i, first + sender.occupancy : first + sender.capacity + 1] = 0.0
@@ -94,7 +94,7 @@ def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.floa
     """Write a context field likewise."""
     for i in range(len(batch.senders)):
         if batch.senders[i].waiting != NOTHING_WAITS:
-            flat[i, first] = function(local(view(batch, i)), last_arrival(batch, i))
+            flat[i, first] = function(view(batch, i), last_arrival(batch, i))
 
 
 def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, row: NDArray[np.float32]) -> None:

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import math
 import operator
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 import numpy as np
@@ -20,10 +18,12 @@ from numpy.typing import NDArray
 from bufgym import scenario as scenarios
 from bufgym.envs.guided import INPUT_FIELDS, guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
+from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
-from bufgym.envs.step import StepOutput, step_rows
+from bufgym.envs.step import step_rows
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import code_for
+from bufgym.ground.threads import Threads
 from bufgym.model.checks import is_number, whole
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
@@ -92,30 +92,6 @@ def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
     if unknown := [name for name in names if name not in NUMBERED]:
         raise BufgymError(f"episode: {unknown[0]!r} is unknown; known: {', '.join(NUMBERED)}")
     return names
-
-
-class Threads:
-    """Does the same work on each part of a batch at once, the first part here and the others in threads.
-
-    Kernels hold no lock of Python's, and rows share no memory that a step writes.
-    """
-
-    def __init__(self, numbers: NDArray[np.int64], num_threads: int) -> None:
-        """``numbers``, int64[n], are rows or cells. They are split into at most ``num_threads`` parts."""
-        parts = np.array_split(numbers, min(whole("num_threads", num_threads, 1), len(numbers)))
-        self.parts = [np.ascontiguousarray(part) for part in parts]
-        self.all = self.parts[0] if len(self.parts) == 1 else None
-        self._pool: ThreadPoolExecutor | None = None
-        self._process = 0
-
-    def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
-        """Call ``work`` on every part; return when all are done."""
-        if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
-            self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
-        running = [self._pool.submit(work, part) for part in self.parts[1:]]
-        work(self.parts[0])
-        for part in running:
-            part.result()
 
 
 class Rows:
@@ -192,7 +168,7 @@ class Rows:
         self._sums_here = bool(self._own_terms)
         self._has_own = bool(self._own_fields) or self._sums_here
         self.output = self.new_output()
-        self._threads = Threads(np.arange(n), num_threads)
+        self._threads = Threads(np.arange(n), whole("num_threads", num_threads, 1))
 
     def __len__(self) -> int:
         return len(self.senders)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import bundle, item, kernel
+from bufgym.ground.kernel import item, kernel
 from bufgym.model.documented import documented
 from bufgym.model.qoi import merging_loss, value
 
@@ -82,7 +82,6 @@ def check_limits(capacity: int, max_bytes: int | None) -> None:
         raise BufgymError(f"max_bytes = {max_bytes!r}: B must be a whole number >= 1, or None for no limit")
 
 
-@bundle
 @documented
 class Buffer(NamedTuple):
     """What a robot knows on board when a message arrives: all that a policy may see. Do not write to it.

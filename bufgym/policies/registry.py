@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.kernel import BundleType, compile_for
+from bufgym.ground.kernel import compile_for
 from bufgym.ground.modules import first_line
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.checks import changed, check_name, constants, named_settings
@@ -213,7 +213,7 @@ def view_type() -> Any:
         "topics": numba.types.Array(numba.from_dtype(TOPIC), 1, "C"),
         **{name: real for name, kind in get_type_hints(Buffer).items() if kind is float},
     }
-    return BundleType(Buffer, tuple(types.get(name, numba.types.int64) for name in Buffer._fields))
+    return cast(Any, numba).types.NamedTuple([types.get(name, numba.types.int64) for name in Buffer._fields], Buffer)
 
 
 @functools.cache

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT, NotKeptError, compile_for, interruptible, kernel, local, named, only_kept
+from bufgym.ground.kernel import JIT, NotKeptError, compile_for, interruptible, kernel, named, only_kept
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, signatures
@@ -51,7 +51,7 @@ def rollout(
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue
             i = sender_of(shares, c)
-            buffer = local(view(batch, i))
+            buffer = view(batch, i)
             if event == DECISION:
                 decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
                 again = batch.senders[i].waiting == ARRIVAL_WAITS  # B has no room yet: the same DECISION is due again

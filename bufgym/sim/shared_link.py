@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import bundle, kernel, records
+from bufgym.ground.kernel import kernel, records
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.decisions import arrive
@@ -49,7 +49,6 @@ CELL = np.dtype(
 )
 
 
-@bundle
 @documented
 class Shares(NamedTuple):
     """The arrays of several cells with N robots each, beside the ``Batch`` of their senders."""

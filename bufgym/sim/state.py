@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import bundle, kernel, records
+from bufgym.ground.kernel import kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER
@@ -136,7 +136,6 @@ NOT_YET = FOREVER - 1
 """Arrival time of a message that a live row still waits for: the row stops there."""
 
 
-@bundle
 @documented
 class Batch(NamedTuple):
     """The arrays of n senders, changed in place by the kernels. A snapshot is a copy of them."""

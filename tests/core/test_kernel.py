@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import announce, bundle, cache, direct, kernel, local
+from bufgym.ground.kernel import announce, cache, direct, kernel
 from tests.conftest import COMPILED
 
 TALE = """
@@ -47,7 +47,6 @@ def run(tmp_path: Path, before: str = "", source: str = TALE, **environment: str
     return done
 
 
-@bundle
 class Numbers(NamedTuple):
     """An array, which may be marked."""
 
@@ -145,9 +144,8 @@ def test_a_direct_call_is_the_call() -> None:
 
 SMALL = """
 from typing import Any, NamedTuple
-from bufgym.ground.kernel import bundle, direct, kernel
+from bufgym.ground.kernel import direct, kernel
 
-@bundle
 class Rows(NamedTuple):
     cells: Any
     several: bool | None = None
@@ -226,8 +224,42 @@ def test_a_bundle_made_in_a_kernel_is_handed_on_by_address() -> None:
 
     @kernel
     def twice(numbers: NDArray[np.float64]) -> float:
-        made = local(Numbers(numbers[1:], None))
+        made = Numbers(numbers[1:], None)
         numbers = numbers[:1]
         return doubled(made) + doubled(made) + numbers[0]
 
     assert twice(np.array([100.0, 3.0])) == 6 + 12 + 100
+
+
+EPISODE = """
+import sys
+{before}
+import numpy as np
+from bufgym.envs import SenderVectorEnv
+from bufgym.ground import kernel
+kernel.compile_silently()
+kernel.compile_here()
+env = SenderVectorEnv(2, "interruption", 3, t_max=12)
+obs, info = env.reset(seed=1)
+total = 0.0
+for k in range(40):
+    actions = np.array([np.flatnonzero(mask)[k % mask.sum()] for mask in info["action_mask"]])
+    obs, rewards, *_, info = env.step(actions)
+    total += float(rewards.sum()) + sum(float(np.sum(part)) for part in obs.values())
+print(total.hex(), kernel.FOLDER != "")
+"""
+
+
+@needs_compilation
+def test_without_numbas_private_parts_episodes_are_equal() -> None:
+    """They are compiled by ``njit`` alone, and one line says so."""
+
+    def played(before: str) -> tuple[list[str], str]:
+        call = [sys.executable, "-c", EPISODE.format(before=before)]
+        done = subprocess.run(call, capture_output=True, text=True, check=True)
+        return done.stdout.split(), done.stderr
+
+    (whole, kept), silent = played("")
+    (plain, unkept), said = played("from numba.core import codegen; del codegen.JITCodeLibrary")
+    assert (plain, kept, unkept, silent) == (whole, "True", "False", "")
+    assert said.startswith("bufgym: this Numba's private parts differ") and said.count("\n") == 1

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import compile_for, entry, local, located, named
+from bufgym.ground.kernel import compile_for, entry, located, named
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.policies import Policy
 from bufgym.policies.registry import signatures
@@ -126,7 +126,7 @@ def ask(
     """Write the policy's answer for each of ``rows`` into ``answers``; ``heard``, int64[n], counts departures."""
     for i in rows:
         sender = batch.senders[i]
-        buffer = local(view(batch, i))
+        buffer = view(batch, i)
         if hears_departures:
             for _ in range(sender.dequeued - heard[i]):
                 on_departure(buffer, memory[i])

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.step import delivered_qoi
+from bufgym.envs.output import delivered_qoi
 from bufgym.sim import Senders
 from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 

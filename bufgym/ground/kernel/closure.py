@@ -26,7 +26,9 @@ TOOLS = (
     llvmlite.__version__,
     np.__version__,
     hashlib.sha256(
-        b"".join((_HERE / f"{name}.py").read_bytes() for name in ("arrays", "bundle", "compile", "pipeline"))
+        b"".join(
+            (_HERE / f"{name}.py").read_bytes() for name in ("arrays", "compile", "indexing", "none_fields", "pipeline")
+        )
     ).hexdigest(),
 )
 """Versions of all that translates kernels, with the sources of this package that take part."""

@@ -5,21 +5,19 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, wait
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import types
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
-from bufgym.ground.kernel.arrays import JIT
 from bufgym.ground.kernel.cache import Code, NotKeptError, only_kept
 from bufgym.ground.kernel.meanwhile import FEW, Meanwhile, is_possible
 from bufgym.ground.kernel.pipeline import PartCompiler, WholeCompiler
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-Result = TypeVar("Result")
 
 # Arithmetic follows IEEE 754 to the letter (no fast maths): single = batch and compiled = uncompiled, bit for bit.
 # Kernels work on arrays that their caller holds, so reference counting (_nrt) is off and one kernel is inlined into the
@@ -59,8 +57,6 @@ def _dispatcher(
 
 def kernel(function: Function) -> Function:
     """Compile ``function`` on its first call, for the types of its arguments."""
-    if not JIT:
-        return function
     return cast(Function, _dispatcher(_Kernel, function, "called", no_cfunc_wrapper=True))
 
 
@@ -69,8 +65,6 @@ def compile_for(signature: Any, function: Function) -> Function:
 
     Functions of one signature share one type: the kernel that receives them is compiled once and serves them all.
     """
-    if not JIT:
-        return function
     compiled = _dispatcher(CPUDispatcher, function, "value")
     compiled.compile(signature)
     compiled.disable_compile()
@@ -83,8 +77,6 @@ def entry(compiled: Any) -> Any:
     To find the code for its arguments, Numba looks at every array of every tuple at each call: 3 us, and ten times that
     with functions among them. Here nobody looks, so wrong types go unnoticed.
     """
-    if not JIT:
-        return compiled
     (overload,) = compiled.overloads.values()
     return overload.entry_point
 
@@ -92,7 +84,8 @@ def entry(compiled: Any) -> Any:
 class _Direct:
     """A kernel whose first argument is a batch.
 
-    Calls with equal ``batch.several``, and None as the last argument or not, have arguments of equal types. Over few rows it runs as plain Python while another process compiles it.
+    Calls with equal ``batch.several``, and None as the last argument or not, have arguments of equal types. Over few
+    rows it runs as plain Python while another process compiles it.
     """
 
     def __init__(self, compiled: Any) -> None:
@@ -140,7 +133,7 @@ def compile_here() -> None:
 
 def direct(compiled: Function) -> Function:
     """A ``kernel`` over a batch that Python calls for every step, without a look at the types of its arguments."""
-    return cast(Function, _Direct(compiled)) if JIT else compiled
+    return cast(Function, _Direct(compiled))
 
 
 def code_for(called: Any, batch: Any, last: Any) -> Any:
@@ -169,26 +162,17 @@ def located(signature: Any, compiled: Any) -> Any:
 
     That saves 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
     """
-    return _Located(compiled, signature) if JIT else compiled
+    return _Located(compiled, signature)
 
 
-def interruptible(work: Callable[[], Result]) -> Result:
-    """Run ``work()``, which may spend minutes in kernels, and still answer Ctrl-C at once.
+TRIED = (0, 68)
+"""The newest Numba that passed all tests; a later one is tried out."""
 
-    Python handles a signal only in its main thread, between two of its own instructions. So the main thread waits (60
-    us) while another works. After a KeyboardInterrupt the other goes on until its kernel or the process ends.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return work()
-    future: Future[Result] = Future()
 
-    def carry_out() -> None:
-        try:
-            future.set_result(work())
-        except BaseException as error:  # to be raised in the waiting thread
-            future.set_exception(error)
-
-    threading.Thread(target=carry_out, daemon=True).start()
-    while not future.done():
-        wait([future], 0.5)  # on Windows a signal does not end a wait; half a second does
-    return future.result()
+def try_out() -> None:
+    """With a later Numba, run a kernel inside another. Raises an error where Numba's private parts differ."""
+    if tuple(map(int, str(numba.__version__).split(".")[:2])) > TRIED:
+        inner: Any = kernel(lambda array: array[1])
+        outer: Any = kernel(lambda array: inner(array))
+        if outer(np.arange(3)) != 1:
+            raise ValueError("a wrong result")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import at, compile_for, kernel, local, records
+from bufgym.ground.kernel import at, compile_for, kernel, records
 from bufgym.model.link import FOREVER, Link
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy, signatures
@@ -72,7 +72,7 @@ def _record(
                     calls, n, SENT, at(batch.log, i, place).transmitted_us, at(batch.arrivals, i, place).size_bytes
                 )
                 sent += 1
-            buffer = local(view(batch, i))
+            buffer = view(batch, i)
             if event == DECISION:
                 arrival = arrival_of(batch, i)
                 decision = on_arrival(buffer, arrival, memory[i])

@@ -1,0 +1,191 @@
+"""What a step hands out: the arrays of n rows, and the kernels that write rewards, masks and observations into them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.ground.kernel import kernel, stretch, table
+from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.model.link import FOREVER
+from bufgym.model.observe import (
+    CONTEXT_FIELDS,
+    REWARD_TERMS,
+    SLOT_FIELDS,
+    TOPIC_CONTEXT_FIELDS,
+    TOPIC_REWARD_TERMS,
+    TOPIC_SLOT_FIELDS,
+    observe,
+    observe_topic_context,
+    observe_topic_slots,
+)
+from bufgym.sim.decisions import can_evict, can_hold, can_reject, can_send, has_room
+from bufgym.sim.rules import age_until
+from bufgym.sim.socket import credit
+from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch
+from bufgym.sim.view import arrival_of, view
+
+DELIVERED, RETAINED, AGE, LATE = range(len(REWARD_TERMS) + len(TOPIC_REWARD_TERMS))
+"""Columns of ``StepOutput.reward_terms``."""
+
+_SLOT_FIELDS, _CONTEXT_FIELDS = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
+_ALL_SLOT_FIELDS, _ALL_CONTEXT_FIELDS = (
+    _SLOT_FIELDS + len(TOPIC_SLOT_FIELDS),
+    _CONTEXT_FIELDS + len(TOPIC_CONTEXT_FIELDS),
+)
+
+
+class StepOutput(NamedTuple):
+    """Results of a step of n rows; the kernels write these arrays in place.
+
+    Fields:
+        flat: float32[n, numbers], field by field: first ``SLOT_FIELDS`` (L + 1 numbers each), with several topics also
+            ``TOPIC_SLOT_FIELDS``; then ``CONTEXT_FIELDS`` (one number each), likewise with ``TOPIC_CONTEXT_FIELDS``.
+        action_mask: int8[n, L + 2], 1 for a valid action.
+        reward_terms: float64[n, reward terms], gain of each term in this step.
+        weights: float64[reward terms], read by the kernels.
+        rewards: float64[n], sum of the terms times their weights; without terms of your own.
+        qoi: float64[n], H of the messages at the server so far.
+        invalid: int64[n], invalid actions of the episode so far.
+        terminated: bool[n], whether the episode is over.
+        slots: int64[1], 1 if ``flat`` has the slot fields, 0 if it has the context fields alone.
+    """
+
+    flat: NDArray[np.float32]
+    action_mask: NDArray[np.int8]
+    reward_terms: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    rewards: NDArray[np.float64]
+    qoi: NDArray[np.float64]
+    invalid: NDArray[np.int64]
+    terminated: NDArray[np.bool_]
+    slots: NDArray[np.int64]
+
+
+@kernel
+def settle_gains(batch: Batch, i: int, ended: bool) -> None:
+    """Bring row ``i``'s delivered QoI and ages up to now, or at an episode's end up to the last delivery."""
+    sender = batch.senders[i]
+    until_us = FOREVER if ended else sender.now_us
+    credit(batch, i, until_us)
+    if ended:
+        # Messages that a dead link never carried were not retained after all.
+        sender.retained_gain = sender.delivered_gain
+    if batch.several is not None:
+        for topic in range(sender.topics):
+            age_until(batch, i, topic, until_us)
+
+
+@kernel
+def write_rewards(batch: Batch, i: int, begins: bool, rewarded: NDArray[np.float64], output: StepOutput) -> None:
+    """Write the gain of each reward term of row ``i`` since the step before; ``rewarded`` keeps the totals.
+
+    An episode that ``begins`` has gained nothing.
+    """
+    sender, terms = batch.senders[i], output.reward_terms
+    output.rewards[i] = 0.0
+    if begins:
+        rewarded[i, :] = 0.0
+        terms[i, :] = 0.0
+        return
+    terms[i, DELIVERED] = sender.delivered_gain - rewarded[i, DELIVERED]
+    terms[i, RETAINED] = sender.retained_gain - rewarded[i, RETAINED]
+    rewarded[i, DELIVERED] = sender.delivered_gain
+    rewarded[i, RETAINED] = sender.retained_gain
+    if batch.several is not None:
+        weight = 0.0
+        for topic in range(sender.topics):
+            weight += batch.topics[i, topic].weight
+        # If all topics have weight 0, nothing is rewarded, and any divisor will do.
+        weight = weight if weight > 0 else 1.0
+        terms[i, AGE] = (rewarded[i, AGE] - sender.aged) / weight
+        terms[i, LATE] = (rewarded[i, LATE] - sender.late) / weight
+        rewarded[i, AGE], rewarded[i, LATE] = sender.aged, sender.late
+    for k in range(len(output.weights)):
+        output.rewards[i] += output.weights[k] * terms[i, k]
+
+
+@kernel
+def delivered_qoi(batch: Batch, i: int) -> float:
+    """H of the messages that have reached row ``i``'s server so far."""
+    sender = batch.senders[i]
+    # The 1 in H = 1 + sum of V, for each topic with a delivery.
+    ones = 1.0 if sender.credited > 0 else 0.0
+    if batch.several is not None:
+        ones = 0.0
+        for topic in range(sender.topics):
+            if batch.topics[i, topic].received > 0:
+                ones += batch.topics[i, topic].weight
+    return float(ones + sender.delivered_gain)
+
+
+@kernel
+def write_state(batch: Batch, i: int, ended: bool, output: StepOutput) -> bool:
+    """Write whether row ``i`` has ended, its H and action mask; return whether a decision is due.
+
+    Without one, also write an observation of zeros, with L as the one valid action.
+    """
+    output.terminated[i] = ended
+    output.qoi[i], output.invalid[i] = delivered_qoi(batch, i), batch.senders[i].invalid
+    if batch.senders[i].waiting == NOTHING_WAITS:
+        output.flat[i, :] = 0.0
+        output.action_mask[i, :] = False
+        output.action_mask[i, batch.senders[i].capacity] = True
+        return False
+    write_mask(batch, i, output.action_mask)
+    return True
+
+
+@kernel
+def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> None:
+    """Write row ``i``'s state and the observation of its tables' fields."""
+    if not write_state(batch, i, ended, output):
+        return
+    sender = batch.senders[i]
+    buffer, entries = view(batch, i), (sender.capacity + 1) * output.slots[0]
+    if batch.several is not None:
+        arriving = sender.waiting == ARRIVAL_WAITS
+        # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
+        arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
+        first = _ALL_SLOT_FIELDS * entries
+        if entries > 0:
+            observe_topic_slots(buffer, arrival, arriving, table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries))
+        observe_topic_context(buffer, arrival, arriving, stretch(output.flat, i, first, _ALL_CONTEXT_FIELDS))
+    else:
+        arrival = arrival_of(batch, i)
+        first = _SLOT_FIELDS * entries
+        rows, context = table(output.flat, i, 0, _SLOT_FIELDS, entries), stretch(output.flat, i, first, _CONTEXT_FIELDS)
+        observe(buffer, arrival, rows, context)
+
+
+@kernel
+def write_mask(batch: Batch, i: int, action_mask: NDArray[np.int8]) -> None:
+    """Write the valid actions of row ``i``, which waits for a decision."""
+    sender = batch.senders[i]
+    capacity = sender.capacity
+    action_mask[i, sender.occupancy : capacity] = False
+    if batch.several is None:
+        # The same as below, only faster.
+        action_mask[i, : sender.occupancy] = True
+        action_mask[i, capacity] = True
+    else:
+        if sender.waiting == SOCKET_WAITS:
+            for k in range(sender.occupancy):
+                action_mask[i, k] = can_send(batch, i, k)
+            action_mask[i, capacity] = can_hold(batch, i)
+            action_mask[i, capacity + 1] = False
+            return
+        for k in range(sender.occupancy):
+            action_mask[i, k] = can_evict(batch, i, k)
+        action_mask[i, capacity] = can_reject(batch, i)
+    action_mask[i, capacity + 1] = has_room(batch, i)
+
+
+@kernel
+def decision_of(action: int, capacity: int) -> int:
+    """The decision for an action: 0..L-1 evict that slot, L reject, L + 1 accept."""
+    if action < capacity:
+        return action
+    return REJECT if action == capacity else ACCEPT

@@ -1,0 +1,34 @@
+"""Work that several threads share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Threads:
+    """Does the same work on each part of a batch at once, the first part here and the others in threads.
+
+    Kernels hold no lock of Python's, and rows share no memory that a step writes.
+    """
+
+    def __init__(self, numbers: NDArray[np.int64], num_threads: int) -> None:
+        """``numbers``, int64[n], are rows or cells. They are split into at most ``num_threads`` parts."""
+        parts = np.array_split(numbers, min(num_threads, len(numbers)))
+        self.parts = [np.ascontiguousarray(part) for part in parts]
+        self.all = self.parts[0] if len(self.parts) == 1 else None
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0
+
+    def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
+        """Call ``work`` on every part; return when all are done."""
+        if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
+            self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
+        running = [self._pool.submit(work, part) for part in self.parts[1:]]
+        work(self.parts[0])
+        for part in running:
+            part.result()
