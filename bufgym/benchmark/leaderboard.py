@@ -13,9 +13,9 @@ from typing import Any
 from bufgym.benchmark import folder
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
-from bufgym.benchmark.summary import shown
+from bufgym.benchmark.summary import places, shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.benchmark.table import Table
+from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
@@ -66,12 +66,13 @@ def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> lis
     """Make one entry for each policy of a suite's rows, best first."""
     task = task_of(suite)
     summary = task.summary(rows, unranked)
-    board = []
-    for rank, standing in enumerate(summary.overall, 1):
-        known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
-        values = {key: standing[key] for key in task.listed}
-        board.append(Entry(suite, standing.policy, rank if known else 0, summary.counted_cells, values, __version__))
-    return board
+    return [
+        Entry(
+            *(suite, place.policy, place.rank or 0, summary.counted_cells),
+            *({key: standing[key] for key in task.listed}, __version__),
+        )
+        for place, standing in zip(places(summary), summary.overall, strict=True)
+    ]
 
 
 def make(path: Path, names: Sequence[str], specs: Mapping[str, Sequence[str]], **options: Any) -> list[Entry]:
@@ -186,7 +187,7 @@ def markdown(board: Sequence[Entry]) -> str:
         lines = []
         for entry in group:
             values = [" ".join(filter(None, shown(entry.values[q.key], q))) for q in quantities]
-            lines.append([str(entry.rank) if entry.rank else "–", entry.policy, *values, f"`{entry.command}`"])
+            lines.append([str(entry.rank or NONE), entry.policy, *values, f"`{entry.command}`"])
         head = ["#", "policy", *(quantity.title for quantity in quantities), "command"]
         about = suites.get(suite).about
         out += ["", f"## {suite}", "", f"{about[0].upper()}{about[1:]}.", ""]

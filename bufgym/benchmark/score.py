@@ -22,7 +22,7 @@ Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -41,6 +41,7 @@ from bufgym.benchmark.bootstrap import (
     times_drawn,
 )
 from bufgym.benchmark.episodes import Arrays, Cell, Numbers
+from bufgym.benchmark.table import NOBODY, Unranked
 from bufgym.oracle.measure import BASELINE, TIE, normalised_score
 
 REFERENCE = "afr"
@@ -74,8 +75,13 @@ class Standing:
     """One policy in one cell, or over all."""
 
     policy: str
-    ranked: bool  # whether it competes with the others
+    apart: str  # reason why it does not compete with the others; empty if it does
     values: Mapping[str, Interval]  # by the key of a ``summary.Quantity``
+
+    @property
+    def ranked(self) -> bool:
+        """Whether it competes."""
+        return not self.apart
 
     def __getitem__(self, key: str) -> Interval:
         return self.values[key]
@@ -118,13 +124,13 @@ def regret(h: Numbers, best: Numbers) -> Numbers:
     return 1 - ratio(h, best, best > 0)
 
 
-def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = (), against: str = "") -> Scores:
+def scores(rows: Sequence[Mapping[str, Any]], unranked: Unranked = NOBODY, against: str = "") -> Scores:
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Args:
         rows: from ``bufgym.benchmark.run``. Rows of a trained agent may have a "training_seed"; the H of an episode is
             then the mean over training seeds.
-        unranked: policies that are shown but not ranked, such as an unbounded queue or the clairvoyant.
+        unranked: policies that are shown but not ranked, with the reasons, see ``table.unranked``.
         against: the policy that every other is compared with by its share of ``REFERENCE``'s regret.
 
     Raises:
@@ -157,7 +163,7 @@ def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = (), ag
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
     _compare(overall, against)
     standings = [
-        Standing(policy, policy not in unranked, {key: interval(numbers) for key, numbers in values.items()})
+        Standing(policy, unranked.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
         for policy, values in overall.items()
     ]
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))

@@ -8,7 +8,7 @@ paired bootstrap over links that ``score`` describes: one draw serves all polici
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
-from bufgym.benchmark.table import Rows, Table, signed
+from bufgym.benchmark.table import NOBODY, NONE, Rows, Table, Unranked, signed
 from bufgym.ground.errors import BufgymError
 
 
@@ -99,7 +99,7 @@ def summarise(
     *,
     rank_by: str,
     baseline: str,
-    unranked: Collection[str] = (),
+    unranked: Unranked = NOBODY,
     against: str = "",
 ) -> Summary:
     """Compare every policy with ``baseline``, by cell and over all cells.
@@ -110,7 +110,7 @@ def summarise(
         quantities: names and formats of the statistics.
         rank_by: the key of the quantity that orders the policies.
         baseline: the policy that the others are measured against.
-        unranked: policies that come last, such as an unbounded queue.
+        unranked: policies that come last, see ``table.unranked``.
         against: the policy that every other is compared with by ``rank_by``, see ``difference``.
 
     Raises:
@@ -151,13 +151,42 @@ def summarise(
                 pooled = (np.sum if quantity.total else np.mean)([by_cell[cell][quantity.key] for cell in over], axis=0)
                 interval = percentile_interval(pooled)
                 values[quantity.key] = Interval(interval.value, math.nan, math.nan) if alone else interval
-            entries.append(Standing(policy, policy not in unranked, values))
+            entries.append(Standing(policy, unranked.get(policy, ""), values))
         return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
 
     return Summary(quantities, rank_by, standings(cells), {cell: standings([cell]) for cell in cells}, baseline)
 
 
 # --- as text ---------------------------------------------------------------------------------------------------------
+
+
+class Place(NamedTuple):
+    """One line of a ranking."""
+
+    rank: int | None  # 1 for the best; None for a policy that is not ranked
+    policy: str
+    values: list[tuple[str, str]]  # (value, interval) as text, a pair for each quantity of the summary
+    reason: str  # why it is not ranked; empty if it is
+
+    @property
+    def place(self) -> str:
+        """Its rank as text."""
+        return NONE if self.rank is None else str(self.rank)
+
+    @property
+    def texts(self) -> list[str]:
+        """Each value with its interval."""
+        return [" ".join(filter(None, texts)) for texts in self.values]
+
+
+def places(summary: Summary, standings: Sequence[Standing] | None = None) -> list[Place]:
+    """Ranked policies best first, then the others; by default over all cells."""
+    found = []
+    for rank, standing in enumerate(summary.overall if standings is None else standings, 1):
+        known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
+        values = [pair(standing, quantity) for quantity in summary.quantities]
+        found.append(Place(rank if known else None, standing.policy, values, standing.apart))
+    return found
 
 
 def pair(standing: Standing, quantity: Quantity) -> tuple[str, str]:

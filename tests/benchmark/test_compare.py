@@ -58,6 +58,15 @@ def test_the_paired_difference_to_a_policy() -> None:
     assert "minus afr's" in fleet.table()
 
 
+def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
+    endless = policies.Policy("mine", policies.get("drop-oldest").on_arrival, unbounded=True)
+    done = bufgym.compare([endless, "drop-oldest"], "interruption", seeds=2, t_max=20)
+    assert done.unranked == {"mine": "its queue is unbounded"}
+    lines = done.table().splitlines()
+    assert [line.split()[0] for line in lines[1:3]] == ["drop-oldest", "mine"]
+    assert "note: mine does not compete: its queue is unbounded" in lines
+
+
 def test_a_suite_by_name() -> None:
     done = bufgym.compare(["afr"], "interruption-v1", capacity=2, seeds=1, progress=False)
     assert {row["policy"] for row in done.rows} == {"afr", "drop-oldest"} and "afr" in done.table()

@@ -80,7 +80,7 @@ def test_one_episode_has_no_interval() -> None:
 def test_unranked_policies_come_last() -> None:
     numbers = runs({"base": [1, 1], "endless": [9, 9]})
     assert [standing.policy for standing in summary(numbers).overall] == ["endless", "base"]
-    found = summary(numbers, unranked=["endless"]).overall
+    found = summary(numbers, unranked={"endless": "its queue is unbounded"}).overall
     assert [(standing.policy, standing.ranked) for standing in found] == [("base", True), ("endless", False)]
 
 

@@ -45,7 +45,7 @@ def markdown(folder: str | Path, against: str | None = None) -> str:
 
 def html(folder: str | Path, against: str = "") -> str:
     """The ranking as an HTML table, for a notebook. Errors as for ``write``."""
-    return tables.html(*_read(folder, against))
+    return tables.html(_read(folder, against)[1])
 
 
 def plain(folder: str | Path, against: str = "") -> str:

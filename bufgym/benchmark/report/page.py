@@ -11,7 +11,7 @@ from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.report import charts, tables, timeline
 from bufgym.benchmark.report.charts import Context
 from bufgym.benchmark.score import DISCRIMINATIVE, REFERENCE, CellScore
-from bufgym.benchmark.summary import Summary, title
+from bufgym.benchmark.summary import Summary, places, title
 from bufgym.ground.errors import BufgymError, install
 
 CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, timeline.timeline)
@@ -50,11 +50,8 @@ def html(run: SuiteRun, summary: Summary) -> str:
         resamples=RESAMPLES,
         versus=REFERENCE,
         threshold=f"{DISCRIMINATIVE:.0%}".replace("%", " %"),
-        places=tables.ranking(run, summary),
-        cells=[
-            (title(cell, run.abouts), tables.ranking(run, summary, standings))
-            for cell, standings in summary.cells.items()
-        ],
+        places=places(summary),
+        cells=[(title(cell, run.abouts), places(summary, found)) for cell, found in summary.cells.items()],
         best=next((s for s in summary.overall[:1] if s.ranked and not math.isnan(s[summary.rank_by].value)), None),
         reference=None if summary.scores is None else summary.standings.get(REFERENCE),
         heat=None if summary.scores is None else tables.heat_map(summary.scores),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from bufgym.benchmark.rows import Layout, Row
 from bufgym.benchmark.summary import Quantity, Summary
+from bufgym.benchmark.table import NOBODY, Unranked
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
@@ -63,12 +64,12 @@ class Task(ABC):
         """Quantities that its summary shows."""
 
     @abstractmethod
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
         """Compare every policy with the baseline.
 
         Args:
             rows: rows of ``run``.
-            unranked: policies that are shown but not ranked.
+            unranked: policies that are shown but not ranked, see ``table.unranked``.
             against: policy that every other is compared with in a further quantity, "against"; empty for none.
         """
 

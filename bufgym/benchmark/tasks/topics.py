@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
-from bufgym.benchmark.table import Column, Rows, Table, decimal, mean, percent, score, written
+from bufgym.benchmark.table import NOBODY, Column, Rows, Table, Unranked, decimal, mean, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, names
@@ -100,7 +100,7 @@ class TopicsTask(Task):
             Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
         runs = by_run(rows, "topic", "weighted_qoi")
         priorities = {max(row["priority"] for row in run.values()) for run in runs.values()}
         first = f"priority {priorities.pop():g}" if len(priorities) == 1 else "first"
@@ -215,12 +215,12 @@ def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Num
 TOPIC_COLUMNS = (
     Column("topic", "topic", str),
     Column("priority", "priority", "{:g}".format),
-    Column("QoI", "qoi", "{:.2f}".format),
-    *(Column(name, name, "{:.1f}".format) for name in ("arrived", "limited", "lost", "delivered", "late")),
-    Column("age mean (s)", "mean_age_s", "{:.3f}".format),
-    Column("age peak (s)", "peak_age_s", "{:.3f}".format),
-    Column("delay mean (s)", "mean_sojourn_s", "{:.3f}".format),
-    Column("delay p95 (s)", "p95_sojourn_s", "{:.3f}".format),
+    Column("QoI", "qoi", _seconds),
+    *(Column(name, name, _one_digit) for name in ("arrived", "limited", "lost", "delivered", "late")),
+    Column("age mean (s)", "mean_age_s", score),
+    Column("age peak (s)", "peak_age_s", score),
+    Column("delay mean (s)", "mean_sojourn_s", score),
+    Column("delay p95 (s)", "p95_sojourn_s", score),
 )
 
 
@@ -237,7 +237,7 @@ def by_topic(rows: Rows, policy: str) -> str:
         (
             title(cell, {}),
             [
-                [topic, *(written(mean([row[c.key] for row in outcomes]), c) for c in TOPIC_COLUMNS[1:])]
+                [topic, *(c.write(mean([row[c.key] for row in outcomes])) for c in TOPIC_COLUMNS[1:])]
                 for topic, outcomes in topics.items()
             ],
         )
