@@ -156,7 +156,7 @@ def report_environment(
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = _save(folder, settings, runs, best, held_out=held_out, scores=entries)
-    apart = unranked(map(registry.get, registry.names()))
+    apart = unranked(rows)
     bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in apart}
     bars, twins = _drawn(bars, alike)
     draw(
@@ -233,7 +233,7 @@ def report_suite(
     rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
     rows += [row for own in agents.values() for row in own]
     write_rows(rows, home / "rows.csv")
-    result = scores(rows, unranked(map(registry.get, registry.names())))
+    result = scores(rows, unranked=[name for name in registry.names() if not registry.get(name).ranked])
     print(standings(result))
     qoi: dict[str, list[float]] = {}
     for row in rows:

@@ -8,7 +8,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ class Comparison:
     """The table as Markdown."""
     html: str
     """The table as HTML."""
-    unranked: Mapping[str, str] = table.NOBODY
+    unranked: Mapping[str, str] = field(default_factory=dict)
     """The policies that do not compete, with the reasons."""
 
     def table(self, form: str = "plain") -> str:
@@ -81,7 +81,7 @@ class Comparison:
         except ImportError:
             raise BufgymError(f"plot needs matplotlib: {install('plot')}") from None
         axes = pyplot.subplots(layout="constrained")[1] if axes is None else axes
-        entries = table.means(self.rows, apart=self.unranked)
+        entries = table.means(self.rows, alone=self.unranked)
         capacities = list(dict.fromkeys(entry["capacity"] for entry in entries))
         names = list(dict.fromkeys(entry["policy"] for entry in reversed(entries)))
         height = 0.8 / len(capacities)
@@ -158,25 +158,25 @@ def compare(
     task = tasks.of(stream)
     chosen = _with(chosen, rival, task)
     alone = all(policy.name != task.baseline for policy in chosen)
-    apart = table.unranked(chosen)
+    unranked = table.apart(chosen)
     if task.kind != "queue":
         chosen = [*chosen, make_policy(task.baseline)] if alone else chosen
         rows = run(chosen, stream, capacities, seeds, label=label, progress=progress)
-        shown = summary.table_of(task.summary(rows, apart, named))
+        shown = summary.table_of(task.summary(rows, unranked, named))
     else:
         rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
         floor = run([BASELINE], stream, capacities, seeds, label=label, bound=named != "", **queue) if alone else []
-        shown = table.of(rows, floor, apart)
+        shown = table.of(rows, floor, unranked)
         if not about and "score" in shown.head:
             shown = shown._replace(notes=[table.SCORE, *shown.notes])
     texts = [shown.plain(), shown.markdown(), shown.html()]
     if named and task.kind == "queue":
-        found = task.summary([*rows, *floor], apart, named)
+        found = task.summary([*rows, *floor], unranked, named)
         paired = [quantity for quantity in found.quantities if quantity.key in ("share", "against")]
         notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
         more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
         texts = ["\n\n".join(both) for both in zip(texts, (more.plain(), more.markdown(), more.html()), strict=True)]
-    return Comparison(rows, about or label or repr(stream), *texts, unranked=apart)
+    return Comparison(rows, about or label or repr(stream), *texts, unranked=unranked)
 
 
 def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
@@ -207,4 +207,4 @@ def _on_suite(
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
         shown = [form(out, against) for form in (report.plain, report.markdown, report.html)]
-        return Comparison(rows, f"suite {name}", *shown, unranked=table.unranked(chosen))
+        return Comparison(rows, f"suite {name}", *shown, unranked=table.apart(chosen))

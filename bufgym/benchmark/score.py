@@ -22,7 +22,7 @@ Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -124,13 +124,15 @@ def regret(h: Numbers, best: Numbers) -> Numbers:
     return 1 - ratio(h, best, best > 0)
 
 
-def scores(rows: Sequence[Mapping[str, Any]], unranked: Unranked = NOBODY, against: str = "") -> Scores:
+def scores(
+    rows: Sequence[Mapping[str, Any]], unranked: Unranked | Collection[str] = NOBODY, against: str = ""
+) -> Scores:
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Args:
         rows: from ``bufgym.benchmark.run``. Rows of a trained agent may have a "training_seed"; the H of an episode is
             then the mean over training seeds.
-        unranked: policies that are shown but not ranked, with the reasons, see ``table.unranked``.
+        unranked: policies that are shown but not ranked, with the reasons, see ``table.apart``.
         against: the policy that every other is compared with by its share of ``REFERENCE``'s regret.
 
     Raises:
@@ -162,8 +164,9 @@ def scores(rows: Sequence[Mapping[str, Any]], unranked: Unranked = NOBODY, again
             )
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
     _compare(overall, against)
+    reasons = unranked if isinstance(unranked, Mapping) else dict.fromkeys(unranked, "it does not compete")
     standings = [
-        Standing(policy, unranked.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
+        Standing(policy, reasons.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
         for policy, values in overall.items()
     ]
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))

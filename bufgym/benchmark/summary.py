@@ -110,7 +110,7 @@ def summarise(
         quantities: names and formats of the statistics.
         rank_by: the key of the quantity that orders the policies.
         baseline: the policy that the others are measured against.
-        unranked: policies that come last, see ``table.unranked``.
+        unranked: policies that come last, see ``table.apart``.
         against: the policy that every other is compared with by ``rank_by``, see ``difference``.
 
     Raises:

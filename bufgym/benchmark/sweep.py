@@ -25,7 +25,7 @@ from bufgym.benchmark import cluster, folder, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
 from bufgym.benchmark.run import bar, by_trace, check_distinct, run
-from bufgym.benchmark.table import unranked
+from bufgym.benchmark.table import apart
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__, modules
 from bufgym.ground.errors import BufgymError
@@ -240,7 +240,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "episodes": sweep.task.describe([setting.scenario for setting in settings.values()], episodes),
         "command": command,
         "policies": [policy.name for policy in sweep.policies],
-        "unranked": unranked(sweep.policies),
+        "unranked": apart(sweep.policies),
         "capacities": list(sweep.capacities),
         "seeds": sweep.seeds,
         "changes": dict(sweep.changes),

@@ -10,13 +10,14 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from bufgym import policies
 from bufgym.ground.errors import printable
 from bufgym.oracle.measure import BASELINE, normalised_score
 from bufgym.policies import Policy
 
 Rows = Sequence[Mapping[str, Any]]
 Unranked = Mapping[str, str]
-"""Policies that do not compete, with the reasons, see ``unranked``."""
+"""Policies that do not compete, with the reasons, see ``apart``."""
 NOBODY: Unranked = MappingProxyType({})
 NONE = "–"
 """No number."""
@@ -154,10 +155,10 @@ UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exac
 """The note below them."""
 
 
-def means(rows: Rows, floor: Rows = (), apart: Collection[str] = ()) -> list[dict[str, Any]]:
+def means(rows: Rows, floor: Rows = (), alone: Collection[str] = ()) -> list[dict[str, Any]]:
     """Average the rows of each policy and capacity, sorted by capacity ascending, then QoI descending.
 
-    Policies ``apart``, which do not compete, come last within a capacity. None and NaN count as missing, and a mean of
+    Those ``alone``, which do not compete, come last within a capacity. None and NaN count as missing, and a mean of
     missing numbers is NaN. The score is that of the cell, see ``measure.normalised_score``. ``floor`` holds rows of
     Drop Oldest on the same episodes if it is not among ``rows``.
     """
@@ -174,7 +175,7 @@ def means(rows: Rows, floor: Rows = (), apart: Collection[str] = ()) -> list[dic
         }
         for (capacity, policy), group in groups.items()
     ]
-    return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in apart, -e["qoi"], e["policy"]))
+    return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in alone, -e["qoi"], e["policy"]))
 
 
 def _episode(row: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -192,17 +193,17 @@ def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
     return float(normalised_score(*sums))
 
 
-def same(rows: Rows, apart: Collection[str] = ()) -> dict[str, list[str]]:
+def same(rows: Rows, alone: Collection[str] = ()) -> dict[str, list[str]]:
     """Group policies with equal rows: map the first, or Drop Oldest if it is among them, to the others.
 
-    One that is ``apart`` is never grouped with one that competes.
+    One that is ``alone`` is never grouped with one that competes.
     """
     fates: dict[str, list[str]] = {}
     for row in rows:
         fates.setdefault(row["policy"], []).append(repr({**row, "policy": ""}))
     groups: dict[tuple[Any, ...], list[str]] = {}
     for name in sorted(fates, key=lambda name: name != BASELINE):
-        groups.setdefault((name in apart, *sorted(fates[name])), []).append(name)
+        groups.setdefault((name in alone, *sorted(fates[name])), []).append(name)
     return {first: others for first, *others in groups.values() if others}
 
 
@@ -211,25 +212,31 @@ def told_once(alike: Mapping[str, Sequence[str]]) -> list[str]:
     return [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in alike.items()]
 
 
-def unranked(policies: Iterable[Policy]) -> dict[str, str]:
+def apart(chosen: Iterable[Policy]) -> dict[str, str]:
     """The policies that do not compete, with the reasons."""
-    return {policy.name: policy.unranked_because for policy in policies if not policy.ranked}
+    return {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
 
 
-def of(rows: Rows, floor: Rows = (), apart: Unranked = NOBODY) -> Table:
+def unranked(rows: Rows) -> dict[str, str]:
+    """The same of the registered policies in rows whose policies are not at hand."""
+    met = {row["policy"].partition(":")[0] for row in rows}
+    return apart(policies.get(name) for name in policies.names() if name in met)
+
+
+def of(rows: Rows, floor: Rows = (), alone: Unranked = NOBODY) -> Table:
     """Make the table of ``means``, with one line for policies that are the ``same``.
 
-    Score and regret are left out if no row has them. ``floor`` and ``apart``, see ``unranked``, are as in ``means``.
+    Score and regret are left out if no row has them. ``floor`` and ``alone``, see ``apart``, are as in ``means``.
     """
-    alike = same(rows, apart)
+    alike = same(rows, alone)
     others = {name for names in alike.values() for name in names}
-    entries = [entry for entry in means(rows, floor, apart) if entry["policy"] not in others]
+    entries = [entry for entry in means(rows, floor, alone) if entry["policy"] not in others]
     bounded = {key for key in ("score", "regret") if any(not math.isnan(entry[key]) for entry in entries)}
     columns = [c for c in COLUMNS if c.key in bounded or c.key not in ("score", "regret")]
     inexact = any(row.get("certified") is False and row.get("regret") is not None for row in rows)
     titles = [REGRET_AT_MOST if c.key == "regret" and inexact else c.title for c in columns]
     by_capacity = [list(block) for _, block in itertools.groupby(entries, lambda entry: entry["capacity"])]
     blocks = [("", [[c.write(entry[c.key]) for c in columns] for entry in block]) for block in by_capacity]
-    notes = [f"note: {policy} does not compete: {reason}" for policy, reason in apart.items()]
+    notes = [f"note: {policy} does not compete: {reason}" for policy, reason in alone.items()]
     notes += [*told_once(alike), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(rows)]
     return Table(titles, blocks, notes)

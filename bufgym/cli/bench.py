@@ -109,7 +109,7 @@ def _bench(
     bounds = _bound_notes(done.rows, stream, decide_at) if recorded else []
     print("\n".join([str(done), *bounds]))
     if recorded:
-        order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows, apart=done.unranked)))
+        order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows, alone=done.unranked)))
         _dropped(chosen, stream, capacity, seeds, settings, order, drops)
     if folder is not None:
         form = out.format or ("parquet" if files.has_pyarrow() else "csv")

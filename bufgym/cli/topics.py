@@ -96,7 +96,7 @@ def _own_client(
     from bufgym.benchmark.rows import write_rows
     from bufgym.benchmark.run import run
     from bufgym.benchmark.summary import plain
-    from bufgym.benchmark.table import invalid, unranked
+    from bufgym.benchmark.table import apart, invalid
     from bufgym.benchmark.tasks import TASKS
     from bufgym.scenario import read_client
 
@@ -109,13 +109,13 @@ def _own_client(
     chosen = [policies.get(spec) for spec in (specs if task.baseline in specs else [*specs, task.baseline])]
     seeds, label = who.seeds or SEEDS, Path(config).stem
     rows = run(chosen, client, who.capacity or (CAPACITY,), seeds, label=label, progress=True)
-    apart = unranked(chosen)
+    unranked = apart(chosen)
     scaled = f" x {client.scale:g}" if client.scale != 1 else ""
     link = client.traces[0].name if len(client.traces) == 1 else f"{len(client.traces)} links"
     about = f"{len(client.topics)} topic{'' if len(client.topics) == 1 else 's'} over {link}{scaled}"
     print(f"The client of {printable(config)}.\n{task.describe([client], seeds * len(client.traces))}\n")
-    print(plain(task.summary(rows, apart), {label: about}) + "\n")
-    notes = [f"{name} has no rank: {reason}." for name, reason in apart.items()]
+    print(plain(task.summary(rows, unranked), {label: about}) + "\n")
+    notes = [f"{name} has no rank: {reason}." for name, reason in unranked.items()]
     print("\n".join([*task.legend, *notes, *invalid(task.senders(rows))]))
     if file is not None:
         print(f"\n{len(rows)} rows in {write_rows(rows, file, task.layout)}")

@@ -305,7 +305,7 @@ def test_the_score_leads_and_is_computed_on_sums() -> None:
     free = [scored("rosbridge", seed, 12.0, regret=None) for seed in (0, 1)]
     entries = {entry["policy"]: entry["score"] for entry in table.means([*BASE, *MINE, *free])}
     assert entries["mine"] == 4 / 11 and entries["drop-oldest"] == 0 and math.isnan(entries["rosbridge"])
-    made = table.of([*BASE, *MINE, *free], apart={"rosbridge": "its queue is unbounded"})
+    made = table.of([*BASE, *MINE, *free], alone={"rosbridge": "its queue is unbounded"})
     lines = made.plain().split("\n")
     assert "note: rosbridge does not compete: its queue is unbounded" in lines
     assert lines[0].split()[:5] == ["policy", "L", "score", "QoI", "regret"]

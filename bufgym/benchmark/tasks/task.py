@@ -69,7 +69,7 @@ class Task(ABC):
 
         Args:
             rows: rows of ``run``.
-            unranked: policies that are shown but not ranked, see ``table.unranked``.
+            unranked: policies that are shown but not ranked, see ``table.apart``.
             against: policy that every other is compared with in a further quantity, "against"; empty for none.
         """
 
