@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import html
 import math
 import os
@@ -17,12 +16,17 @@ from bufgym.benchmark import report, sources, summary, table, tasks
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, install, unknown
+from bufgym.ground.modules import is_named
 from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.policies.registry import OnArrival
 from bufgym.scenario import suites
+from bufgym.scenario.registry import parameters
 
+KEYWORDS = ("capacity", "seeds", "progress", "about", "against")
+QUEUE = ("max_bytes", "decide_at")
+"""Settings of a queue."""
 PolicyLike = Policy | str | Path | OnArrival
 
 
@@ -147,11 +151,14 @@ def compare(
             raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
         chosen = _with(chosen, rival, tasks.TASKS[suites.get(on).kind])
         return _on_suite(chosen, files, on, capacities, seeds, progress, named)
-    if isinstance(on, str) and on.isidentifier() and on not in scenario.SCENARIOS:
-        close = difflib.get_close_matches(on, [*scenario.SCENARIOS, *suites.SUITES], 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join([*scenario.SCENARIOS, *suites.SUITES])}"
-        raise BufgymError(f"{on!r}: no scenario and no suite; {hint}")
-    queue = {name: settings.pop(name) for name in ("max_bytes", "decide_at") if name in settings}
+    if isinstance(on, str) and not (on in scenario.SCENARIOS or on.endswith(".toml") or is_named(on)):
+        raise unknown("scenario or suite", on, [*scenario.SCENARIOS, *suites.SUITES])
+    queue = {name: settings.pop(name) for name in QUEUE if name in settings}
+    stream = scenario.get(on) if isinstance(on, str) else on
+    known = parameters(stream) if isinstance(on, str) else []
+    for name in settings:
+        if name not in known:
+            raise unknown("keyword", name, [*KEYWORDS, *QUEUE, *known], place="compare")
     stream = scenario.get(on, **settings) if isinstance(on, str) else on
     label = on if isinstance(on, str) else ""
     seeds, capacities = 10 if seeds is None else seeds, capacities or [8]
@@ -202,7 +209,7 @@ def _on_suite(
     names = tuple(policy.name for policy in chosen)
     sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=tuple(dict.fromkeys(files)))
     # Other processes can't know what a user's own code registered in this one.
-    own = any(not policy.on_arrival.__module__.startswith("bufgym.") for policy in chosen) and not files
+    own = not all(policy.built_in for policy in chosen) and not files
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)

@@ -80,7 +80,7 @@ def check_distinct(policies: Sequence[Policy]) -> None:
     given = [policy.name for policy in policies]
     for name in given:
         if given.count(name) > 1:
-            own = [p for p in policies if p.name == name and not p.on_arrival.__module__.startswith("bufgym.")]
+            own = [p for p in policies if p.name == name and not p.built_in]
             why = f"; {name!r} is a built-in policy's name, give your own another" if own and name in names() else ""
             raise BufgymError(f"policies: {name!r} is given more than once{why}")
 

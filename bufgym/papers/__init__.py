@@ -45,7 +45,7 @@ def figure(name: str, out: Path | None = None, **options: Any) -> Figure:
     known = [option.name for option in fields(kind)]
     for option in options:
         if option not in known:
-            raise BufgymError(f"{name}: no option {option!r}; it has: {', '.join(known)}")
+            raise unknown("option", option, known, place=name)
     if out is not None and "store" in known:
         options.setdefault("store", out / STORE)
     reproduction: Figure = kind(**options)

@@ -25,7 +25,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import unknown
 from bufgym.papers.extra import library
 
 Content = dict[str, Any]
@@ -144,7 +144,7 @@ def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topi
         numbers = encoding == "json-numbers"
         operation = {"op": "publish", "topic": topic, "msg": _json(message, numbers)}
         return json.dumps(operation, separators=(",", ":") if numbers else None, allow_nan=False).encode()
-    raise BufgymError(f"unknown encoding {encoding!r}; known: {', '.join(ENCODINGS)}")
+    raise unknown("encoding", encoding, ENCODINGS)
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.files import check_keys, read_toml
 from bufgym.ground.kernel import records
 from bufgym.model import qoi
@@ -70,7 +70,7 @@ class Stream:
                 raise BufgymError(f"moves = {self.moves!r}: must be true or false")
             for name, size in self.encodings.items():
                 if name not in ENCODINGS:
-                    raise BufgymError(f"unknown encoding {name!r}; known: {', '.join(ENCODINGS)}")
+                    raise unknown("encoding", name, ENCODINGS)
                 up_to(f"bytes in {name}", size, MAX_MESSAGE_BYTES)
         except BufgymError as error:
             raise BufgymError(f"topic {self.topic.name!r}: {error}") from None

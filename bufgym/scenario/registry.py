@@ -99,9 +99,13 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
         spec = checked(spec, type(spec).__name__)
     if not overrides:
         return spec
-    known: set[str] = {f.name for f in fields(spec)} if is_dataclass(spec) else set()
+    known = parameters(spec)
     for name in overrides:
         if name not in known:
-            has = ", ".join(sorted(known)) or "none (it is no dataclass)"
-            raise BufgymError(f"{type(spec).__name__}: no parameter {name!r}; it has: {has}")
+            raise unknown("parameter", name, known, "" if known else " (it is no dataclass)", type(spec).__name__)
     return replace(spec, **overrides)  # type: ignore[type-var]
+
+
+def parameters(spec: Any) -> list[str]:
+    """Names of a scenario's parameters, sorted; none where it is no dataclass."""
+    return sorted(f.name for f in fields(spec)) if is_dataclass(spec) else []

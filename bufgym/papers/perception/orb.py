@@ -73,7 +73,8 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode) -> Policy:
         return victim
 
     about = "ORBBuf by what two images have in common; it sees the images, as no other policy does."
-    return Policy("orbbuf-images", on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
+    source = "ORBBuf [wang2021orbbuf], ORB features by OpenCV"
+    return Policy("orbbuf-images", on_arrival, about=about, source=source, built_in=True)
 
 
 COMPARED: Final = 3
