@@ -99,15 +99,13 @@ class Table(NamedTuple):
         return "<tr>" + "".join(f'<{tag} style="text-align: {side}">{cell}</{tag}>' for side, cell in cells) + "</tr>"
 
 
-def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Align rows of cells as lines of text: the first column to the left, the others to the right."""
-    lines = [list(map(printable, line)) for line in lines]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    out = []
-    for first, *rest in lines:
-        padded = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
-        out.append("  ".join([first.ljust(widths[0]), *padded]).rstrip())
-    return out
+def aligned(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:
+    """Align rows of cells as lines of text: the first ``left`` columns to the left, the others to the right."""
+    texts = [list(map(printable, line)) for line in lines]
+    sides = [(max(map(len, column)), "<" if k < left else ">") for k, column in enumerate(zip(*texts, strict=True))]
+    return [
+        "  ".join(f"{cell:{side}{n}}" for cell, (n, side) in zip(line, sides, strict=True)).rstrip() for line in texts
+    ]
 
 
 def invalid(rows: Rows) -> list[str]:

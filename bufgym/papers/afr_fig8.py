@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.table import aligned
 from bufgym.papers.figure import finish, heat_table
 from bufgym.papers.frame_runs import POLICIES, FrameFigure
-from bufgym.papers.rows import FigureRows, table
+from bufgym.papers.rows import FigureRows
 
 THIRD = 1 / 3
 """Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
@@ -42,7 +43,7 @@ class Reproduction(FrameFigure):
                 of = len(shown.where(policy=policy))
                 text = ", ".join(map(str, first)) or "none"
                 cells.append([POLICIES[policy][0], *counts, sum(counts), of, text])
-            lines += [f"{recording}, runs of {self.offsets} in which tracking breaks, by L:", *table(cells), ""]
+            lines += [f"{recording}, runs of {self.offsets} in which tracking breaks, by L:", *aligned(cells), ""]
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.benchmark.rows import Row
 from bufgym.papers.afr_theorems import gaps_of
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import FrameFigure
 from bufgym.papers.perception.views import overlap_information
-from bufgym.papers.rows import FigureRows, Row
+from bufgym.papers.rows import FigureRows
 
 NOISE = 0.05
 """Violation of a rule that still counts as keeping it, because depth has noise and edges."""

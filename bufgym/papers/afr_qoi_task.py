@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.table import aligned
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import POLICIES, FrameFigure, spearman_over
-from bufgym.papers.rows import FigureRows, Row, listed, table
+from bufgym.papers.rows import FigureRows, listed
 
 MEASURES = {
     "H_time": "time",
@@ -71,7 +73,7 @@ class Reproduction(FrameFigure):
             cells = [[m, *map(_spelled, shown.where(measure=m))] for m in MEASURES.values()]
             lines += [
                 f"{recording}, {scope}: Spearman's correlation [95 %]",
-                *table([["", *TASKS.values()], *cells]),
+                *aligned([["", *TASKS.values()], *cells]),
                 "",
             ]
         for recording in rows.distinct("recording"):
@@ -81,7 +83,7 @@ class Reproduction(FrameFigure):
                 for policy in sorted(self.policies, key=lambda name: shown.mean("rmse_mm", policy=name))
             ]
             heads = ["policy", *MEASURES.values(), *TASKS.values()]
-            lines += [f"{recording}, mean of all runs (of failures: their part):", *table([heads, *cells]), ""]
+            lines += [f"{recording}, mean of all runs (of failures: their part):", *aligned([heads, *cells]), ""]
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from bufgym.ground.errors import BufgymError, install
+from bufgym.model import checks
 from bufgym.model.checks import above_0
 from bufgym.papers.rows import FigureRows
 
@@ -42,19 +43,13 @@ WIDTH = 120
 
 # --- options ---------------------------------------------------------------------------------------------------------
 
-Rule = Callable[[str, Any], None]
+Rule = Callable[[str, Any], Any]
 """Checks an option, given its name and value; raises a BufgymError that names it."""
 
 
 def whole(least: int = 1, most: int | None = None) -> Rule:
     """Rule for an integer from ``least`` to ``most``; None means no limit."""
-
-    def check(name: str, number: Any) -> None:
-        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= (most or number):
-            limits = f">= {least}" if most is None else f"from {least} to {most}"
-            raise BufgymError(f"{name} = {number!r}: must be a whole number {limits}")
-
-    return check
+    return functools.partial(checks.whole, least=least, most=most)
 
 
 def at_least_0(name: str, number: Any) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
 from bufgym.benchmark import cluster
+from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import bar
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
@@ -20,7 +21,6 @@ from bufgym.papers.extra import library
 from bufgym.papers.perception.recordings import open_sequence
 from bufgym.papers.perception.room import made_up_room
 from bufgym.papers.perception.stage import WIDTH, Stage
-from bufgym.papers.rows import Row
 from bufgym.traces import Trace
 
 SEVEN_SCENES = "rgbd_7scenes"

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.rows import Row
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.robofleet_evaluation import (
     BYTES,
@@ -29,7 +30,7 @@ from bufgym.papers.robofleet_evaluation import (
     played_once,
     stream,
 )
-from bufgym.papers.rows import FigureRows, Row
+from bufgym.papers.rows import FigureRows
 from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.encodings import ENCODINGS, KINDS, Content, content, encode
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import FigureRows, table
+from bufgym.papers.rows import FigureRows
 
 PAPER = {
     "LaserScan": (7_260, 7_328, 28_000),
@@ -78,7 +79,7 @@ class Reproduction(Figure):
                 numbers = [row[name] for row in rows.where(message=kind)]
                 texts = ["-" if n is None else n if isinstance(n, str) else f"{n:,}" for n in numbers]
                 lines.append([kind if label == "ours" else "", label, *texts])
-        return table(lines, left=2)
+        return aligned(lines, left=2)
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         sizes = sizes_of(rows)
