@@ -7,7 +7,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,14 +54,14 @@ class Comparison:
     """One row for each policy, capacity and episode; with several topics or robots, one for each of these."""
     about: str
     """The scenario or suite."""
+    unranked: Mapping[str, str]
+    """The policies that do not compete, with the reasons."""
     plain: str
     """The table as aligned text."""
     markdown: str
     """The table as Markdown."""
     html: str
     """The table as HTML."""
-    unranked: Mapping[str, str] = field(default_factory=dict)
-    """The policies that do not compete, with the reasons."""
 
     def table(self, form: str = "plain") -> str:
         """Means by policy: ``"plain"`` text or ``"markdown"``."""
@@ -183,7 +183,7 @@ def compare(
         notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
         more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
         texts = ["\n\n".join(both) for both in zip(texts, (more.plain(), more.markdown(), more.html()), strict=True)]
-    return Comparison(rows, about or label or repr(stream), *texts, unranked=unranked)
+    return Comparison(rows, about or label or repr(stream), unranked, *texts)
 
 
 def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
@@ -214,4 +214,4 @@ def _on_suite(
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
         shown = [form(out, against) for form in (report.plain, report.markdown, report.html)]
-        return Comparison(rows, f"suite {name}", *shown, unranked=table.apart(chosen))
+        return Comparison(rows, f"suite {name}", table.apart(chosen), *shown)

@@ -140,10 +140,9 @@ def reward_term(
 
     def add(function: Function) -> Function:
         _check_function("reward term", name, function, 2)
-        settings = {"parameters": dict(parameters or {}), "memory": dict(memory or {})}
-        text = modules.first_line(function)
-        kind = {"one_queue": one_queue, "compile": compile, "built_in": built_in}
-        OWN_TERMS[name] = OwnTerm(name, unit, text, function=function, **kind, **settings)
+        settings: Any = {"parameters": dict(parameters or {}), "memory": dict(memory or {}), "one_queue": one_queue}
+        settings |= {"compile": compile, "built_in": built_in}
+        OWN_TERMS[name] = OwnTerm(name, unit, modules.first_line(function), function=function, **settings)
         return function
 
     return add
