@@ -119,8 +119,7 @@ class Validation(BetweenUpdates):
 
     def validate(self, model: Any, last: bool = False) -> None:
         """Validate if it is due, or the last time."""
-        done = bool(self.validations.rows) and self.validations.rows[-1][0] == model.num_timesteps
-        if done or not (last or self.validations.due(model.num_timesteps)):
+        if not self.validations.due(model.num_timesteps, last):
             return
         save(model, self.home)
         measures = self.measure(model)

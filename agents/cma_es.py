@@ -36,8 +36,6 @@ POPULATION = 16
 """Candidates per generation."""
 MEMORY = 10
 """Generations over which the strategy's mean is averaged, exponentially."""
-DIAGONAL = 400
-"""Number of weights from which a diagonal covariance (Ros and Hansen 2008) learns faster than a full one."""
 
 
 # --- how candidates are evaluated ------------------------------------------------------------------------------------
@@ -116,7 +114,7 @@ class Evolution:
     def around(like: GuidedWeights, sigma: float, seed: int) -> Evolution:
         """A new search around these weights."""
         begin = like.weight.reshape(-1).astype(np.float64)
-        options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9, "CMA_diagonal": len(begin) > DIAGONAL}
+        options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9}
         return Evolution(like, cma.CMAEvolutionStrategy(begin, sigma, options), begin)
 
     def weights(self, vector: Vector) -> GuidedWeights:

@@ -63,8 +63,8 @@ def of_suite(
     return found
 
 
-def merged(found: dict[str, list[Run]], chosen: Callable[[str], bool] = bool) -> list[Run]:
-    """The runs of all labels that are chosen."""
+def merged(found: dict[str, list[Run]], chosen: Callable[[str], bool] = lambda label: True) -> list[Run]:
+    """The runs of all labels that are chosen, by default of all."""
     return [run for label, runs in found.items() if chosen(label) for run in runs]
 
 
@@ -107,10 +107,8 @@ def random_streams(split: str, count: int = 120) -> list[Run]:
     for seed in range(FIRST_SEED[split], FIRST_SEED[split] + count):
         rng = np.random.default_rng([seed, 5])
         rate_hz, size = float(rng.choice([5, 10, 30, 60])), int(np.exp(rng.uniform(np.log(2e4), np.log(5e6))))
-        load, L = (
-            np.exp(rng.uniform(np.log(0.04), np.log(1.1))),
-            round(float(np.exp(rng.uniform(np.log(2), np.log(48))))),
-        )
+        load = np.exp(rng.uniform(np.log(0.04), np.log(1.1)))
+        L = round(float(np.exp(rng.uniform(np.log(2), np.log(48)))))
         link, moves = random_link(rng, seed, float(load * rate_hz * size)), rng.random() < 0.6
         by_time = (
             qoi.exponential(rng.choice([0.3, 0.618, 0.9]))
@@ -215,3 +213,9 @@ class Family:
         weights = times_drawn(int(self._link.max()) + 1, RESAMPLES, np.random.default_rng(0))
         shares = [self.shares(self.play(policy), weights) for policy in policies]
         return [(float(own[0]), [percentile_interval(own - other) for other in shares]) for own in shares]
+
+
+def divided(name: str, runs: Sequence[Run], n: int, parts: int, rng: np.random.Generator) -> list[Family]:
+    """So many families of n of the runs, in a random order that begins again at its end."""
+    order = rng.permutation(len(runs))
+    return [Family(name, [runs[order[(p * n + k) % len(runs)]] for k in range(n)]) for p in range(parts)]

@@ -10,10 +10,14 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor, nn
 
 from agents.callbacks import BetweenUpdates, Curve
 from agents.held_out import split_scenario
@@ -22,12 +26,13 @@ from bufgym.policies import guided
 from bufgym.policies.guided import GuidedWeights
 from bufgym.sb3 import make_vec_env
 
-ENVS, N_STEPS, MINIBATCH, EPOCHS = 256, 168, 3_584, 4
-"""Batches of 43,000 decisions; 7,000 fail."""
-DISCOUNT, TRACE = 0.99, 0.95
-"""gamma and lambda. With 0.9 and 0.9 it is best within 16 s and then drifts to worse than the rule."""
-RATE, WIDTH = 1e-3, 64
-"""Learning rate, and hidden units of the critic's two layers."""
+ENVS, N_STEPS, MINIBATCH, EPOCHS = 256, 128, 4_096, 4
+"""Batches of 33,000 decisions; 7,000 fail."""
+DISCOUNT, TRACE = 0.9, 0.9
+"""gamma and lambda."""
+RATE, WIDTH = 1e-3, 32
+"""Learning rate, which falls linearly to 0, and hidden units of the critic's two layers."""
+PLAIN = list(guided.INPUTS).index("plain")
 SPREADS = (0.3, 0.1)
 """Standard deviation of the actions, at the start and at the end."""
 
@@ -47,40 +52,55 @@ def training_env(settings: Settings) -> VecEnv:
     )
 
 
+class Inputs(BaseFeaturesExtractor):
+    """The rule's inputs, zero where the plain rule stays."""
+
+    def __init__(self, observation_space: spaces.Box) -> None:
+        super().__init__(observation_space, guided.N_INPUTS)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The inputs of n decisions, [n, inputs]."""
+        return observation * (1 - observation[:, PLAIN, None])
+
+
+class GuidedPolicy(ActorCriticPolicy):
+    """A linear actor that begins at zero, without bias as one input is always 1; and a critic with hidden layers."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        own = {"net_arch": {"pi": [], "vf": [WIDTH, WIDTH]}, "features_extractor_class": Inputs}
+        super().__init__(*args, **{**settings, **own})
+        actor: Any = self.action_net
+        for parameter in (actor.weight, actor.bias):
+            nn.init.zeros_(parameter)
+        actor.bias.requires_grad_(False)
+        self.log_std.requires_grad_(False)
+
+
 def new(settings: Settings, env: VecEnv) -> PPO:
-    """An actor of zeros, which is the rule."""
-    layers = {"pi": [], "vf": [WIDTH, WIDTH]}
+    """An agent that is still the rule."""
     steps = min(N_STEPS, max(1, settings.steps // env.num_envs))
-    model = PPO(
-        "MlpPolicy",
+    return PPO(
+        GuidedPolicy,
         env,
-        learning_rate=RATE,
+        learning_rate=LinearSchedule(RATE, 0.0, 1.0),
         n_steps=steps,
         batch_size=math.gcd(MINIBATCH, steps * env.num_envs),
         n_epochs=EPOCHS,
         gamma=DISCOUNT,
         gae_lambda=TRACE,
-        policy_kwargs={"net_arch": layers},
         device="cpu",
     )
-    policy: Any = model.policy
-    with torch.no_grad():
-        policy.action_net.weight.zero_()
-        policy.action_net.bias.zero_()
-    return model
 
 
 def weights_of(model: PPO) -> GuidedWeights:
-    """The actor's weights; the bias counts for the input that is always 1."""
+    """The actor's weights."""
     policy: Any = model.policy
-    actor = policy.action_net
-    weight: NDArray[np.float32] = actor.weight.detach().numpy().copy()
-    weight[:, list(guided.INPUTS).index("one")] += actor.bias.detach().numpy()
+    weight: NDArray[np.float32] = policy.action_net.weight.detach().numpy()
     return GuidedWeights((weight * guided.SCALES[:, None]).astype(np.float32))
 
 
 class Budget(BetweenUpdates):
-    """Ends the training after so many seconds, and narrows the actions until then."""
+    """Ends the training after so many seconds, and narrows the actions over its steps."""
 
     def __init__(self, seconds: float, curve: Curve, steps: int) -> None:
         super().__init__()
@@ -90,9 +110,5 @@ class Budget(BetweenUpdates):
         return self.curve.spent() < self.seconds
 
     def _on_rollout_start(self) -> None:
-        done = min(max(self.curve.spent() / self.seconds, self.num_timesteps / self.steps), 1.0)
         policy: Any = self.model.policy
-        spread = policy.log_std
-        spread.requires_grad_(False)
-        with torch.no_grad():
-            spread.fill_(float(np.log(SPREADS[0]) + done * np.log(SPREADS[1] / SPREADS[0])))
+        nn.init.constant_(policy.log_std, math.log(np.interp(self.num_timesteps / self.steps, (0, 1), SPREADS)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
@@ -85,6 +86,16 @@ class FixedEpisodes:
                 lost = None if name in unbounded else regret(result.qoi, plan.qoi)
                 rows.append({**key, **asdict(result), **known, "regret": lost})
         return rows
+
+
+def fixed_episodes(settings: Settings, split: str) -> FixedEpisodes:
+    """The episodes of these settings, whose bounds take seconds: a process makes them once for all algorithms."""
+    return _made(Settings(**{name: getattr(settings, name) for name in _MATTER}), split)
+
+
+_MATTER = ("env", "size_bytes", "duration_s", "capacity", "decide_at", "validation_episodes", "episodes")
+"""Settings that the episodes depend on."""
+_made = functools.lru_cache(maxsize=4)(FixedEpisodes)
 
 
 def known_mean(numbers: Sequence[float]) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from agents import training
 from agents.evaluation import EvaluationSet, sweep_for, test_rows
 from agents.figure import draw
-from agents.held_out import FixedEpisodes, summarise
+from agents.held_out import fixed_episodes, summarise
 from agents.objectives import fleet, topics
 from agents.page import written
 from agents.runs import Run, write_notes
@@ -46,7 +46,7 @@ def lines_to_beat(settings: Settings) -> dict[str, float]:
     """The validation scores of Drop Oldest, AFR and the best rule written by hand in an environment, as printed."""
     if settings.kind != "environment":
         return {}
-    episodes = FixedEpisodes(settings, "validation")
+    episodes = fixed_episodes(settings, "validation")
     scores = {name: episodes.score(episodes.run(name)) for name in by_hand()}
     best = max(scores, key=lambda name: scores[name])
     lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "afr", best))}
@@ -143,7 +143,7 @@ def report_environment(
     lines: Mapping[str, float],
 ) -> dict[str, Any]:
     """Evaluate all agents and fixed policies on the held-out episodes; return the best agent's notes."""
-    test = FixedEpisodes(settings, "test")
+    test = fixed_episodes(settings, "test")
     outcomes = test.run_fixed()
     names = {agent_name(run): run for run in runs} | {f"agent by PPO (seed {run.seed})": run for run in beside}
     for name, run in names.items():
@@ -176,7 +176,8 @@ def verdict(entries: Sequence[dict[str, Any]], agent: str) -> str:
     known, rules = {entry["policy"]: entry for entry in entries}, by_hand()
     best = next(entry for entry in entries if entry["policy"] in rules)
     rivals = {f"the best rule, {best['policy']}": best}
-    rivals |= {name: entry for name, entry in known.items() if name.startswith("agent by PPO")}
+    by_ppo = [name for name in known if name.startswith("agent by PPO")]  # best first, as all entries are
+    rivals |= {name: known[name] for name in by_ppo[:1]}
     told = []
     for name, entry in rivals.items():
         low, high = sorted(-bound for bound in entry["minus_agent_95"])

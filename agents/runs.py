@@ -201,12 +201,12 @@ class Validations:
         row: Numbers = self.choose(self.rows, key=lambda row: row[-1])
         return row
 
-    def due(self, steps: int) -> bool:
-        """Whether a validation is due; at the beginning and at the end it always is."""
+    def due(self, steps: int, last: bool = False) -> bool:
+        """Whether a validation is due; at the beginning and at the end it always is. ``last`` is an early end."""
         if not self.rows:
             return True
         since = steps - self.rows[-1][0]
-        return since >= self.settings.validate_every or (steps >= self.settings.steps and since > 0)
+        return since >= self.settings.validate_every or ((last or steps >= self.settings.steps) and since > 0)
 
     def add(self, steps: int, seconds: float, measures: Numbers) -> bool:
         """Add a validation; return whether it is the best so far."""

@@ -43,8 +43,9 @@ age of information at the server. "First" are the topics of priority 20, and "ot
 ## Against the best rule of each setting
 
 The best rule is the hand-written one with the most QoI in the setting, on the test split itself. A second row has the
-best one that keeps to n_T, as the agents must: `ros-native` does not wait for acks. Differences are those of QoI /
-robofleet's, with paired 95 % intervals over links. Age is that of the topics of priority 20, as a share of Robofleet's.
+best one that keeps to n_T, as the agents must: `ros-native` does not wait for acks. Differences are in QoI /
+robofleet's, with paired 95 % intervals over links. Age is the age of the topics of priority
+20, as a share of Robofleet's.
 
 | setting | rule | seed {best} minus the rule | all seeds | age, seed {best} | age, rule | no_drop lost, rule |
 |---|---|---|---|---|---|---:|

@@ -19,6 +19,8 @@ from bufgym.scenario.uplink import RGBD_BYTES
 Kind = Literal["environment", "queue", "topics", "fleet"]
 """The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
 
+PPO_VALIDATES = 65_536
+"""Steps between validations of guided-ppo, two of its updates: it is best within half a million decisions."""
 _ALONE = {"topics": ("a scheduler", ("guided",)), "fleet": ("a fleet's agent", ("guided", "maskable-ppo"))}
 """Kinds for one suite alone, with the trained agent and its algorithms."""
 
@@ -29,7 +31,6 @@ def _number(**limits: float) -> Parameter:
 
 Count = Annotated[int, _number(gte=1)]
 Natural = Annotated[int, _number(gte=0)]
-Units = Annotated[int, _number(gte=0, lte=MAX_WIDTH)]
 Share = Annotated[float, _number(gte=0, lte=1)]
 Positive = Annotated[float, _number(gt=0, lt=math.inf)]
 
@@ -53,7 +54,7 @@ class Settings:
     """guided: CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue). guided-ppo: PPO on the
     same numbers, in an environment. On slots: PPO with action masks, PPO without, and double DQN with masks."""
     beside: bool = True
-    """With guided, in an environment: then train guided-ppo for as many seconds, to compare."""
+    """With guided, in an environment: then train guided-ppo for no longer, to compare."""
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
@@ -98,7 +99,7 @@ class Settings:
     checkpoint_every: Count = 250_000
     """Steps."""
     validate_every: Natural = 0
-    """Steps; 0: a sixth of them."""
+    """Steps; 0: a sixth of them, and 65,536 for guided-ppo."""
     validation_episodes: Count = 300
     """About so many in each validation, with a suite over all scenarios and capacities."""
     test_seeds: Annotated[int, _number(gte=0, lte=1000)] = 0
@@ -150,7 +151,8 @@ class Settings:
     def resolved(self) -> Settings:
         """These settings with the steps that suit the algorithm, where they are left open."""
         steps = self.steps or (40_000_000 if self.evolves else 1_500_000)
-        return replace(self, steps=steps, validate_every=self.validate_every or -(-steps // 6))
+        every = PPO_VALIDATES if self.algo == "guided-ppo" else -(-steps // 6)
+        return replace(self, steps=steps, validate_every=self.validate_every or every)
 
     def checked(self) -> Settings:
         """Check these settings and return them; a BufgymError names the first that breaks a rule, and the rule."""

@@ -28,7 +28,7 @@ from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoin
 from agents.cluster import begun
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluation import EvaluationSet, ValidationSets, Verdict
-from agents.held_out import FixedEpisodes, split_scenario
+from agents.held_out import fixed_episodes, split_scenario
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.fleet import FleetObjective, fleet_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
@@ -53,14 +53,14 @@ def train_all(settings: Settings, folder: Path) -> list[Run]:
 
 
 def train_beside(settings: Settings, folder: Path, runs: Sequence[Run]) -> list[Run]:
-    """With ``settings.beside``: PPO on the same actions, for as long as the longest of the runs."""
+    """With ``settings.beside``: PPO on the same actions, for no longer than the longest of the runs."""
     if not (settings.beside and settings.algo == "guided" and settings.kind == "environment"):
         return []
     home, seconds = folder / "ppo", max(run.seconds for run in runs)
     home.mkdir(exist_ok=True)
-    print(f"PPO on the same actions, for {seconds:.0f} s")
-    # So many steps that time ends it.
-    other = replace(settings, algo="guided-ppo", validate_every=guided_ppo.ENVS * guided_ppo.N_STEPS * 5)
+    print(f"PPO on the same actions, for at most {seconds:.0f} s")
+    usual = replace(settings, algo="guided-ppo", steps=0, validate_every=0).resolved()
+    other = replace(usual, steps=min(settings.steps, usual.steps))
     return each_seed(functools.partial(train_seed, seconds=seconds), other, home)
 
 
@@ -110,7 +110,7 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, secon
 def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, steps: int) -> Validation:
     """The validation of a learner on this kind of task."""
     if settings.kind == "environment":
-        episodes = FixedEpisodes(settings, "validation")
+        episodes = fixed_episodes(settings, "validation")
 
         def score(model: Any) -> Numbers:
             if settings.algo == "guided-ppo":
@@ -260,7 +260,7 @@ ALGORITHMS = (*LEARNERS, "guided")
 def load(settings: Settings, run: Run) -> Any:
     """The learner that the run kept."""
     torch.set_num_threads(1)  # on batches this small, more threads only wait for one another
-    return LEARNERS[settings.algo][0].load(run.model, device="cpu")
+    return LEARNERS[settings.algo][0].load(run.folder / "model.zip", device="cpu")
 
 
 def test_rows(settings: Settings, run: Run, evaluation: EvaluationSet) -> list[Row]:

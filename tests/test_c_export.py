@@ -84,7 +84,7 @@ def driver(folder, text, *flags):
 
 
 def every_field() -> Policy:
-    """A random agent of two layers that reads every field there is, and mixes them."""
+    """A random agent of two layers that reads every field there is."""
     rng = np.random.default_rng(3)
 
     def some(*shape):
@@ -97,9 +97,7 @@ def every_field() -> Policy:
             inputs = width
         return Network(some(len(NAMES)), some(1), tuple(layers), some(inputs if widths else 0))
 
-    slots = len(Weights.SLOT_NAMES)
-    mix = some(len(NAMES) - slots, slots)
-    return learned.policy("every-field", Weights(NAMES, network(7, 5), network(7, 5), mix=mix))
+    return learned.policy("every-field", Weights(NAMES, network(7, 5), network(7, 5)))
 
 
 def every_output() -> Policy:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from agents.evaluation import qoi_of
-from agents.held_out import FixedEpisodes, split_scenario
+from agents.held_out import FixedEpisodes, fixed_episodes, split_scenario
 from agents.objectives.objective import Objective
 from bufgym.benchmark.run import draw
 from bufgym.policies import Policy
@@ -56,7 +56,7 @@ class GuidedObjective(Objective):
     @functools.cached_property
     def judges(self) -> FixedEpisodes:
         """Other episodes on the training links."""
-        return FixedEpisodes(self.settings, "validation")
+        return fixed_episodes(self.settings, "validation")
 
     def measure(self, policy: Policy, episodes: Sequence[Played]) -> float:
         """Mean H over all episodes of a part."""

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 from agents.evaluation import ValidationSets, Verdict
-from agents.families import Family, merged, of_suite
+from agents.families import Family, divided, merged, of_suite
 from agents.objectives.objective import Objective
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
@@ -28,17 +28,14 @@ class SuitesObjective(Objective):
     def training(self) -> list[list[Family]]:
         """A family of runs of each suite, in parts."""
         settings, rng = self.settings, np.random.default_rng(self.seed)
-        parts: list[list[Family]] = [[] for _ in range(PARTS)]
+        by_suite = []
         for suite in settings.suites:
             capacities = settings.capacities_of(suite) if settings.capacities else ()
             runs = merged(of_suite(suite, "train", capacities, data=settings.data or None))
-            order = rng.permutation(len(runs))
-            for p, part in enumerate(parts):
-                chosen = [order[(p * RUNS + k) % len(runs)] for k in range(min(RUNS, len(runs)))]
-                part.append(Family(suite, [runs[k] for k in chosen]))
-                if not (part[-1].best > part[-1].afr).any():
-                    raise BufgymError(f"suite {suite}: AFR loses nothing there, so nothing can be learned")
-        return parts
+            by_suite.append(divided(suite, runs, min(RUNS, len(runs)), PARTS, rng))
+            if not all((family.best > family.afr).any() for family in by_suite[-1]):
+                raise BufgymError(f"suite {suite}: AFR loses nothing there, so nothing can be learned")
+        return [list(part) for part in zip(*by_suite, strict=True)]
 
     @functools.cached_property
     def judges(self) -> ValidationSets:

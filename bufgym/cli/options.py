@@ -44,10 +44,6 @@ def checked(convert: Callable[[str], Any], holds: Callable[[Any], bool], rule: s
     return Parameter(converter=parse, n_tokens=1, consume_multiple=False, accepts_keys=False)
 
 
-def _capacities(text: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in text.split(","))
-
-
 Whole = Annotated[int, checked(int, lambda number: True, "a whole number")]
 Count = Annotated[int, checked(int, lambda number: number >= 1, "a whole number >= 1")]
 Natural = Annotated[int, checked(int, lambda number: number >= 0, "a whole number >= 0")]
@@ -58,7 +54,11 @@ Positive = Annotated[float, checked(float, lambda number: 0 < number < math.inf,
 Least0 = Annotated[float, checked(float, lambda number: 0 <= number < math.inf, "a number >= 0")]
 Capacities = Annotated[
     tuple[int, ...],
-    checked(_capacities, lambda Ls: min(Ls) >= 1 and len(set(Ls)) == len(Ls), "whole numbers >= 1, no two alike"),
+    checked(
+        lambda text: tuple(map(int, text.split(","))),
+        lambda Ls: min(Ls) >= 1 and len(set(Ls)) == len(Ls),
+        "whole numbers >= 1, no two alike",
+    ),
 ]
 """Distinct integers, as in ``4,8,16``."""
 PolicyFile: TypeAlias = Annotated[

@@ -99,7 +99,7 @@ class ScenarioOptions:
     own: OwnOptions
 
     def given(self) -> dict[str, Any]:
-        """Those that the user gave."""
+        """What the user gave."""
         return given(self.interruption) | given(self.stream) | given(self.workload) | given(self.own)
 
     def scenario(self, seeds: int | None) -> tuple[Scenario, str]:

@@ -59,8 +59,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``actions``: "slots", as above, or "guided" (one queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule
       gap-price for this decision, by the table ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is
       no mask, and no invalid action.
-    - ``fields``: names of the fields to observe, your own included; by default all of the tables. "compact" for all
-      context fields alone; "guided" for what the rule knows, ``bufgym.policies.guided.INPUTS``, all in [-4, 4].
+    - ``fields``: names of the fields to observe, your own included; by default all of the tables. "compact" means
+      all of the context's. "guided" means ``bufgym.policies.guided.INPUTS``, which lie in [-4, 4].
     - ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,
       and at an episode's end its summary; "none" has only this summary.

@@ -38,7 +38,8 @@ def read_whole(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     except (OSError, ValueError) as error:
         if isinstance(error, BufgymError):
             raise
-        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {_why(error)}"
+        told = getattr(error, "strerror", None) or error
+        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {told}"
         raise BufgymError(f"{path}: {why}") from None
     if len(data) > most_bytes:
         raise BufgymError(f"{path}: larger than {most_bytes} bytes: must be at most that")
@@ -77,10 +78,6 @@ def check_keys(table: Mapping[str, Any], known: set[str], first: str = "") -> No
 def unpacked_limit(packed_bytes: int) -> int:
     """Most bytes that so many packed bytes may unpack to."""
     return FREELY_UNPACKED_BYTES + MOST_UNPACKED * packed_bytes
-
-
-def _why(error: Exception) -> str:
-    return str(getattr(error, "strerror", None) or error)
 
 
 @contextmanager

@@ -27,10 +27,8 @@ COLUMNS = 3 + SPAN
 """Numbers of scratch for each place of a chain: the best chain from it, to it and without it, then its steps."""
 FROM, TO, WITHOUT = range(3)
 STEPS = 3
-OUTSIDE = 3
-"""Places of a chain besides the queue's: the message dequeued last, the newcomer, the end."""
 SCRATCH = (2 * COLUMNS, COLUMNS)
-"""``Policy.work`` of a rule that weighs chains: the newcomer is one of its candidates."""
+"""``Policy.work`` of a rule that weighs chains: a place for each candidate, the message dequeued last, and the end."""
 
 
 @kernel

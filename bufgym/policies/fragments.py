@@ -74,6 +74,7 @@ BATCH, BATCHES, SOCKET, WAIT, MORE, FORGETS = range(6)  # indices of Zenoh's par
         "rate_memory_s": 1.0,
     },
     memory=PIPE,
+    reads_left=True,
     source="Zenoh, congestion control DROP [zenoh], measured against version 1.10.2",
 )
 def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -109,6 +110,7 @@ def zenoh_drop(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     "ros2-best-effort",
     parameters={"queue_kb": 200.0, "rate_memory_s": 1.0},
     memory=PIPE,
+    reads_left=True,
     source="ROS 2 over Fast DDS and UDP, RELIABILITY best effort [fastdds]",
 )
 def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -132,6 +134,7 @@ def ros2_best_effort(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     "ros2-reliable-udp",
     parameters={"queue_kb": 200.0, "depth": 10.0, "rate_memory_s": 1.0},
     memory=PIPE,
+    reads_left=True,
     source="ROS 2 over Fast DDS and UDP, RELIABILITY reliable, HISTORY KEEP_LAST(depth) [fastdds]",
 )
 def ros2_reliable_udp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:

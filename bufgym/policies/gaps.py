@@ -37,7 +37,7 @@ def discounted(buffer: Buffer, arrival: Arrival, in_time: bool, k: int, discount
     s = len(buffer.slots)
     before_us, after_us, before, after, _ = gaps(buffer, arrival, True, k)
     left = float(before_us + after_us) if in_time else before + after
-    return left * (1 - discount * (1 - k / s)) if k < s else left
+    return left * (1 - discount * (1 - k / s)) if k < s and discount != 0 else left
 
 
 @kernel

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -260,11 +260,6 @@ class GuidedWeights:
     def fields(self) -> tuple[str, ...]:
         """Names of the inputs."""
         return self.CONTEXT_NAMES
-
-    @property
-    def guided(self) -> Self:
-        """The one network."""
-        return self
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights."""

@@ -1,13 +1,13 @@
-"""Guided scheduling: one rule for several topics, whose numbers an agent moves by what the client sees.
+"""Guided scheduling: an agent moves the numbers of one rule for several topics.
 
-The rule weighs what is known of a message. With ``FEATURES`` f, it sends the oldest message of the topic with the
-largest n f, and drops the message with the largest m f, once that exceeds the threshold ``room`` or nothing fits.
+The rule weighs messages. With ``FEATURES`` f, it sends the oldest message of the topic with the largest n f, and drops
+the message with the largest m f, once that exceeds the threshold ``room`` or nothing fits.
 Robofleet's order is n = 1 for ``priority`` and ``wait`` alone, strict priority is n = 1 for ``priority``. ``PLAIN``
 are the plain rule's numbers: high priorities first, then much QoI a byte and long waits; large, old messages of topics
 with a low priority, or sent a moment ago, make room.
 
-The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``; lg is that of ``guided``), so W = 0 is the plain
-rule. ``no_drop`` messages go first in any case, as in Robofleet, and are lost only if the queue holds nothing else.
+The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``, with lg as in ``guided``). W = 0 is the plain rule.
+``no_drop`` messages go first in any case, as in Robofleet, and are lost only if the queue holds nothing else.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ INPUTS = {
     "window": "1 - 2 / n_T",
 }
 N_FEATURES, N_INPUTS = len(FEATURES), len(INPUTS)
-SENDS, DROPS, ROOM = 0, N_FEATURES, 2 * N_FEATURES
+DROPS, ROOM = N_FEATURES, 2 * N_FEATURES
 OUTPUTS = (*(f"send_{name}" for name in FEATURES), *(f"drop_{name}" for name in FEATURES), "room")
 N_OUTPUTS = len(OUTPUTS)
 PLAIN = {
@@ -141,11 +141,6 @@ class SchedulerWeights(GuidedWeights):
     NETWORKS = ("scheduler",)
     SHAPE = LIGHT = (N_OUTPUTS, N_INPUTS)
     TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), list(INPUTS.items()), OUTPUTS, PLAIN]
-
-    @property
-    def scheduler(self) -> SchedulerWeights:
-        """The one network."""
-        return self
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights, for any topics and every L."""

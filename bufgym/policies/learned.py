@@ -6,9 +6,6 @@ network scores dropping the candidate. The *accept* network scores accepting the
 policy takes the decision that scores highest; ties go to the oldest message. Under a byte limit a newcomer that would
 take the place of several messages is dropped, unless messages with no lower a score make room.
 
-The context c may also change the weights of the candidate's own features s, by the matrix ``mix`` M: the score of
-dropping it grows by c M s. So one agent can weigh a rank or a gap differently where V is straight and where it is flat.
-
 The network decides at every decision. No rule stands beside it: what rules know, such as the link's rate or the mean
 motion, is among the fields that it may read.
 
@@ -103,8 +100,6 @@ class Weights:
     """Scores dropping a candidate."""
     accept: Network
     """Scores accepting the newcomer, where there is room."""
-    mix: NDArray[np.float32] | None = None
-    """[context fields, slot fields], each kind in the order of ``fields``: c M s is added to the score of a drop."""
 
     @property
     def context(self) -> tuple[str, ...]:
@@ -127,9 +122,8 @@ class Weights:
         order = [self.fields.index(name) for name in (*self.context, *self.slot)]
         places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
         networks = [getattr(self, name).flat(order) for name in self.NETWORKS]
-        mixing = np.zeros(0) if self.mix is None else self.mix.reshape(-1)
-        header = [len(self.fields), len(self.context), *self.widths, len(networks[0]), len(mixing)]
-        return np.concatenate([header, places, *networks, mixing])
+        header = [len(self.fields), len(self.context), *self.widths, len(networks[0])]
+        return np.concatenate([header, places, *networks])
 
 
 def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
@@ -138,5 +132,7 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
     numbers, (first, second) = tuple(weights.parameters().tolist()), weights.widths
     work = 2 * len(weights.fields) - len(weights.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
     reads_rate = not on_link.isdisjoint(weights.fields)
-    policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_rate=reads_rate, built_in=True)
+    policy = Policy(
+        name, on_arrival, weights=numbers, work=work, compile=True, reads_rate=reads_rate, reads_left=True, built_in=True
+    )
     return replace(policy, about=summary, source=source)

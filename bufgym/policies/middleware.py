@@ -59,7 +59,10 @@ built_in(
 
 
 @built_in(
-    "foxglove-backlog", parameters={"limit_mb": 10.0}, source="ros-foxglove-bridge, send_buffer_limit, default 10 MB"
+    "foxglove-backlog",
+    parameters={"limit_mb": 10.0},
+    source="ros-foxglove-bridge, send_buffer_limit, default 10 MB",
+    reads_left=True,
 )
 def foxglove_backlog(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """ros-foxglove-bridge: drops the newcomer when all bytes not yet sent, with it, reach `limit_mb`, or none fits."""

@@ -124,6 +124,8 @@ class Policy:
     """Whether its functions are bufgym's own; ``register`` then keeps its name."""
     reads_rate: bool = False
     """Whether a built-in policy reads the link's rate, which takes time to measure. Others may always read it."""
+    reads_left: bool = False
+    """The same for the bytes left in the socket."""
     client: ClientSettings = ClientSettings()
     """How the program around it sends."""
     for_topics: bool = False

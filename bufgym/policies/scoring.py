@@ -5,8 +5,8 @@ it as
 
     h = relu(W1 f + b1), then once more if there is a second layer;  score = w h + skip f + b
 
-The parameters of a scorer are one row of numbers: a header, the fields that it reads, its networks one after another,
-and the mixing weights if it has any. ``learned.Weights.parameters`` writes this layout, ``unpack`` reads it.
+The parameters of a scorer are one row of numbers: a header, the fields that it reads, and its networks one after
+another. ``learned.Weights.parameters`` writes this layout, ``unpack`` reads it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 
-HEADER = 6
-"""Numbers before the fields: fields read, the context's share of them, widths of both layers, numbers of one network,
-mixing weights."""
+HEADER = 5
+"""Numbers before the fields: fields read, the context's share of them, widths of both layers, size of one network."""
 DROP, KEEP = range(2)
 """Networks of a scorer, in the order of its parameters: they score dropping and accepting a candidate."""
 OF_INPUTS = {"skip", "0.weight"}
@@ -46,8 +45,6 @@ class Scorer(NamedTuple):
     w."""
     size: int
     """Numbers of one network."""
-    mix: NDArray[np.float64]
-    """[context fields, slot fields], or empty."""
 
 
 class Scratch(NamedTuple):
@@ -71,8 +68,7 @@ def unpack(parameters: NDArray[np.float64]) -> Scorer:
     inputs, context = int(parameters[0]), int(parameters[1])
     first, second, size = int(parameters[2]), int(parameters[3]), int(parameters[4])
     nets = HEADER + inputs
-    mix = nets + 2 * size
-    return Scorer(context, first, second, parameters[HEADER:nets], parameters[nets:mix], size, parameters[mix:])
+    return Scorer(context, first, second, parameters[HEADER:nets], parameters[nets:], size)
 
 
 @kernel
@@ -101,10 +97,6 @@ def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
     n, c, first = len(f), scorer.context, scorer.first
     for i in range(n - c):
         skip[i] = net[c + i]
-    if which == DROP and len(scorer.mix) > 0:
-        for j in range(c):
-            for i in range(n - c):
-                skip[i] += f[j] * scorer.mix[j * (n - c) + i]
     score = net[n]
     for i in range(c):
         score += net[i] * f[i]

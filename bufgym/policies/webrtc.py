@@ -102,6 +102,7 @@ def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
         ),
     },
     source="WebRTC, modules/video_coding/utility/frame_dropper [webrtc]",
+    reads_left=True,
 )
 def webrtc_frame_dropper(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """WebRTC's frame dropper: a leaky bucket at the socket's own rate; a full queue drops the newcomer."""

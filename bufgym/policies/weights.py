@@ -56,8 +56,6 @@ KEY = "bufgym"
 """The entry of the header's metadata that holds the JSON text."""
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
 """Metadata that ``save`` itself writes."""
-MIX = "drop.mix"
-"""An optional tensor."""
 
 
 def observation_hash(names: Sequence[str] = ()) -> str:
@@ -147,14 +145,11 @@ def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
 
 def _tensors(weights: AnyWeights) -> Tensors:
     """Name -> tensor, little-endian and in C order, as in the file."""
-    tensors = {
+    return {
         f"{network}.{name}": np.ascontiguousarray(tensor, "<f4")
         for network in weights.NETWORKS
-        for name, tensor in getattr(weights, network).tensors().items()
+        for name, tensor in cast(Any, getattr(weights, network, weights)).tensors().items()
     }
-    if isinstance(weights, Weights) and weights.mix is not None:
-        tensors[MIX] = np.ascontiguousarray(weights.mix, "<f4")
-    return tensors
 
 
 def _sha256(fields: Sequence[str], tensors: Tensors) -> str:
@@ -204,12 +199,11 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
         raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
     if issubclass(kind, GuidedWeights):
         return kind(*tensors.values()), metadata
-    mix = {"mix": tensors.pop(MIX)} if MIX in tensors else {}
     networks = [
         Network.of({name.removeprefix(f"{n}."): tensors[name] for name in tensors if name.startswith(f"{n}.")})
         for n in kind.NETWORKS
     ]
-    return cast(Any, kind)(tuple(metadata["fields"]), *networks, **mix), metadata
+    return cast(Any, kind)(tuple(metadata["fields"]), *networks), metadata
 
 
 def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
@@ -301,9 +295,6 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
     if issubclass(kind, GuidedWeights):
         name = f"{kind.NETWORKS[0]}.weight"
         required = {name: shapes[name] if shapes.get(name) in (kind.SHAPE, kind.LIGHT) else kind.SHAPE}
-    if MIX in shapes and kind is Weights:
-        slots = sum(name in kind.SLOT_NAMES for name in fields)
-        required[MIX] = (len(fields) - slots, slots)
     for name in (*required, *shapes):
         if name not in shapes:
             _refuse(path, name, "is missing")

@@ -111,12 +111,9 @@ class FleetScenario:
     def draw(self, streams: Streams) -> FleetEpisode:
         """Draw one episode."""
         first = self._cell.draw(streams)
-        others = [self._beside(first.arrivals["arrival_us"], streams, robot) for robot in range(1, self.robots)]
+        ticks_us = first.arrivals["arrival_us"]
+        others = [read_only(self.uplink.stream(streams.arrival, robot, ticks_us)) for robot in range(1, self.robots)]
         return FleetEpisode((first.arrivals, *others), first.link, first.ends_us)
-
-    def _beside(self, arrival_us: NDArray[np.int64], streams: Streams, robot: int) -> NDArray[Any]:
-        """MESSAGE[n] of one more robot whose camera ticks at these times."""
-        return read_only(self.uplink.stream(streams.arrival, robot, arrival_us))
 
     @functools.cached_property
     def _cell(self) -> Uplink:

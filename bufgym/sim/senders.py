@@ -24,10 +24,9 @@ from bufgym.sim.state import FRESH, SENDER, beginning, new_batch
 Begun = tuple[int, Episode, np.random.Generator | None]
 """Arguments of ``Senders.load``: a sender, the episode it begins, and the generator of its uniform draws."""
 
-_EPISODE = ("arrivals", "first_decision", "last_decision")
-_TRACE = ("first_knot", "last_knot", "after", "segment_now", "segment_finish")
-_DELAYS = ("offset_us", "propagation_us", "window", "ack_delay_us", "v_start", "ends_us")
-_LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in (*_EPISODE, *_TRACE, *_DELAYS)])
+_EPISODE = "arrivals first_decision last_decision window ack_delay_us ends_us v_start offset_us propagation_us"
+_LINK = "first_knot last_knot after segment_now segment_finish"
+_LOADED = np.array([list(cast(Any, SENDER.names)).index(name) for name in f"{_EPISODE} {_LINK}".split()])
 """Fields of SENDER that differ from episode to episode."""
 
 
@@ -93,10 +92,22 @@ class Senders:
     def load_all(self, begun: Sequence[Begun]) -> None:
         """Call ``load`` for each of ``begun`` at once."""
         v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any sender is changed
+        batch, rows, lines = self.batch, [i for i, _, _ in begun], []
+        # NumPy copies records field by field; as whole words it copies them five times as fast.
+        arrivals, log = batch.arrivals.view(np.int64), batch.log.view(np.int64)
         for (i, episode, uniforms), v_start in zip(begun, v_starts, strict=True):
-            self._begin(i, episode, v_start)
+            link, n, words = episode.link, len(episode.arrivals), episode.arrivals.view(np.int64)
+            place = self._knots.place(link.trace, i)
+            arrivals[i, : len(words)], log[i, : n * len(FRESH)] = words, self._unlogged[: n * len(FRESH)]
+            line = n, episode.first_decision, episode.last_decision, episode.window, episode.ack_delay_us
+            ends_us = FOREVER if episode.ends_us is None else episode.ends_us
+            lines.append((*line, ends_us, v_start, link.offset_us, link.propagation_us, *place, place[0], place[0]))
             self.episodes[i], self._uniforms[i] = episode, uniforms
-            self.begun[i] += 1
+        self.begun[rows] += 1
+        batch.topics.view(np.int64)[rows] = self._rules
+        beginnings = np.repeat(self._beginning[None], len(rows), 0)
+        beginnings[:, _LOADED] = np.reshape(np.array(lines, np.int64), (-1, len(_LOADED)))
+        batch.senders.view(np.int64).reshape(len(self), -1)[rows] = beginnings
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
 
@@ -113,23 +124,6 @@ class Senders:
         if not self.topics:
             episode.check_one_queue()
         return 0 if episode.value is None else self._v_start(episode.value)
-
-    def _begin(self, i: int, episode: Episode, v_start: int) -> None:
-        """Put sender ``i`` at the beginning of ``episode``."""
-        link, n, words = episode.link, len(episode.arrivals), episode.arrivals.view(np.int64)
-        first_knot, last_knot, after = self._knots.place(link.trace, i)
-        # NumPy copies records field by field; as whole words it copies them five times as fast.
-        batch, beginning = self.batch, self._beginning
-        batch.arrivals.view(np.int64)[i, : len(words)] = words
-        batch.log.view(np.int64)[i, : n * len(FRESH)] = self._unlogged[: n * len(FRESH)]
-        batch.topics.view(np.int64)[i] = self._rules
-        beginning[_LOADED] = (
-            *(n, episode.first_decision, episode.last_decision),
-            *(first_knot, last_knot, after, first_knot, first_knot),
-            *(link.offset_us, link.propagation_us, episode.window, episode.ack_delay_us, v_start),
-            FOREVER if episode.ends_us is None else episode.ends_us,
-        )
-        batch.senders.view(np.int64)[i * len(beginning) : (i + 1) * len(beginning)] = beginning
 
     def value_of(self, i: int) -> Value:
         """The V for the QoI of sender ``i``'s episode; without topics."""
@@ -181,7 +175,7 @@ class Senders:
         """Configure when ``policy`` is asked, and how the client around it sends."""
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
-        senders["measures"] = policy.measures
+        senders["measures"], senders["shows_left"] = policy.measures, policy.measures or policy.reads_left
         for rule in ("limit_at_send", "limit_since_sent", "flush_no_drop"):
             senders[rule] = getattr(client, rule)
         if not client.awaits_acks:

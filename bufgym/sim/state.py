@@ -40,6 +40,7 @@ SENDER = np.dtype(
         ("screens", np.int64),  # 1: an arrival may ask for no decision, or for several: ask_when_full, or a limit B
         ("ask_at_dequeue", np.int64),  # 1: the policy may drop the head before the socket dequeues it
         ("measures", np.int64),  # 1: the link's rate is measured at each arrival; 0: nobody reads it
+        ("shows_left", np.int64),  # 1: the bytes left in the socket are shown; 0: nobody reads them
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
         ("window", np.int64),  # n_T: most messages sent and not yet acked
@@ -203,7 +204,7 @@ def words(dtype: np.dtype[Any], **values: float) -> NDArray[np.int64]:
 
 def beginning(**settings: int) -> NDArray[np.int64]:
     """int64[fields]: SENDER at the beginning of an episode: empty buffer, idle socket, nothing arrived."""
-    return words(SENDER, first=1, finish_us=FOREVER, measures=1, **settings)
+    return words(SENDER, first=1, finish_us=FOREVER, measures=1, shows_left=1, **settings)
 
 
 FRESH = words(LOG_ENTRY, dequeued_us=NEVER, transmitted_us=NEVER, dropped_us=NEVER)

@@ -41,9 +41,8 @@ def view(batch: Batch, i: int) -> Buffer:
             while at(batch.slots, i, k).topic != arrival.topic:
                 k += 1
             dequeued_arrival_us, dequeued_x = at(batch.slots, i, k).arrival_us, at(batch.slots, i, k).x
-    busy, left_bytes, left_fraction = 0, 0, 0.0
-    if sender.busy > 0:
-        busy = 1
+    left_bytes, left_fraction = 0, 0.0
+    if sender.busy > 0 and sender.shows_left == 1:
         total_bytes = held_bytes(batch, i)
         if sender.measures == 1 and sender.waiting == ARRIVAL_WAITS:
             left_bytes = sender.left_bytes
@@ -63,7 +62,7 @@ def view(batch: Batch, i: int) -> Buffer:
         dequeued_seq,
         previous_us,
         previous_x,
-        busy,
+        min(sender.busy, 1),
         left_bytes,
         left_fraction,
         sender.now_us - sender.last_dequeue_us,

@@ -1,7 +1,6 @@
 """Learned policies decide as their weights say: against a slow twin, a fixed policy, and the network they came from."""
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -45,13 +44,13 @@ CONTEXT_NAMES = [field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)]
 
 @st.composite
 def weights(draw):
-    """Any fields in any order; no, one or two hidden layers; mixed or not."""
+    """Any fields in any order; no, one or two hidden layers."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    fields = tuple(draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True)))
+    on_board = draw(st.sets(st.sampled_from([field.name for field in ON_BOARD_SLOT_FIELDS]), min_size=1))
+    others = draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True))
+    fields = tuple(dict.fromkeys([*others, *(sorted(on_board) if draw(st.booleans()) else [])]))
     widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
-    made = Weights(fields, network(rng, len(fields), *widths), network(rng, len(fields), *widths))
-    mix = rng.normal(0, 1, (len(made.context), len(made.slot))).astype(np.float32)
-    return replace(made, mix=draw(st.sampled_from([None, mix])))
+    return Weights(fields, network(rng, len(fields), *widths), network(rng, len(fields), *widths))
 
 
 def twin(made):
@@ -69,12 +68,7 @@ def twin(made):
             return [float(seen[name]) for name in made.fields]
 
         def drop_score(k):
-            f = dict(zip(made.fields, features(k), strict=True))
-            mixed = 0.0
-            if made.mix is not None:
-                pairs = [(j, i) for j in range(len(made.context)) for i in range(len(made.slot))]
-                mixed = math.fsum(float(made.mix[j, i]) * f[made.context[j]] * f[made.slot[i]] for j, i in pairs)
-            return score(made.drop, features(k)) + mixed
+            return score(made.drop, features(k))
 
         choices, own = [(drop_score(k), k) for k in range(s)], drop_score(L)
         freed = sum(int(buffer.slots[k]["size_bytes"]) for value, k in choices if value >= own)

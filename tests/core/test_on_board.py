@@ -1,6 +1,7 @@
 """Fields of what a robot has on board: the link's rate by hand and against the twin, and gaps counted in messages."""
 
 from dataclasses import replace
+from types import FunctionType
 
 import naive
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import given
 from test_sender import MS, V, line
 
 from bufgym import policies
+from bufgym import scenario as scenarios
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
@@ -20,6 +22,8 @@ from bufgym.model.observe import (
     observe_on_board,
     observe_on_board_slots,
 )
+from bufgym.scenario import draw
+from bufgym.sim import rollout, run
 
 pytestmark = pytest.mark.kernels
 
@@ -97,6 +101,39 @@ def test_fields_by_hand():
 def test_only_those_who_read_the_rate_have_it_measured():
     assert not policies.get("afr").measures
     assert policies.Policy("own", lambda buffer, arrival, memory: ACCEPT).measures
+
+
+def names_read(policy):
+    """Names that the policy's functions read, and all functions that they call."""
+    names, waiting, seen = set(), [getattr(function, "py_func", function) for function in policy.compiled], set()
+    while waiting:
+        function = waiting.pop()
+        if function not in seen:
+            seen.add(function)
+            names |= set(function.__code__.co_names)
+            called = (function.__globals__.get(name) for name in function.__code__.co_names)
+            waiting += [f for f in (getattr(one, "py_func", one) for one in called) if isinstance(f, FunctionType)]
+    return names
+
+
+@pytest.mark.parametrize("name", [name for name in policies.names() if policies.get(name).compile])
+def test_what_a_policy_reads_of_the_socket_is_there(name):
+    policy = policies.get(name)
+    names = names_read(policy)
+    assert policy.measures or policy.reads_left or not names & {"left_bytes", "left_fraction"}
+    assert policy.measures or not names & {"short_rate_bytes_per_s", "medium_rate_bytes_per_s", "drained_us"}
+
+
+def test_a_rollout_of_its_own_does_the_same(monkeypatch):
+    episodes = [draw(scenarios.get("lte", duration_s=4.0), seed) for seed in range(3)]
+    for name in ("afr", "codel"):
+        logs = []
+        for pays_s in (np.inf, -1.0):
+            monkeypatch.setattr(rollout, "_PAYS_IF_KEPT_S", pays_s)
+            monkeypatch.setattr(rollout, "_PAYS_S", pays_s)
+            batch = run(policies.get(name), episodes, 4, V).batch
+            logs.append([np.asarray(array).tobytes() for array in (batch.log, batch.order, batch.slots)])
+        assert logs[0] == logs[1], name
 
 
 NUMBERS = [field.name for field in ON_BOARD_SLOT_FIELDS]

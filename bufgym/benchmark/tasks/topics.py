@@ -92,7 +92,7 @@ class TopicsTask(Task):
         return (
             Quantity("qoi", "QoI", _one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
             Quantity("relative", f"QoI / {BASELINE}", score, f"QoI divided by {BASELINE}'s QoI. {paired}", drawn=True),
-            Quantity("lost", "no_drop lost", _messages, lost, interval=False, total=True),
+            Quantity("lost", "no_drop lost", lambda number: f"{round(number, 1):g}", lost, interval=False, total=True),
             Quantity("age_first_s", f"age, {first} (s)", _seconds, first_age, interval=False),
             Quantity("age_relative", f"age / {BASELINE}", score, relative_age, drawn=True),
             Quantity("age_others_s", "age, others (s)", _seconds, others_age),
@@ -163,10 +163,6 @@ def _folded(copies: Sequence[TopicOutcome]) -> Row:
 
 
 _seconds, _one_digit = (partial(decimal, digits=digits) for digits in (2, 1))
-
-
-def _messages(number: float) -> str:
-    return f"{round(number, 1):g}"
 
 
 def _numbers(topics: Rows) -> list[float]:

@@ -103,7 +103,7 @@ class Player:
             self._begun[i] = senders.begun[i]
 
     def _checked(self, answers: NDArray[np.int64], capacity: int, *, sends: bool) -> NDArray[np.int64]:
-        """The actions for the policy's answers at arrivals, or where the socket asks what it ``sends``."""
+        """Actions for the policy's answers at arrivals. Where the socket asks, for the slot it ``sends``."""
         wrong = answers[(answers < (HOLD if sends else ACCEPT)) | (answers >= capacity)]
         if len(wrong):
             told, last = ("sends slot", "or HOLD") if sends else ("decision", "REJECT or ACCEPT")

@@ -46,7 +46,9 @@ def ansi(senders: Senders, i: int) -> str:
         " " * _LABEL + legend + (f"  {scene.question}" if scene.topics else f"  {_painted([(_RED, '9')])} missing"),
     ]
     if scene.demand > 0:
-        height = f"full height {_speed(2 * scene.demand)}, twice the demand"
+        mb_per_s = 2 * scene.demand / 1e6
+        speed = f"{mb_per_s:.1f} MB/s" if mb_per_s >= 1 else f"{1e3 * mb_per_s:.0f} KB/s"
+        height = f"full height {speed}, twice the demand"
         lines.append(" " * _LABEL + f"{height}; {_painted([(_RED, 'red')])}: below the demand")
     return "\n".join(lines) + "\n"
 
@@ -61,10 +63,6 @@ def _painted(marks: Iterable[tuple[str, str]]) -> str:
         (colour, "".join(text for _, text in run)) for colour, run in itertools.groupby(marks, lambda mark: mark[0])
     ]
     return "".join(f"\x1b[{colour}m{text}\x1b[0m" if colour else text for colour, text in runs)
-
-
-def _speed(bytes_per_s: float) -> str:
-    return f"{bytes_per_s / 1e6:.1f} MB/s" if bytes_per_s >= 1e6 else f"{bytes_per_s / 1e3:.0f} KB/s"
 
 
 def _capacity_line(senders: Senders, i: int, scene: Scene, latest: slice) -> str:

@@ -110,6 +110,7 @@ def recorded(
     senders = Senders(len(episodes), capacity, value, max_messages=longest, max_bytes=max_bytes)
     senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
     senders.follow(policy)
+    senders.batch.senders["shows_left"] = 1
     # An arrival may need as many evictions as the queue holds, but each message is evicted only once.
     most = sum(2 + 4 * len(episode.arrivals) for episode in episodes)
     calls = records(most, CALL)

@@ -133,10 +133,8 @@ def _scorer(policy: Policy) -> dict[str, Any]:
     inputs, units = len(scorer.fields), max(1, 2 * scorer.first + scorer.second)
     text = _array("int", "bufgym_fields", scorer.fields.astype(int))
     text += _array("double", "bufgym_networks", scorer.networks)
-    text += _array("double", "bufgym_mix", scorer.mix) if len(scorer.mix) else ""
-    sizes = inputs, scorer.context, scorer.first, scorer.second, scorer.size, len(scorer.mix)
-    arrays = f"bufgym_fields, bufgym_networks, {'bufgym_mix' if len(scorer.mix) else '0'}"
-    text += f"static const struct bufgym_scorer bufgym_scorer = {{{', '.join(map(str, sizes))}, {arrays}}};\n"
+    sizes = ", ".join(map(str, (inputs, scorer.context, scorer.first, scorer.second, scorer.size)))
+    text += f"static const struct bufgym_scorer bufgym_scorer = {{{sizes}, bufgym_fields, bufgym_networks}};\n"
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
         f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{learned.CONTEXT}];\n"

@@ -5,10 +5,9 @@ enum { BUFGYM_DROP, BUFGYM_KEEP };
 struct bufgym_scorer {
     int inputs, context; /* fields read, those of the context first */
     int first, second;   /* units of the hidden layers, 0: none */
-    int size, mixing;    /* numbers of one network, and mixing weights */
+    int size;            /* numbers of one network */
     const int *fields;
     const double *networks; /* skip and b; W1 (a row for each input) and b1; W2 and b2; w */
-    const double *mix;      /* [context fields][slot fields] */
 };
 
 @WEIGHTS@
@@ -18,13 +17,9 @@ static inline double bufgym_begin(struct bufgym_queue *q, const struct bufgym_sc
     const double *net = scorer->networks + which * scorer->size, *weights;
     const int n = scorer->inputs, c = scorer->context, first = scorer->first;
     double score = net[n];
-    int i, j, o;
+    int i, o;
     for (i = 0; i < n - c; i++)
         q->skip[i] = net[c + i];
-    if (which == BUFGYM_DROP && scorer->mixing > 0)
-        for (j = 0; j < c; j++)
-            for (i = 0; i < n - c; i++)
-                q->skip[i] += q->f[j] * scorer->mix[j * (n - c) + i];
     for (i = 0; i < c; i++)
         score += net[i] * q->f[i];
     weights = net + n + 1;
