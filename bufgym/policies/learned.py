@@ -133,6 +133,13 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
     work = 2 * len(weights.fields) - len(weights.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
     reads_rate = not on_link.isdisjoint(weights.fields)
     policy = Policy(
-        name, on_arrival, weights=numbers, work=work, compile=True, reads_rate=reads_rate, reads_left=True, built_in=True
+        name,
+        on_arrival,
+        weights=numbers,
+        work=work,
+        compile=True,
+        reads_rate=reads_rate,
+        reads_left=True,
+        built_in=True,
     )
     return replace(policy, about=summary, source=source)
