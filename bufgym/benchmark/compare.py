@@ -160,30 +160,47 @@ def compare(
         if name not in known:
             raise unknown("keyword", name, [*KEYWORDS, *QUEUE, *known], place="compare")
     stream = scenario.get(on, **settings) if isinstance(on, str) else on
-    label = on if isinstance(on, str) else ""
-    seeds, capacities = 10 if seeds is None else seeds, capacities or [8]
+    label, seeds, capacities = on if isinstance(on, str) else "", 10 if seeds is None else seeds, capacities or [8]
+    return beside(chosen, stream, capacities, seeds, label=label, about=about, rival=rival, progress=progress, **queue)
+
+
+def beside(
+    chosen: Sequence[Policy],
+    stream: Any,
+    capacities: Sequence[int],
+    seeds: int | Sequence[int],
+    *,
+    label: str = "",
+    about: str = "",
+    rival: Policy | None = None,
+    progress: bool = True,
+    **queue: Any,
+) -> Comparison:
+    """``compare`` for policies and a scenario that are at hand; ``label`` is the scenario's name in the rows."""
     task = tasks.of(stream)
     chosen = _with(chosen, rival, task)
     alone = all(policy.name != task.baseline for policy in chosen)
-    unranked = table.apart(chosen)
+    if alone and task.kind != "queue":
+        chosen = [*chosen, make_policy(task.baseline)]
+    unranked, named = table.apart(chosen), "" if rival is None else rival.name
+    rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
+    heading = about or label or scenario.about(stream)
     if task.kind != "queue":
-        chosen = [*chosen, make_policy(task.baseline)] if alone else chosen
-        rows = run(chosen, stream, capacities, seeds, label=label, progress=progress)
-        shown = summary.table_of(task.summary(rows, unranked, named))
-    else:
-        rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
-        floor = run([BASELINE], stream, capacities, seeds, label=label, bound=named != "", **queue) if alone else []
-        shown = table.of(rows, floor, unranked)
-        if not about and "score" in shown.head:
-            shown = shown._replace(notes=[table.SCORE, *shown.notes])
-    texts = [shown.plain(), shown.markdown(), shown.html()]
-    if named and task.kind == "queue":
+        found = task.summary(rows, unranked, named)
+        shown = summary.table_of(found, {label: scenario.about(stream)}, ["", *task.notes(rows, found)])
+        return Comparison(rows, heading, unranked, *shown.forms())
+    floor = run([BASELINE], stream, capacities, seeds, label=label, bound=rival is not None, **queue) if alone else []
+    shown = table.of(rows, floor, unranked)
+    if "score" in shown.head:
+        shown = shown._replace(notes=[table.SCORE, *shown.notes])
+    texts = shown.forms()
+    if rival is not None:
         found = task.summary([*rows, *floor], unranked, named)
         paired = [quantity for quantity in found.quantities if quantity.key in ("share", "against")]
         notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
         more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
-        texts = ["\n\n".join(both) for both in zip(texts, (more.plain(), more.markdown(), more.html()), strict=True)]
-    return Comparison(rows, about or label or repr(stream), unranked, *texts)
+        texts = ["\n\n".join(both) for both in zip(texts, more.forms(), strict=True)]
+    return Comparison(rows, heading, unranked, *texts)
 
 
 def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:

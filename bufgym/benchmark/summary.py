@@ -207,18 +207,12 @@ def title(cell: Cell, abouts: Mapping[str, str]) -> str:
     return ", ".join(filter(None, (scenario, f"L = {capacity}")))
 
 
-def plain(summary: Summary, abouts: Mapping[str, str] | None = None) -> str:
-    """Write ``table_of`` as aligned text."""
-    return table_of(summary, abouts).plain()
-
-
-def table_of(summary: Summary, abouts: Mapping[str, str] | None = None) -> Table:
+def table_of(summary: Summary, abouts: Mapping[str, str], notes: Sequence[str] = ()) -> Table:
     """Make a block for each cell, and one over all cells if there are several."""
-    blocks = [(title(cell, abouts or {}), standings) for cell, standings in summary.cells.items()]
+    blocks = [(title(cell, abouts), standings) for cell, standings in summary.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", summary.overall))
-
-    return table_over(blocks, summary.quantities)
+    return table_over(blocks, summary.quantities)._replace(notes=notes)
 
 
 def table_over(blocks: Sequence[tuple[str, Sequence[Standing]]], quantities: Sequence[Quantity]) -> Table:

@@ -90,8 +90,12 @@ class Table(NamedTuple):
     def html(self) -> str:
         """One HTML table of all blocks, without their titles."""
         body = [self._row("td", line) for line in self.lines]
-        notes = [f"<p>{html.escape(note)}</p>" for note in self.notes]
+        notes = [f"<p>{html.escape(note)}</p>" for note in self.notes if note]
         return "\n".join(["<table>", self._row("th", self.head), *body, "</table>", *notes])
+
+    def forms(self) -> list[str]:
+        """The table as aligned text, Markdown and HTML."""
+        return [self.plain(), self.markdown(), self.html()]
 
     def _row(self, tag: str, line: Sequence[str]) -> str:
         sides = ["left" if k < self.left else "right" for k in range(len(line))]
@@ -145,7 +149,10 @@ COLUMNS = (
 )
 
 
-SCORE = "score: 0 is Drop Oldest, the rule of ROS; 1 is the clairvoyant, which knows the whole link beforehand"
+SCORE = (
+    "score: 0 is Drop Oldest, the rule of ROS; 1 is the clairvoyant, which knows the whole link beforehand;"
+    " regret = 1 - QoI / the clairvoyant's"
+)
 """The line below a table with scores."""
 REGRET_AT_MOST = "regret, at most"
 """Title of regrets if some rest on an uncertified bound."""

@@ -75,7 +75,7 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'; topics and fleet have their own); --out DIR keeps it, a second call resumes it."""
+    """Which ('bufgym list suites'); --out DIR keeps it, a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None
@@ -128,6 +128,23 @@ class OutOptions:
         if not file.absolute().parent.is_dir():
             raise BufgymError(f"{self.out}: no folder to write this file to")
         return file
+
+    def folder(self) -> Path | None:
+        """The folder of ``--out``, made before the long work, for a run that is not of a suite; None for no folder."""
+        if self.out is None or self.file() is not None:
+            return None
+        folder = Path(self.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "manifest.json").exists():
+            raise BufgymError(
+                f"{folder}: holds the run of a suite; choose another --out (its rows are never written over)"
+            )
+        return folder
+
+
+ByTopic: TypeAlias = Annotated[
+    str | None, Parameter(group=RESULTS, help="With several topics: print each topic's numbers under this policy.")
+]
 
 
 def given(options: object, *names: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from bufgym.model.qoi import Value
 from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
+from bufgym.scenario.texts import rated
 from bufgym.scenario.uplink import uplink_over_lte
 
 
@@ -104,6 +105,11 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
         if name not in known:
             raise unknown("parameter", name, known, "" if known else " (it is no dataclass)", type(spec).__name__)
     return replace(spec, **overrides)  # type: ignore[type-var]
+
+
+def about(scenario: Any) -> str:
+    """Lines about a scenario: its own ``about``, or how it is rated where it has none."""
+    return str(getattr(scenario, "about", "") or rated(scenario))
 
 
 def parameters(spec: Any) -> list[str]:

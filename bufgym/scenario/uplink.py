@@ -20,6 +20,7 @@ from bufgym.scenario.arrivals import messages, read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
 from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
+from bufgym.scenario.texts import moved, over, rated
 from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
@@ -116,6 +117,24 @@ class Uplink:
     def max_messages(self) -> int:
         """Arrivals of an episode."""
         return round(self.rate_hz * self.duration_s) if self.workload is None else len(self.workload)
+
+    @property
+    def about(self) -> str:
+        """What is sent over which links, and how it is rated."""
+        links = over(self.traces, self.scale[0])
+        if self.workload is None:
+            sent = f"{self.rate_hz:g} messages/s of {self.size_bytes} bytes for {self.duration_s:g} s over {links}"
+            moving, source = "camera's", f"from {moved(self.motion)}"
+            places, frame = "from random offsets" if self.random_offset else "from their start", "the frame index"
+        else:
+            sent, moving, frame = f"Played over {links}", "", "the number of the message"
+            source = f"from {moved(self.motion)}" if self.motion else "as recorded"
+            shared = "; all topics share one queue" if len(self.workload.topics) > 1 else ""
+            places = ("from random places" if self.random_offset else "from the trace's start") + shared
+        moves = self.motion or (self.workload is not None and self.workload.x is not None)
+        camera = f"the {moving} motion".replace("  ", " ")
+        x = f"{camera}, in fields of view, {source}" if moves else frame
+        return f"{sent}, {places}.\n{rated(self)}\nx is {x}."
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:

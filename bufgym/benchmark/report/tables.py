@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.score import CellScore, Scores, Standing
-from bufgym.benchmark.summary import Summary, places, title
-from bufgym.benchmark.summary import plain as blocks
-from bufgym.benchmark.table import SCORE, UPPER_BOUND, Table, invalid, score
+from bufgym.benchmark.summary import Summary, places, table_of, title
+from bufgym.benchmark.table import SCORE, UPPER_BOUND, Table, score
 
 NOTHING_SCORED = (
     "Nothing is scored here: on these episodes Drop Oldest's regret is under 1 % in every cell, so there is nothing to"
@@ -45,10 +44,9 @@ def heat_map(scores: Scores) -> HeatMap:
 
 def plain(run: SuiteRun, summary: Summary) -> str:
     """Write aligned text: the ranking, or a block for each cell if there are no scores, then the notes."""
-    notes = [f"{s.policy} has no rank: {s.apart}." for s in summary.overall if not s.ranked]
-    notes += [*invalid(run.task.senders(run.rows)), *summary.notes]
+    notes = run.task.notes(run.rows, summary)
     if summary.scores is None:
-        return "\n".join([*intro(run), "", blocks(summary, run.abouts), "", *run.task.legend, *notes])
+        return "\n".join([*intro(run), "", table_of(summary, run.abouts, ["", *notes]).plain()])
     if not any(cell.discriminative for cell in summary.scores.cells):
         notes.append(NOTHING_SCORED)
     bound = [] if summary.scores.exact else [f"{UPPER_BOUND[0].upper()}{UPPER_BOUND[1:]}."]

@@ -54,6 +54,8 @@ class TopicsTask(Task):
     baseline = BASELINE
     reference = BASELINE
     listed = ("relative", "lost", "age_relative")
+    capacity = 32
+    seeds = 5
     no_plan = "a queue of its own, which no topic of a client has"
     legend = (
         "QoI: sum over topics of weight x H, mean over episodes; [low, high]: 95 % intervals, resampling links.",
