@@ -20,7 +20,7 @@ CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]
 
 
 @contextmanager
-def begun(backend: str, address: str | None) -> Iterator[str]:
+def running(backend: str, address: str | None) -> Iterator[str]:
     """Yield the address of a ``ray`` or ``dask`` cluster; without one, run a cluster on this machine meanwhile.
 
     Raises BufgymError: the library is missing, or nothing answers at the address.
@@ -35,7 +35,7 @@ def connected(backend: str, address: str | None) -> Iterator[CallEach]:
 
     A Ray task, or a Dask worker with one thread, has a process to itself, which keeps the function's caches.
 
-    Raises BufgymError as ``begun`` does. The calls raise WorkerDiedError.
+    Raises BufgymError as ``running`` does. The calls raise WorkerDiedError.
     """
     with _client(backend, address) as client:
         if backend == "dask":

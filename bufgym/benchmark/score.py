@@ -22,9 +22,9 @@ Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ from bufgym.benchmark.bootstrap import (
     times_drawn,
 )
 from bufgym.benchmark.episodes import Arrays, Cell, Numbers
-from bufgym.benchmark.table import NOBODY, Unranked
+from bufgym.benchmark.table import NOBODY, RunRows, Unranked
 from bufgym.oracle.measure import BASELINE, TIE, normalised_score
 
 REFERENCE = "afr"
@@ -124,9 +124,7 @@ def regret(h: Numbers, best: Numbers) -> Numbers:
     return 1 - ratio(h, best, best > 0)
 
 
-def scores(
-    rows: Sequence[Mapping[str, Any]], unranked: Unranked | Collection[str] = NOBODY, against: str = ""
-) -> Scores:
+def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Scores:
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Args:
@@ -164,9 +162,8 @@ def scores(
             )
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
     _compare(overall, against)
-    reasons = unranked if isinstance(unranked, Mapping) else dict.fromkeys(unranked, "it does not compete")
     standings = [
-        Standing(policy, reasons.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
+        Standing(policy, unranked.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
         for policy, values in overall.items()
     ]
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))

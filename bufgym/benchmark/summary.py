@@ -18,7 +18,7 @@ from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
-from bufgym.benchmark.table import NOBODY, NONE, Rows, Table, Unranked, signed
+from bufgym.benchmark.table import NOBODY, NONE, RunRows, Table, Unranked, signed
 from bufgym.ground.errors import BufgymError
 
 
@@ -78,7 +78,7 @@ episode.
 """
 
 
-def by_run(rows: Rows, part: str, value: str) -> dict[Run, dict[Any, Mapping[str, Any]]]:
+def by_run(rows: RunRows, part: str, value: str) -> dict[Run, dict[Any, Mapping[str, Any]]]:
     """Group each run's rows by column ``part``; raise an error for a row without ``value`` or a repeated part."""
     runs: dict[Run, dict[Any, Mapping[str, Any]]] = {}
     for number, row in enumerate(rows):
@@ -207,9 +207,9 @@ def title(cell: Cell, abouts: Mapping[str, str]) -> str:
     return ", ".join(filter(None, (scenario, f"L = {capacity}")))
 
 
-def table_of(summary: Summary, abouts: Mapping[str, str], notes: Sequence[str] = ()) -> Table:
+def table_of(summary: Summary, abouts: Mapping[str, str] | None = None, notes: Sequence[str] = ()) -> Table:
     """Make a block for each cell, and one over all cells if there are several."""
-    blocks = [(title(cell, abouts), standings) for cell, standings in summary.cells.items()]
+    blocks = [(title(cell, abouts or {}), standings) for cell, standings in summary.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", summary.overall))
     return table_over(blocks, summary.quantities)._replace(notes=notes)

@@ -55,7 +55,7 @@ class Sweep:
     policy_file: str | None = None  # a Python file that registers policies, run wherever shards run
     sources: tuple[str, ...] = ()
     """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
-    folder: str = field(default_factory=os.getcwd)  # folder of the sources
+    home: str = field(default_factory=os.getcwd)  # folder of the sources
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
@@ -72,12 +72,12 @@ class Sweep:
     def settings(self) -> dict[str, Setting]:
         """The suite's settings of the split, with the changes."""
         settings = suites.get(self.suite).settings(self.split, self.data)
+        if not self.changes:
+            return settings
         known = parameters(next(iter(settings.values())).scenario)
         for name in self.changes:
             if name not in known:
                 raise unknown("parameter", name, known, place=self.suite)
-        if not self.changes:
-            return settings
         return {
             label: replace(setting, scenario=replace(setting.scenario, **self.changes))
             for label, setting in settings.items()
@@ -147,7 +147,7 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
         load(sweep.policy_file)
         _LOADED.add(sweep.policy_file)
     for source in sweep.sources:
-        sources.load(source, sweep.folder)
+        sources.load(source, sweep.home)
     setting = sweep.setting(shard.label, shard.trace)
     limits: dict[str, Any] = {} if setting.max_bytes is None else {"max_bytes": setting.max_bytes}
     return run(sweep.policies, setting.scenario, sweep.capacities_of(setting), shard.seeds, label=shard.label, **limits)
@@ -250,7 +250,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "seeds": sweep.seeds,
         "changes": dict(sweep.changes),
         "policy_file": code and hashlib.sha256(code).hexdigest()[:16],
-        "sources": sources.digests(sweep.sources, sweep.folder) or None,
+        "sources": sources.digests(sweep.sources, sweep.home) or None,
         "scenarios": {
             label: {
                 "about": setting.about,

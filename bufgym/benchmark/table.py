@@ -10,12 +10,11 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from bufgym import policies
 from bufgym.ground.errors import printable
 from bufgym.oracle.measure import BASELINE, normalised_score
 from bufgym.policies import Policy
 
-Rows = Sequence[Mapping[str, Any]]
+RunRows = Sequence[Mapping[str, Any]]
 Unranked = Mapping[str, str]
 """Policies that do not compete, with the reasons, see ``apart``."""
 NOBODY: Unranked = MappingProxyType({})
@@ -112,7 +111,7 @@ def aligned(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:
     ]
 
 
-def invalid(rows: Rows) -> list[str]:
+def invalid(rows: RunRows) -> list[str]:
     """Write a note for each policy that made invalid decisions; ``rows`` has one row per sender."""
     counts: dict[str, int] = {}
     for row in rows:
@@ -160,7 +159,7 @@ UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exac
 """The note below them."""
 
 
-def means(rows: Rows, floor: Rows = (), alone: Collection[str] = ()) -> list[dict[str, Any]]:
+def means(rows: RunRows, floor: RunRows = (), alone: Collection[str] = ()) -> list[dict[str, Any]]:
     """Average the rows of each policy and capacity, sorted by capacity ascending, then QoI descending.
 
     Those ``alone``, which do not compete, come last within a capacity. None and NaN count as missing, and a mean of
@@ -187,7 +186,7 @@ def _episode(row: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(row.get(name) for name in ("scenario", "trace", "seed", "capacity"))
 
 
-def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
+def _score(group: RunRows, base: Mapping[tuple[Any, ...], float]) -> float:
     """Score of one policy at one capacity; NaN if one of the three sums is unknown or L does not bind the policy."""
     if any(row.get("regret") is None or _episode(row) not in base for row in group):
         return math.nan
@@ -198,7 +197,7 @@ def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
     return float(normalised_score(*sums))
 
 
-def same(rows: Rows, alone: Collection[str] = ()) -> dict[str, list[str]]:
+def same(rows: RunRows, alone: Collection[str] = ()) -> dict[str, list[str]]:
     """Group policies with equal rows: map the first, or Drop Oldest if it is among them, to the others.
 
     One that is ``alone`` is never grouped with one that competes.
@@ -222,13 +221,7 @@ def apart(chosen: Iterable[Policy]) -> dict[str, str]:
     return {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
 
 
-def unranked(rows: Rows) -> dict[str, str]:
-    """The same of the registered policies in rows whose policies are not at hand."""
-    met = {row["policy"].partition(":")[0] for row in rows}
-    return apart(policies.get(name) for name in policies.names() if name in met)
-
-
-def of(rows: Rows, floor: Rows = (), alone: Unranked = NOBODY) -> Table:
+def of(rows: RunRows, floor: RunRows = (), alone: Unranked = NOBODY) -> Table:
     """Make the table of ``means``, with one line for policies that are the ``same``.
 
     Score and regret are left out if no row has them. ``floor`` and ``alone``, see ``apart``, are as in ``means``.

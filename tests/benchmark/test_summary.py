@@ -16,7 +16,7 @@ from bufgym.benchmark import leaderboard, report
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
 from bufgym.benchmark.score import scores
-from bufgym.benchmark.summary import Quantity, Run, Summary, plain, summarise
+from bufgym.benchmark.summary import Quantity, Run, Summary, summarise, table_of
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import score
 from bufgym.benchmark.tasks import TASKS
@@ -73,7 +73,7 @@ def test_one_episode_has_no_interval() -> None:
     found = summary(runs({"base": [2], "mine": [3]}))
     value, low, high = found.standings["mine"]["over"]
     assert value == 1.5 and math.isnan(low) and math.isnan(high)
-    lines = [line.split() for line in plain(found).splitlines()]
+    lines = [line.split() for line in table_of(found).plain().splitlines()]
     assert lines[3:] == [["mine", "3.000", "1.500", "[–]", "1"], ["base", "2.000", "–", "1"]]
 
 

@@ -13,7 +13,7 @@ from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
-from bufgym.benchmark.table import NOBODY, Column, Rows, Table, Unranked, decimal, mean, percent, score
+from bufgym.benchmark.table import NOBODY, Column, RunRows, Table, Unranked, decimal, mean, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, names
@@ -167,7 +167,7 @@ def _folded(copies: Sequence[TopicOutcome]) -> Row:
 _seconds, _one_digit = (partial(decimal, digits=digits) for digits in (2, 1))
 
 
-def _numbers(topics: Rows) -> list[float]:
+def _numbers(topics: RunRows) -> list[float]:
     """Numbers of one run for ``_statistics``: QoI, no_drop messages lost, age of the first topics and of the others,
     messages late, delivered with a deadline and delivered in all, seconds."""
     highest = max(row["priority"] for row in topics)
@@ -222,7 +222,7 @@ TOPIC_COLUMNS = (
 )
 
 
-def by_topic(rows: Rows, policy: str) -> str:
+def by_topic(rows: RunRows, policy: str) -> str:
     """Write each topic's mean outcome over episodes under one policy as aligned text, a block for each cell."""
     cells: dict[tuple[str, int], dict[str, list[Mapping[str, Any]]]] = {}
     for row in rows:
