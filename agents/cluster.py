@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from bufgym.benchmark.cluster import WorkerDiedError, connected_ray, dask_client, imported
+from bufgym.benchmark.cluster import WorkerDiedError, connected_ray, dask_client
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import library
 
 Call = Callable[..., Any]
 CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]
@@ -39,7 +40,7 @@ def connected(backend: str, address: str | None) -> Iterator[CallEach]:
     """
     with _client(backend, address) as client:
         if backend == "dask":
-            died: tuple[type[Exception], ...] = (imported("distributed", "dask").KilledWorker,)
+            died: tuple[type[Exception], ...] = (library("distributed", "dask").KilledWorker,)
 
             def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
                 # Not pure, so that equal arguments are called again.

@@ -122,7 +122,7 @@ def test_a_mistake_typed_is_not_the_files_fault(config: str, capsys: Capsys, mon
     Path(config).write_text(f"window = 0\n{CONFIG}")
     fails(["topics", "--config", config], "mine.toml: window = 0: n_T must be a whole number", capsys)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    fails(["topics", "--out", "rows.parquet"], "Parquet files need pyarrow", capsys)
+    fails(["topics", "--out", "rows.parquet"], "a Parquet file, unlike .csv, needs pyarrow", capsys)
 
 
 # A message a second; nothing crosses for 4 s, then 10 kB/s.

@@ -16,7 +16,8 @@ from bufgym.benchmark import report, sources, summary, table, tasks
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.ground.errors import BufgymError, install, unknown
+from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.libraries import library
 from bufgym.ground.modules import is_named
 from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
@@ -80,10 +81,7 @@ class Comparison:
 
     def plot(self, axes: Any = None) -> Any:
         """Draw each policy's regret as a bar, a colour for each L; Matplotlib's axes. QoI where no regret is known."""
-        try:
-            from matplotlib import pyplot
-        except ImportError:
-            raise BufgymError(f"plot needs matplotlib: {install('plot')}") from None
+        pyplot = library("matplotlib.pyplot", "plot", "plot")
         axes = pyplot.subplots(layout="constrained")[1] if axes is None else axes
         entries = table.means(self.rows, alone=self.unranked)
         capacities = list(dict.fromkeys(entry["capacity"] for entry in entries))

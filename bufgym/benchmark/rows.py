@@ -9,8 +9,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
+from bufgym.ground.libraries import library
 from bufgym.sim.metrics import Outcome
 
 Row = dict[str, Any]
@@ -131,9 +132,7 @@ def has_pyarrow() -> bool:
 
 
 def _pyarrow() -> tuple[Any, Any]:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise BufgymError(f"Parquet files need pyarrow: {install('bench')} (or write .csv)") from None
-    return pyarrow, pyarrow.parquet
+    pyarrow, parquet = (
+        library(name, "bench", "a Parquet file, unlike .csv,") for name in ("pyarrow", "pyarrow.parquet")
+    )
+    return pyarrow, parquet

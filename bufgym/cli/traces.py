@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from bufgym.cli.options import columns
-from bufgym.ground.errors import BufgymError, TraceError, install, printable
+from bufgym.ground.errors import BufgymError, TraceError, printable
+from bufgym.ground.libraries import library
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,14 +123,11 @@ def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = 
     """
     from bufgym import traces
 
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
+    figures = library("matplotlib.figure", "plot", "drawing")
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
     loaded = [traces.load(name, format, column=column) for name in files]
-    figure = Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
+    figure = figures.Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
     axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
     for axis, trace in zip(axes, loaded, strict=True):
         _draw(axis, trace)

@@ -26,7 +26,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from bufgym.ground.errors import unknown
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 
 Content = dict[str, Any]
 """Fields of a message by their ROS 2 names. Nested messages are Contents or lists of them; arrays are numpy's."""

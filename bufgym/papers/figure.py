@@ -18,7 +18,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import library
 from bufgym.model import checks
 from bufgym.model.checks import above_0
 from bufgym.papers.rows import FigureRows
@@ -164,14 +165,9 @@ def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
 
 def save_picture(reproduction: Figure, rows: FigureRows, path: Path) -> Path:
     """Draw and write the PNG; return its path. An error that names the extra where matplotlib is absent."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure as Picture
-    except ImportError:
-        raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
-    # Avoids pyplot, which opens windows and keeps global state.
-    picture = Picture(figsize=reproduction.size_inches(rows), layout="constrained")
-    FigureCanvasAgg(picture)
+    # Avoids pyplot, which opens windows and keeps global state; a figure of its own draws with Agg.
+    figures = library("matplotlib.figure", "plot", "drawing")
+    picture = figures.Figure(figsize=reproduction.size_inches(rows), layout="constrained")
     reproduction.draw(rows, picture)
     path.parent.mkdir(parents=True, exist_ok=True)
     picture.savefig(path, dpi=150)

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from bufgym import traces
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
 from bufgym.benchmark.rows import Row
+from bufgym.ground.libraries import library
 from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES
-from bufgym.papers.extra import library
 from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views

@@ -17,7 +17,7 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import bar
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception.recordings import open_sequence
 from bufgym.papers.perception.room import made_up_room
 from bufgym.papers.perception.stage import WIDTH, Stage

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception.frames import Camera, encoded_bytes
 from bufgym.papers.perception.recordings import open_sequence
 

@@ -16,7 +16,7 @@ from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.score import CellScore
 from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.benchmark.table import REGRET_AT_MOST, means, percent
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.libraries import library
 
 PALETTE = {
     **{"ink": "#1b1f24", "grid": "#e7eaee", "axis": "#a3abb5", "muted": "#a2aab4"},
@@ -83,14 +83,10 @@ class Context:
 
 def svg(draw: Callable[[Any], None], height: float) -> str:
     """Let ``draw`` fill a figure of 9 by ``height`` inches; return it as an SVG element."""
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise BufgymError(f"the report needs matplotlib and Jinja: {install('report')}") from None
+    matplotlib, figures = (library(name, "report", "the report") for name in ("matplotlib", "matplotlib.figure"))
     out = io.StringIO()
     with matplotlib.rc_context(STYLE):
-        figure = Figure((9, height), layout="constrained")
+        figure = figures.Figure((9, height), layout="constrained")
         draw(figure)
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         figure.savefig(out, format="svg", transparent=True, metadata=nothing)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception import tsdf
 from bufgym.papers.perception.frames import Camera, Sequence
 from bufgym.traces.trace import Float64Array

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.ground.libraries import library
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
-from bufgym.papers.extra import library
 from bufgym.papers.perception.frames import Image, Sequence
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode

@@ -23,7 +23,7 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8, read_whole
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception.frames import Camera, Depth, Image, Sequence
 from bufgym.traces.formats.text import open_text
 from bufgym.traces.formats.trajectories import read_poses, seconds
