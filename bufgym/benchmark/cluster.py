@@ -57,7 +57,6 @@ def _own(backend: str) -> dict[str, Any]:
 
 @contextmanager
 def _connected(backend: str, address: str | None) -> Iterator[None]:
-    """Connect joblib's backend of that name."""
     joblib = library("joblib", "bench")
     with nullcontext() if backend != "dask" else dask_client(address):
         if backend == "ray":

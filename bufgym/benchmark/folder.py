@@ -48,7 +48,6 @@ class SuiteRun:
 
     @property
     def task(self) -> Task:
-        """The task of its suite."""
         return TASKS[self.manifest["task"]]
 
     @property

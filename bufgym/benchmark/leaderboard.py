@@ -58,7 +58,6 @@ class Entry:
 
 
 def task_of(suite: str) -> Task:
-    """Find the task of the suite."""
     return TASKS[suites.get(suite).kind]
 
 
@@ -165,7 +164,6 @@ def read(path: Path) -> dict[str, Entry]:
 
 
 def find(path: Path, name: str) -> Entry:
-    """Find the entry of that name."""
     board = read(path)
     if name not in board:
         raise BufgymError(f"{path}: no row {name!r}; rows are named suite/policy, such as {next(iter(board), 'none')}")

@@ -70,7 +70,6 @@ def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str], 
 
 
 def read_rows(path: str | os.PathLike[str], layout: Layout = RUNS) -> list[Row]:
-    """Read the rows that ``write_rows`` wrote."""
     source = Path(path)
     if source.exists() and not source.is_file():
         raise BufgymError(f"{source}: must be a regular file")

@@ -80,7 +80,6 @@ class Standing:
 
     @property
     def ranked(self) -> bool:
-        """Whether it competes."""
         return not self.apart
 
     def __getitem__(self, key: str) -> Interval:
@@ -107,7 +106,6 @@ class Scores:
 
     @property
     def counted(self) -> int:
-        """Number of discriminative cells."""
         return len({(cell.scenario, cell.capacity) for cell in self.cells if cell.discriminative})
 
     @property

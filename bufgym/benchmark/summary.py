@@ -57,7 +57,6 @@ class Summary:
 
     @property
     def standings(self) -> dict[str, Standing]:
-        """Over all cells, by policy."""
         return {standing.policy: standing for standing in self.overall}
 
 
@@ -170,12 +169,10 @@ class Place(NamedTuple):
 
     @property
     def place(self) -> str:
-        """Its rank as text."""
         return NONE if self.rank is None else str(self.rank)
 
     @property
     def texts(self) -> list[str]:
-        """Each value with its interval."""
         return [" ".join(filter(None, texts)) for texts in self.values]
 
 

@@ -61,12 +61,10 @@ class Sweep:
 
     @property
     def task(self) -> Task:
-        """The task that the suite is for."""
         return tasks.TASKS[suites.get(self.suite).kind]
 
     @property
     def policies(self) -> list[policies.Policy]:
-        """Policies of ``specs``."""
         return [policies.get(spec) for spec in self.specs]
 
     def settings(self) -> dict[str, Setting]:
@@ -131,7 +129,6 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """Name of its file."""
         return f"{self.label}-{self.trace}-{self.seeds[0]}"
 
 

@@ -67,7 +67,6 @@ class Table(NamedTuple):
 
     @property
     def lines(self) -> list[Sequence[str]]:
-        """Lines of all blocks."""
         return [line for _, block in self.blocks for line in block]
 
     def plain(self) -> str:
@@ -93,7 +92,6 @@ class Table(NamedTuple):
         return "\n".join(["<table>", self._row("th", self.head), *body, "</table>", *notes])
 
     def forms(self) -> list[str]:
-        """The table as aligned text, Markdown and HTML."""
         return [self.plain(), self.markdown(), self.html()]
 
     def _row(self, tag: str, line: Sequence[str]) -> str:
@@ -212,7 +210,6 @@ def same(rows: RunRows, alone: Collection[str] = ()) -> dict[str, list[str]]:
 
 
 def told_once(alike: Mapping[str, Sequence[str]]) -> list[str]:
-    """Write a note for each line that stands for several policies, see ``same``."""
     return [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in alike.items()]
 
 

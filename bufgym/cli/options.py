@@ -163,7 +163,6 @@ def refuse(options: Mapping[str, Any], why: str) -> None:
 
 
 def command_line(command: str, **options: Any) -> str:
-    """Write the command with the given options."""
     words = [command]
     for name, value in options.items():
         if value is not None and value is not False:

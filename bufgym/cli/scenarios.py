@@ -170,7 +170,6 @@ class ScenarioOptions:
 
 
 def _parameters(options: StreamOptions, *names: str) -> dict[str, Any]:
-    """Select the options that the user gave, as parameters of the scenario."""
     return {_PARAMETERS.get(name, name): value for name, value in given(options, *names).items()}
 
 

@@ -116,7 +116,6 @@ def topic_policy(by_topic: str | None, task: Task, specs: Sequence[str]) -> str 
 
 
 def print_topics(rows: Sequence[Row], policy: str) -> None:
-    """Print the policy's numbers topic by topic."""
     from bufgym.benchmark.tasks import topics
 
     print(f"\n{policy}, topic by topic: means over episodes\n{topics.by_topic(rows, policy)}")

@@ -168,6 +168,5 @@ def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
 
 
 def _summary_cells(topic: TopicSummary) -> list[str]:
-    """Messages, rate, bytes and share of a topic."""
     rate = "-" if math.isnan(topic.rate_hz) else f"{topic.rate_hz:.3f}"
     return [f"{topic.messages:,}", rate, f"{topic.total_bytes:,}", f"{topic.share:.1%}"]

@@ -110,7 +110,6 @@ class Reproduction(LinkFigure):
             "fewest": counts[main][0],
             "most": counts[main][1],
             "near": 100 * NEAR,
-            "within": WITHIN_HZ,
             "counted_kb": listed([f"{kb:g}" for kb in sizes if many[kb]]),
             "rated_kb": listed([f"{kb:g}" for kb in sizes if fast[kb]]),
             "both_kb": listed([f"{kb:g}" for kb in sizes if many[kb] and fast[kb]]),

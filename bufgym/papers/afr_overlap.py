@@ -72,7 +72,7 @@ class Reproduction(FrameFigure):
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         by_frames = rows.where(by="frames")
         played = FigureRows(row for row in by_frames if row["behind"] is not None)
-        facts: dict[str, Any] = {"about": self.about(), "noise": NOISE}
+        facts: dict[str, Any] = {}
         for rule in ("broken_5", "broken_6"):
             facts[rule] = "; ".join(
                 f"{recording} {shown.mean(rule, by='frames'):.0%} of the cases by frames, "

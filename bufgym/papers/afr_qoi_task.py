@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.table import aligned
+from bufgym.benchmark.table import NONE, aligned
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import POLICIES, FrameFigure, spearman_over
 from bufgym.papers.rows import FigureRows, listed
@@ -46,7 +46,6 @@ class Reproduction(FrameFigure):
 
     @cached_property
     def runs(self) -> FigureRows:
-        """Runs of Fig. 7 and 8."""
         return self.play("map", "track")
 
     def simulate(self) -> FigureRows:
@@ -99,7 +98,6 @@ class Reproduction(FrameFigure):
         asked = rows.where(scope=ACROSS, task="map error")
         wrong = [f"{row['measure']} on {row['recording']}" for row in asked if not row["high"] < 0]
         return {
-            "about": self.about(),
             "stands": not wrong,
             "right": len(asked) - len(wrong),
             "asked": len(asked),
@@ -141,5 +139,5 @@ def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.floa
 
 def _spelled(row: Row) -> str:
     if np.isnan(row["spearman"]):
-        return "-"
+        return NONE
     return f"{row['spearman']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"

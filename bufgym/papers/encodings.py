@@ -21,6 +21,7 @@ import base64
 import functools
 import json
 import math
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -37,37 +38,6 @@ _TIME: Final = "builtin_interfaces/msg/Time"
 
 
 # --- messages --------------------------------------------------------------------------------------------------------
-
-
-class Kind(NamedTuple):
-    """A kind of message."""
-
-    type: str  # its ROS type
-    frame_id: str  # the frame_id of its header by default
-
-
-KINDS: Final = {
-    "LaserScan": Kind("sensor_msgs/msg/LaserScan", "laser"),
-    "NavSatFix": Kind("sensor_msgs/msg/NavSatFix", "gps"),
-    "CompressedImage": Kind("sensor_msgs/msg/CompressedImage", "cam"),
-    "PointCloud2": Kind("sensor_msgs/msg/PointCloud2", "lidar"),
-    "PoseStamped": Kind("geometry_msgs/msg/PoseStamped", "map"),
-}
-
-
-def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters: Any) -> Content:
-    """Build a message of ``kind`` with seeded content; ``parameters`` go to its builder, such as ``beams``."""
-    uniform = np.random.Generator(np.random.PCG64(seed))
-    build = {
-        "LaserScan": _laser_scan,
-        "NavSatFix": _nav_sat_fix,
-        "CompressedImage": _compressed_image,
-        "PointCloud2": _point_cloud2,
-        "PoseStamped": _pose_stamped,
-    }[kind]
-    stamp = {"sec": 1_600_000_000, "nanosec": 123_456_789}
-    name = KINDS[kind].frame_id if frame_id is None else frame_id
-    return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **build(uniform, **parameters)}
 
 
 def _laser_scan(uniform: np.random.Generator, beams: int = 1080) -> Content:
@@ -122,6 +92,29 @@ def _pose_stamped(uniform: np.random.Generator) -> Content:
     x, y, yaw = uniform.uniform(-50, 50), uniform.uniform(-50, 50), uniform.uniform(-math.pi, math.pi)
     turn = {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
     return {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}}
+
+
+class Kind(NamedTuple):
+    type: str  # its ROS type
+    frame_id: str  # the frame_id of its header by default
+    build: Callable[..., Content]  # (generator, parameters such as ``beams``) -> its fields besides the header
+
+
+KINDS: Final = {
+    "LaserScan": Kind("sensor_msgs/msg/LaserScan", "laser", _laser_scan),
+    "NavSatFix": Kind("sensor_msgs/msg/NavSatFix", "gps", _nav_sat_fix),
+    "CompressedImage": Kind("sensor_msgs/msg/CompressedImage", "cam", _compressed_image),
+    "PointCloud2": Kind("sensor_msgs/msg/PointCloud2", "lidar", _point_cloud2),
+    "PoseStamped": Kind("geometry_msgs/msg/PoseStamped", "map", _pose_stamped),
+}
+
+
+def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters: Any) -> Content:
+    """Build a message of ``kind`` with seeded content; ``parameters`` go to its builder, such as ``beams``."""
+    stamp = {"sec": 1_600_000_000, "nanosec": 123_456_789}
+    name = KINDS[kind].frame_id if frame_id is None else frame_id
+    built = KINDS[kind].build(np.random.Generator(np.random.PCG64(seed)), **parameters)
+    return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **built}
 
 
 # --- encodings -------------------------------------------------------------------------------------------------------

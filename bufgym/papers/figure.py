@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import sys
 import textwrap
 import tomllib
 from abc import ABC, abstractmethod
@@ -54,7 +55,6 @@ def whole(least: int = 1, most: int | None = None) -> Rule:
 
 
 def at_least_0(name: str, number: Any) -> None:
-    """Check that an option is a finite number >= 0."""
     if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number < math.inf:
         raise BufgymError(f"{name} = {number!r}: must be a number >= 0")
 
@@ -129,8 +129,10 @@ def statements() -> dict[str, dict[str, Any]]:
 
 
 def facts_of(figure: Figure, rows: FigureRows) -> dict[str, Any]:
-    """Collect what the texts may quote: the figure's options and the results of its claims."""
-    return {option.name: getattr(figure, option.name) for option in fields(figure)} | dict(figure.claims(rows))
+    """Collect what the texts may quote: its module's constants, ``figure``, its options, the results of its claims."""
+    constants = {name: value for name, value in vars(sys.modules[type(figure).__module__]).items() if name.isupper()}
+    options = {option.name: getattr(figure, option.name) for option in fields(figure)}
+    return {**constants, "figure": figure, **options, **figure.claims(rows)}
 
 
 def report(name: str, figure: Figure, rows: FigureRows) -> list[str]:

@@ -63,7 +63,6 @@ def _rows(name: str, data: Path | None, out: Path | None) -> list[str]:
 
 
 def claims_page(data: Path | None = None, out: Path | None = None) -> str:
-    """Run every figure and return the whole page."""
     lines = [HEAD]
     for paper, title in PAPERS.items():
         lines += [f"## {title}", ""]

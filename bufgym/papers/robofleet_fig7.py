@@ -140,7 +140,6 @@ class Reproduction(ClientFigure):
             ),
             "spikes": sum(spikes),
             "played": len(spikes),
-            "spike_times": SPIKE,
             "zones": ", ".join(f"{bad:g}" for bad in self.bad_mbit_per_s),
             "affected": "; ".join(
                 f"{PROGRAMS[name].label.split(',')[0]} {', '.join(f'{s:.1f}' for s in seconds)} s"
@@ -148,10 +147,8 @@ class Reproduction(ClientFigure):
             ),
             "no-drop": lost == 0,
             "lost": lost,
-            "from_s": self.zone_s[0],
             "topics": "; ".join(_rules_of(kind) for kind in TOPICS),
             "demand": sum(BYTES[kind][1] * hz for kind, (hz, _) in TOPICS.items()) / MBIT,
-            "shown": self.shown,
             "medians": ", ".join(medians),
         }
 

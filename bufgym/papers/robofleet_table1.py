@@ -54,7 +54,6 @@ class Reproduction(Figure):
 
     @cached_property
     def messages(self) -> dict[str, Content]:
-        """Map each kind to the message that is encoded."""
         messages = fitted(self.beams)
         for kind in KINDS:
             parameters: dict[str, Any] = {"points": self.points} if kind == "PointCloud2" else {}
@@ -126,7 +125,6 @@ class Reproduction(Figure):
 
 
 def sizes_of(rows: FigureRows) -> dict[str, dict[str, int]]:
-    """Map kind and encoding to bytes."""
     sizes: dict[str, dict[str, int]] = {}
     for row in rows:
         sizes.setdefault(row["message"], {})[row["encoding"]] = row["bytes"]

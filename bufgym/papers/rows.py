@@ -66,7 +66,6 @@ class FigureRows(list[Row]):
 
 
 def average(numbers: NDArray[np.float64]) -> float:
-    """Mean, or NaN without numbers."""
     return float(numbers.mean()) if len(numbers) else math.nan
 
 

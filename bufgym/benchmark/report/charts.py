@@ -73,7 +73,6 @@ class Context:
         return [cell for cell in cells if not math.isnan(cell.regret.value)]
 
     def colour(self, policy: str) -> str:
-        """Name of the colour."""
         return self.colours.get(policy, "muted")
 
     def paint(self, policy: str) -> str:

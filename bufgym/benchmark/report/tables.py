@@ -56,7 +56,6 @@ def plain(run: SuiteRun, summary: Summary) -> str:
 
 
 def html(summary: Summary) -> str:
-    """The ranking as an HTML table."""
     return _ranking(summary, summary.overall, str).html()
 
 

@@ -43,7 +43,6 @@ class Camera:
 
     @property
     def fov_deg(self) -> float:
-        """Horizontal field of view, degrees."""
         return float(np.degrees(2 * np.arctan(self.width / (2 * self.fx))))
 
     @property

@@ -94,7 +94,6 @@ class Map:
 
     @staticmethod
     def empty(grid: VoxelGrid) -> Map:
-        """Make an empty map."""
         return Map(grid, np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32))
 
     def add(
