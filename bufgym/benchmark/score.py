@@ -125,15 +125,8 @@ def regret(h: Numbers, best: Numbers) -> Numbers:
 def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Scores:
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
-    Args:
-        rows: from ``bufgym.benchmark.run``. Rows of a trained agent may have a "training_seed"; the H of an episode is
-            then the mean over training seeds.
-        unranked: policies that are shown but not ranked, with the reasons, see ``table.apart``.
-        against: the policy that every other is compared with by its share of ``REFERENCE``'s regret.
-
-    Raises:
-        BufgymError: there are no rows, rows are incomplete or duplicate, a cell lacks the baseline, or policies met
-            different episodes or disagree on the clairvoyant; or ``against`` has no rows.
+    Rows of a trained agent may have a "training_seed"; the H of an episode is then the mean over training seeds. Every
+    policy is compared with ``against`` by its share of ``REFERENCE``'s regret. Errors are those of ``episodes.read``.
     """
     table = episodes.read(rows, BASELINE, against)
     drawn = links_drawn(table.episodes, RESAMPLES, SEED)

@@ -103,18 +103,8 @@ def summarise(
 ) -> Summary:
     """Compare every policy with ``baseline``, by cell and over all cells.
 
-    Args:
-        runs: numbers of each run for ``statistics``, with equally many entries within a cell.
-        statistics: computes the quantities of one policy in one cell.
-        quantities: names and formats of the statistics.
-        rank_by: the key of the quantity that orders the policies.
-        baseline: the policy that the others are measured against.
-        unranked: policies that come last, see ``table.apart``.
-        against: the policy that every other is compared with by ``rank_by``, see ``difference``.
-
-    Raises:
-        BufgymError: there are no runs, a cell lacks the baseline, policies met different episodes, or ``against`` has
-            no runs.
+    ``runs`` holds the numbers of each run for ``statistics``, with equally many entries within a cell. The quantity
+    ``rank_by`` orders the policies; those ``unranked`` come last. ``against`` is as in ``difference``.
     """
     # ``read`` makes sure that all met the same episodes, and orders them.
     rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]

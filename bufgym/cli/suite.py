@@ -26,13 +26,8 @@ def run_suite(
 ) -> None:
     """Run a suite and print its summary.
 
-    Args:
-        options: the suite and its machines.
-        who: policies, capacities and seeds.
-        out: where the rows go.
-        changes: parameters of the suite's scenarios that are not as they are.
-        against: policy that every other is compared with; it and the task's reference run too.
-        by_topic: policy whose numbers are also printed topic by topic.
+    ``changes`` are parameters of its scenarios that are not as they are. Every policy is compared with ``against``,
+    which runs too, as does the task's reference. ``by_topic`` is printed topic by topic.
     """
     from bufgym import policies
     from bufgym.benchmark import report

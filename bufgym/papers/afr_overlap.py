@@ -128,10 +128,7 @@ _NOTHING: Row = {"behind": None, "afr_of_best": None, "oldest_of_best": None}
 def _rules(v: NDArray[np.float64], at: NDArray[np.float64], d: float) -> Row | None:
     """Measure V at distance ``d`` from each frame and how often 2 d breaks a rule; None if no frame is so far.
 
-    Args:
-        v: float64[frames, frames], V(i, j).
-        at: float64[frames], position of each frame, non-decreasing.
-        d: the distance.
+    ``v`` float64[frames, frames] is V(i, j), and ``at`` float64[frames] the position of each frame, never falling.
     """
     once, twice = (np.searchsorted(at, at + distance - 1e-9) for distance in (d, 2 * d))
     i = np.flatnonzero(twice < len(at))

@@ -121,11 +121,7 @@ def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters:
 
 
 def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topic") -> bytes:
-    """Encode ``message``, made by ``content``, as bytes; ``topic`` goes into the flatbuffer and the JSON.
-
-    Raises:
-        BufgymError: an unknown encoding; rosbags or flatbuffers is not installed (extra ``robofleet``).
-    """
+    """Encode ``message``, made by ``content``, as bytes; ``topic`` goes into the flatbuffer and the JSON."""
     type_name = KINDS[kind].type
     if encoding in ("ros1", "cdr"):
         store = stores()[encoding]

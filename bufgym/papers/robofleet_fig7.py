@@ -147,7 +147,10 @@ class Reproduction(ClientFigure):
             ),
             "no-drop": lost == 0,
             "lost": lost,
-            "topics": "; ".join(_rules_of(kind) for kind in TOPICS),
+            "topics": "; ".join(
+                f"{kind} {hz:g} Hz, " + ("no_drop" if rules.get("no_drop") else f"priority {rules['priority']:g}")
+                for kind, (hz, rules) in TOPICS.items()
+            ),
             "demand": sum(BYTES[kind][1] * hz for kind, (hz, _) in TOPICS.items()) / MBIT,
             "medians": ", ".join(medians),
         }
@@ -190,8 +193,3 @@ def _entry(sent: Sent, zone_s: tuple[float, float]) -> Row:
         "affected_after_s": max(0.0, float(received.received_s[late].max(initial=0)) - zone_s[1]),
         "lost": len(sent) - len(sent.received),
     }
-
-
-def _rules_of(kind: str) -> str:
-    hz, rules = TOPICS[kind]
-    return f"{kind} {hz:g} Hz, " + ("no_drop" if rules.get("no_drop") else f"priority {rules['priority']:g}")

@@ -36,9 +36,7 @@ class FigureRows(list[Row]):
     def pivot(self, index: str, by: str, value: str, spec: str, labels: Mapping[Any, str] | None = None) -> list[str]:
         """Tabulate means of the column ``value``, with a line per value of ``index`` and a column per value of ``by``.
 
-        Args:
-            spec: format of a mean, such as ".1f" or ".0%".
-            labels: names of lines and columns to show instead of their values.
+        ``labels`` are names of lines and columns to show instead of their values.
         """
         known = labels or {}
 

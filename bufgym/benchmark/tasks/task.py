@@ -67,13 +67,7 @@ class Task(ABC):
 
     @abstractmethod
     def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
-        """Compare every policy with the baseline.
-
-        Args:
-            rows: rows of ``run``.
-            unranked: policies that are shown but not ranked, see ``table.apart``.
-            against: policy that every other is compared with in a further quantity, "against"; empty for none.
-        """
+        """Compare every policy with the baseline, and with ``against`` in a further quantity of that name."""
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
         """Select one row for each sender, for columns that all rows of a sender repeat."""

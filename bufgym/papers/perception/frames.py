@@ -51,11 +51,7 @@ class Camera:
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def every(self, stride: int) -> Camera:
-        """The camera of every ``stride``-th pixel of every ``stride``-th row, the first among them.
-
-        Raises:
-            BufgymError: a stride that does not divide width and height.
-        """
+        """The camera of every ``stride``-th pixel of every ``stride``-th row, the first among them."""
         if stride < 1 or self.width % stride or self.height % stride:
             raise BufgymError(f"stride = {stride}: must divide {self.width} x {self.height}")
         small = {name: getattr(self, name) / stride for name in ("fx", "fy", "cx", "cy")}
@@ -79,11 +75,7 @@ class Sequence(ABC):
 
     @abstractmethod
     def depth(self, k: int) -> Depth:
-        """Of frame k.
-
-        Raises:
-            BufgymError: the frame is missing, truncated or of another size; the message names the file.
-        """
+        """Of frame k."""
 
     @abstractmethod
     def image(self, k: int) -> Image:

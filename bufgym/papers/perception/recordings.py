@@ -106,11 +106,7 @@ def _unzipped(file: zipfile.Path) -> bytes:
 
 
 def open_sequence(path: str | PathLike[str]) -> Sequence:
-    """Open the recording in a folder, whose files tell the layout: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives.
-
-    Raises:
-        BufgymError: no such folder, none of these layouts, a missing list or pose file; the message names the file.
-    """
+    """Open the recording in a folder, whose files tell the layout: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives."""
     folder = Path(path)
     if not folder.is_dir():
         raise BufgymError(f"{folder}: no such folder")

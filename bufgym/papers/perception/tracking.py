@@ -75,16 +75,10 @@ def track(
     grid: VoxelGrid | None = None,
     smooth: Callable[[int], Depth] | None = None,
 ) -> Track:
-    """Follow the camera through the frames that arrived, until that fails.
+    """Follow the camera through the frames that arrived, in order, until that fails.
 
-    Args:
-        sequence: the recording; `Sequence.reduced` to about 160x120 is meant.
-        frames: indices of the frames that arrived, in order.
-        grid: grid of the model; by default `grid_of` the whole recording.
-        smooth: returns `smoothed` of frame k, for callers that cache it.
-
-    Raises:
-        BufgymError: no frame, or frames that are not in order.
+    ``sequence`` is meant to be reduced to about 160x120. ``smooth`` returns `smoothed` of frame k, for callers that
+    keep it.
     """
     arrived = np.array(list(frames), np.int64)
     if not len(arrived) or (np.diff(arrived) <= 0).any() or arrived[0] < 0 or arrived[-1] >= len(sequence):
