@@ -8,7 +8,7 @@ from typing import Any
 from bufgym.ground.errors import BufgymError, install
 
 
-def library(name: str, extra: str = "perception", user: str = "this") -> Any:
+def library(name: str, extra: str = "perception", user: str = "bufgym") -> Any:
     """Import the module of that name; the error where it is missing says that ``user`` needs the extra."""
     try:
         return importlib.import_module(name)
