@@ -29,13 +29,20 @@ _OF_A_CLIENT = ("trace", "motion", "scale")
 """Options that a client of one's own takes too."""
 
 
-@Parameter(name="*", group=Group.create_ordered("The stream and its link (default: as in bufgym/Uplink-v0)"))
+@Parameter(name="*")
 @dataclass(frozen=True)
-class StreamOptions:
+class LinkOptions:
     trace: list[str] | None = None
     """Bandwidth traces: files, shipped names, or module:function, a seed -> Trace (default: shipped LTE)."""
     motion: list[str] | None = None
     """Motion recordings, likewise; 'none': x is the frame index."""
+    scale: Positive | None = None
+    """Multiply the link's capacity (default: 1)."""
+
+
+@Parameter(name="*", group=Group.create_ordered("The stream and its link (default: as in bufgym/Uplink-v0)"))
+@dataclass(frozen=True)
+class StreamOptions(LinkOptions):
     fps: Positive | None = None
     """Messages a second."""
     bytes: Count | None = None
@@ -50,8 +57,6 @@ class StreamOptions:
     """The sender is told beforehand how long the stream lasts."""
     jitter: Least0 | None = None
     """Arrivals move by up to this part of a period."""
-    scale: Positive | None = None
-    """Multiply the link's capacity (default: 1)."""
     value: str | None = None
     """V of the QoI: exponential:BASE, saturating:DISTANCE, tabulated:D=V,..., or module:function of your own
     (default: exponential:0.05 over motion, exponential:0.367879 over a recording's motion, exponential:0.618 over
@@ -91,13 +96,18 @@ class OwnOptions:
     """A client's topics and their rules, as in examples/client.toml; --trace, --motion and --scale give its links."""
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class SendOptions:
+    consumers: Whole | None = None
+    """How many want each message; native ROS sends each a copy."""
+    window: Whole | None = None
+    """n_T: messages sent and not yet acknowledged, at most."""
+
+
 @Parameter(name="*", group=Group.create_ordered("Several topics or robots, of a suite or a scenario"))
 @dataclass(frozen=True)
-class SharedOptions:
-    consumers: Whole | None = None
-    """How many want each message of a client; native ROS sends each a copy."""
-    window: Whole | None = None
-    """n_T of a client: messages sent and not yet acknowledged, at most."""
+class SharedOptions(SendOptions):
     robots: Count | None = None
     """That share the cell of a fleet, whose capacity grows with them (default: 16)."""
 

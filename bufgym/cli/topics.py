@@ -2,57 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated
 
 from cyclopts import Group, Parameter
 
 from bufgym.cli.bench import bench
-from bufgym.cli.options import ByTopic, Count, OutOptions, Positive, SuiteOptions, Whole, WhoOptions, given, refuse
-from bufgym.cli.scenarios import OwnOptions, SharedOptions, StreamOptions
+from bufgym.cli.options import ByTopic, Count, OutOptions, SuiteOptions, WhoOptions, given, refuse
+from bufgym.cli.scenarios import LinkOptions, OwnOptions, SendOptions, SharedOptions, StreamOptions
 from bufgym.ground.errors import BufgymError
 
-
-@Parameter(name="*", group=Group.create_ordered("Or a client of your own"))
-@dataclass(frozen=True)
-class ClientOptions:
-    config: str | None = None
-    """Its topics and their rules, as in examples/client.toml."""
-    trace: list[str] | None = None
-    """Bandwidth traces, files or shipped names (default: shipped LTE)."""
-    scale: Positive | None = None
-    """The traces' capacity times this (default: 1)."""
-    motion: list[str] | None = None
-    """Motion recordings, likewise (default: shipped); or 'none'."""
-
-
-@Parameter(name="*", group=Group.create_ordered("How the client sends"))
-@dataclass(frozen=True)
-class SendOptions:
-    consumers: Whole | None = None
-    """How many want each message; native ROS sends each a copy."""
-    window: Whole | None = None
-    """n_T: messages sent and not yet acknowledged, at most."""
+CLIENT = Group.create_ordered("Or a client of your own")
 
 
 def topics(
     *,
     suite: SuiteOptions = SuiteOptions(),
-    client: ClientOptions = ClientOptions(),
-    send: SendOptions = SendOptions(),
+    config: Annotated[str | None, Parameter(group=CLIENT)] = None,
+    link: Annotated[LinkOptions, Parameter(group=CLIENT)] = LinkOptions(),
+    send: Annotated[SendOptions, Parameter(group=Group.create_ordered("How the client sends"))] = SendOptions(),
     who: WhoOptions = WhoOptions(),
     out: OutOptions = OutOptions(),
     by_topic: ByTopic = None,
 ) -> None:
-    """Run policies side by side on several topics over one uplink."""
-    links = given(client, "trace", "scale", "motion")
-    if client.config is None:
-        refuse(links, "needs --config: a suite's episodes are frozen")
+    """Run policies side by side on several topics over one uplink.
+
+    Args:
+        config: Its topics and their rules, as in examples/client.toml.
+    """
+    if config is None:
+        refuse(given(link), "needs --config: a suite's episodes are frozen")
         suite = _of(suite, "topics", "topics-v1")
     else:
         refuse(given(suite), "cannot go with --config")
-    own, shared = OwnOptions(config=client.config), SharedOptions(**given(send))
-    bench(suite=suite, stream=StreamOptions(**links), own=own, shared=shared, who=who, out=out, by_topic=by_topic)
+    stream, shared = StreamOptions(**vars(link)), SharedOptions(**vars(send))
+    bench(suite=suite, stream=stream, own=OwnOptions(config=config), shared=shared, who=who, out=out, by_topic=by_topic)
 
 
 def fleet(
