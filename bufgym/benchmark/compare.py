@@ -57,12 +57,9 @@ class Comparison:
     """The scenario or suite."""
     unranked: Mapping[str, str]
     """The policies that do not compete, with the reasons."""
-    plain: str
-    """The table as aligned text."""
+    plain: str  # the table as aligned text
     markdown: str
-    """The table as Markdown."""
     html: str
-    """The table as HTML."""
 
     def table(self, form: str = "plain") -> str:
         """Means by policy: ``"plain"`` text or ``"markdown"``."""

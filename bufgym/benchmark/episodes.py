@@ -37,7 +37,6 @@ class Arrays:
 
 
 def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]]:
-    """Group the rows by (policy, cell), then by (training seed, episode)."""
     if not rows:
         raise BufgymError("no rows to score")
     groups: dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]] = {}

@@ -55,11 +55,6 @@ class SuiteRun:
         """Map each scenario's label to its description."""
         return {label: str(entry.get("about", "")) for label, entry in self.manifest["scenarios"].items()}
 
-    def place(self, scenario: str) -> tuple[int, str]:
-        """Sort key: scenarios in the manifest's order, then any others by name."""
-        listed = list(self.manifest["scenarios"])
-        return (listed.index(scenario) if scenario in listed else len(listed), scenario)
-
 
 def read(folder: Path) -> SuiteRun:
     """Read the run in ``folder``; an error names the file and the broken rule."""
@@ -162,7 +157,6 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
 
 
 def write_json(file: Path, content: dict[str, Any]) -> None:
-    """Write the file, whole or not at all."""
     with replaced(file) as temporary:
         temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
 

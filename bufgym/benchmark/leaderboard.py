@@ -36,8 +36,6 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Entry:
-    """One policy on one suite."""
-
     suite: str
     policy: str  # as ``bufgym bench --policies`` takes it
     rank: int  # 1 for the best; 0 for a policy that is not ranked
@@ -47,12 +45,10 @@ class Entry:
 
     @property
     def name(self) -> str:
-        """Name that ``bufgym validate`` takes."""
         return f"{self.suite}/{self.policy}"
 
     @property
     def command(self) -> str:
-        """Command that makes it again."""
         needs = " --data DIR" if suites.get(self.suite).needs else ""
         return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
 
@@ -65,9 +61,10 @@ def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> lis
     """Make one entry for each policy of a suite's rows, best first."""
     task = task_of(suite)
     summary = task.summary(rows, unranked)
+    cells = len(summary.cells) if summary.scores is None else summary.scores.counted
     return [
         Entry(
-            *(suite, place.policy, place.rank or 0, summary.counted_cells),
+            *(suite, place.policy, place.rank or 0, cells),
             *({key: standing[key] for key in task.listed}, __version__),
         )
         for place, standing in zip(places(summary), summary.overall, strict=True)

@@ -56,8 +56,6 @@ NEGLIGIBLE = 1e-9
 
 @dataclass(frozen=True)
 class CellScore:
-    """One policy in one cell."""
-
     scenario: str
     capacity: int  # L, messages
     policy: str
@@ -142,7 +140,9 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
             cell: _statistics(h, compared.get(cell), samples[cell]) for cell, h in _resampled(table, policy).items()
         }
         if policy in table.unbounded:
-            by_cell = {cell: s.without_bound() for cell, s in by_cell.items()}
+            for cell, s in by_cell.items():  # the clairvoyant's L does not bind it
+                none = {name: np.full_like(getattr(s, name), np.nan) for name in ("score", "regret", "by_trace")}
+                by_cell[cell] = s._replace(**none)
         for cell, s in by_cell.items():
             cell_scores.append(
                 CellScore(
@@ -152,7 +152,11 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
                 )
             )
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
-    _compare(overall, against)
+    for values in overall.values():
+        lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
+        values["share"] = ratio(values["regret"], lost, lost > NEGLIGIBLE)
+    for values in overall.values() if against else ():
+        values["against"] = values["share"] - overall[against]["share"]
     standings = [
         Standing(policy, unranked.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
         for policy, values in overall.items()
@@ -201,11 +205,6 @@ class _Statistics(NamedTuple):
     improvement: Numbers
     by_trace: Numbers  # scores, [1 + resamples, traces]
 
-    def without_bound(self) -> _Statistics:
-        """Remove score and regret, for a policy that the clairvoyant's L does not bind."""
-        none = {name: np.full_like(getattr(self, name), np.nan) for name in ("score", "regret", "by_trace")}
-        return self._replace(**none)
-
 
 def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statistics:
     sums = sample.sums(h)
@@ -229,15 +228,6 @@ def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> dict[s
     weights = np.hstack([np.add.reduceat(sample.weights, sample.starts, axis=1) for sample in samples])
     means = {name: np.mean([getattr(c, name) for c in cells], axis=0) for name in ("score", "regret", "improvement")}
     return {**means, "iqm": _interquartile_means(values, weights / weights[0])}
-
-
-def _compare(overall: Mapping[str, dict[str, Numbers]], against: str) -> None:
-    """Add the share of the reference's regret to the statistics of each policy, and how it differs from another's."""
-    for values in overall.values():
-        lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
-        values["share"] = ratio(values["regret"], lost, lost > NEGLIGIBLE)
-    for values in overall.values() if against else ():
-        values["against"] = values["share"] - overall[against]["share"]
 
 
 def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:

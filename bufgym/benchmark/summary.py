@@ -37,8 +37,6 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of a task's rows."""
-
     quantities: tuple[Quantity, ...]  # quantities shown, in this order
     rank_by: str  # the key of the quantity that orders the policies, largest first
     overall: list[Standing]  # over all cells; ranked policies first, best first
@@ -47,13 +45,6 @@ class Summary:
     baseline: str  # the policy that the others are measured against
     scores: Scores | None = None  # scores between the baseline and the clairvoyant, where one is known
     notes: tuple[str, ...] = ()  # sentences about single policies, below the ranking
-
-    @property
-    def counted_cells(self) -> int:
-        """Number of cells that ``overall`` covers; with scores only discriminative cells count."""
-        if self.scores is None:
-            return len(self.cells)
-        return self.scores.counted
 
     @property
     def standings(self) -> dict[str, Standing]:
@@ -150,8 +141,6 @@ def summarise(
 
 
 class Place(NamedTuple):
-    """One line of a ranking."""
-
     rank: int | None  # 1 for the best; None for a policy that is not ranked
     policy: str
     values: list[tuple[str, str]]  # (value, interval) as text, a pair for each quantity of the summary

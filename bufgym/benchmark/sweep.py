@@ -68,7 +68,6 @@ class Sweep:
         return [policies.get(spec) for spec in self.specs]
 
     def settings(self) -> dict[str, Setting]:
-        """The suite's settings of the split, with the changes."""
         settings = suites.get(self.suite).settings(self.split, self.data)
         if not self.changes:
             return settings
@@ -184,11 +183,9 @@ def run_sweep(
         out: a folder that does not exist, is empty, or holds an earlier run of the same sweep, finished or not.
         jobs: parallel processes; -1 starts one per core, and None does too if joblib is installed.
         backend: one of ``BACKENDS`` (joblib's); "ray" and "dask" use the cluster at ``address``, or a local one.
-        address: address of the cluster's head.
         command: command that the report shows to run it again.
         form: "parquet" or "csv"; by default parquet if pyarrow is installed.
         load: function that runs ``Sweep.policy_file`` in a worker.
-        progress: show a bar on stderr, where that is a terminal.
     """
     sweep = sweep.checked()
     if jobs is None:
@@ -227,7 +224,6 @@ def run_sweep(
 
 
 def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
-    """Make the content of ``manifest.json`` for a checked sweep."""
     suite, settings = suites.get(sweep.suite), sweep.settings()
     episodes = sum(len(shard.seeds) for shard in shards)
     code = sweep.policy_file and Path(sweep.policy_file).read_bytes()

@@ -122,8 +122,6 @@ def invalid(rows: RunRows) -> list[str]:
 
 
 class Column(NamedTuple):
-    """One column of a table of means."""
-
     title: str
     key: str  # column of the rows that it averages
     write: Callable[[float], str]

@@ -96,7 +96,6 @@ def _bench(
     against: str | None,
     by_topic: str | None,
 ) -> None:
-    """Run the scenario that the options describe."""
     from bufgym import policies
     from bufgym.benchmark import table, tasks
     from bufgym.benchmark.compare import beside
@@ -143,7 +142,6 @@ def _about(made: Described, task: Task, seeds: int | None) -> str:
 def _write(
     done: Comparison, task: Task, file: Path | None, folder: Path | None, form: str | None, bounds: Sequence[str]
 ) -> None:
-    """Write the rows to the file, or the rows and the table into the folder."""
     from bufgym.benchmark.rows import has_pyarrow, write_rows
 
     if file is not None:

@@ -126,8 +126,6 @@ class Described(NamedTuple):
 
 @dataclass(frozen=True)
 class ScenarioOptions:
-    """All options that describe a scenario."""
-
     stream: StreamOptions
     workload: WorkloadOptions
     interruption: InterruptionOptions

@@ -55,7 +55,6 @@ def fleet(
 
 
 def _of(options: SuiteOptions, kind: str, default: str) -> SuiteOptions:
-    """The options with a suite of this kind."""
     from bufgym.scenario import suites
 
     suite = suites.get(options.suite or default)

@@ -67,7 +67,6 @@ class RecordingOptions(MotionOptions):
 
 
 def workload_lines(workload: Workload) -> list[str]:
-    """Write a table of its topics and a description of its motion."""
     from bufgym.benchmark.table import aligned
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "mean bytes", "share"]]

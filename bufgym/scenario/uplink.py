@@ -122,18 +122,20 @@ class Uplink:
     def about(self) -> str:
         """What is sent over which links, and how it is rated."""
         links = over(self.traces, self.scale[0])
+        source = f"from {moved(self.motion)}" if self.motion else "as recorded"
         if self.workload is None:
             sent = f"{self.rate_hz:g} messages/s of {self.size_bytes} bytes for {self.duration_s:g} s over {links}"
-            moving, source = "camera's", f"from {moved(self.motion)}"
-            places, frame = "from random offsets" if self.random_offset else "from their start", "the frame index"
+            places = "from random offsets" if self.random_offset else "from their start"
+            x = f"the camera's motion, in fields of view, {source}" if self.motion else "the frame index"
         else:
-            sent, moving, frame = f"Played over {links}", "", "the number of the message"
-            source = f"from {moved(self.motion)}" if self.motion else "as recorded"
             shared = "; all topics share one queue" if len(self.workload.topics) > 1 else ""
-            places = ("from random places" if self.random_offset else "from the trace's start") + shared
-        moves = self.motion or (self.workload is not None and self.workload.x is not None)
-        camera = f"the {moving} motion".replace("  ", " ")
-        x = f"{camera}, in fields of view, {source}" if moves else frame
+            sent, places = (
+                f"Played over {links}",
+                "from random places" if self.random_offset else "from the trace's start",
+            )
+            places += shared
+            moves = self.motion or self.workload.x is not None
+            x = f"the motion, {source}, in fields of view" if moves else "the number of the message"
         return f"{sent}, {places}.\n{rated(self)}\nx is {x}."
 
     @functools.cached_property

@@ -43,8 +43,6 @@ STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart on the page."""
-
     id: str  # of its section
     alt: str  # text for readers who can't see it
     panels: list[tuple[str, str]]  # (what it is of, or nothing for a single one, SVG)
@@ -52,8 +50,6 @@ class Chart:
 
 @dataclass(frozen=True)
 class Context:
-    """Input of every chart."""
-
     run: SuiteRun
     summary: Summary
     colours: dict[str, str]  # names of highlighted policies' colours
@@ -76,7 +72,6 @@ class Context:
         return self.colours.get(policy, "muted")
 
     def paint(self, policy: str) -> str:
-        """The colour that a chart is drawn in."""
         return PALETTE[self.colour(policy)]
 
 
@@ -244,7 +239,6 @@ def _regret_curves(
 
 
 def regret_title(cells: Iterable[CellScore]) -> str:
-    """The title of an axis of regrets."""
     return "regret" if all(cell.exact for cell in cells) else REGRET_AT_MOST
 
 

@@ -27,7 +27,6 @@ class HeatMap(NamedTuple):
 
 
 def heat_map(scores: Scores) -> HeatMap:
-    """All cells, in the order of the standings."""
     by_policy: dict[str, list[CellScore]] = {}
     for cell in scores.cells:
         by_policy.setdefault(cell.policy, []).append(cell)
@@ -60,7 +59,6 @@ def html(summary: Summary) -> str:
 
 
 def intro(run: SuiteRun) -> list[str]:
-    """Describe the run in a few lines."""
     manifest = run.manifest
     lines = [f"Suite {manifest['suite']}, {manifest['split']}: {manifest['about']}.", manifest["episodes"]]
     if manifest["changes"]:
@@ -77,11 +75,9 @@ def markdown(run: SuiteRun, summary: Summary) -> str:
     out = ["```", run.manifest["command"], "```", "", _ranking(summary, summary.overall).markdown()]
     if summary.notes:
         out += ["", *(f"* {_plain(note)}" for note in summary.notes)]
-    if summary.scores is not None:
-        return "\n".join([*out, *_score_tables(summary.scores)]) + "\n"
     for cell, standings in summary.cells.items():
         out += ["", f"{_plain(title(cell, run.abouts))}:", "", _ranking(summary, standings).markdown()]
-    return "\n".join(out) + "\n"
+    return "\n".join([*out, *(_score_tables(summary.scores) if summary.scores else [])]) + "\n"
 
 
 def _ranking(summary: Summary, standings: Sequence[Standing], escaped: Callable[[str], str] | None = None) -> Table:

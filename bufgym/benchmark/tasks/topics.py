@@ -125,7 +125,6 @@ class TopicsTask(Task):
 
 
 def _rows(client: Client, senders: Senders, i: int) -> Result:
-    """Make the rows of each topic at sender ``i``."""
     sender, messages = np.asarray(senders.batch.senders)[i], received(senders, i)
     log = np.asarray(senders.batch.log[i])
     last_us = int(np.asarray(senders.batch.arrivals[i])["arrival_us"][sender["arrivals"] - 1])
@@ -155,7 +154,6 @@ def _rows(client: Client, senders: Senders, i: int) -> Result:
 
 
 def _folded(copies: Sequence[TopicOutcome]) -> Row:
-    """Average a topic's copies over the consumers."""
     outcomes = [asdict(copy) for copy in copies]
     means: Row = {name: mean([outcome[name] for outcome in outcomes]) for name in _OUTCOME}
     return {**means, "arrived": int(means["arrived"])}
