@@ -50,9 +50,6 @@ def info(files: Files, /, *, format: Format = None, column: Column = None) -> in
     return 2 if failed else 0
 
 
-# --- validate --------------------------------------------------------------------------------------------------------
-
-
 def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
     """Read each file and say whether it is sound; exit code 1 if not all."""
     from bufgym import traces
@@ -110,9 +107,6 @@ def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
         if [path for _, path in targets].count(target) > 1 or target.exists():
             raise BufgymError(f"{name}: {target} is taken: must be written by itself, with --out FILE")
     return targets
-
-
-# --- plot ------------------------------------------------------------------------------------------------------------
 
 
 def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = None) -> None:
