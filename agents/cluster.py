@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from bufgym.benchmark.cluster import WorkerDiedError, connected_ray, dask_client, imported
+from bufgym.benchmark.cluster import WorkerDiedError, connected_ray, dask_client
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import library
 
 Call = Callable[..., Any]
 CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]
@@ -20,7 +21,7 @@ CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]
 
 
 @contextmanager
-def begun(backend: str, address: str | None) -> Iterator[str]:
+def running(backend: str, address: str | None) -> Iterator[str]:
     """Yield the address of a ``ray`` or ``dask`` cluster; without one, run a cluster on this machine meanwhile.
 
     Raises BufgymError: the library is missing, or nothing answers at the address.
@@ -35,11 +36,11 @@ def connected(backend: str, address: str | None) -> Iterator[CallEach]:
 
     A Ray task, or a Dask worker with one thread, has a process to itself, which keeps the function's caches.
 
-    Raises BufgymError as ``begun`` does. The calls raise WorkerDiedError.
+    Raises BufgymError as ``running`` does. The calls raise WorkerDiedError.
     """
     with _client(backend, address) as client:
         if backend == "dask":
-            died: tuple[type[Exception], ...] = (imported("distributed", "dask").KilledWorker,)
+            died: tuple[type[Exception], ...] = (library("distributed", "dask").KilledWorker,)
 
             def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
                 # Not pure, so that equal arguments are called again.

@@ -24,7 +24,7 @@ from bufgym.benchmark import summary
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
-from bufgym.benchmark.table import aligned, same, told_once, unranked
+from bufgym.benchmark.table import aligned, apart, same, told_once
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
 from bufgym.oracle import BASELINE
@@ -126,7 +126,7 @@ def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
     rows = test_rows(settings, [*agents, *RIVALS[settings.kind]()])
     task = TASKS[settings.kind]
     write_rows(rows, folder / "rows.csv", task.layout)
-    text = summary.plain(task.summary(rows))
+    text = summary.table_of(task.summary(rows)).plain()
     (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
 
@@ -156,8 +156,8 @@ def report_environment(
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = _save(folder, settings, runs, best, held_out=held_out, scores=entries)
-    apart = unranked(rows)
-    bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in apart}
+    unranked = apart(map(registry.get, registry.names()))
+    bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in unranked}
     bars, twins = _drawn(bars, alike)
     draw(
         folder / "figure.png",
@@ -234,7 +234,7 @@ def report_suite(
     rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
     rows += [row for own in agents.values() for row in own]
     write_rows(rows, home / "rows.csv")
-    result = scores(rows, unranked=[name for name in registry.names() if not registry.get(name).ranked])
+    result = scores(rows, apart(map(registry.get, registry.names())))
     print(standings(result))
     qoi: dict[str, list[float]] = {}
     for row in rows:

@@ -10,7 +10,7 @@ from agents.runs import MODEL, read_settings
 from bufgym import policies
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.score import Standing
-from bufgym.benchmark.summary import Summary, plain
+from bufgym.benchmark.summary import Summary, table_of
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.errors import BufgymError
 
@@ -93,7 +93,7 @@ def main(run: Path, out: Path | None = None) -> None:
         overall="\n".join(_line(standing) for standing in standings),
         notes=notes,
         rules="\n".join(_against_rules(rows, results, f"agent (seed {best})", unbounded)),
-        text=plain(results),
+        text=table_of(results).plain(),
     )
     publish(text, out)
 

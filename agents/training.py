@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents import cma_es, guided_ppo
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
-from agents.cluster import begun
+from agents.cluster import running
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
 from agents.evaluation import EvaluationSet, ValidationSets, Verdict
 from agents.held_out import fixed_episodes, split_scenario
@@ -48,7 +48,7 @@ def train_all(settings: Settings, folder: Path) -> list[Run]:
         ValidationSets(settings, folder, progress=True)  # compute the clairvoyant's bounds once for all seeds
     if settings.backend == "local":
         return each_seed(cma_es.train if settings.evolves else train_seed, settings, folder)
-    with begun(settings.backend, settings.address or None) as address:
+    with running(settings.backend, settings.address or None) as address:
         return each_seed(cma_es.train, replace(settings, address=address), folder)
 
 

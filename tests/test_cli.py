@@ -200,7 +200,6 @@ def test_a_users_mistake_is_shown_where_it_is(trace: str, tmp_path: Path, text: 
         ("--trace no-such.csv", "no-such.csv"),
         ("--t-max 5", "--t-max needs --interruption"),
         ("--interruption --trace x.csv", "--trace cannot go with --interruption"),
-        ("--out rows.csv", "rows.csv: without --suite it must be"),
         ("--nonsense", "--nonsense"),
         ("--size 3", "--size. Did you mean --sizes?"),
     ],

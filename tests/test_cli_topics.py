@@ -7,6 +7,7 @@ import pytest
 from cli_cases import FAR_OFF, Capsys, Patch, fails, shown
 
 from bufgym.benchmark.rows import read_rows
+from bufgym.benchmark.tasks.fleet import ROWS as FLEET_ROWS
 from bufgym.benchmark.tasks.topics import ROWS
 from bufgym.cli import main
 from bufgym.policies import registry
@@ -50,6 +51,24 @@ def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: Capsys) -> No
     assert {row["capacity"] for row in rows} == {2, 4} and {row["window"] for row in rows} == {3}
 
 
+def test_bench_is_the_one_door(config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch) -> None:
+    """``bench`` runs a client or a fleet as it runs one queue; the client's numbers are those of ``topics``."""
+    words = ["--config", config, "--trace", "lte-synthetic-0", "--seeds", "1", "--policies", "edf", "--window", "2"]
+    for command in ("topics", "bench"):
+        shown([command, *words, "--out", tmp_path / command], capsys)
+    written = [(tmp_path / command / "table.md").read_bytes() for command in ("topics", "bench")]
+    assert written[0] == written[1] and b"edf" in written[0]
+    monkeypatch.chdir(tmp_path)
+    Path("cell_of_two.py").write_text(
+        "from bufgym.scenario import FleetScenario\n"
+        "make = lambda: FleetScenario.of(2, traces='lte-synthetic-0', duration_s=2.0)\n"
+    )
+    policies = ["--policies", "random", "--seeds", "1", "--capacity", "2"]
+    shown(["bench", "--scenario", "cell_of_two:make", "--robots", "3", *policies, "--out", "rows.csv"], capsys)
+    rows = read_rows("rows.csv", FLEET_ROWS)
+    assert [(row["policy"], row["robot"]) for row in rows] == [(p, i) for p in ("random", "afr") for i in range(3)]
+
+
 @pytest.mark.nightly
 def test_the_suite_runs_by_default(capsys: Capsys) -> None:
     words = "topics --split validation --seeds 1 --policies robofleet --consumers 2"
@@ -85,7 +104,10 @@ def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Caps
         ("topics --out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
         ("topics --config no-such.toml", "error: no-such.toml: no such file\n"),
         ("topics --config x.toml --suite topics-v1", "--suite cannot go with --config"),
-        ("topics --config x.toml --out folder", "folder: with --config rows are written to .csv or .parquet files"),
+        ("bench --by-topic afr", "--by-topic needs several topics"),
+        ("bench --window 2", "--window needs --suite, --scenario or --config"),
+        ("bench --suite lte-v1 --window 2", "unknown parameter 'window'"),
+        ("bench --scenario topics --max-bytes 9", "--max-bytes is for one queue"),
         ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
         ("fleet --robots 257", "robots = 257: must be a whole number from 1 to 256"),
     ],
@@ -100,7 +122,7 @@ def test_a_mistake_typed_is_not_the_files_fault(config: str, capsys: Capsys, mon
     Path(config).write_text(f"window = 0\n{CONFIG}")
     fails(["topics", "--config", config], "mine.toml: window = 0: n_T must be a whole number", capsys)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    fails(["topics", "--out", "rows.parquet"], "Parquet files need pyarrow", capsys)
+    fails(["topics", "--out", "rows.parquet"], "a Parquet file, unlike .csv, needs pyarrow", capsys)
 
 
 # A message a second; nothing crosses for 4 s, then 10 kB/s.

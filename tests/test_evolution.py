@@ -143,5 +143,5 @@ def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pyte
 @pytest.mark.parametrize("backend", ["dask", "ray"])
 def test_a_missing_library_is_one_clear_error(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, LIBRARY[backend], None)
-    with pytest.raises(BufgymError, match=f"{LIBRARY[backend]} is missing: "), cluster.begun(backend, None):
+    with pytest.raises(BufgymError, match=f"needs {LIBRARY[backend]}: "), cluster.running(backend, None):
         pass

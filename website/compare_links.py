@@ -17,7 +17,7 @@ import numpy as np
 
 from bufgym.traces.fit import (
     LOW_BYTES_PER_S,
-    Rows,
+    Rates,
     autocorrelation,
     centred,
     fit_links,
@@ -36,15 +36,15 @@ _KBPS: Final = 1e-3
 _FIRST_SEED: Final = 1_000_000
 
 
-def _quantile(q: float) -> Callable[[Rows], float]:
+def _quantile(q: float) -> Callable[[Rates], float]:
     return lambda rows: float(np.quantile(np.concatenate(rows), q)) * _KBPS
 
 
-def _correlation(lag_s: int) -> Callable[[Rows], float]:
+def _correlation(lag_s: int) -> Callable[[Rates], float]:
     return lambda rows: float(autocorrelation(rows, (lag_s,))[0][0])
 
 
-def _spread_of_means(rows: Rows) -> float:
+def _spread_of_means(rows: Rates) -> float:
     means = np.array([row.mean() for row in rows]) * _KBPS
     return float(means.std(ddof=1)) if len(rows) > 1 else float("nan")
 
@@ -54,7 +54,7 @@ def _of_any(values: Float64Array, statistic: Callable[[Float64Array], float]) ->
     return float(statistic(values)) if values.size else float("nan")
 
 
-STATISTICS: Final[Mapping[str, Callable[[Rows], float]]] = {
+STATISTICS: Final[Mapping[str, Callable[[Rates], float]]] = {
     "mean, KB/s": lambda rows: float(np.concatenate(rows).mean()) * _KBPS,
     "standard deviation, KB/s": lambda rows: float(np.concatenate(rows).std()) * _KBPS,
     "standard deviation of the recordings' means, KB/s": _spread_of_means,
@@ -111,13 +111,13 @@ class HeldOut:
     """Recordings farther off than 95 % of single generated traces."""
 
 
-def generated_sets(link: LinkParameters, rows: Rows, sets: int) -> list[list[Float64Array]]:
+def generated_sets(link: LinkParameters, rows: Rates, sets: int) -> list[list[Float64Array]]:
     """`sets` times a generated trace for each recording, as long as the recording."""
     n = len(rows)
     return [[link_rates(link, _FIRST_SEED + k * n + i, len(row)) for i, row in enumerate(rows)] for k in range(sets)]
 
 
-def compare(link: LinkParameters, rows: Rows, sets: int = SETS) -> list[Row]:
+def compare(link: LinkParameters, rows: Rates, sets: int = SETS) -> list[Row]:
     """A row for each of `STATISTICS`, and one for the distance of the whole distribution."""
     generated = generated_sets(link, rows, sets)
     compared = []
@@ -130,7 +130,7 @@ def compare(link: LinkParameters, rows: Rows, sets: int = SETS) -> list[Row]:
     return [*compared, Row(KS_DISTANCE, real, *_middle(distances), p)]
 
 
-def held_out(mode: str, rows: Rows, sets: int = SETS, most: int | None = None) -> HeldOut:
+def held_out(mode: str, rows: Rates, sets: int = SETS, most: int | None = None) -> HeldOut:
     """How far recordings are from links that were fitted without them; of more than `most`, so many evenly spaced."""
     parts = list(rows) if len(rows) > 1 else [np.array(half) for half in np.array_split(rows[0], 2)]
     count = len(parts) if most is None else min(most, len(parts))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from bufgym.cli.trace_fit import recordings_of
-from bufgym.traces.fit import Rows, autocorrelation, outage_gaps, outage_lengths
+from bufgym.traces.fit import Rates, autocorrelation, outage_gaps, outage_lengths
 from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.parameters import SHOULDER_S, LinkParameters, read_links
 from bufgym.traces.trace import Float64Array
@@ -64,7 +64,7 @@ for a whole trace, *level* stays the same for a while, and *fast* changes every 
 
 def write_page(
     links: Mapping[str, LinkParameters],
-    recordings: Mapping[str, Rows],
+    recordings: Mapping[str, Rates],
     page: Path,
     command: str,
     file: str,
@@ -203,7 +203,7 @@ def _short(value: float) -> str:
 # --- pictures --------------------------------------------------------------------------------------------------------
 
 
-def _picture(mode: str, link: LinkParameters, rows: Rows, folder: Path) -> str | None:
+def _picture(mode: str, link: LinkParameters, rows: Rates, folder: Path) -> str | None:
     """Draw one mode; the picture's path relative to the page, or None without matplotlib."""
     try:
         import matplotlib

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception import Sequence, open_sequence
 from bufgym.traces.formats.text import write_text
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.episodes import Episode, Numbers
+from bufgym.benchmark.table import NONE
 
 RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0
 """Resamples, confidence of the intervals and seed of the draws."""
@@ -34,9 +35,9 @@ UNKNOWN = Interval(math.nan, math.nan, math.nan)
 def written(interval: Interval, write: Callable[[float], str]) -> tuple[str, str]:
     """Format the value and its interval, as in 1.03 and [1.01, 1.05]; without a value, a dash and nothing."""
     if math.isnan(interval.value):
-        return "–", ""
+        return NONE, ""
     if math.isnan(interval.low):
-        return write(interval.value), "[–]"
+        return write(interval.value), f"[{NONE}]"
     low, high = (write(bound).removesuffix(" %") for bound in (interval.low, interval.high))
     return write(interval.value), f"[{low}, {high}]"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import os
 from collections.abc import Iterable, Iterator
@@ -10,7 +9,8 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import library
 from bufgym.ground.processes import end_with
 
 BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
@@ -29,7 +29,7 @@ def spread(
 
     Raises WorkerDiedError: results that other workers had not returned by then are lost.
     """
-    joblib = imported("joblib", "bench")
+    joblib = library("joblib", "bench")
     wrapped = (joblib.delayed(function)(*arguments) for function, arguments in calls)
     with _connected(backend, address):
         # joblib's Ray backend returns results only when all are there, so it gets a few calls at a time.
@@ -57,18 +57,17 @@ def _own(backend: str) -> dict[str, Any]:
 
 @contextmanager
 def _connected(backend: str, address: str | None) -> Iterator[None]:
-    """Connect joblib's backend of that name."""
-    joblib = imported("joblib", "bench")
+    joblib = library("joblib", "bench")
     with nullcontext() if backend != "dask" else dask_client(address):
         if backend == "ray":
             connected_ray(address)
-            imported("ray.util.joblib", "ray").register_ray()
+            library("ray.util.joblib", "ray").register_ray()
         with joblib.parallel_config(backend=backend):
             yield
 
 
 def dask_client(address: str | None) -> Any:
-    distributed = imported("distributed", "dask")
+    distributed = library("distributed", "dask")
     if address is not None:
         return distributed.Client(address)
     return distributed.Client(processes=True, threads_per_worker=1, dashboard_address=None)
@@ -76,14 +75,7 @@ def dask_client(address: str | None) -> Any:
 
 def connected_ray(address: str | None) -> tuple[Any, bool]:
     """Connect the module ``ray``; also return whether it was unconnected before."""
-    ray = imported("ray", "ray")
+    ray = library("ray", "ray")
     if own := not ray.is_initialized():
         ray.init(address=address, log_to_driver=False)
     return ray, own
-
-
-def imported(module: str, extra: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise BufgymError(f"{module} is missing: {install(extra)}") from None

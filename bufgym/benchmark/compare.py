@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import html
 import math
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,18 @@ from bufgym.benchmark import report, sources, summary, table, tasks
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.libraries import library
+from bufgym.ground.modules import is_named
 from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.policies.registry import OnArrival
 from bufgym.scenario import suites
+from bufgym.scenario.registry import parameters
 
+KEYWORDS = ("capacity", "seeds", "progress", "about", "against")
+QUEUE = ("max_bytes", "decide_at")
+"""Settings of a queue."""
 PolicyLike = Policy | str | Path | OnArrival
 
 
@@ -50,12 +55,11 @@ class Comparison:
     """One row for each policy, capacity and episode; with several topics or robots, one for each of these."""
     about: str
     """The scenario or suite."""
-    plain: str
-    """The table as aligned text."""
+    unranked: Mapping[str, str]
+    """The policies that do not compete, with the reasons."""
+    plain: str  # the table as aligned text
     markdown: str
-    """The table as Markdown."""
     html: str
-    """The table as HTML."""
 
     def table(self, form: str = "plain") -> str:
         """Means by policy: ``"plain"`` text or ``"markdown"``."""
@@ -74,12 +78,9 @@ class Comparison:
 
     def plot(self, axes: Any = None) -> Any:
         """Draw each policy's regret as a bar, a colour for each L; Matplotlib's axes. QoI where no regret is known."""
-        try:
-            from matplotlib import pyplot
-        except ImportError:
-            raise BufgymError(f"plot needs matplotlib: {install('plot')}") from None
+        pyplot = library("matplotlib.pyplot", "plot", "plot")
         axes = pyplot.subplots(layout="constrained")[1] if axes is None else axes
-        entries = table.means(self.rows)
+        entries = table.means(self.rows, alone=self.unranked)
         capacities = list(dict.fromkeys(entry["capacity"] for entry in entries))
         names = list(dict.fromkeys(entry["policy"] for entry in reversed(entries)))
         height = 0.8 / len(capacities)
@@ -145,35 +146,56 @@ def compare(
             raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
         chosen = _with(chosen, rival, tasks.TASKS[suites.get(on).kind])
         return _on_suite(chosen, files, on, capacities, seeds, progress, named)
-    if isinstance(on, str) and on.isidentifier() and on not in scenario.SCENARIOS:
-        close = difflib.get_close_matches(on, [*scenario.SCENARIOS, *suites.SUITES], 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join([*scenario.SCENARIOS, *suites.SUITES])}"
-        raise BufgymError(f"{on!r}: no scenario and no suite; {hint}")
-    queue = {name: settings.pop(name) for name in ("max_bytes", "decide_at") if name in settings}
+    if isinstance(on, str) and not (on in scenario.SCENARIOS or on.endswith(".toml") or is_named(on)):
+        raise unknown("scenario or suite", on, [*scenario.SCENARIOS, *suites.SUITES])
+    queue = {name: settings.pop(name) for name in QUEUE if name in settings}
+    stream = scenario.get(on) if isinstance(on, str) else on
+    known = parameters(stream) if isinstance(on, str) else []
+    for name in settings:
+        if name not in known:
+            raise unknown("keyword", name, [*KEYWORDS, *QUEUE, *known], place="compare")
     stream = scenario.get(on, **settings) if isinstance(on, str) else on
-    label = on if isinstance(on, str) else ""
-    seeds, capacities = 10 if seeds is None else seeds, capacities or [8]
+    label, seeds, capacities = on if isinstance(on, str) else "", 10 if seeds is None else seeds, capacities or [8]
+    return beside(chosen, stream, capacities, seeds, label=label, about=about, rival=rival, progress=progress, **queue)
+
+
+def beside(
+    chosen: Sequence[Policy],
+    stream: Any,
+    capacities: Sequence[int],
+    seeds: int | Sequence[int],
+    *,
+    label: str = "",
+    about: str = "",
+    rival: Policy | None = None,
+    progress: bool = True,
+    **queue: Any,
+) -> Comparison:
+    """``compare`` for policies and a scenario that are at hand; ``label`` is the scenario's name in the rows."""
     task = tasks.of(stream)
     chosen = _with(chosen, rival, task)
     alone = all(policy.name != task.baseline for policy in chosen)
+    if alone and task.kind != "queue":
+        chosen = [*chosen, make_policy(task.baseline)]
+    unranked, named = table.apart(chosen), "" if rival is None else rival.name
+    rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
+    heading = about or label or scenario.about(stream)
     if task.kind != "queue":
-        chosen = [*chosen, make_policy(task.baseline)] if alone else chosen
-        rows = run(chosen, stream, capacities, seeds, label=label, progress=progress)
-        shown = summary.table_of(task.summary(rows, table.unranked(rows), named))
-    else:
-        rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
-        floor = run([BASELINE], stream, capacities, seeds, label=label, bound=named != "", **queue) if alone else []
-        shown = table.of(rows, floor)
-        if not about and "score" in shown.head:
-            shown = shown._replace(notes=[table.SCORE, *shown.notes])
-    texts = [shown.plain(), shown.markdown(), shown.html()]
-    if named and task.kind == "queue":
-        found = task.summary([*rows, *floor], table.unranked(rows), named)
+        found = task.summary(rows, unranked, named)
+        shown = summary.table_of(found, {label: scenario.about(stream)}, ["", *task.notes(rows, found)])
+        return Comparison(rows, heading, unranked, *shown.forms())
+    floor = run([BASELINE], stream, capacities, seeds, label=label, bound=rival is not None, **queue) if alone else []
+    shown = table.of(rows, floor, unranked)
+    if "score" in shown.head:
+        shown = shown._replace(notes=[table.SCORE, *shown.notes])
+    texts = shown.forms()
+    if rival is not None:
+        found = task.summary([*rows, *floor], unranked, named)
         paired = [quantity for quantity in found.quantities if quantity.key in ("share", "against")]
         notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
         more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
-        texts = ["\n\n".join(both) for both in zip(texts, (more.plain(), more.markdown(), more.html()), strict=True)]
-    return Comparison(rows, about or label or repr(stream), *texts)
+        texts = ["\n\n".join(both) for both in zip(texts, more.forms(), strict=True)]
+    return Comparison(rows, heading, unranked, *texts)
 
 
 def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
@@ -199,9 +221,9 @@ def _on_suite(
     names = tuple(policy.name for policy in chosen)
     sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=tuple(dict.fromkeys(files)))
     # Other processes can't know what a user's own code registered in this one.
-    own = any(not policy.on_arrival.__module__.startswith("bufgym.") for policy in chosen) and not files
+    own = not all(policy.built_in for policy in chosen) and not files
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
         shown = [form(out, against) for form in (report.plain, report.markdown, report.html)]
-        return Comparison(rows, f"suite {name}", *shown)
+        return Comparison(rows, f"suite {name}", table.apart(chosen), *shown)

@@ -52,11 +52,7 @@ def drops(
     max_bytes: int | None = None,
     decide_at: str = "arrival",
 ) -> Iterator[Drop]:
-    """Yield in time order every message that each policy drops in the runs of ``run.run`` with these arguments.
-
-    Raises:
-        BufgymError: the scenario plays no recording.
-    """
+    """Yield in time order every message that each policy drops in the runs of ``run.run`` with these arguments."""
     workload = scenario.workload
     if workload is None:
         raise BufgymError("drops: the scenario must play a recording (workload=...)")

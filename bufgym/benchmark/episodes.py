@@ -37,7 +37,6 @@ class Arrays:
 
 
 def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]]:
-    """Group the rows by (policy, cell), then by (training seed, episode)."""
     if not rows:
         raise BufgymError("no rows to score")
     groups: dict[tuple[str, Cell], dict[Run, Mapping[str, Any]]] = {}
@@ -55,7 +54,11 @@ def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Ru
 
 
 def read(rows: Sequence[Mapping[str, Any]], baseline: str, against: str = "") -> Arrays:
-    """Make arrays of the rows, checked as ``score.scores`` says."""
+    """Make arrays of the rows.
+
+    Rows that are incomplete or duplicate, a cell without the baseline, and policies that met different episodes or
+    disagree on the clairvoyant are errors; so is ``against`` without rows.
+    """
     groups = _by_run(rows)
     cells = sorted({cell for _, cell in groups})
     met: dict[str, set[Episode]] = {scenario: set() for scenario, _ in cells}

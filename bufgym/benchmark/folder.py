@@ -48,18 +48,12 @@ class SuiteRun:
 
     @property
     def task(self) -> Task:
-        """The task of its suite."""
         return TASKS[self.manifest["task"]]
 
     @property
     def abouts(self) -> dict[str, str]:
         """Map each scenario's label to its description."""
         return {label: str(entry.get("about", "")) for label, entry in self.manifest["scenarios"].items()}
-
-    def place(self, scenario: str) -> tuple[int, str]:
-        """Sort key: scenarios in the manifest's order, then any others by name."""
-        listed = list(self.manifest["scenarios"])
-        return (listed.index(scenario) if scenario in listed else len(listed), scenario)
 
 
 def read(folder: Path) -> SuiteRun:
@@ -163,7 +157,6 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
 
 
 def write_json(file: Path, content: dict[str, Any]) -> None:
-    """Write the file, whole or not at all."""
     with replaced(file) as temporary:
         temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
 

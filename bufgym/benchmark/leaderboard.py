@@ -13,9 +13,9 @@ from typing import Any
 from bufgym.benchmark import folder
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
-from bufgym.benchmark.summary import shown
+from bufgym.benchmark.summary import places, shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.benchmark.table import Table
+from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
@@ -36,8 +36,6 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Entry:
-    """One policy on one suite."""
-
     suite: str
     policy: str  # as ``bufgym bench --policies`` takes it
     rank: int  # 1 for the best; 0 for a policy that is not ranked
@@ -47,18 +45,15 @@ class Entry:
 
     @property
     def name(self) -> str:
-        """Name that ``bufgym validate`` takes."""
         return f"{self.suite}/{self.policy}"
 
     @property
     def command(self) -> str:
-        """Command that makes it again."""
         needs = " --data DIR" if suites.get(self.suite).needs else ""
         return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
 
 
 def task_of(suite: str) -> Task:
-    """Find the task of the suite."""
     return TASKS[suites.get(suite).kind]
 
 
@@ -66,12 +61,14 @@ def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> lis
     """Make one entry for each policy of a suite's rows, best first."""
     task = task_of(suite)
     summary = task.summary(rows, unranked)
-    board = []
-    for rank, standing in enumerate(summary.overall, 1):
-        known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
-        values = {key: standing[key] for key in task.listed}
-        board.append(Entry(suite, standing.policy, rank if known else 0, summary.counted_cells, values, __version__))
-    return board
+    cells = len(summary.cells) if summary.scores is None else summary.scores.counted
+    return [
+        Entry(
+            *(suite, place.policy, place.rank or 0, cells),
+            *({key: standing[key] for key in task.listed}, __version__),
+        )
+        for place, standing in zip(places(summary), summary.overall, strict=True)
+    ]
 
 
 def make(path: Path, names: Sequence[str], specs: Mapping[str, Sequence[str]], **options: Any) -> list[Entry]:
@@ -164,7 +161,6 @@ def read(path: Path) -> dict[str, Entry]:
 
 
 def find(path: Path, name: str) -> Entry:
-    """Find the entry of that name."""
     board = read(path)
     if name not in board:
         raise BufgymError(f"{path}: no row {name!r}; rows are named suite/policy, such as {next(iter(board), 'none')}")
@@ -186,7 +182,7 @@ def markdown(board: Sequence[Entry]) -> str:
         lines = []
         for entry in group:
             values = [" ".join(filter(None, shown(entry.values[q.key], q))) for q in quantities]
-            lines.append([str(entry.rank) if entry.rank else "–", entry.policy, *values, f"`{entry.command}`"])
+            lines.append([str(entry.rank or NONE), entry.policy, *values, f"`{entry.command}`"])
         head = ["#", "policy", *(quantity.title for quantity in quantities), "command"]
         about = suites.get(suite).about
         out += ["", f"## {suite}", "", f"{about[0].upper()}{about[1:]}.", ""]

@@ -9,8 +9,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
+from bufgym.ground.libraries import library
 from bufgym.sim.metrics import Outcome
 
 Row = dict[str, Any]
@@ -69,7 +70,6 @@ def write_rows(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike[str], 
 
 
 def read_rows(path: str | os.PathLike[str], layout: Layout = RUNS) -> list[Row]:
-    """Read the rows that ``write_rows`` wrote."""
     source = Path(path)
     if source.exists() and not source.is_file():
         raise BufgymError(f"{source}: must be a regular file")
@@ -131,9 +131,7 @@ def has_pyarrow() -> bool:
 
 
 def _pyarrow() -> tuple[Any, Any]:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise BufgymError(f"Parquet files need pyarrow: {install('bench')} (or write .csv)") from None
-    return pyarrow, pyarrow.parquet
+    pyarrow, parquet = (
+        library(name, "bench", "a Parquet file, unlike .csv,") for name in ("pyarrow", "pyarrow.parquet")
+    )
+    return pyarrow, parquet

@@ -39,10 +39,8 @@ def run(
     Args:
         policies: each a ``Policy``, a name or a policy function, as ``bufgym.policies.get`` takes them.
         scenario: a ``Scenario`` or a ``FleetScenario``; each of its traces is met on its own.
-        capacities: L, messages.
         seeds: a number of seeds counted from 0, or a list of seeds.
         label: name of the scenario in the rows.
-        progress: show a bar on stderr, where that is a terminal and tqdm is installed.
         settings: settings of the task; for one queue ``max_bytes``, ``decide_at`` and ``bound``, see ``QueueTask``.
     """
     task = tasks.of(scenario, **settings)
@@ -80,7 +78,7 @@ def check_distinct(policies: Sequence[Policy]) -> None:
     given = [policy.name for policy in policies]
     for name in given:
         if given.count(name) > 1:
-            own = [p for p in policies if p.name == name and not p.on_arrival.__module__.startswith("bufgym.")]
+            own = [p for p in policies if p.name == name and not p.built_in]
             why = f"; {name!r} is a built-in policy's name, give your own another" if own and name in names() else ""
             raise BufgymError(f"policies: {name!r} is given more than once{why}")
 

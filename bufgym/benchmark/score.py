@@ -22,9 +22,9 @@ Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,7 @@ from bufgym.benchmark.bootstrap import (
     times_drawn,
 )
 from bufgym.benchmark.episodes import Arrays, Cell, Numbers
+from bufgym.benchmark.table import NOBODY, RunRows, Unranked
 from bufgym.oracle.measure import BASELINE, TIE, normalised_score
 
 REFERENCE = "afr"
@@ -55,8 +56,6 @@ NEGLIGIBLE = 1e-9
 
 @dataclass(frozen=True)
 class CellScore:
-    """One policy in one cell."""
-
     scenario: str
     capacity: int  # L, messages
     policy: str
@@ -74,8 +73,12 @@ class Standing:
     """One policy in one cell, or over all."""
 
     policy: str
-    ranked: bool  # whether it competes with the others
+    apart: str  # reason why it does not compete with the others; empty if it does
     values: Mapping[str, Interval]  # by the key of a ``summary.Quantity``
+
+    @property
+    def ranked(self) -> bool:
+        return not self.apart
 
     def __getitem__(self, key: str) -> Interval:
         return self.values[key]
@@ -101,7 +104,6 @@ class Scores:
 
     @property
     def counted(self) -> int:
-        """Number of discriminative cells."""
         return len({(cell.scenario, cell.capacity) for cell in self.cells if cell.discriminative})
 
     @property
@@ -118,18 +120,11 @@ def regret(h: Numbers, best: Numbers) -> Numbers:
     return 1 - ratio(h, best, best > 0)
 
 
-def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = (), against: str = "") -> Scores:
+def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Scores:
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
-    Args:
-        rows: from ``bufgym.benchmark.run``. Rows of a trained agent may have a "training_seed"; the H of an episode is
-            then the mean over training seeds.
-        unranked: policies that are shown but not ranked, such as an unbounded queue or the clairvoyant.
-        against: the policy that every other is compared with by its share of ``REFERENCE``'s regret.
-
-    Raises:
-        BufgymError: there are no rows, rows are incomplete or duplicate, a cell lacks the baseline, or policies met
-            different episodes or disagree on the clairvoyant; or ``against`` has no rows.
+    Rows of a trained agent may have a "training_seed"; the H of an episode is then the mean over training seeds. Every
+    policy is compared with ``against`` by its share of ``REFERENCE``'s regret. Errors are those of ``episodes.read``.
     """
     table = episodes.read(rows, BASELINE, against)
     drawn = links_drawn(table.episodes, RESAMPLES, SEED)
@@ -145,7 +140,9 @@ def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = (), ag
             cell: _statistics(h, compared.get(cell), samples[cell]) for cell, h in _resampled(table, policy).items()
         }
         if policy in table.unbounded:
-            by_cell = {cell: s.without_bound() for cell, s in by_cell.items()}
+            for cell, s in by_cell.items():  # the clairvoyant's L does not bind it
+                none = {name: np.full_like(getattr(s, name), np.nan) for name in ("score", "regret", "by_trace")}
+                by_cell[cell] = s._replace(**none)
         for cell, s in by_cell.items():
             cell_scores.append(
                 CellScore(
@@ -155,9 +152,13 @@ def scores(rows: Sequence[Mapping[str, Any]], unranked: Collection[str] = (), ag
                 )
             )
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
-    _compare(overall, against)
+    for values in overall.values():
+        lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
+        values["share"] = ratio(values["regret"], lost, lost > NEGLIGIBLE)
+    for values in overall.values() if against else ():
+        values["against"] = values["share"] - overall[against]["share"]
     standings = [
-        Standing(policy, policy not in unranked, {key: interval(numbers) for key, numbers in values.items()})
+        Standing(policy, unranked.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
         for policy, values in overall.items()
     ]
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
@@ -204,11 +205,6 @@ class _Statistics(NamedTuple):
     improvement: Numbers
     by_trace: Numbers  # scores, [1 + resamples, traces]
 
-    def without_bound(self) -> _Statistics:
-        """Remove score and regret, for a policy that the clairvoyant's L does not bind."""
-        none = {name: np.full_like(getattr(self, name), np.nan) for name in ("score", "regret", "by_trace")}
-        return self._replace(**none)
-
 
 def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statistics:
     sums = sample.sums(h)
@@ -232,15 +228,6 @@ def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> dict[s
     weights = np.hstack([np.add.reduceat(sample.weights, sample.starts, axis=1) for sample in samples])
     means = {name: np.mean([getattr(c, name) for c in cells], axis=0) for name in ("score", "regret", "improvement")}
     return {**means, "iqm": _interquartile_means(values, weights / weights[0])}
-
-
-def _compare(overall: Mapping[str, dict[str, Numbers]], against: str) -> None:
-    """Add the share of the reference's regret to the statistics of each policy, and how it differs from another's."""
-    for values in overall.values():
-        lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
-        values["share"] = ratio(values["regret"], lost, lost > NEGLIGIBLE)
-    for values in overall.values() if against else ():
-        values["against"] = values["share"] - overall[against]["share"]
 
 
 def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:

@@ -39,9 +39,6 @@ def load(source: str, folder: str | None = None) -> str:
 
     ``folder`` is where relative paths begin and where modules are found, besides Python's own places. None means the
     current folder.
-
-    Raises:
-        BufgymError: there is no such policy, or another policy has its name.
     """
     place = folder or os.getcwd()
     known = _NAMES.get((place, source))

@@ -8,7 +8,7 @@ paired bootstrap over links that ``score`` describes: one draw serves all polici
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
-from bufgym.benchmark.table import Rows, Table, signed
+from bufgym.benchmark.table import NOBODY, NONE, RunRows, Table, Unranked, signed
 from bufgym.ground.errors import BufgymError
 
 
@@ -37,8 +37,6 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of a task's rows."""
-
     quantities: tuple[Quantity, ...]  # quantities shown, in this order
     rank_by: str  # the key of the quantity that orders the policies, largest first
     overall: list[Standing]  # over all cells; ranked policies first, best first
@@ -49,15 +47,7 @@ class Summary:
     notes: tuple[str, ...] = ()  # sentences about single policies, below the ranking
 
     @property
-    def counted_cells(self) -> int:
-        """Number of cells that ``overall`` covers; with scores only discriminative cells count."""
-        if self.scores is None:
-            return len(self.cells)
-        return self.scores.counted
-
-    @property
     def standings(self) -> dict[str, Standing]:
-        """Over all cells, by policy."""
         return {standing.policy: standing for standing in self.overall}
 
 
@@ -78,7 +68,7 @@ episode.
 """
 
 
-def by_run(rows: Rows, part: str, value: str) -> dict[Run, dict[Any, Mapping[str, Any]]]:
+def by_run(rows: RunRows, part: str, value: str) -> dict[Run, dict[Any, Mapping[str, Any]]]:
     """Group each run's rows by column ``part``; raise an error for a row without ``value`` or a repeated part."""
     runs: dict[Run, dict[Any, Mapping[str, Any]]] = {}
     for number, row in enumerate(rows):
@@ -99,23 +89,13 @@ def summarise(
     *,
     rank_by: str,
     baseline: str,
-    unranked: Collection[str] = (),
+    unranked: Unranked = NOBODY,
     against: str = "",
 ) -> Summary:
     """Compare every policy with ``baseline``, by cell and over all cells.
 
-    Args:
-        runs: numbers of each run for ``statistics``, with equally many entries within a cell.
-        statistics: computes the quantities of one policy in one cell.
-        quantities: names and formats of the statistics.
-        rank_by: the key of the quantity that orders the policies.
-        baseline: the policy that the others are measured against.
-        unranked: policies that come last, such as an unbounded queue.
-        against: the policy that every other is compared with by ``rank_by``, see ``difference``.
-
-    Raises:
-        BufgymError: there are no runs, a cell lacks the baseline, policies met different episodes, or ``against`` has
-            no runs.
+    ``runs`` holds the numbers of each run for ``statistics``, with equally many entries within a cell. The quantity
+    ``rank_by`` orders the policies; those ``unranked`` come last. ``against`` is as in ``difference``.
     """
     # ``read`` makes sure that all met the same episodes, and orders them.
     rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
@@ -151,13 +131,38 @@ def summarise(
                 pooled = (np.sum if quantity.total else np.mean)([by_cell[cell][quantity.key] for cell in over], axis=0)
                 interval = percentile_interval(pooled)
                 values[quantity.key] = Interval(interval.value, math.nan, math.nan) if alone else interval
-            entries.append(Standing(policy, policy not in unranked, values))
+            entries.append(Standing(policy, unranked.get(policy, ""), values))
         return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
 
     return Summary(quantities, rank_by, standings(cells), {cell: standings([cell]) for cell in cells}, baseline)
 
 
 # --- as text ---------------------------------------------------------------------------------------------------------
+
+
+class Place(NamedTuple):
+    rank: int | None  # 1 for the best; None for a policy that is not ranked
+    policy: str
+    values: list[tuple[str, str]]  # (value, interval) as text, a pair for each quantity of the summary
+    reason: str  # why it is not ranked; empty if it is
+
+    @property
+    def place(self) -> str:
+        return NONE if self.rank is None else str(self.rank)
+
+    @property
+    def texts(self) -> list[str]:
+        return [" ".join(filter(None, texts)) for texts in self.values]
+
+
+def places(summary: Summary, standings: Sequence[Standing] | None = None) -> list[Place]:
+    """Ranked policies best first, then the others; by default over all cells."""
+    found = []
+    for rank, standing in enumerate(summary.overall if standings is None else standings, 1):
+        known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
+        values = [pair(standing, quantity) for quantity in summary.quantities]
+        found.append(Place(rank if known else None, standing.policy, values, standing.apart))
+    return found
 
 
 def pair(standing: Standing, quantity: Quantity) -> tuple[str, str]:
@@ -178,18 +183,12 @@ def title(cell: Cell, abouts: Mapping[str, str]) -> str:
     return ", ".join(filter(None, (scenario, f"L = {capacity}")))
 
 
-def plain(summary: Summary, abouts: Mapping[str, str] | None = None) -> str:
-    """Write ``table_of`` as aligned text."""
-    return table_of(summary, abouts).plain()
-
-
-def table_of(summary: Summary, abouts: Mapping[str, str] | None = None) -> Table:
+def table_of(summary: Summary, abouts: Mapping[str, str] | None = None, notes: Sequence[str] = ()) -> Table:
     """Make a block for each cell, and one over all cells if there are several."""
     blocks = [(title(cell, abouts or {}), standings) for cell, standings in summary.cells.items()]
     if len(blocks) > 1:
         blocks.append((f"mean of these {len(blocks)}", summary.overall))
-
-    return table_over(blocks, summary.quantities)
+    return table_over(blocks, summary.quantities)._replace(notes=notes)
 
 
 def table_over(blocks: Sequence[tuple[str, Sequence[Standing]]], quantities: Sequence[Quantity]) -> Table:

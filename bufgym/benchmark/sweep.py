@@ -25,12 +25,14 @@ from bufgym.benchmark import cluster, folder, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
 from bufgym.benchmark.run import bar, by_trace, check_distinct, run
+from bufgym.benchmark.table import apart
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__, modules
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.files import locked
 from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE
+from bufgym.scenario.registry import parameters
 from bufgym.scenario.suites import Setting
 
 _SEEDS_PER_SHARD = 25
@@ -53,25 +55,26 @@ class Sweep:
     policy_file: str | None = None  # a Python file that registers policies, run wherever shards run
     sources: tuple[str, ...] = ()
     """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
-    folder: str = field(default_factory=os.getcwd)  # folder of the sources
+    home: str = field(default_factory=os.getcwd)  # folder of the sources
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
     @property
     def task(self) -> Task:
-        """The task that the suite is for."""
         return tasks.TASKS[suites.get(self.suite).kind]
 
     @property
     def policies(self) -> list[policies.Policy]:
-        """Policies of ``specs``."""
         return [policies.get(spec) for spec in self.specs]
 
     def settings(self) -> dict[str, Setting]:
-        """The suite's settings of the split, with the changes."""
         settings = suites.get(self.suite).settings(self.split, self.data)
         if not self.changes:
             return settings
+        known = parameters(next(iter(settings.values())).scenario)
+        for name in self.changes:
+            if name not in known:
+                raise unknown("parameter", name, known, place=self.suite)
         return {
             label: replace(setting, scenario=replace(setting.scenario, **self.changes))
             for label, setting in settings.items()
@@ -125,7 +128,6 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """Name of its file."""
         return f"{self.label}-{self.trace}-{self.seeds[0]}"
 
 
@@ -141,7 +143,7 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
         load(sweep.policy_file)
         _LOADED.add(sweep.policy_file)
     for source in sweep.sources:
-        sources.load(source, sweep.folder)
+        sources.load(source, sweep.home)
     setting = sweep.setting(shard.label, shard.trace)
     limits: dict[str, Any] = {} if setting.max_bytes is None else {"max_bytes": setting.max_bytes}
     return run(sweep.policies, setting.scenario, sweep.capacities_of(setting), shard.seeds, label=shard.label, **limits)
@@ -181,11 +183,9 @@ def run_sweep(
         out: a folder that does not exist, is empty, or holds an earlier run of the same sweep, finished or not.
         jobs: parallel processes; -1 starts one per core, and None does too if joblib is installed.
         backend: one of ``BACKENDS`` (joblib's); "ray" and "dask" use the cluster at ``address``, or a local one.
-        address: address of the cluster's head.
         command: command that the report shows to run it again.
         form: "parquet" or "csv"; by default parquet if pyarrow is installed.
         load: function that runs ``Sweep.policy_file`` in a worker.
-        progress: show a bar on stderr, where that is a terminal.
     """
     sweep = sweep.checked()
     if jobs is None:
@@ -224,7 +224,6 @@ def run_sweep(
 
 
 def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
-    """Make the content of ``manifest.json`` for a checked sweep."""
     suite, settings = suites.get(sweep.suite), sweep.settings()
     episodes = sum(len(shard.seeds) for shard in shards)
     code = sweep.policy_file and Path(sweep.policy_file).read_bytes()
@@ -239,12 +238,12 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "episodes": sweep.task.describe([setting.scenario for setting in settings.values()], episodes),
         "command": command,
         "policies": [policy.name for policy in sweep.policies],
-        "unranked": {policy.name: policy.unranked_because for policy in sweep.policies if not policy.ranked},
+        "unranked": apart(sweep.policies),
         "capacities": list(sweep.capacities),
         "seeds": sweep.seeds,
         "changes": dict(sweep.changes),
         "policy_file": code and hashlib.sha256(code).hexdigest()[:16],
-        "sources": sources.digests(sweep.sources, sweep.folder) or None,
+        "sources": sources.digests(sweep.sources, sweep.home) or None,
         "scenarios": {
             label: {
                 "about": setting.about,

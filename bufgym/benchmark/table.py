@@ -5,40 +5,47 @@ from __future__ import annotations
 import html
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from bufgym import policies
-from bufgym.ground.errors import BufgymError, printable
+from bufgym.ground.errors import printable
 from bufgym.oracle.measure import BASELINE, normalised_score
+from bufgym.policies import Policy
 
-Rows = Sequence[Mapping[str, Any]]
+RunRows = Sequence[Mapping[str, Any]]
+Unranked = Mapping[str, str]
+"""Policies that do not compete, with the reasons, see ``apart``."""
+NOBODY: Unranked = MappingProxyType({})
+NONE = "–"
+"""No number."""
 
 # --- numbers ---------------------------------------------------------------------------------------------------------
 
 
-def decimal(number: float, digits: int) -> str:
-    """Format with a true minus sign, but none before a zero; NaN is a dash."""
+def decimal(number: float, digits: int, unit: str = "") -> str:
+    """Format with a true minus sign, but none before a zero; NaN is ``NONE``."""
     if math.isnan(number):
-        return "–"
+        return NONE
     text = f"{abs(number):.{digits}f}"
-    return f"\N{MINUS SIGN}{text}" if number < 0 and float(text) else text
+    return ("\N{MINUS SIGN}" if number < 0 and float(text) else "") + text + unit
 
 
 def score(number: float) -> str:
-    """Format a score as 0.713, or NaN as a dash."""
+    """Format a score as 0.713."""
     return decimal(number, 3)
 
 
 def signed(number: float) -> str:
-    """Format a difference as +0.713, or NaN as a dash."""
+    """Format a difference as +0.713."""
     return ("+" if number >= 0 else "") + score(number)
 
 
 def percent(number: float) -> str:
     """Format with three digits: 12.3 %, 1.23 %, 0.123 %."""
     size = float(f"{abs(number * 100):.3g}")  # rounded first: 9.999 % is 10.0 %
-    return decimal(number * 100, 1 if size >= 10 else 2 if size >= 1 else 3) + ("" if math.isnan(number) else " %")
+    return decimal(number * 100, 1 if size >= 10 else 2 if size >= 1 else 3, " %")
 
 
 def mean(numbers: Sequence[float | None]) -> float:
@@ -60,7 +67,6 @@ class Table(NamedTuple):
 
     @property
     def lines(self) -> list[Sequence[str]]:
-        """Lines of all blocks."""
         return [line for _, block in self.blocks for line in block]
 
     def plain(self) -> str:
@@ -82,8 +88,11 @@ class Table(NamedTuple):
     def html(self) -> str:
         """One HTML table of all blocks, without their titles."""
         body = [self._row("td", line) for line in self.lines]
-        notes = [f"<p>{html.escape(note)}</p>" for note in self.notes]
+        notes = [f"<p>{html.escape(note)}</p>" for note in self.notes if note]
         return "\n".join(["<table>", self._row("th", self.head), *body, "</table>", *notes])
+
+    def forms(self) -> list[str]:
+        return [self.plain(), self.markdown(), self.html()]
 
     def _row(self, tag: str, line: Sequence[str]) -> str:
         sides = ["left" if k < self.left else "right" for k in range(len(line))]
@@ -91,18 +100,16 @@ class Table(NamedTuple):
         return "<tr>" + "".join(f'<{tag} style="text-align: {side}">{cell}</{tag}>' for side, cell in cells) + "</tr>"
 
 
-def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Align rows of cells as lines of text: the first column to the left, the others to the right."""
-    lines = [list(map(printable, line)) for line in lines]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    out = []
-    for first, *rest in lines:
-        padded = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
-        out.append("  ".join([first.ljust(widths[0]), *padded]).rstrip())
-    return out
+def aligned(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:
+    """Align rows of cells as lines of text: the first ``left`` columns to the left, the others to the right."""
+    texts = [list(map(printable, line)) for line in lines]
+    sides = [(max(map(len, column)), "<" if k < left else ">") for k, column in enumerate(zip(*texts, strict=True))]
+    return [
+        "  ".join(f"{cell:{side}{n}}" for cell, (n, side) in zip(line, sides, strict=True)).rstrip() for line in texts
+    ]
 
 
-def invalid(rows: Rows) -> list[str]:
+def invalid(rows: RunRows) -> list[str]:
     """Write a note for each policy that made invalid decisions; ``rows`` has one row per sender."""
     counts: dict[str, int] = {}
     for row in rows:
@@ -115,8 +122,6 @@ def invalid(rows: Rows) -> list[str]:
 
 
 class Column(NamedTuple):
-    """One column of a table of means."""
-
     title: str
     key: str  # column of the rows that it averages
     write: Callable[[float], str]
@@ -126,20 +131,23 @@ COLUMNS = (
     Column("policy", "policy", str),
     Column("L", "capacity", str),
     Column("score", "score", score),
-    Column("QoI", "qoi", "{:.3f}".format),
-    Column("regret", "regret", "{:.2%}".format),
-    Column("delivered", "delivered", "{:.1f}".format),
-    Column("dropped", "dropped", "{:.1f}".format),
-    Column("longest gap (x)", "longest_gap", "{:.3f}".format),
-    Column("longest gap (s)", "longest_gap_s", "{:.3f}".format),
-    Column("sojourn mean (s)", "mean_sojourn_s", "{:.3f}".format),
-    Column("sojourn p95 (s)", "p95_sojourn_s", "{:.3f}".format),
-    Column("age mean (s)", "mean_age_s", "{:.3f}".format),
-    Column("age peak (s)", "peak_age_s", "{:.3f}".format),
+    Column("QoI", "qoi", score),
+    Column("regret", "regret", lambda share: decimal(100 * share, 2, "%")),
+    Column("delivered", "delivered", partial(decimal, digits=1)),
+    Column("dropped", "dropped", partial(decimal, digits=1)),
+    Column("longest gap (x)", "longest_gap", score),
+    Column("longest gap (s)", "longest_gap_s", score),
+    Column("sojourn mean (s)", "mean_sojourn_s", score),
+    Column("sojourn p95 (s)", "p95_sojourn_s", score),
+    Column("age mean (s)", "mean_age_s", score),
+    Column("age peak (s)", "peak_age_s", score),
 )
 
 
-SCORE = "score: 0 is Drop Oldest, the rule of ROS; 1 is the clairvoyant, which knows the whole link beforehand"
+SCORE = (
+    "score: 0 is Drop Oldest, the rule of ROS; 1 is the clairvoyant, which knows the whole link beforehand;"
+    " regret = 1 - QoI / the clairvoyant's"
+)
 """The line below a table with scores."""
 REGRET_AT_MOST = "regret, at most"
 """Title of regrets if some rest on an uncertified bound."""
@@ -147,12 +155,12 @@ UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exac
 """The note below them."""
 
 
-def means(rows: Rows, floor: Rows = ()) -> list[dict[str, Any]]:
+def means(rows: RunRows, floor: RunRows = (), alone: Collection[str] = ()) -> list[dict[str, Any]]:
     """Average the rows of each policy and capacity, sorted by capacity ascending, then QoI descending.
 
-    Policies that do not compete, see ``unranked``, come last within a capacity. None and NaN count as missing, and a
-    mean of missing numbers is NaN. ``measure.normalised_score`` computes the score on sums; it is NaN without a
-    clairvoyant's H. ``floor`` holds rows of Drop Oldest on the same episodes if it is not among ``rows``.
+    Those ``alone``, which do not compete, come last within a capacity. None and NaN count as missing, and a mean of
+    missing numbers is NaN. The score is that of the cell, see ``measure.normalised_score``. ``floor`` holds rows of
+    Drop Oldest on the same episodes if it is not among ``rows``.
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -167,15 +175,14 @@ def means(rows: Rows, floor: Rows = ()) -> list[dict[str, Any]]:
         }
         for (capacity, policy), group in groups.items()
     ]
-    apart = unranked(rows)
-    return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in apart, -e["qoi"], e["policy"]))
+    return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in alone, -e["qoi"], e["policy"]))
 
 
 def _episode(row: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(row.get(name) for name in ("scenario", "trace", "seed", "capacity"))
 
 
-def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
+def _score(group: RunRows, base: Mapping[tuple[Any, ...], float]) -> float:
     """Score of one policy at one capacity; NaN if one of the three sums is unknown or L does not bind the policy."""
     if any(row.get("regret") is None or _episode(row) not in base for row in group):
         return math.nan
@@ -186,54 +193,43 @@ def _score(group: Rows, base: Mapping[tuple[Any, ...], float]) -> float:
     return float(normalised_score(*sums))
 
 
-def same(rows: Rows) -> dict[str, list[str]]:
-    """Group policies with equal rows: map the first, or Drop Oldest if it is among them, to the others."""
+def same(rows: RunRows, alone: Collection[str] = ()) -> dict[str, list[str]]:
+    """Group policies with equal rows: map the first, or Drop Oldest if it is among them, to the others.
+
+    One that is ``alone`` is never grouped with one that competes.
+    """
     fates: dict[str, list[str]] = {}
     for row in rows:
         fates.setdefault(row["policy"], []).append(repr({**row, "policy": ""}))
-    apart = unranked(rows)
     groups: dict[tuple[Any, ...], list[str]] = {}
     for name in sorted(fates, key=lambda name: name != BASELINE):
-        groups.setdefault((name in apart, *sorted(fates[name])), []).append(name)
+        groups.setdefault((name in alone, *sorted(fates[name])), []).append(name)
     return {first: others for first, *others in groups.values() if others}
 
 
 def told_once(alike: Mapping[str, Sequence[str]]) -> list[str]:
-    """Write a note for each line that stands for several policies, see ``same``."""
     return [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in alike.items()]
 
 
-def unranked(rows: Rows) -> dict[str, str]:
-    """Find the policies that do not compete, with the reasons."""
-    reasons = {}
-    for name in dict.fromkeys(row["policy"] for row in rows):
-        try:
-            reason = policies.get(name).unranked_because
-        except BufgymError:
-            continue  # a run's agent that is not registered
-        if reason:
-            reasons[name] = reason
-    return reasons
+def apart(chosen: Iterable[Policy]) -> dict[str, str]:
+    """The policies that do not compete, with the reasons."""
+    return {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
 
 
-def of(rows: Rows, floor: Rows = ()) -> Table:
+def of(rows: RunRows, floor: RunRows = (), alone: Unranked = NOBODY) -> Table:
     """Make the table of ``means``, with one line for policies that are the ``same``.
 
-    Score and regret are left out if no row has them. ``floor`` is as in ``means``.
+    Score and regret are left out if no row has them. ``floor`` and ``alone``, see ``apart``, are as in ``means``.
     """
-    others = {name for alike in same(rows).values() for name in alike}
-    entries = [entry for entry in means(rows, floor) if entry["policy"] not in others]
+    alike = same(rows, alone)
+    others = {name for names in alike.values() for name in names}
+    entries = [entry for entry in means(rows, floor, alone) if entry["policy"] not in others]
     bounded = {key for key in ("score", "regret") if any(not math.isnan(entry[key]) for entry in entries)}
     columns = [c for c in COLUMNS if c.key in bounded or c.key not in ("score", "regret")]
     inexact = any(row.get("certified") is False and row.get("regret") is not None for row in rows)
     titles = [REGRET_AT_MOST if c.key == "regret" and inexact else c.title for c in columns]
     by_capacity = [list(block) for _, block in itertools.groupby(entries, lambda entry: entry["capacity"])]
-    blocks = [("", [[written(entry[c.key], c) for c in columns] for entry in block]) for block in by_capacity]
-    notes = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked(rows).items()]
-    notes += [*told_once(same(rows)), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(rows)]
+    blocks = [("", [[c.write(entry[c.key]) for c in columns] for entry in block]) for block in by_capacity]
+    notes = [f"note: {policy} does not compete: {reason}" for policy, reason in alone.items()]
+    notes += [*told_once(alike), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(rows)]
     return Table(titles, blocks, notes)
-
-
-def written(number: Any, column: Column) -> str:
-    """Format an entry; an unknown one is a hyphen."""
-    return "-" if isinstance(number, float) and math.isnan(number) else column.write(number)

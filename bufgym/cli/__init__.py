@@ -76,7 +76,6 @@ COMMANDS: dict[str, Any] = {
 
 
 def app() -> App:
-    """The commands and their options."""
     root = App(
         name="bufgym",
         help="A robot's send buffer is full: which message should go?",

@@ -12,6 +12,7 @@ from cyclopts import Group, Parameter
 from bufgym.cli.options import (
     RESULTS,
     WHO,
+    ByTopic,
     Count,
     OutOptions,
     SuiteOptions,
@@ -19,14 +20,25 @@ from bufgym.cli.options import (
     given,
     load_policies,
     loaded,
+    one_policy,
     refuse,
 )
-from bufgym.cli.scenarios import InterruptionOptions, OwnOptions, ScenarioOptions, StreamOptions, WorkloadOptions
-from bufgym.cli.suite import run_suite
+from bufgym.cli.scenarios import (
+    Described,
+    InterruptionOptions,
+    OwnOptions,
+    ScenarioOptions,
+    SharedOptions,
+    StreamOptions,
+    WorkloadOptions,
+)
+from bufgym.cli.suite import print_topics, run_suite, topic_policy
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 
 if TYPE_CHECKING:
+    from bufgym.benchmark.compare import Comparison
+    from bufgym.benchmark.tasks import Task
     from bufgym.policies import Policy
     from bufgym.scenario import Scenario
 
@@ -48,74 +60,97 @@ def bench(
     workload: WorkloadOptions = WorkloadOptions(),
     interruption: InterruptionOptions = InterruptionOptions(),
     own: OwnOptions = OwnOptions(),
+    shared: SharedOptions = SharedOptions(),
     buffer: BufferOptions = BufferOptions(),
     out: OutOptions = OutOptions(),
     against: Annotated[str | None, Parameter(group=WHO)] = None,
     drops: Annotated[str | None, Parameter(group=RESULTS)] = None,
+    by_topic: ByTopic = None,
 ) -> None:
     """Run policies side by side on the same episodes.
 
     Args:
-        against: Compare every policy with this one, by the paired difference of their shares of AFR's regret.
+        against: Compare every policy with this one, by the paired difference of their shares of AFR's regret (of QoI
+            over Robofleet's with topics, of the gain over AFR with a fleet).
         drops: With --workload: write each message that each policy dropped to this CSV file.
     """
     load_policies(who.policy_file)
-    scenario = ScenarioOptions(stream, workload, interruption, own)
+    options = ScenarioOptions(stream, workload, interruption, own, shared)
     if suite.suite is not None:
-        frozen = scenario.given() | given(buffer) | ({} if drops is None else {"drops": drops})
+        frozen = options.given() | given(buffer) | ({} if drops is None else {"drops": drops})
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
-        run_suite("bench", suite, who, out, against=against or "")
+        run_suite(suite, who, out, given(shared), against=against or "", by_topic=by_topic)
         return
     refuse(given(suite), "needs --suite")
-    if out.file() is not None:
-        raise BufgymError(f"--out {out.out}: without --suite it must be a folder")
     if drops is not None and workload.workload is None:
         raise BufgymError("--drops needs --workload")
-    _bench(scenario, who, buffer, out, drops, against)
+    _bench(options.scenario(who.seeds), who, buffer, out, drops, against, by_topic)
 
 
 def _bench(
-    options: ScenarioOptions,
+    made: Described,
     who: WhoOptions,
     buffer: BufferOptions,
     out: OutOptions,
     drops: str | None,
     against: str | None,
+    by_topic: str | None,
 ) -> None:
-    """Run the scenario that the options describe."""
     from bufgym import policies
-    from bufgym.benchmark import rows as files
-    from bufgym.benchmark import table
-    from bufgym.benchmark.compare import compare
+    from bufgym.benchmark import table, tasks
+    from bufgym.benchmark.compare import beside
 
-    recorded = options.workload.workload is not None
-    decide_at = buffer.decide_at or "arrival"
-    specs = loaded(who.policies)[0]
-    chosen = [policies.get(spec) for spec in specs or policies.names(for_topics=False)]
-    if decide_at == "overflow" and not specs:
+    stream, specs = made.scenario, loaded(who.policies)[0]
+    task = tasks.of(stream)
+    if task.kind != "queue":
+        refuse(given(buffer), "is for one queue")
+    chosen = [policies.get(spec) for spec in specs or task.default_policies("")]
+    if buffer.decide_at == "overflow" and not specs:
         chosen = [policy for policy in chosen if policy.privileged is None]  # see QueueTask.check
-    stream, about = options.scenario(who.seeds)
-    folder = None if out.out is None else Path(out.out)
-    if folder is not None:
-        # Before the long work, so that an impossible folder is reported at once.
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / "manifest.json").exists():
-            raise BufgymError(
-                f"{folder}: holds the run of a suite; choose another --out (its rows are never written over)"
-            )
-    capacity, seeds = list(who.capacity or (8,)), who.seeds or (1 if recorded else 10)
-    settings: dict[str, Any] = {"max_bytes": buffer.max_bytes, "decide_at": decide_at}
-    done = compare(chosen, stream, capacity=capacity, seeds=seeds, about=about, against=against, **settings)
-    bounds = _bound_notes(done.rows, stream, decide_at) if recorded else []
+    by_name = topic_policy(by_topic, task, [policy.name for policy in chosen])
+    rival = None if against is None else policies.get(one_policy(against))
+    file, folder = out.file(), out.folder()
+    capacity = who.capacity or (task.capacity,)
+    seeds = who.seeds or (1 if made.recorded else task.seeds)
+    queue: dict[str, Any] = given(buffer)
+    about = _about(made, task, None if made.recorded and who.seeds is None else seeds)
+    done = beside(chosen, stream, capacity, seeds, label=made.label, about=about, rival=rival, **queue)
+    bounds = _bound_notes(done.rows, stream, buffer.decide_at or "arrival") if made.recorded else []
     print("\n".join([str(done), *bounds]))
-    if recorded:
-        order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows)))
-        _dropped(chosen, stream, capacity, seeds, settings, order, drops)
-    if folder is not None:
-        form = out.format or ("parquet" if files.has_pyarrow() else "csv")
-        written = files.write_rows(done.rows, folder / f"rows.{form}")
+    if made.recorded:
+        order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows, alone=done.unranked)))
+        _dropped(chosen, stream, capacity, seeds, queue, order, drops)
+    if by_name is not None:
+        print_topics(done.rows, by_name)
+    _write(done, task, file, folder, out.format, bounds)
+
+
+def _about(made: Described, task: Task, seeds: int | None) -> str:
+    """Lines about the scenario and its episodes; ``seeds`` is None for a recording that is played once."""
+    from bufgym.scenario import about
+    from bufgym.scenario.numbered import by_trace
+
+    traces = len(by_trace(made.scenario))
+    lines = [*made.lines, *([about(made.scenario)] if task.kind == "queue" else [])]
+    if seeds is not None:
+        met = "" if traces == 1 else f"{traces} traces x "
+        means = f"Means over {met}{seeds} seeds; every policy meets the same episodes."
+        lines.append(task.describe([made.scenario], seeds * traces) or means)
+    return "\n".join(lines)
+
+
+def _write(
+    done: Comparison, task: Task, file: Path | None, folder: Path | None, form: str | None, bounds: Sequence[str]
+) -> None:
+    from bufgym.benchmark.rows import has_pyarrow, write_rows
+
+    if file is not None:
+        print(f"\n{len(done.rows)} rows in {write_rows(done.rows, file, task.layout)}")
+    elif folder is not None:
+        target = folder / f"rows.{form or ('parquet' if has_pyarrow() else 'csv')}"
+        written = write_rows(done.rows, target, task.layout)
         with replaced(folder / "table.md") as temporary:
-            text = "\n".join([f"{about}\n\n{done.markdown}", *([""] if bounds else []), *bounds])
+            text = "\n".join([f"{done.about}\n\n{done.markdown}", *([""] if bounds else []), *bounds])
             temporary.write_text(text + "\n", encoding="utf-8")
         print(f"\n{len(done.rows)} rows in {written}, this table in {folder / 'table.md'}")
 
@@ -139,7 +174,7 @@ def _bound_notes(rows: Sequence[Mapping[str, Any]], stream: Scenario, decide_at:
 def _dropped(
     chosen: Sequence[Policy],
     stream: Scenario,
-    capacity: list[int],
+    capacity: Sequence[int],
     seeds: int,
     settings: dict[str, Any],
     order: Sequence[str],

@@ -32,12 +32,8 @@ def environments() -> dict[str, str]:
 def _list_environments() -> str:
     from bufgym.scenario import SCENARIOS
 
-    return columns(
-        [
-            (id, f"scenario {scenario}", SCENARIOS[scenario][1] if scenario in SCENARIOS else "")
-            for id, scenario in sorted(environments().items())
-        ]
-    )
+    known = sorted(environments().items())
+    return columns([(id, f"scenario {name}", SCENARIOS[name][1] if name in SCENARIOS else "") for id, name in known])
 
 
 def _list_scenarios() -> str:
@@ -61,31 +57,31 @@ def _list_policies() -> str:
         "made for several topics side by side": policies.names(for_topics=True),
     }
     width = max(map(len, policies.names()))
-    lines = []
+    lines: list[str] = []
     for title, names in parts.items():
-        if title:
-            lines.append(f"  -- {title} --")
-        for name in names:
-            policy = policies.get(name)
-            lines.append(f"  {name:<{width}}  {policy.summary[:1].upper()}{policy.summary[1:]}".rstrip())
+        lines += [f"  -- {title} --"] if title else []
+        for policy in map(policies.get, names):
             settings = ", ".join(f"{setting}={number:g}" for setting, number in policy.parameters.items())
-            if settings:
-                lines.append(f"  {'':<{width}}  settings: {settings}")
-            lines.append(f"  {'':<{width}}  from: {policy.source or 'a policy file'}")
+            told = [
+                f"{policy.summary[:1].upper()}{policy.summary[1:]}",
+                *([f"settings: {settings}"] if settings else []),
+            ]
+            told.append(f"from: {policy.source or 'a policy file'}")
+            heads = [policy.name, *[""] * (len(told) - 1)]
+            lines += [f"  {head:<{width}}  {text}".rstrip() for head, text in zip(heads, told, strict=True)]
     return "\n".join(lines)
 
 
 def _list_values() -> str:
     from bufgym.model import qoi
 
-    return columns(
-        [
-            ("exponential:BASE", first_line(qoi.exponential)),
-            ("saturating:DISTANCE", first_line(qoi.saturating)),
-            ("tabulated:D=V,...", first_line(qoi.tabulated)),
-            ("module:function", first_line(qoi.of_function)),
-        ]
-    )
+    forms = {
+        "exponential:BASE": qoi.exponential,
+        "saturating:DISTANCE": qoi.saturating,
+        "tabulated:D=V,...": qoi.tabulated,
+        "module:function": qoi.of_function,
+    }
+    return columns([(form, first_line(function)) for form, function in forms.items()])
 
 
 def _list_rewards() -> str:

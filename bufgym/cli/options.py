@@ -75,7 +75,7 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'; topics and fleet have their own); --out DIR keeps it, a second call resumes it."""
+    """Which ('bufgym list suites'); --out DIR keeps it, a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None
@@ -129,6 +129,23 @@ class OutOptions:
             raise BufgymError(f"{self.out}: no folder to write this file to")
         return file
 
+    def folder(self) -> Path | None:
+        """The folder of ``--out``, made before the long work, for a run that is not of a suite; None for no folder."""
+        if self.out is None or self.file() is not None:
+            return None
+        folder = Path(self.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "manifest.json").exists():
+            raise BufgymError(
+                f"{folder}: holds the run of a suite; choose another --out (its rows are never written over)"
+            )
+        return folder
+
+
+ByTopic: TypeAlias = Annotated[
+    str | None, Parameter(group=RESULTS, help="With several topics: print each topic's numbers under this policy.")
+]
+
 
 def given(options: object, *names: str) -> dict[str, Any]:
     """Select the options of a group that the user gave; ``names``: among these alone."""
@@ -146,7 +163,6 @@ def refuse(options: Mapping[str, Any], why: str) -> None:
 
 
 def command_line(command: str, **options: Any) -> str:
-    """Write the command with the given options."""
     words = [command]
     for name, value in options.items():
         if value is not None and value is not False:

@@ -6,7 +6,6 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,14 +88,9 @@ def play(
             break
     print(end)
     if film is not None and out is not None:
-        _write(film, out, speed)
+        from PIL import Image  # comes with matplotlib, which drew them
+
+        first, *others = map(Image.fromarray, film)
+        with replaced(out) as temporary:  # 10 images a second where there is no pause
+            first.save(temporary, FILMS[out.suffix], save_all=True, append_images=others, duration=1000 / (speed or 10))
         print(f"wrote {out} ({len(film)} pictures)")
-
-
-def _write(film: Sequence[Any], path: Path, speed: float) -> None:
-    """Write the images uint8[height, width, 3] as an animation of ``speed`` images a second, 10 where it is 0."""
-    from PIL import Image  # comes with matplotlib, which drew them
-
-    first, *others = map(Image.fromarray, film)
-    with replaced(path) as temporary:
-        first.save(temporary, FILMS[path.suffix], save_all=True, append_images=others, duration=1000 / (speed or 10))

@@ -1,25 +1,22 @@
-"""Scenario that options describe: a stream over traces, a recording, one interruption, or one of the user's own."""
+"""Scenario that options describe: a stream over traces, a recording, one interruption, or a named one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cyclopts import Group, Parameter
 
-from bufgym.cli.options import Count, Least0, Positive, given, refuse
+from bufgym.cli.options import Count, Least0, Positive, Whole, given, refuse
 from bufgym.cli.trace_bags import MOTION, MotionOptions, RecordingOptions, workload_lines
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, printable
 
 if TYPE_CHECKING:
-    from bufgym.scenario import Scenario, Uplink
     from bufgym.traces import Motion
-
-SCORE = "Score: 0 is Drop Oldest, 1 the clairvoyant; regret = 1 - QoI / the clairvoyant's."
-"""Legend of the table's first columns."""
 
 _PARAMETERS = {"trace": "traces", "fps": "rate_hz", "bytes": "size_bytes", "seconds": "duration_s"}
 """Options whose scenario parameter has another name. Options not given take the scenario's defaults, and text is read
@@ -28,14 +25,24 @@ there."""
 _MESSAGES = ("fps", "bytes", "size_cv", "sizes", "seconds", "jitter")
 """Options of a made stream, which a recording has itself."""
 
+_OF_A_CLIENT = ("trace", "motion", "scale")
+"""Options that a client of one's own takes too."""
 
-@Parameter(name="*", group=Group.create_ordered("The stream and its link (default: as in bufgym/Uplink-v0)"))
+
+@Parameter(name="*")
 @dataclass(frozen=True)
-class StreamOptions:
+class LinkOptions:
     trace: list[str] | None = None
     """Bandwidth traces: files, shipped names, or module:function, a seed -> Trace (default: shipped LTE)."""
     motion: list[str] | None = None
     """Motion recordings, likewise; 'none': x is the frame index."""
+    scale: Positive | None = None
+    """Multiply the link's capacity (default: 1)."""
+
+
+@Parameter(name="*", group=Group.create_ordered("The stream and its link (default: as in bufgym/Uplink-v0)"))
+@dataclass(frozen=True)
+class StreamOptions(LinkOptions):
     fps: Positive | None = None
     """Messages a second."""
     bytes: Count | None = None
@@ -50,8 +57,6 @@ class StreamOptions:
     """The sender is told beforehand how long the stream lasts."""
     jitter: Least0 | None = None
     """Arrivals move by up to this part of a period."""
-    scale: Positive | None = None
-    """Multiply the link's capacity (default: 1)."""
     value: str | None = None
     """V of the QoI: exponential:BASE, saturating:DISTANCE, tabulated:D=V,..., or module:function of your own
     (default: exponential:0.05 over motion, exponential:0.367879 over a recording's motion, exponential:0.618 over
@@ -87,85 +92,111 @@ class OwnOptions:
     """A Python file that registers it; its code is run."""
     scenario: str | None = None
     """Which; also any other in 'bufgym list scenarios', or module:function."""
+    config: str | None = None
+    """A client's topics and their rules, as in examples/client.toml; --trace, --motion and --scale give its links."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class SendOptions:
+    consumers: Whole | None = None
+    """How many want each message; native ROS sends each a copy."""
+    window: Whole | None = None
+    """n_T: messages sent and not yet acknowledged, at most."""
+
+
+@Parameter(name="*", group=Group.create_ordered("Several topics or robots, of a suite or a scenario"))
+@dataclass(frozen=True)
+class SharedOptions(SendOptions):
+    robots: Count | None = None
+    """That share the cell of a fleet, whose capacity grows with them (default: 16)."""
+
+
+class Described(NamedTuple):
+    """A scenario that options describe."""
+
+    scenario: Any
+    lines: Sequence[str] = ()
+    """What is to be said of it besides its own ``about``."""
+    label: str = ""
+    """Its name in rows."""
+    recorded: bool = False
+    """Whether it plays a recording."""
 
 
 @dataclass(frozen=True)
 class ScenarioOptions:
-    """All options that describe a scenario."""
-
     stream: StreamOptions
     workload: WorkloadOptions
     interruption: InterruptionOptions
     own: OwnOptions
+    shared: SharedOptions
 
     def given(self) -> dict[str, Any]:
-        """What the user gave."""
+        """What the user gave, besides changes that a suite takes too."""
         return given(self.interruption) | given(self.stream) | given(self.workload) | given(self.own)
 
-    def scenario(self, seeds: int | None) -> tuple[Scenario, str]:
-        """Make the scenario, and a few lines about it; ``seeds`` is None where the user gave none."""
+    def scenario(self, seeds: int | None) -> Described:
+        """Make the scenario; ``seeds`` is None where the user gave none."""
+        from bufgym import scenario as scenarios
+
         stream, workload, law = self.stream, self.workload, given(self.interruption)
         if given(self.own):
-            described = {name: value for name, value in self.given().items() if name not in vars(self.own)}
-            refuse(described, "cannot go with a scenario of your own, which says it itself")
-            return _own(self.own, seeds or 10)
+            return self._own()
+        refuse(given(self.shared), "needs --suite, --scenario or --config of several topics or robots")
         if law.pop("interruption", False):
             uplinks = {name: v for name, v in given(stream).items() if name not in ("fps", "bytes", "sizes", "value")}
             refuse(uplinks | given(workload), "cannot go with --interruption")
-            return _interruption(stream, law, seeds or 10)
+            law |= _parameters(stream, "fps", "bytes", "sizes", "value")
+            return Described(scenarios.get("interruption", **law))
         refuse(law, "needs --interruption")
         if workload.workload is not None:
             return _recording(workload.workload, stream, workload, seeds)
         refuse(given(workload, "topics", "odom", "bridge_gaps"), "needs --workload")
         if stream.motion is None:
             refuse(given(workload, *MOTION), "needs --motion, or --workload with --odom")
-        return _uplink(stream, workload, seeds or 10)
+        return _uplink(stream, workload)
+
+    def _own(self) -> Described:
+        """The client of a file, or a scenario by name after the file that registers it was run."""
+        from bufgym import scenario as scenarios
+
+        config, allowed = self.own.config, () if self.own.config is None else _OF_A_CLIENT
+        described = {name: v for name, v in self.given().items() if name not in (*vars(self.own), *allowed)}
+        refuse(described, "cannot go with a scenario of your own, which says it itself")
+        changes = _parameters(self.stream, *allowed) if allowed else {}
+        changes |= given(self.shared)
+        if config is not None:
+            refuse(given(self.own, "scenario", "scenario_file"), "cannot go with --config")
+            # What the user typed does not go through ``read_client``, whose errors name the file.
+            client = scenarios.get(scenarios.read_client(config), **changes)
+            return Described(client, [f"The client of {printable(config)}."], Path(config).stem)
+        name = _registered(self.own)
+        what = scenarios.SCENARIOS[name][1] if name in scenarios.SCENARIOS else ""
+        found = scenarios.get(name, **changes)
+        return Described(found, [f"Scenario {printable(name)}: {printable(what or type(found).__name__)}"])
 
 
 def _parameters(options: StreamOptions, *names: str) -> dict[str, Any]:
-    """Select the options that the user gave, as parameters of the scenario."""
     return {_PARAMETERS.get(name, name): value for name, value in given(options, *names).items()}
 
 
-def _own(options: OwnOptions, seeds: int) -> tuple[Scenario, str]:
-    """Find a scenario by name after running the file that registers it."""
-    from bufgym import scenario as scenarios
-    from bufgym.benchmark.run import by_trace
+def _registered(options: OwnOptions) -> str:
+    """The name of the scenario, after the file that registers it was run."""
+    from bufgym.scenario import SCENARIOS
 
-    before, name = dict(scenarios.SCENARIOS), options.scenario
+    before, name = dict(SCENARIOS), options.scenario
     if options.scenario_file is not None:
         modules.run_file(options.scenario_file, "--scenario-file")
-    added = [key for key, entry in scenarios.SCENARIOS.items() if before.get(key) is not entry]
+    added = [key for key, entry in SCENARIOS.items() if before.get(key) is not entry]
     if name is None and len(added) != 1:
         names = f"registers {', '.join(added)}: choose by --scenario" if added else "registers no scenario"
         raise BufgymError(f"{options.scenario_file}: {names}")
-    name = name or added[0]
-    found = scenarios.get(name)
-    if found.topics:
-        raise BufgymError(f"scenario {name}: has several topics; bufgym bench runs those of one queue")
-    what = scenarios.SCENARIOS[name][1] if name in scenarios.SCENARIOS else type(found).__name__
-    traces = len(by_trace(found))
-    met = "" if traces == 1 else f"{traces} traces x "
-    return found, "\n".join(
-        [
-            f"Scenario {printable(name)}: {printable(what)}",
-            f"QoI = 1 + sum of V(step in x) over the messages received; V = {printable(found.value.name)}.",
-            f"Means over {met}{seeds} seeds; every policy meets the same episodes.",
-            SCORE,
-        ]
-    )
+    return name or added[0]
 
 
-def _interruption(stream: StreamOptions, settings: dict[str, Any], seeds: int) -> tuple[Scenario, str]:
-    from bufgym.scenario import Interruption
-
-    made = Interruption(**settings, **_parameters(stream, "fps", "bytes", "sizes", "value"))
-    length = f"T = {made.t_max}" if made.law == "fixed" else f"T {made.law} on {made.t_min}..{made.t_max}"
-    about = f"One interruption of T messages, {length}; V = {made.value.name} over frame indices."
-    return made, f"{about}\nMeans over {seeds} seeds. {SCORE}"
-
-
-def _uplink(stream: StreamOptions, measured: MotionOptions, seeds: int) -> tuple[Scenario, str]:
+def _uplink(stream: StreamOptions, measured: MotionOptions) -> Described:
+    from bufgym import scenario as scenarios
     from bufgym.model import qoi
 
     settings = _parameters(stream)
@@ -173,24 +204,12 @@ def _uplink(stream: StreamOptions, measured: MotionOptions, seeds: int) -> tuple
         settings["motion"] = _motions(stream.motion, measured)
     if stream.motion == ["none"]:
         settings = {"value": qoi.exponential(), **settings}
-    uplink = _over_lte(**settings)
-    recorded = _some([_with_gaps(motion) for motion in uplink.motion])
-    x = f"the camera's motion, in fields of view, from {recorded}" if uplink.motion else "the frame index"
-    traces_met = f"{len(uplink.traces)} {'trace' if len(uplink.traces) == 1 else 'traces'}"
-    about = [
-        f"{uplink.rate_hz:g} messages/s of {uplink.size_bytes} bytes for {uplink.duration_s:g} s"
-        f" over {_over(uplink)}, from random offsets.",
-        *_measured(uplink, x),
-        f"Means over {traces_met} x {seeds} seeds; every policy meets the same episodes.",
-        SCORE,
-    ]
-    return uplink, "\n".join(about)
+    return Described(scenarios.get("lte", **settings))
 
 
-def _recording(
-    file: str, stream: StreamOptions, recording: RecordingOptions, seeds: int | None
-) -> tuple[Scenario, str]:
+def _recording(file: str, stream: StreamOptions, recording: RecordingOptions, seeds: int | None) -> Described:
     """Make a workload as recorded; with --seeds it starts at random places of each trace."""
+    from bufgym import scenario as scenarios
     from bufgym.model import qoi
     from bufgym.traces import read_workload
 
@@ -200,36 +219,13 @@ def _recording(
     if recording.odom is None and not motions:
         refuse(given(recording, *MOTION), "needs --odom or --motion")
     by_motion = bool(motions) or workload.x is not None
-    value = stream.value or (qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential())
-    settings = _parameters(stream, "trace", "scale", "tells_duration")
-    uplink = _over_lte(motion=motions, random_offset=seeds is not None, value=value, workload=workload, **settings)
-    source = f"from {_some([_with_gaps(motion) for motion in motions])}" if motions else "as recorded"
-    places = "from the trace's start" if seeds is None else f"{seeds} random places each"
-    shared = "; all topics share one queue" if len(workload.topics) > 1 else ""
-    about = [
-        *(printable(workload.source), "", *workload_lines(workload), ""),
-        f"Played over {_over(uplink)}, {places}{shared}.",
-        *_measured(uplink, f"the motion, {source}, in fields of view" if by_motion else "the number of the message"),
-    ]
-    return uplink, "\n".join([*about, SCORE])
-
-
-def _over_lte(**settings: Any) -> Uplink:
-    """Change the uplink over the shipped links."""
-    from bufgym.scenario import Uplink, get
-
-    uplink = get("lte", **settings)
-    assert isinstance(uplink, Uplink)
-    return uplink
-
-
-def _over(uplink: Uplink) -> str:
-    scaled = f" x {uplink.scale[0]:g}" if uplink.scale != (1.0,) else ""
-    return _some([trace.name for trace in uplink.traces]) + scaled
-
-
-def _measured(uplink: Uplink, x: str) -> list[str]:
-    return [f"QoI = 1 + sum of V(step in x) over the messages received; V = {uplink.value.name}.", f"x is {x}."]
+    settings: dict[str, Any] = {
+        "value": qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential(),
+        **_parameters(stream, "trace", "scale", "tells_duration", "value"),
+        **{"motion": motions, "random_offset": seeds is not None, "workload": workload},
+    }
+    lines = [printable(workload.source), "", *workload_lines(workload), ""]
+    return Described(scenarios.get("lte", **settings), lines, recorded=True)
 
 
 def _motions(names: Sequence[str], measured: MotionOptions) -> tuple[Motion, ...]:
@@ -246,14 +242,3 @@ def _motions(names: Sequence[str], measured: MotionOptions) -> tuple[Motion, ...
         if motions[-1].source.endswith(f"({MOTION_HEADER})"):
             refuse(given(measured, *MOTION), f"cannot go with {name}, which holds finished coordinates")
     return tuple(motions)
-
-
-def _with_gaps(motion: Motion) -> str:
-    """Write its name and the interpolated share."""
-    if not motion.gaps:
-        return motion.name
-    return f"{motion.name} (gaps bridged: {len(motion.gaps)}, the longest {motion.longest_gap_s:.1f} s)"
-
-
-def _some(names: Sequence[str]) -> str:
-    return printable(", ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}")

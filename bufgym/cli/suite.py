@@ -1,8 +1,9 @@
-"""The run of a suite, for ``bufgym bench --suite``, ``bufgym topics`` and ``bufgym fleet``."""
+"""The run of a suite, for ``bufgym bench --suite``, and one policy topic by topic."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,30 +12,22 @@ from bufgym.ground.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.benchmark.rows import Row
+    from bufgym.benchmark.tasks import Task
 
 
 def run_suite(
-    command: str,
     options: SuiteOptions,
     who: WhoOptions,
     out: OutOptions,
-    changes: dict[str, Any] | None = None,
+    changes: dict[str, Any],
     *,
-    default: str = "",
-    kind: str | None = None,
     against: str = "",
-) -> list[Row]:
-    """Run a suite, print its summary and return its rows.
+    by_topic: str | None = None,
+) -> None:
+    """Run a suite and print its summary.
 
-    Args:
-        command: subcommand of bufgym, such as "topics".
-        options: the suite and its machines.
-        who: policies, capacities and seeds.
-        out: where the rows go.
-        changes: parameters of the suite's scenarios that are not as they are.
-        default: suite where the options name none.
-        kind: kind of task; a suite of another kind is an error.
-        against: policy that every other is compared with; it and the task's reference run too.
+    ``changes`` are parameters of its scenarios that are not as they are. Every policy is compared with ``against``,
+    which runs too, as does the task's reference. ``by_topic`` is printed topic by topic.
     """
     from bufgym import policies
     from bufgym.benchmark import report
@@ -43,9 +36,7 @@ def run_suite(
     from bufgym.benchmark.tasks import TASKS
     from bufgym.scenario import suites
 
-    suite, file, changes = suites.get(options.suite or default), out.file(), changes or {}
-    if kind not in (None, suite.kind):
-        raise BufgymError(f"suite {suite.name} is not one of {kind}: bufgym bench --suite {suite.name}")
+    suite, file = suites.get(options.suite or ""), out.file()
     task = TASKS[suite.kind]
     named, sources = loaded(who.policies)
     specs = named or task.default_policies(suite.name)
@@ -55,6 +46,7 @@ def run_suite(
         against = policies.get(rival).name
         known = {policies.get(spec).name for spec in specs}
         specs = [*specs, *(name for name in dict.fromkeys((against, task.reference)) if name not in known)]
+    by_name = topic_policy(by_topic, task, specs)
     sweep = Sweep(
         suite.name,
         tuple(specs),
@@ -67,13 +59,14 @@ def run_suite(
         changes=changes,
     )
     again = command_line(
-        f"bufgym {command}",
+        "bufgym bench",
         suite=suite.name,
         split=None if options.split == "test" else options.split,
         policies=tuple(who.policies or ()) or None,
         capacity=who.capacity,
         seeds=who.seeds,
         against=against or None,
+        by_topic=by_topic,
         **changes,
         policy_file=who.policy_file,
         data=options.data,
@@ -99,4 +92,25 @@ def run_suite(
         print(f"\n{len(rows)} rows in {write_rows(rows, file, task.layout)}")
     elif out.out is not None:
         print(f"\n{len(rows)} rows in {folder}; bufgym report {folder} makes a page of them")
-    return rows
+    if by_name is not None:
+        print_topics(rows, by_name)
+
+
+def topic_policy(by_topic: str | None, task: Task, specs: Sequence[str]) -> str | None:
+    """The policy of ``--by-topic``; an error if it does not run, or not on several topics."""
+    from bufgym import policies
+
+    if by_topic is None:
+        return None
+    if task.kind != "topics":
+        raise BufgymError("--by-topic needs several topics")
+    name = policies.get(by_topic).name
+    if name not in {policies.get(spec).name for spec in (*specs, task.baseline)}:
+        raise BufgymError(f"--by-topic {by_topic}: not among the policies that run")
+    return name
+
+
+def print_topics(rows: Sequence[Row], policy: str) -> None:
+    from bufgym.benchmark.tasks import topics
+
+    print(f"\n{policy}, topic by topic: means over episodes\n{topics.by_topic(rows, policy)}")

@@ -67,7 +67,6 @@ class RecordingOptions(MotionOptions):
 
 
 def workload_lines(workload: Workload) -> list[str]:
-    """Write a table of its topics and a description of its motion."""
     from bufgym.benchmark.table import aligned
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "mean bytes", "share"]]
@@ -168,6 +167,5 @@ def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
 
 
 def _summary_cells(topic: TopicSummary) -> list[str]:
-    """Messages, rate, bytes and share of a topic."""
     rate = "-" if math.isnan(topic.rate_hz) else f"{topic.rate_hz:.3f}"
     return [f"{topic.messages:,}", rate, f"{topic.total_bytes:,}", f"{topic.share:.1%}"]

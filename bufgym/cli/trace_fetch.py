@@ -47,7 +47,9 @@ def fetch(
         raise BufgymError(f"{name}: no such data set: must be one of {', '.join(table)}")
     dataset = table[name]
     if list:
-        print(f"{dataset.name}\n{columns(_about(dataset))}\n{_addresses(dataset)}".rstrip())
+        files = [("file", remote.address, f"sha256 {remote.sha256 or NOT_KNOWN}") for remote in dataset.files]
+        by_hand = [("address", f"{NOT_KNOWN}: fetch by hand from the page, then --from FILE")]
+        print(f"{dataset.name}\n{columns(_about(dataset))}\n{columns(files or by_hand)}".rstrip())
         return
     fetched = fetch_dataset(dataset, to, local_files, note=lambda sentence: print(sentence, file=sys.stderr))
     print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")
@@ -74,12 +76,6 @@ def _about(dataset: Dataset) -> list[tuple[str, str]]:
         ("licence", dataset.licence or NOT_KNOWN),
         ("please cite", dataset.citation),
     ]
-
-
-def _addresses(dataset: Dataset) -> str:
-    if not dataset.files:
-        return columns([("address", f"{NOT_KNOWN}: fetch by hand from the page, then --from FILE")])
-    return columns([("file", remote.address, f"sha256 {remote.sha256 or NOT_KNOWN}") for remote in dataset.files])
 
 
 def _results(fetched: list[Fetched]) -> list[tuple[str, str]]:

@@ -50,7 +50,6 @@ def fit(
 
 
 def _print_sizes(files: Sequence[str], others: dict[str, object]) -> None:
-    """Print the laws of each file's topics or columns."""
     from bufgym.traces.fit_sizes import fits
 
     if given := [name for name, value in others.items() if value is not None]:

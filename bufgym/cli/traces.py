@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from bufgym.cli.options import columns
-from bufgym.ground.errors import BufgymError, TraceError, install, printable
+from bufgym.ground.errors import BufgymError, TraceError, printable
+from bufgym.ground.libraries import library
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,9 +48,6 @@ def info(files: Files, /, *, format: Format = None, column: Column = None) -> in
         knots = ("knots", f"{len(trace.time_us)}")
         print("\n" * (k > failed) + f"{printable(trace.name)}\n{columns([('source', trace.source), knots, *lines])}")
     return 2 if failed else 0
-
-
-# --- validate --------------------------------------------------------------------------------------------------------
 
 
 def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
@@ -111,9 +109,6 @@ def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
     return targets
 
 
-# --- plot ------------------------------------------------------------------------------------------------------------
-
-
 def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = None) -> None:
     """Draw bandwidth traces (needs the extra 'plot').
 
@@ -122,14 +117,11 @@ def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = 
     """
     from bufgym import traces
 
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
+    figures = library("matplotlib.figure", "plot", "drawing")
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
     loaded = [traces.load(name, format, column=column) for name in files]
-    figure = Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
+    figure = figures.Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
     axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
     for axis, trace in zip(axes, loaded, strict=True):
         _draw(axis, trace)

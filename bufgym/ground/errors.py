@@ -39,12 +39,12 @@ class TraceError(BufgymError):
     """A trace or motion file that cannot be read or written; the message names file and line."""
 
 
-def unknown(what: str, name: str, known: Iterable[str], also: str = "") -> BufgymError:
+def unknown(what: str, name: object, known: Iterable[str], also: str = "", place: str = "") -> BufgymError:
     """The error for a name that is not among those ``known``: names the one that was meant, or all of them."""
     names = list(known)
-    close = difflib.get_close_matches(name, names, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}{also}"
-    return BufgymError(f"unknown {what} {name!r}; {hint}")
+    close = difflib.get_close_matches(str(name), names, 1)
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{also}"
+    return BufgymError(f"{place and f'{place}: '}unknown {what} {name!r}; {hint}")
 
 
 def where(

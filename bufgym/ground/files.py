@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError, where
+from bufgym.ground.errors import BufgymError, unknown, where
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -71,9 +71,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 def check_keys(table: Mapping[str, Any], known: set[str], first: str = "") -> None:
     """Check that every key of the table is known; the message names ``first`` before the known keys."""
-    unknown = sorted(set(table) - known)
-    if unknown:
-        raise BufgymError(f"unknown key {unknown[0]!r}; known: {first}{', '.join(sorted(known))}")
+    for key in sorted(set(table) - known):
+        raise unknown("key", key, [*filter(None, first.split(", ")), *sorted(known)])
 
 
 def unpacked_limit(packed_bytes: int) -> int:

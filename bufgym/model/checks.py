@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 
 MAX_WINDOW = 10**6
 
@@ -78,7 +78,7 @@ def changed(what: str, parameters: Mapping[str, float], settings: Mapping[str, f
     """Replace ``parameters`` by the given ``settings``; raise for an unknown name or an unusable number."""
     for name, number in settings.items():
         if name not in parameters:
-            raise BufgymError(f"{what}: no parameter {name!r}; it has: {', '.join(parameters) or 'none'}")
+            raise unknown("parameter", name, parameters, place=what)
         if not (isinstance(number, int | float) and math.isfinite(number) and number > 0):
             raise BufgymError(f"{what}: {name} = {number!r}: must be a number > 0")
     return {**parameters, **{name: float(number) for name, number in settings.items()}}

@@ -28,7 +28,7 @@ from bufgym.model.qoi import Value
 from bufgym.oracle import labels, unequal
 from bufgym.oracle.interruption import evenly_kept
 from bufgym.oracle.programme import NEVER
-from bufgym.policies.registry import register
+from bufgym.policies.registry import built_in
 from bufgym.scenario import Episode
 
 _SHORT = 2_000  # messages of an episode whose plan takes a fraction of a second on any link
@@ -153,7 +153,7 @@ def privileged(episode: Episode, capacity: int, max_bytes: int, v: Value) -> Flo
     return clairvoyant(episode, capacity, v, max_bytes=limit).kept.astype(np.float64)
 
 
-@register("clairvoyant", privileged=privileged, source="bufgym.oracle.clairvoyant", compile=True)
+@built_in("clairvoyant", privileged=privileged, source="bufgym.oracle.clairvoyant")
 def follow(buffer: Buffer, arrival: Any, memory: Floats) -> int:
     """Knows the whole link and workload beforehand: the bound that no other policy exceeds."""
     return ACCEPT if memory[arrival.seq] > 0 else REJECT
@@ -174,11 +174,10 @@ def integer_plan(episode: Episode, capacity: int, max_bytes: int, v: Value) -> F
     return kept
 
 
-register(
+built_in(
     "oracle",
     privileged=integer_plan,
     named_only=True,
     source="AFR paper, Sec. III-C, in whole numbers",
     about="Knows T beforehand: the best whole-numbered gaps in one interruption, the only place where it plays.",
-    compile=True,
 )(follow)

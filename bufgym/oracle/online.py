@@ -84,7 +84,8 @@ class OnlineOptimum:
         mid-stream. Min-gap decides for a full queue that the table lacks (an arrival after t_max, two messages in one
         period). A buffer with another L is an error.
         """
-        return Policy(f"online-optimum:L={self.capacity}", self._on_arrival, source="dynamic programme, exact")
+        name = f"online-optimum:L={self.capacity}"
+        return Policy(name, self._on_arrival, source="dynamic programme, exact", built_in=True)
 
     def _on_arrival(self, buffer: Buffer, arrival: Any, memory: Floats) -> int:
         """A full queue drops what the exact dynamic programme over the unknown length T drops."""

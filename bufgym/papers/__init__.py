@@ -36,16 +36,12 @@ STORE = "frame-runs"
 
 
 def figure(name: str, out: Path | None = None, **options: Any) -> Figure:
-    """Make the figure ``name`` with these options; a figure on frames keeps its finished runs in the folder ``out``.
-
-    Raises:
-        BufgymError: an unknown name or option, or an option's value that cannot be used.
-    """
+    """Make the figure ``name`` with these options; a figure on frames keeps its finished runs in the folder ``out``."""
     kind = _kind(name)
     known = [option.name for option in fields(kind)]
     for option in options:
         if option not in known:
-            raise BufgymError(f"{name}: no option {option!r}; it has: {', '.join(known)}")
+            raise unknown("option", option, known, place=name)
     if out is not None and "store" in known:
         options.setdefault("store", out / STORE)
     reproduction: Figure = kind(**options)
@@ -89,11 +85,7 @@ Watch: TypeAlias = Callable[[int, float], AbstractContextManager[Callable[[], No
 def run_live(name: str, out: Path | None = None, watch: Watch | None = None, **options: Any) -> str:
     """Run one figure both simulated and on real sockets, with the fewer and shorter runs of its ``LIVE`` options.
 
-    Args:
-        name: one of robofleet-fig3 to -fig7.
-        out: folder for the CSV and PNG files of both; None saves nothing.
-        watch: shows the progress of the live runs.
-        options: as for ``run``; they replace the options of ``LIVE``.
+    ``watch`` shows the progress of the live runs. The rest is as for ``run``; options replace those of ``LIVE``.
     """
     from bufgym.papers.on_sockets import apart  # sockets and threads, not needed to simulate
 

@@ -33,8 +33,6 @@ MESSAGES = 20
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """One motion of the camera."""
-
     label: str  # label in the picture
     view: Callable[[float], tuple[float, float]]  # left and right edge of a message's view, given the message's number
     dimensions: int  # 1 if the view has edges in one direction, 2 if it has the same edges in both

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
+from bufgym.benchmark.table import aligned
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
-from bufgym.papers.rows import FigureRows, table
+from bufgym.papers.rows import FigureRows
 from bufgym.policies.afr import C, P, R
 from bufgym.scenario import Interruption
 
@@ -82,7 +83,7 @@ class Reproduction(Figure):
             T, dropped = row["T"], row["dropped"]
             note = "  (newcomer rejected by the counter)" if dropped == T else ""
             lines.append([T, dropped or "-", PAPER_DROPS.get(T, "-"), row["r"], row["c"], row["p"], row["kept"] + note])
-        return table(lines, left=7)
+        return aligned(lines, left=7)
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         same = [row["dropped"] == PAPER_DROPS[row["T"]] for row in rows if row["T"] in PAPER_DROPS]

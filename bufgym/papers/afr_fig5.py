@@ -127,8 +127,6 @@ class Reproduction(Figure):
             "peaks": listed(peaks),
             "paper_peaks": listed(PAPER_PEAKS),
             "below": listed([f"{row['T']}: {row['afr'] / row['oracle-ideal']:.5f}" for row in printed]),
-            "first": MEAN_OVER[0],
-            "last": MEAN_OVER[1],
             "afr_mean": afr_mean,
             "oldest_mean": oldest_mean,
         }
@@ -154,5 +152,4 @@ class Reproduction(Figure):
 
 
 def equal_lengths(rows: FigureRows) -> list[int]:
-    """Find the T above L at which AFR equals oracle-ideal."""
     return [r["T"] for r in rows if r["T"] > PAPER_L and r["oracle-ideal"] - r["afr"] <= EQUAL * r["oracle-ideal"]]

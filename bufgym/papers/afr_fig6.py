@@ -65,9 +65,7 @@ class Reproduction(LinkFigure):
         return {
             "low-seconds": low_seconds == PAPER_LOW,
             "overload": bool((rates < self.demand).all()),
-            "link": self.link.name,
             "duration_s": self.link.duration_us / 1e6,
-            "rate_hz": RATE_HZ,
             "stream_s": self.frames / RATE_HZ,
             "low_seconds": listed(low_seconds),
             "low_of_all": len(low_of_all),

@@ -64,7 +64,7 @@ class Reproduction(FrameFigure):
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         main = self.recordings[-1]
-        facts: dict[str, Any] = {"about": self.about(), "main": main, "offsets": self.offsets, "moves": "not run"}
+        facts: dict[str, Any] = {"main": main, "moves": "not run"}
         for other, paper in PAPER.items():
             key = other.removeprefix("drop-").removesuffix("-images")
             facts[key] = None
@@ -100,7 +100,6 @@ class Reproduction(FrameFigure):
 
     @property
     def shown(self) -> list[str]:
-        """Policies whose maps are drawn."""
         return [name for name in SHOWN if name in self.policies] or [self.policies[0]]
 
     def draw(self, rows: FigureRows, figure: Any) -> None:

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.table import aligned
 from bufgym.papers.figure import finish, heat_table
 from bufgym.papers.frame_runs import POLICIES, FrameFigure
-from bufgym.papers.rows import FigureRows, table
+from bufgym.papers.rows import FigureRows
 
 THIRD = 1 / 3
 """Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
@@ -42,7 +43,7 @@ class Reproduction(FrameFigure):
                 of = len(shown.where(policy=policy))
                 text = ", ".join(map(str, first)) or "none"
                 cells.append([POLICIES[policy][0], *counts, sum(counts), of, text])
-            lines += [f"{recording}, runs of {self.offsets} in which tracking breaks, by L:", *table(cells), ""]
+            lines += [f"{recording}, runs of {self.offsets} in which tracking breaks, by L:", *aligned(cells), ""]
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
@@ -51,7 +52,7 @@ class Reproduction(FrameFigure):
             for name in self.recordings
         }
         runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
-        facts: dict[str, Any] = {"about": self.about(), "offsets": self.offsets, "runs": runs}
+        facts: dict[str, Any] = {"runs": runs}
         facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count"), "not run")
         facts["counts"] = "; ".join(
             f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
@@ -92,7 +93,6 @@ class Reproduction(FrameFigure):
             self._broken(right, recording, shown)
 
     def _counts(self, axes: Any, recording: str, shown: FigureRows) -> None:
-        """Draw a table of how many runs break for each policy and L."""
         counts = np.array([[failures(shown, policy=policy, L=L) for L in self.capacities] for policy in self.policies])
         labels = [POLICIES[policy][0] for policy in self.policies]
         heat_table(axes, counts, "d", labels, list(map(str, self.capacities)), vmin=0, vmax=1.25 * self.offsets)
@@ -124,5 +124,4 @@ class Reproduction(FrameFigure):
 
 
 def failures(rows: FigureRows, **where: object) -> int:
-    """Count the runs in which tracking broke."""
     return sum(bool(row["failed"]) for row in rows.where(**where))

@@ -168,9 +168,6 @@ class Reproduction(Figure):
             "orbbuf": NEAR_MS[0] <= images_ms[0] <= NEAR_MS[1] if images_ms else None,
             "images": f"{images_ms[0]:.1f} ms, median of {self.images}" if images_ms else "Not tested: no images",
             "times": all(row["inside_us"] < 10 for row in fast),
-            "how": HOW,
-            "limit_compiled": LIMIT_COMPILED_US,
-            "limit_python": LIMIT_PYTHON_US,
             "inside": listed(inside),
             "called": listed(called),
         }

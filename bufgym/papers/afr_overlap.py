@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.benchmark.rows import Row
 from bufgym.papers.afr_theorems import gaps_of
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import FrameFigure
 from bufgym.papers.perception.views import overlap_information
-from bufgym.papers.rows import FigureRows, Row
+from bufgym.papers.rows import FigureRows
 
 NOISE = 0.05
 """Violation of a rule that still counts as keeping it, because depth has noise and edges."""
@@ -71,7 +72,7 @@ class Reproduction(FrameFigure):
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         by_frames = rows.where(by="frames")
         played = FigureRows(row for row in by_frames if row["behind"] is not None)
-        facts: dict[str, Any] = {"about": self.about(), "noise": NOISE}
+        facts: dict[str, Any] = {}
         for rule in ("broken_5", "broken_6"):
             facts[rule] = "; ".join(
                 f"{recording} {shown.mean(rule, by='frames'):.0%} of the cases by frames, "
@@ -127,10 +128,7 @@ _NOTHING: Row = {"behind": None, "afr_of_best": None, "oldest_of_best": None}
 def _rules(v: NDArray[np.float64], at: NDArray[np.float64], d: float) -> Row | None:
     """Measure V at distance ``d`` from each frame and how often 2 d breaks a rule; None if no frame is so far.
 
-    Args:
-        v: float64[frames, frames], V(i, j).
-        at: float64[frames], position of each frame, non-decreasing.
-        d: the distance.
+    ``v`` float64[frames, frames] is V(i, j), and ``at`` float64[frames] the position of each frame, never falling.
     """
     once, twice = (np.searchsorted(at, at + distance - 1e-9) for distance in (d, 2 * d))
     i = np.flatnonzero(twice < len(at))

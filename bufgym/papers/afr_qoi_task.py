@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.benchmark.rows import Row
+from bufgym.benchmark.table import NONE, aligned
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import POLICIES, FrameFigure, spearman_over
-from bufgym.papers.rows import FigureRows, Row, listed, table
+from bufgym.papers.rows import FigureRows, listed
 
 MEASURES = {
     "H_time": "time",
@@ -44,7 +46,6 @@ class Reproduction(FrameFigure):
 
     @cached_property
     def runs(self) -> FigureRows:
-        """Runs of Fig. 7 and 8."""
         return self.play("map", "track")
 
     def simulate(self) -> FigureRows:
@@ -71,7 +72,7 @@ class Reproduction(FrameFigure):
             cells = [[m, *map(_spelled, shown.where(measure=m))] for m in MEASURES.values()]
             lines += [
                 f"{recording}, {scope}: Spearman's correlation [95 %]",
-                *table([["", *TASKS.values()], *cells]),
+                *aligned([["", *TASKS.values()], *cells]),
                 "",
             ]
         for recording in rows.distinct("recording"):
@@ -81,7 +82,7 @@ class Reproduction(FrameFigure):
                 for policy in sorted(self.policies, key=lambda name: shown.mean("rmse_mm", policy=name))
             ]
             heads = ["policy", *MEASURES.values(), *TASKS.values()]
-            lines += [f"{recording}, mean of all runs (of failures: their part):", *table([heads, *cells]), ""]
+            lines += [f"{recording}, mean of all runs (of failures: their part):", *aligned([heads, *cells]), ""]
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
@@ -97,7 +98,6 @@ class Reproduction(FrameFigure):
         asked = rows.where(scope=ACROSS, task="map error")
         wrong = [f"{row['measure']} on {row['recording']}" for row in asked if not row["high"] < 0]
         return {
-            "about": self.about(),
             "stands": not wrong,
             "right": len(asked) - len(wrong),
             "asked": len(asked),
@@ -139,5 +139,5 @@ def _less_mean(numbers: NDArray[np.float64], cell: list[Any]) -> NDArray[np.floa
 
 def _spelled(row: Row) -> str:
     if np.isnan(row["spearman"]):
-        return "-"
+        return NONE
     return f"{row['spearman']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
+from bufgym.benchmark.rows import Row
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import FigureRows, Row
+from bufgym.papers.rows import FigureRows
 from bufgym.scenario import Interruption
 from bufgym.sim import metrics
 

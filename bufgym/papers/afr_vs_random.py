@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.benchmark.rows import Row
 from bufgym.papers.afr_theorems import extremes, gaps_of
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import FigureRows, Row
+from bufgym.papers.rows import FigureRows
 
 ROUNDING = 1e-9
 """Relative tolerance; the expectations are sums of some ten thousand products."""

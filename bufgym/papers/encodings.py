@@ -21,12 +21,13 @@ import base64
 import functools
 import json
 import math
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.errors import unknown
+from bufgym.ground.libraries import library
 
 Content = dict[str, Any]
 """Fields of a message by their ROS 2 names. Nested messages are Contents or lists of them; arrays are numpy's."""
@@ -37,37 +38,6 @@ _TIME: Final = "builtin_interfaces/msg/Time"
 
 
 # --- messages --------------------------------------------------------------------------------------------------------
-
-
-class Kind(NamedTuple):
-    """A kind of message."""
-
-    type: str  # its ROS type
-    frame_id: str  # the frame_id of its header by default
-
-
-KINDS: Final = {
-    "LaserScan": Kind("sensor_msgs/msg/LaserScan", "laser"),
-    "NavSatFix": Kind("sensor_msgs/msg/NavSatFix", "gps"),
-    "CompressedImage": Kind("sensor_msgs/msg/CompressedImage", "cam"),
-    "PointCloud2": Kind("sensor_msgs/msg/PointCloud2", "lidar"),
-    "PoseStamped": Kind("geometry_msgs/msg/PoseStamped", "map"),
-}
-
-
-def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters: Any) -> Content:
-    """Build a message of ``kind`` with seeded content; ``parameters`` go to its builder, such as ``beams``."""
-    uniform = np.random.Generator(np.random.PCG64(seed))
-    build = {
-        "LaserScan": _laser_scan,
-        "NavSatFix": _nav_sat_fix,
-        "CompressedImage": _compressed_image,
-        "PointCloud2": _point_cloud2,
-        "PoseStamped": _pose_stamped,
-    }[kind]
-    stamp = {"sec": 1_600_000_000, "nanosec": 123_456_789}
-    name = KINDS[kind].frame_id if frame_id is None else frame_id
-    return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **build(uniform, **parameters)}
 
 
 def _laser_scan(uniform: np.random.Generator, beams: int = 1080) -> Content:
@@ -124,15 +94,34 @@ def _pose_stamped(uniform: np.random.Generator) -> Content:
     return {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turn}}
 
 
+class Kind(NamedTuple):
+    type: str  # its ROS type
+    frame_id: str  # the frame_id of its header by default
+    build: Callable[..., Content]  # (generator, parameters such as ``beams``) -> its fields besides the header
+
+
+KINDS: Final = {
+    "LaserScan": Kind("sensor_msgs/msg/LaserScan", "laser", _laser_scan),
+    "NavSatFix": Kind("sensor_msgs/msg/NavSatFix", "gps", _nav_sat_fix),
+    "CompressedImage": Kind("sensor_msgs/msg/CompressedImage", "cam", _compressed_image),
+    "PointCloud2": Kind("sensor_msgs/msg/PointCloud2", "lidar", _point_cloud2),
+    "PoseStamped": Kind("geometry_msgs/msg/PoseStamped", "map", _pose_stamped),
+}
+
+
+def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters: Any) -> Content:
+    """Build a message of ``kind`` with seeded content; ``parameters`` go to its builder, such as ``beams``."""
+    stamp = {"sec": 1_600_000_000, "nanosec": 123_456_789}
+    name = KINDS[kind].frame_id if frame_id is None else frame_id
+    built = KINDS[kind].build(np.random.Generator(np.random.PCG64(seed)), **parameters)
+    return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **built}
+
+
 # --- encodings -------------------------------------------------------------------------------------------------------
 
 
 def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topic") -> bytes:
-    """Encode ``message``, made by ``content``, as bytes; ``topic`` goes into the flatbuffer and the JSON.
-
-    Raises:
-        BufgymError: an unknown encoding; rosbags or flatbuffers is not installed (extra ``robofleet``).
-    """
+    """Encode ``message``, made by ``content``, as bytes; ``topic`` goes into the flatbuffer and the JSON."""
     type_name = KINDS[kind].type
     if encoding in ("ros1", "cdr"):
         store = stores()[encoding]
@@ -144,7 +133,7 @@ def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topi
         numbers = encoding == "json-numbers"
         operation = {"op": "publish", "topic": topic, "msg": _json(message, numbers)}
         return json.dumps(operation, separators=(",", ":") if numbers else None, allow_nan=False).encode()
-    raise BufgymError(f"unknown encoding {encoding!r}; known: {', '.join(ENCODINGS)}")
+    raise unknown("encoding", encoding, ENCODINGS)
 
 
 @functools.cache

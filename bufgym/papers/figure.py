@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import sys
 import textwrap
 import tomllib
 from abc import ABC, abstractmethod
@@ -18,7 +19,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import library
+from bufgym.model import checks
 from bufgym.model.checks import above_0
 from bufgym.papers.rows import FigureRows
 
@@ -42,23 +45,16 @@ WIDTH = 120
 
 # --- options ---------------------------------------------------------------------------------------------------------
 
-Rule = Callable[[str, Any], None]
+Rule = Callable[[str, Any], Any]
 """Checks an option, given its name and value; raises a BufgymError that names it."""
 
 
 def whole(least: int = 1, most: int | None = None) -> Rule:
     """Rule for an integer from ``least`` to ``most``; None means no limit."""
-
-    def check(name: str, number: Any) -> None:
-        if isinstance(number, bool) or not isinstance(number, int) or not least <= number <= (most or number):
-            limits = f">= {least}" if most is None else f"from {least} to {most}"
-            raise BufgymError(f"{name} = {number!r}: must be a whole number {limits}")
-
-    return check
+    return functools.partial(checks.whole, least=least, most=most)
 
 
 def at_least_0(name: str, number: Any) -> None:
-    """Check that an option is a finite number >= 0."""
     if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number < math.inf:
         raise BufgymError(f"{name} = {number!r}: must be a number >= 0")
 
@@ -133,8 +129,10 @@ def statements() -> dict[str, dict[str, Any]]:
 
 
 def facts_of(figure: Figure, rows: FigureRows) -> dict[str, Any]:
-    """Collect what the texts may quote: the figure's options and the results of its claims."""
-    return {option.name: getattr(figure, option.name) for option in fields(figure)} | dict(figure.claims(rows))
+    """Collect what the texts may quote: its module's constants, ``figure``, its options, the results of its claims."""
+    constants = {name: value for name, value in vars(sys.modules[type(figure).__module__]).items() if name.isupper()}
+    options = {option.name: getattr(figure, option.name) for option in fields(figure)}
+    return {**constants, "figure": figure, **options, **figure.claims(rows)}
 
 
 def report(name: str, figure: Figure, rows: FigureRows) -> list[str]:
@@ -169,14 +167,9 @@ def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
 
 def save_picture(reproduction: Figure, rows: FigureRows, path: Path) -> Path:
     """Draw and write the PNG; return its path. An error that names the extra where matplotlib is absent."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure as Picture
-    except ImportError:
-        raise BufgymError(f"drawing needs matplotlib: {install('plot')}") from None
-    # Avoids pyplot, which opens windows and keeps global state.
-    picture = Picture(figsize=reproduction.size_inches(rows), layout="constrained")
-    FigureCanvasAgg(picture)
+    # Avoids pyplot, which opens windows and keeps global state; a figure of its own draws with Agg.
+    figures = library("matplotlib.figure", "plot", "drawing")
+    picture = figures.Figure(figsize=reproduction.size_inches(rows), layout="constrained")
     reproduction.draw(rows, picture)
     path.parent.mkdir(parents=True, exist_ok=True)
     picture.savefig(path, dpi=150)

@@ -26,13 +26,14 @@ from numpy.typing import NDArray
 
 from bufgym import traces
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
+from bufgym.benchmark.rows import Row
+from bufgym.ground.libraries import library
 from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES
-from bufgym.papers.extra import library
 from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views
 from bufgym.papers.perception.stage import IMAGES, OFFSETS, Stage
-from bufgym.papers.rows import FigureRows, Row
+from bufgym.papers.rows import FigureRows
 from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
 from bufgym.traces import Trace
 
@@ -91,7 +92,6 @@ class FrameFigure(Figure):
 
     @property
     def recordings(self) -> list[str]:
-        """Names of the recordings available."""
         real = self.data is not None and (self.data / SEVEN_SCENES).is_dir()
         return ["room", *(["7-scenes"] if real else [])]
 
@@ -102,11 +102,9 @@ class FrameFigure(Figure):
         return fade() if path is None or not path.is_file() else traces.read_trace(path)
 
     def stage(self, recording: str) -> Stage:
-        """The recording, opened once."""
         return stage(recording, self._folder, self.frames)
 
     def settings(self) -> list[FrameRun]:
-        """Every run, in the order of the rows."""
         return list(starmap(FrameRun, product(self.recordings, range(self.offsets), self.capacities, self.policies)))
 
     @cached_property
@@ -114,14 +112,12 @@ class FrameFigure(Figure):
         return {}
 
     def done(self, *tasks: FrameTask) -> list[Row]:
-        """Results of these tasks."""
         missing = [task for task in tasks if task not in self._results]
         jobs = self.jobs if len(missing) > 1 else 1
         self._results.update(carry_out(missing, self._folder, self.link, self.store, jobs))
         return [self._results[task] for task in tasks]
 
     def task(self, kind: Kind, setting: FrameRun) -> FrameTask:
-        """Make the task of this kind for a run."""
         about = (setting.policy, self.link.name, setting.k, setting.L) if kind == "kept" else self.kept(setting)
         return FrameTask(kind, setting.recording, self.frames, about)
 
@@ -153,6 +149,7 @@ class FrameFigure(Figure):
             "coverage": on.coverage.share(kept),
         }
 
+    @property
     def about(self) -> str:
         """Describe the recordings and the link in sentences."""
         parts = []

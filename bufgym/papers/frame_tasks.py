@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
 from bufgym.benchmark import cluster
+from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import bar
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception.recordings import open_sequence
 from bufgym.papers.perception.room import made_up_room
 from bufgym.papers.perception.stage import WIDTH, Stage
-from bufgym.papers.rows import Row
 from bufgym.traces import Trace
 
 SEVEN_SCENES = "rgbd_7scenes"

@@ -39,11 +39,7 @@ compares all rows.
 
 
 def claim_rows(name: str, out: Path | None = None, **options: Any) -> list[str]:
-    """Return the Markdown rows of one section of ``afr.toml`` or ``robofleet.toml``; ``out`` as in ``figure``.
-
-    Raises:
-        BufgymError: the figure cannot be made, for example without recordings.
-    """
+    """Return the Markdown rows of one section of ``afr.toml`` or ``robofleet.toml``; ``out`` as in ``figure``."""
     texts = statements()[name]
     facts: dict[str, Any] = {}
     if name in FIGURES:
@@ -63,7 +59,6 @@ def _rows(name: str, data: Path | None, out: Path | None) -> list[str]:
 
 
 def claims_page(data: Path | None = None, out: Path | None = None) -> str:
-    """Run every figure and return the whole page."""
     lines = [HEAD]
     for paper, title in PAPERS.items():
         lines += [f"## {title}", ""]
@@ -79,11 +74,7 @@ def claims_page(data: Path | None = None, out: Path | None = None) -> str:
 
 
 def renewed(page: str, names: Iterable[str], data: Path | None = None, out: Path | None = None) -> str:
-    """Run only these figures and return the page with their rows renewed.
-
-    Raises:
-        BufgymError: the page has no row for one of the figures.
-    """
+    """Run only these figures and return the page with their rows renewed."""
     lines = page.splitlines()
     for name in names:
         own = [n for n, line in enumerate(lines) if f"| `{name}` |" in line or f"| `{name}` † |" in line]

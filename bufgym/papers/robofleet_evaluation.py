@@ -65,7 +65,6 @@ class SendingProgram:
 
     @property
     def style(self) -> dict[str, Any]:
-        """How this program's line is drawn."""
         return {"color": self.colour, "marker": self.marker, "markersize": 4.5, "linewidth": 1.4}
 
 
@@ -104,7 +103,6 @@ class Sent:
         return self._only(in_order[: int((~np.isnan(self.received_s)).sum())])
 
     def on(self, topic: int) -> Sent:
-        """Select the messages of one stream."""
         return self._only(np.flatnonzero(self.topic == topic))
 
     def between(self, from_s: float, until_s: float) -> Sent:
@@ -205,7 +203,6 @@ class ClientFigure(Figure):
     def send(
         self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
     ) -> Sent:
-        """Call ``send`` with the figure's own options."""
         if "queue_size" not in client:
             client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
         sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
@@ -243,7 +240,6 @@ class CloudFigure(ClientFigure):
 
 
 def p95(numbers: NDArray[np.float64]) -> float:
-    """95th percentile, or NaN without numbers."""
     return float(np.percentile(numbers, 95)) if len(numbers) else np.nan
 
 

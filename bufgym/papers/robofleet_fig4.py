@@ -88,11 +88,6 @@ class Reproduction(CloudFigure):
             for group in dict.fromkeys((kind, mbit) for kind, mbit, _ in about)
         }
         return {
-            "paper_ratio": PAPER_RATIO,
-            "factor": FACTOR,
-            "about_from": ABOUT[0],
-            "about_to": ABOUT[1],
-            "watched": WATCHED,
             "cells": len(cells),
             "sooner_cells": sum(r > 1 for r in ratios.values()),
             "about_cells": len(about),

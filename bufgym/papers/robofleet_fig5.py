@@ -115,7 +115,6 @@ class Reproduction(CloudFigure):
                 f"{SHORT[name]} {'never' if second is None else f'in second {second}'}"
                 for name, second in broken.items()
             ),
-            "broken": BROKEN,
             "bridge_s": highest_s["rosbridge"],
             "bridge_share": share["rosbridge"],
             "json_demand": self.rate_hz * cloud_bytes(self.points)[2] / MBIT,

@@ -14,10 +14,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bufgym.papers.figure import COLOURS, finish, legend_below, several, whole
-from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, ClientFigure, Sent, cloud_bytes, p95, stream
+from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, ClientFigure, cloud_bytes, p95, stream
 from bufgym.papers.rows import FigureRows, average, listed
 from bufgym.traces.generate import steady
 
@@ -56,6 +55,7 @@ class Reproduction(ClientFigure):
             sent = self.send(name, (topic,), link, self.duration_s, seed, **settings)
             in_time = sent.received_s <= self.duration_s
             latency_s = sent.latency_s[in_time]
+            reached = np.bincount(sent.consumer, in_time) / np.bincount(sent.consumer)  # share of each consumer
             label = f"native ROS, queue of {queue}" if name == "ros-native" else PROGRAMS[name].label.split(",")[0]
             key = {"points": points, "consumers": n, "sender": name, "queue_size": queue, "run": seed, "line": label}
             rows.append(
@@ -64,7 +64,7 @@ class Reproduction(ClientFigure):
                     "mean_latency_s": average(latency_s),
                     "p95_latency_s": p95(latency_s),
                     "received_share": float(in_time.mean()),
-                    "least_received_share": least_share(sent, in_time),
+                    "least_received_share": float(reached.min()),
                 }
             )
         return rows
@@ -90,7 +90,6 @@ class Reproduction(ClientFigure):
         return lines[:-1]
 
     def latencies_s(self, rows: FigureRows, points: int, line: str) -> list[float]:
-        """Mean latency for each number of consumers, s."""
         shown = rows.where(points=points, line=line)
         return [shown.mean("mean_latency_s", consumers=n) for n in range(1, self.max_consumers + 1)]
 
@@ -144,8 +143,3 @@ class Reproduction(ClientFigure):
             axes.set_xticks(consumers)
         panels[0].set_ylabel("mean latency, s")
         legend_below(figure, 4, panels[0])
-
-
-def least_share(sent: Sent, received: NDArray[np.bool_]) -> float:
-    """Smallest share of a consumer's messages that reached it; ``received``, bool[messages], marks the counted ones."""
-    return float((np.bincount(sent.consumer, received) / np.bincount(sent.consumer)).min())

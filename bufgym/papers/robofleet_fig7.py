@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.rows import Row
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.robofleet_evaluation import (
     BYTES,
@@ -29,7 +30,7 @@ from bufgym.papers.robofleet_evaluation import (
     played_once,
     stream,
 )
-from bufgym.papers.rows import FigureRows, Row
+from bufgym.papers.rows import FigureRows
 from bufgym.traces import Trace
 
 SENDERS = ("robofleet", "rosbridge", "ros-native")
@@ -139,7 +140,6 @@ class Reproduction(ClientFigure):
             ),
             "spikes": sum(spikes),
             "played": len(spikes),
-            "spike_times": SPIKE,
             "zones": ", ".join(f"{bad:g}" for bad in self.bad_mbit_per_s),
             "affected": "; ".join(
                 f"{PROGRAMS[name].label.split(',')[0]} {', '.join(f'{s:.1f}' for s in seconds)} s"
@@ -147,10 +147,11 @@ class Reproduction(ClientFigure):
             ),
             "no-drop": lost == 0,
             "lost": lost,
-            "from_s": self.zone_s[0],
-            "topics": "; ".join(_rules_of(kind) for kind in TOPICS),
+            "topics": "; ".join(
+                f"{kind} {hz:g} Hz, " + ("no_drop" if rules.get("no_drop") else f"priority {rules['priority']:g}")
+                for kind, (hz, rules) in TOPICS.items()
+            ),
             "demand": sum(BYTES[kind][1] * hz for kind, (hz, _) in TOPICS.items()) / MBIT,
-            "shown": self.shown,
             "medians": ", ".join(medians),
         }
 
@@ -192,8 +193,3 @@ def _entry(sent: Sent, zone_s: tuple[float, float]) -> Row:
         "affected_after_s": max(0.0, float(received.received_s[late].max(initial=0)) - zone_s[1]),
         "lost": len(sent) - len(sent.received),
     }
-
-
-def _rules_of(kind: str) -> str:
-    hz, rules = TOPICS[kind]
-    return f"{kind} {hz:g} Hz, " + ("no_drop" if rules.get("no_drop") else f"priority {rules['priority']:g}")

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.encodings import ENCODINGS, KINDS, Content, content, encode
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import FigureRows, table
+from bufgym.papers.rows import FigureRows
 
 PAPER = {
     "LaserScan": (7_260, 7_328, 28_000),
@@ -53,7 +54,6 @@ class Reproduction(Figure):
 
     @cached_property
     def messages(self) -> dict[str, Content]:
-        """Map each kind to the message that is encoded."""
         messages = fitted(self.beams)
         for kind in KINDS:
             parameters: dict[str, Any] = {"points": self.points} if kind == "PointCloud2" else {}
@@ -78,7 +78,7 @@ class Reproduction(Figure):
                 numbers = [row[name] for row in rows.where(message=kind)]
                 texts = ["-" if n is None else n if isinstance(n, str) else f"{n:,}" for n in numbers]
                 lines.append([kind if label == "ours" else "", label, *texts])
-        return table(lines, left=2)
+        return aligned(lines, left=2)
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         sizes = sizes_of(rows)
@@ -125,7 +125,6 @@ class Reproduction(Figure):
 
 
 def sizes_of(rows: FigureRows) -> dict[str, dict[str, int]]:
-    """Map kind and encoding to bytes."""
     sizes: dict[str, dict[str, int]] = {}
     for row in rows:
         sizes.setdefault(row["message"], {})[row["encoding"]] = row["bytes"]

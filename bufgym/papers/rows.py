@@ -1,8 +1,7 @@
-"""FigureRows of a figure's numbers: queries, and tables of text."""
+"""Rows of a figure's numbers: queries, and tables of text."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,14 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.files import replaced
-
-Row = dict[str, Any]
-"""Column -> text, number or None."""
+from bufgym.benchmark.rows import Row, write_rows
+from bufgym.benchmark.table import aligned
 
 
 class FigureRows(list[Row]):
-    """FigureRows with the same columns. In each method ``where`` selects rows whose columns have these values."""
+    """Rows with the same columns. In each method ``where`` selects rows whose columns have these values."""
 
     def where(self, **values: object) -> FigureRows:
         return FigureRows(row for row in self if all(row[name] == value for name, value in values.items()))
@@ -39,9 +36,7 @@ class FigureRows(list[Row]):
     def pivot(self, index: str, by: str, value: str, spec: str, labels: Mapping[Any, str] | None = None) -> list[str]:
         """Tabulate means of the column ``value``, with a line per value of ``index`` and a column per value of ``by``.
 
-        Args:
-            spec: format of a mean, such as ".1f" or ".0%".
-            labels: names of lines and columns to show instead of their values.
+        ``labels`` are names of lines and columns to show instead of their values.
         """
         known = labels or {}
 
@@ -53,38 +48,23 @@ class FigureRows(list[Row]):
         for key in self.distinct(index):
             means = (self.mean(value, **{index: key, by: head}) for head in heads)
             lines.append([label(key), *(format(number, spec) for number in means)])
-        return table(lines)
+        return aligned(lines)
 
     def listing(self, columns: Mapping[str, tuple[str, str]], left: int = 1) -> list[str]:
         """Tabulate with a line per row; ``columns`` maps a head to a column and the format of its numbers."""
         cells = (
             ["-" if row[name] is None else format(row[name], spec) for name, spec in columns.values()] for row in self
         )
-        return table([list(columns), *cells], left)
+        return aligned([list(columns), *cells], left)
 
     def save(self, path: Path) -> Path:
         """Write the rows as CSV; return the path."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(self[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(self)
-        return path
+        return write_rows(self, path)
 
 
 def average(numbers: NDArray[np.float64]) -> float:
-    """Mean, or NaN without numbers."""
     return float(numbers.mean()) if len(numbers) else math.nan
-
-
-def table(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:
-    """Align the columns of a table; the first ``left`` columns are flush left, the others flush right."""
-    texts = [[str(cell) for cell in line] for line in lines]
-    widths = [max(map(len, cells)) for cells in zip(*texts, strict=True)]
-    return [
-        "  ".join(f"{cell:{'<' if k < left else '>'}{widths[k]}}" for k, cell in enumerate(line)).rstrip()
-        for line in texts
-    ]
 
 
 def listed(numbers: Sequence[Any]) -> str:

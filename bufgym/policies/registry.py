@@ -120,6 +120,8 @@ class Policy:
     """Whether its queue grows without limit, whatever L is; bounds for L messages do not hold for it."""
     privileged: Privileged | None = None
     """(episode, L, B, V) -> memory, for policies that know the future, as no robot does."""
+    built_in: bool = False
+    """Whether its functions are bufgym's own; ``register`` then keeps its name."""
     reads_rate: bool = False
     """Whether a built-in policy reads the link's rate, which takes time to measure. Others may always read it."""
     reads_left: bool = False
@@ -149,7 +151,7 @@ class Policy:
     @property
     def measures(self) -> bool:
         """Whether the link's rate must be measured for it."""
-        return self.reads_rate or not getattr(self.on_arrival, "__module__", "").startswith("bufgym.")
+        return self.reads_rate or not self.built_in
 
     @property
     def unranked_because(self) -> str:
@@ -237,6 +239,7 @@ class Later(NamedTuple):
     for_topics: bool
     """As in ``Policy``, like the next field."""
     named_only: bool
+    built_in: bool = True
 
 
 _REGISTRY: dict[str, Policy | Later] = {}
@@ -252,7 +255,7 @@ def register(name: str, /, **fields: Any) -> Callable[[OnArrival], OnArrival]:
         BufgymError: the name is empty, holds one of ``:,=`` or a blank, or another policy has it.
     """
     known = _REGISTRY.get(name)
-    if isinstance(known, Later) or (known is not None and known.on_arrival.__module__.startswith("bufgym.")):
+    if known is not None and known.built_in:
         raise BufgymError(f"policy {name!r}: a built-in policy has this name")
     check_name("policy", name)
 
@@ -277,7 +280,7 @@ def _place(function: OnArrival) -> str:
     return f"{function.__module__}.{function.__qualname__}"
 
 
-built_in = functools.partial(register, compile=True)
+built_in = functools.partial(register, compile=True, built_in=True)
 """The same for bufgym's own policies, which run compiled."""
 
 
@@ -315,7 +318,7 @@ def get(spec: str | Policy | OnArrival) -> Policy:
     _, numbers = named_settings("policy", spec)
     entry = _REGISTRY[name]
     if isinstance(entry, Later):
-        entry = _REGISTRY[name] = replace(entry.make(), named_only=entry.named_only)
+        entry = _REGISTRY[name] = replace(entry.make(), named_only=entry.named_only, built_in=True)
     return entry.with_parameters(**numbers)
 
 

@@ -14,4 +14,6 @@ def skip_pending(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return REJECT if buffer.busy else ACCEPT
 
 
-POLICY: Final = Policy(SKIP_PENDING, skip_pending, source="Robofleet's server (ut-amrl/robofleet_server)", compile=True)
+POLICY: Final = Policy(
+    SKIP_PENDING, skip_pending, source="Robofleet's server (ut-amrl/robofleet_server)", compile=True, built_in=True
+)

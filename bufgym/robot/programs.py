@@ -38,9 +38,9 @@ _POLL_S: Final = 0.02
 class Worker:
     """A process that runs ``work`` with one end of a pipe to this process."""
 
-    def __init__(self, name: str, work: Callable[[Connection], None], begun: list[Worker]) -> None:
-        """``begun`` lists all programs of a run."""
-        self._name, self._begun = name, begun
+    def __init__(self, name: str, work: Callable[[Connection], None], workers: list[Worker]) -> None:
+        """``workers`` lists all programs of a run."""
+        self._name, self._workers = name, workers
         self._words, words = Pipe()
         self._failures, failures = Pipe(duplex=False)
         fork = multiprocessing.get_context("fork")
@@ -61,7 +61,7 @@ class Worker:
         """
         deadline_s = time.monotonic() + patience_s
         while not self._words.poll():
-            for one in self._begun:
+            for one in self._workers:
                 one.check()
             if time.monotonic() > deadline_s:
                 raise BufgymError(f"{self._name}: said nothing for {patience_s:g} s")
@@ -106,13 +106,13 @@ def running(**works: Callable[[Connection], None]) -> Iterator[list[Worker]]:
     """Run programs by name while the block runs."""
     if not hasattr(os, "fork"):
         raise BufgymError("episodes on ROS need a system whose processes fork, such as Linux")
-    begun: list[Worker] = []
+    workers: list[Worker] = []
     try:
         for name, work in works.items():
-            begun.append(Worker(name, work, begun))
-        yield begun
+            workers.append(Worker(name, work, workers))
+        yield workers
     finally:
-        for one in begun:
+        for one in workers:
             one.end()
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.files import check_keys, read_toml
 from bufgym.ground.kernel import records
 from bufgym.model import qoi
@@ -29,6 +29,7 @@ from bufgym.scenario.arrivals import read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
 from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes
 from bufgym.scenario.episode import Episode, Streams
+from bufgym.scenario.texts import over
 from bufgym.traces import Motion, Trace
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
@@ -70,7 +71,7 @@ class Stream:
                 raise BufgymError(f"moves = {self.moves!r}: must be true or false")
             for name, size in self.encodings.items():
                 if name not in ENCODINGS:
-                    raise BufgymError(f"unknown encoding {name!r}; known: {', '.join(ENCODINGS)}")
+                    raise unknown("encoding", name, ENCODINGS)
                 up_to(f"bytes in {name}", size, MAX_MESSAGE_BYTES)
         except BufgymError as error:
             raise BufgymError(f"topic {self.topic.name!r}: {error}") from None
@@ -141,6 +142,12 @@ class Client:
     def topics(self) -> tuple[Topic, ...]:
         """The rules of its topics."""
         return tuple(stream.topic for stream in self.streams)
+
+    @property
+    def about(self) -> str:
+        """Its number of topics, and its links."""
+        topics = f"{len(self.topics)} topic{'' if len(self.topics) == 1 else 's'}"
+        return f"{topics} over {over(self.traces, self.scale)}"
 
     @property
     def max_messages(self) -> int:

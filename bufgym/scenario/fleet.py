@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,11 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
 from bufgym.scenario import registry
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
 from bufgym.scenario.episode import Episode, Streams, check_end, check_link
+from bufgym.scenario.texts import over
 from bufgym.scenario.uplink import Uplink
 
 MAX_ROBOTS = 256
@@ -85,6 +87,9 @@ class FleetScenario:
     uplink: Uplink = field(default_factory=lambda: _uplink("lte"))
     """The uplink that each robot would have alone."""
 
+    topics: ClassVar[tuple[Topic, ...]] = ()
+    """Empty: one queue for each robot."""
+
     def __post_init__(self) -> None:
         check_robots(self.robots)
         if not isinstance(self.uplink, Uplink):
@@ -97,6 +102,11 @@ class FleetScenario:
         """Make a fleet of ``robots`` robots with the stream of that scenario and changed ``parameters``."""
         uplink = scenario.uplink if isinstance(scenario, FleetScenario) else scenario
         return FleetScenario(robots, _uplink(uplink, **parameters))
+
+    @property
+    def about(self) -> str:
+        """The size of the cell, and its links."""
+        return f"{self.robots} robots in a cell over {over(self.uplink.traces, self.uplink.scale[0])}"
 
     @property
     def value(self) -> Value:

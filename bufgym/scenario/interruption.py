@@ -88,6 +88,12 @@ class Interruption:
         return frozenset(self.lengths)
 
     @property
+    def about(self) -> str:
+        """The law of T, and V."""
+        length = f"T = {self.t_max}" if self.law == "fixed" else f"T {self.law} on {self.t_min}..{self.t_max}"
+        return f"One interruption of T messages, {length}; V = {self.value.name} over frame indices."
+
+    @property
     def max_messages(self) -> int:
         """Arrivals of the longest episode."""
         return self.t_max + 2

@@ -15,6 +15,7 @@ from bufgym.model.qoi import Value
 from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
+from bufgym.scenario.texts import rated
 from bufgym.scenario.uplink import uplink_over_lte
 
 
@@ -99,9 +100,18 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
         spec = checked(spec, type(spec).__name__)
     if not overrides:
         return spec
-    known: set[str] = {f.name for f in fields(spec)} if is_dataclass(spec) else set()
+    known = parameters(spec)
     for name in overrides:
         if name not in known:
-            has = ", ".join(sorted(known)) or "none (it is no dataclass)"
-            raise BufgymError(f"{type(spec).__name__}: no parameter {name!r}; it has: {has}")
+            raise unknown("parameter", name, known, "" if known else " (it is no dataclass)", type(spec).__name__)
     return replace(spec, **overrides)  # type: ignore[type-var]
+
+
+def about(scenario: Any) -> str:
+    """Lines about a scenario: its own ``about``, or how it is rated where it has none."""
+    return str(getattr(scenario, "about", "") or rated(scenario))
+
+
+def parameters(spec: Any) -> list[str]:
+    """Names of a scenario's parameters, sorted; none where it is no dataclass."""
+    return sorted(f.name for f in fields(spec)) if is_dataclass(spec) else []

@@ -20,6 +20,7 @@ from bufgym.scenario.arrivals import even, messages, read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
 from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
+from bufgym.scenario.texts import moved, over, rated
 from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
@@ -116,6 +117,26 @@ class Uplink:
     def max_messages(self) -> int:
         """Arrivals of an episode."""
         return round(self.rate_hz * self.duration_s) if self.workload is None else len(self.workload)
+
+    @property
+    def about(self) -> str:
+        """What is sent over which links, and how it is rated."""
+        links = over(self.traces, self.scale[0])
+        source = f"from {moved(self.motion)}" if self.motion else "as recorded"
+        if self.workload is None:
+            sent = f"{self.rate_hz:g} messages/s of {self.size_bytes} bytes for {self.duration_s:g} s over {links}"
+            places = "from random offsets" if self.random_offset else "from their start"
+            x = f"the camera's motion, in fields of view, {source}" if self.motion else "the frame index"
+        else:
+            shared = "; all topics share one queue" if len(self.workload.topics) > 1 else ""
+            sent, places = (
+                f"Played over {links}",
+                "from random places" if self.random_offset else "from the trace's start",
+            )
+            places += shared
+            moves = self.motion or self.workload.x is not None
+            x = f"the motion, {source}, in fields of view" if moves else "the number of the message"
+        return f"{sent}, {places}.\n{rated(self)}\nx is {x}."
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:

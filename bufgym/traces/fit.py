@@ -37,7 +37,7 @@ from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import LOW_QUANTILES, PROBABILITIES, SHOULDER_S, LinkParameters, OutageParameters
 from bufgym.traces.trace import US_PER_S, Float64Array
 
-Rows: TypeAlias = Sequence[Float64Array]
+Rates: TypeAlias = Sequence[Float64Array]
 """A row for each recording: float64[n], the rate of each second in bytes/s."""
 
 # 4 Mbit/s: the limit that the tables of the recordings use.
@@ -78,7 +78,7 @@ def mode_of(path: StrPath) -> str:
     return "-".join(words)
 
 
-def fit_links(recordings: Mapping[str, Rows]) -> dict[str, LinkParameters]:
+def fit_links(recordings: Mapping[str, Rates]) -> dict[str, LinkParameters]:
     """Mode -> parameters.
 
     Args:
@@ -96,7 +96,7 @@ def fit_links(recordings: Mapping[str, Rows]) -> dict[str, LinkParameters]:
     return {mode: _with_memory(link, recordings[mode]) for mode, link in borrowed.items()}
 
 
-def _fit(mode: str, rows: Rows) -> LinkParameters:
+def _fit(mode: str, rows: Rates) -> LinkParameters:
     """The parameters without memory."""
     pooled = np.concatenate(rows) if rows else np.zeros(0)
     if not np.isfinite(pooled).all() or (pooled < 0).any():
@@ -141,7 +141,7 @@ def _rounded_quantiles(values: Float64Array, probabilities: Sequence[float]) -> 
 # --- memory ----------------------------------------------------------------------------------------------------------
 
 
-def _with_memory(link: LinkParameters, rows: Rows) -> LinkParameters:
+def _with_memory(link: LinkParameters, rows: Rates) -> LinkParameters:
     """The link with shares, stay and memory whose generated rates are correlated most like the `rows`."""
     real, pairs = autocorrelation(rows, LAGS_S)
     within = autocorrelation(centred(rows), LAGS_S)[0]
@@ -181,7 +181,7 @@ def _fit_memory(target: Float64Array, pairs: Float64Array, place: float) -> tupl
 # --- outages ---------------------------------------------------------------------------------------------------------
 
 
-def _fit_outages(rows: Rows) -> OutageParameters | None:
+def _fit_outages(rows: Rates) -> OutageParameters | None:
     lengths_s = outage_lengths(rows)
     if not lengths_s.size:
         return None
@@ -250,12 +250,12 @@ def _three_digits(value: float) -> float:
 # --- statistics of recordings ----------------------------------------------------------------------------------------
 
 
-def centred(rows: Rows) -> list[Float64Array]:
+def centred(rows: Rates) -> list[Float64Array]:
     """Each row minus its own mean."""
     return [row - row.mean() for row in rows]
 
 
-def autocorrelation(rows: Rows, lags: Sequence[int]) -> tuple[Float64Array, Float64Array]:
+def autocorrelation(rows: Rates, lags: Sequence[int]) -> tuple[Float64Array, Float64Array]:
     """Correlation at each lag about the mean of all rows, and the number of pairs it comes from."""
     pooled = np.concatenate(rows)
     mean, variance = float(pooled.mean()), float(pooled.var())
@@ -273,12 +273,12 @@ def spells(row: Float64Array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int
     return edges[::2], edges[1::2]
 
 
-def outage_lengths(rows: Rows) -> Float64Array:
+def outage_lengths(rows: Rates) -> Float64Array:
     """Lengths of the outages, s."""
     return np.concatenate([ends - starts for starts, ends in map(spells, rows)]).astype(np.float64)
 
 
-def outage_gaps(rows: Rows) -> Float64Array:
+def outage_gaps(rows: Rates) -> Float64Array:
     """Times from the end of one outage to the start of the next, s."""
     return np.concatenate([starts[1:] - ends[:-1] for starts, ends in map(spells, rows)]).astype(np.float64)
 
@@ -291,7 +291,7 @@ def beside_outages(row: Float64Array) -> npt.NDArray[np.bool_]:
     return near & (row >= LOW_BYTES_PER_S)
 
 
-def shoulder_of(rows: Rows) -> float:
+def shoulder_of(rows: Rates) -> float:
     """Mean rate beside outages over the mean rate of other seconds outside outages, at most 1; 1 without any."""
     near = np.concatenate([row[beside_outages(row)] for row in rows])
     far = np.concatenate([row[~beside_outages(row) & (row >= LOW_BYTES_PER_S)] for row in rows])

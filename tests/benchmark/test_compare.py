@@ -58,6 +58,15 @@ def test_the_paired_difference_to_a_policy() -> None:
     assert "minus afr's" in fleet.table()
 
 
+def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
+    endless = policies.Policy("mine", policies.get("drop-oldest").on_arrival, unbounded=True)
+    done = bufgym.compare([endless, "drop-oldest"], "interruption", seeds=2, t_max=20)
+    assert done.unranked == {"mine": "its queue is unbounded"}
+    lines = done.table().splitlines()
+    assert [line.split()[0] for line in lines[1:3]] == ["drop-oldest", "mine"]
+    assert "note: mine does not compete: its queue is unbounded" in lines
+
+
 def test_a_suite_by_name() -> None:
     done = bufgym.compare(["afr"], "interruption-v1", capacity=2, seeds=1, progress=False)
     assert {row["policy"] for row in done.rows} == {"afr", "drop-oldest"} and "afr" in done.table()
@@ -122,8 +131,8 @@ def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: py
     ("arguments", "says"),
     [
         ((["afrr"],), "unknown policy 'afrr'; did you mean 'afr'?"),
-        ((["afr"], "ltee"), "'ltee': no scenario and no suite; did you mean 'lte'?"),
-        ((["afr"], "outage"), "'outage': no scenario and no suite; did you mean 'outage-v1'?"),
+        ((["afr"], "ltee"), "unknown scenario or suite 'ltee'; did you mean 'lte'?"),
+        ((["afr"], "outage"), "unknown scenario or suite 'outage'; did you mean 'outage-v1'?"),
         (([stubborn], "outage-v1"), "policy stubborn: register it to run it on a suite"),
         (([],), "policies = .*: need at least one"),
     ],

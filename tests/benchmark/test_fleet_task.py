@@ -10,7 +10,7 @@ from sweep_cases import exactly
 from bufgym import policies
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.run import run
-from bufgym.benchmark.summary import plain
+from bufgym.benchmark.summary import table_of
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.fleet import ROWS
 from bufgym.ground.errors import BufgymError
@@ -115,4 +115,4 @@ def test_the_command_prints_a_table_and_writes_rows(tmp_path: Path, capsys: pyte
     assert ", L = 3\n" in text and "mean of these" not in text and f"36 rows in {out}" in text
     rows = read_rows(out, ROWS)
     assert len(rows) == 6 * 2 * 3 and {row["policy"] for row in rows} == {"drop-oldest", "min-gap", "afr"}
-    assert plain(TASK.summary(rows)).splitlines()[3:] == text.splitlines()[7:10]
+    assert table_of(TASK.summary(rows)).plain().splitlines()[3:] == text.splitlines()[7:10]

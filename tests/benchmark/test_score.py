@@ -75,7 +75,7 @@ def test_the_scale_is_fixed_at_both_ends_and_open_beyond() -> None:
     """Whatever is drawn: Drop Oldest scores 0, the clairvoyant 1, and an unbounded queue may pass it."""
     best = [14, 24, 9]
     h = {"drop-oldest": [10, 20, 7], "clairvoyant": best, "rosbridge": [16, 26, 11]}
-    made = score.scores(rows_of(h, best), unranked=["clairvoyant", "rosbridge", "not there"])
+    made = score.scores(rows_of(h, best), unranked=dict.fromkeys(["clairvoyant", "rosbridge", "not there"], "why"))
     assert standing_of(made, "drop-oldest")["score"] == (0, 0, 0)
     assert standing_of(made, "clairvoyant")["score"] == pytest.approx((1, 1, 1))
     assert standing_of(made, "clairvoyant")["regret"] == pytest.approx((0, 0, 0))
@@ -305,12 +305,20 @@ def test_the_score_leads_and_is_computed_on_sums() -> None:
     free = [scored("rosbridge", seed, 12.0, regret=None) for seed in (0, 1)]
     entries = {entry["policy"]: entry["score"] for entry in table.means([*BASE, *MINE, *free])}
     assert entries["mine"] == 4 / 11 and entries["drop-oldest"] == 0 and math.isnan(entries["rosbridge"])
-    lines = table.of([*BASE, *MINE, *free]).plain().split("\n")
+    made = table.of([*BASE, *MINE, *free], alone={"rosbridge": "its queue is unbounded"})
+    lines = made.plain().split("\n")
+    assert "note: rosbridge does not compete: its queue is unbounded" in lines
     assert lines[0].split()[:5] == ["policy", "L", "score", "QoI", "regret"]
     assert lines[1].split()[:4] == ["mine", "8", "0.364", "6.500"]
     assert "score" not in table.of(MINE).plain()
     assert table.of(MINE, BASE).plain().split("\n")[1].split()[2] == "0.364"
     assert "drop-oldest" not in table.of(MINE, BASE).plain()
+
+
+def test_the_score_of_a_table_is_that_of_its_cell() -> None:
+    rows = [{**entry, "scenario": ""} for entry in [*BASE, scored("mine", 0, 6.0), scored("mine", 1, 7.0)]]
+    cells = {cell.policy: (cell.score.value, cell.qoi.value) for cell in score.scores(rows).cells}
+    assert cells == {entry["policy"]: (entry["score"], entry["qoi"]) for entry in table.means(rows)}
 
 
 def test_policies_that_no_row_tells_apart_are_one_line() -> None:
@@ -324,4 +332,4 @@ def test_policies_that_no_row_tells_apart_are_one_line() -> None:
     assert "| drop-oldest |" in table.of(rows).markdown() and "| ros-keep-last |" not in table.of(rows).markdown()
     # One that does not compete is a line of its own, whatever its rows.
     unbounded = [{**entry, "policy": "rosbridge"} for entry in BASE]
-    assert table.same([*BASE, *unbounded]) == {}
+    assert table.same([*BASE, *unbounded], ["rosbridge"]) == {}

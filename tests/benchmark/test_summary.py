@@ -16,7 +16,7 @@ from bufgym.benchmark import leaderboard, report
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
 from bufgym.benchmark.score import scores
-from bufgym.benchmark.summary import Quantity, Run, Summary, plain, summarise
+from bufgym.benchmark.summary import Quantity, Run, Summary, summarise, table_of
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import score
 from bufgym.benchmark.tasks import TASKS
@@ -73,14 +73,14 @@ def test_one_episode_has_no_interval() -> None:
     found = summary(runs({"base": [2], "mine": [3]}))
     value, low, high = found.standings["mine"]["over"]
     assert value == 1.5 and math.isnan(low) and math.isnan(high)
-    lines = [line.split() for line in plain(found).splitlines()]
+    lines = [line.split() for line in table_of(found).plain().splitlines()]
     assert lines[3:] == [["mine", "3.000", "1.500", "[–]", "1"], ["base", "2.000", "–", "1"]]
 
 
 def test_unranked_policies_come_last() -> None:
     numbers = runs({"base": [1, 1], "endless": [9, 9]})
     assert [standing.policy for standing in summary(numbers).overall] == ["endless", "base"]
-    found = summary(numbers, unranked=["endless"]).overall
+    found = summary(numbers, unranked={"endless": "its queue is unbounded"}).overall
     assert [(standing.policy, standing.ranked) for standing in found] == [("base", True), ("endless", False)]
 
 

@@ -10,7 +10,7 @@ from sweep_cases import exactly
 from bufgym import policies
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
-from bufgym.benchmark.summary import plain
+from bufgym.benchmark.summary import table_of
 from bufgym.benchmark.tasks import TASKS, topics
 from bufgym.benchmark.tasks.topics import ROWS
 from bufgym.model import qoi
@@ -140,4 +140,4 @@ def test_unknown_ages_are_left_out() -> None:
     (standing,) = TASK.summary(same).overall
     assert math.isnan(standing["age_others_s"].value) and math.isnan(standing["late"].value)
     assert math.isnan(standing["relative"].value)  # of nothing
-    assert "  –  " in plain(TASK.summary(same))
+    assert "  –  " in table_of(TASK.summary(same)).plain()

@@ -94,7 +94,7 @@ def test_a_registered_scenario_is_one_like_the_others() -> None:
     while not ended:
         _, _, ended, _, info = env.step(env.action_space.sample(info["action_mask"]))
     assert info["arrived"] == 10
-    with pytest.raises(BufgymError, match=r"Steady: no parameter 'speed'; it has: none \(it is no dataclass\)"):
+    with pytest.raises(BufgymError, match=r"Steady: unknown parameter 'speed'; known: none \(it is no dataclass\)"):
         scenario.get("steady-ten", speed=2)
 
 

@@ -69,6 +69,8 @@ def test_agrees_with_twin(spec, case, v):
 def test_the_built_in_policies_are_there():
     built_in = set(twins(qoi.exponential())) - {"test-anything"}
     assert built_in <= set(ALL) and len(built_in) == 40
+    assert all(policies.get(name).built_in for name in [*policies.names(), *policies.names(named_only=True)])
+    assert policies.get("decimate:every=2").built_in and not policies.get(keep_even).built_in
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -137,7 +139,7 @@ def test_parameters():
     [
         ("nobody", "unknown policy 'nobody'; known: .*afr"),
         ("lifo", "unknown policy 'lifo'; did you mean 'fifo'"),
-        ("afr:speed=2", "policy afr: no parameter 'speed'; it has: none"),
+        ("afr:speed=2", "policy afr: unknown parameter 'speed'; known: none"),
         ("decimate:every=0", "policy decimate: every = 0.0: must be a number > 0"),
         *((f"decimate:every={wrong}", f"every = {wrong}: must be a number > 0") for wrong in ("-1.0", "nan", "inf")),
         ("decimate:every", "'every' is not of the form parameter=number"),

@@ -154,7 +154,7 @@ def test_shipped_agents_are_read_when_they_are_asked_for(path, monkeypatch):
         policies.get("broken")
     with pytest.raises(BufgymError, match=r"name = small: must be renamed, as the file"):
         policies.get("renamed")
-    with pytest.raises(BufgymError, match="no parameter"):
+    with pytest.raises(BufgymError, match="unknown parameter"):
         policies.get("small:w0=1")
     for name in ("small", "broken"):
         with pytest.raises(BufgymError, match="a built-in policy has this name"):

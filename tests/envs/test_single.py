@@ -264,7 +264,7 @@ WHOLE = r"must be a whole number in 0\.\.5 \(L = 4\)"
         (lambda: SenderEnv(fields="rank"), "must be a list of names"),
         (lambda: SenderEnv(decide_at="noon"), "decide_at = 'noon'"),
         (lambda: SenderEnv(max_bytes=0), "max_bytes = 0"),
-        (lambda: SenderEnv(colour="red"), "no parameter 'colour'"),
+        (lambda: SenderEnv(colour="red"), "unknown parameter 'colour'"),
         (lambda: SenderEnv(render_mode="human"), "render_mode = 'human'"),
         *(
             (lambda action=action: begun().step(action), rf"action = .*: {WHOLE}")

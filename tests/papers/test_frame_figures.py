@@ -57,7 +57,6 @@ def fig8_claims(broken: dict[tuple[str, str, int], int], data: Path | None, *cap
         for k in range(10)
     )
     fig8 = afr_fig8.Reproduction(policies=policies, capacities=capacities, data=data)
-    object.__setattr__(fig8, "about", lambda: "")
     return fig8.claims(rows)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception.frames import Camera, encoded_bytes
 from bufgym.papers.perception.recordings import open_sequence
 
@@ -98,7 +98,7 @@ def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(BufgymError, match="no such folder"):
         open_sequence(tmp_path / "desk")
     monkeypatch.setitem(sys.modules, "rvl", None)
-    with pytest.raises(BufgymError, match=r"bufgym\.papers needs rvl: pip install .*(rvl|perception)"):
+    with pytest.raises(BufgymError, match=r"bufgym needs rvl: pip install .*(rvl|perception)"):
         library("rvl")
 
 

@@ -30,7 +30,7 @@ STATUS = {"status": "on", "is_ok": True, "battery_level": 1.0, "location": "lab"
 def status(monkeypatch: pytest.MonkeyPatch) -> None:
     """A short message of Robofleet's own, to be counted by hand."""
     of, fields = "amrl_msgs/msg/RobofleetStatus", "string status\nbool is_ok\nfloat32 battery_level\nstring location\n"
-    monkeypatch.setitem(KINDS, "RobofleetStatus", Kind(of, ""))
+    monkeypatch.setitem(KINDS, "RobofleetStatus", Kind(of, "", dict))
     for store in stores().values():
         if of not in store.fielddefs:
             store.register(get_types_from_msg(fields, of))

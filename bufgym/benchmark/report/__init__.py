@@ -45,7 +45,7 @@ def markdown(folder: str | Path, against: str | None = None) -> str:
 
 def html(folder: str | Path, against: str = "") -> str:
     """The ranking as an HTML table, for a notebook. Errors as for ``write``."""
-    return tables.html(*_read(folder, against))
+    return tables.html(_read(folder, against)[1])
 
 
 def plain(folder: str | Path, against: str = "") -> str:
@@ -72,6 +72,9 @@ def _read(folder: str | Path, against: str | None = None) -> tuple[SuiteRun, Sum
     except BufgymError as error:
         raise BufgymError(f"{run.rows_file}: {error}") from None
     if summary.scores is not None:
-        cells = sorted(summary.scores.cells, key=lambda c: (run.place(c.scenario), c.capacity, c.policy))
+        place = {scenario: k for k, scenario in enumerate(run.manifest["scenarios"])}  # any others come last, by name
+        cells = sorted(
+            summary.scores.cells, key=lambda c: (place.get(c.scenario, len(place)), c.scenario, c.capacity, c.policy)
+        )
         summary = replace(summary, scores=replace(summary.scores, cells=cells))
     return run, summary

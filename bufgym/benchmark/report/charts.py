@@ -16,7 +16,7 @@ from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.score import CellScore
 from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.benchmark.table import REGRET_AT_MOST, means, percent
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.libraries import library
 
 PALETTE = {
     **{"ink": "#1b1f24", "grid": "#e7eaee", "axis": "#a3abb5", "muted": "#a2aab4"},
@@ -43,8 +43,6 @@ STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart on the page."""
-
     id: str  # of its section
     alt: str  # text for readers who can't see it
     panels: list[tuple[str, str]]  # (what it is of, or nothing for a single one, SVG)
@@ -52,8 +50,6 @@ class Chart:
 
 @dataclass(frozen=True)
 class Context:
-    """Input of every chart."""
-
     run: SuiteRun
     summary: Summary
     colours: dict[str, str]  # names of highlighted policies' colours
@@ -73,24 +69,18 @@ class Context:
         return [cell for cell in cells if not math.isnan(cell.regret.value)]
 
     def colour(self, policy: str) -> str:
-        """Name of the colour."""
         return self.colours.get(policy, "muted")
 
     def paint(self, policy: str) -> str:
-        """The colour that a chart is drawn in."""
         return PALETTE[self.colour(policy)]
 
 
 def svg(draw: Callable[[Any], None], height: float) -> str:
     """Let ``draw`` fill a figure of 9 by ``height`` inches; return it as an SVG element."""
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise BufgymError(f"the report needs matplotlib and Jinja: {install('report')}") from None
+    matplotlib, figures = (library(name, "report", "the report") for name in ("matplotlib", "matplotlib.figure"))
     out = io.StringIO()
     with matplotlib.rc_context(STYLE):
-        figure = Figure((9, height), layout="constrained")
+        figure = figures.Figure((9, height), layout="constrained")
         draw(figure)
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         figure.savefig(out, format="svg", transparent=True, metadata=nothing)
@@ -249,7 +239,6 @@ def _regret_curves(
 
 
 def regret_title(cells: Iterable[CellScore]) -> str:
-    """The title of an axis of regrets."""
     return "regret" if all(cell.exact for cell in cells) else REGRET_AT_MOST
 
 

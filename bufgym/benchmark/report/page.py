@@ -11,8 +11,8 @@ from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.report import charts, tables, timeline
 from bufgym.benchmark.report.charts import Context
 from bufgym.benchmark.score import DISCRIMINATIVE, REFERENCE, CellScore
-from bufgym.benchmark.summary import Summary, title
-from bufgym.ground.errors import BufgymError, install
+from bufgym.benchmark.summary import Summary, places, title
+from bufgym.ground.libraries import library
 
 CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, timeline.timeline)
 """Functions that make the charts; each returns None if the run has nothing to show."""
@@ -20,10 +20,7 @@ CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, time
 
 def html(run: SuiteRun, summary: Summary) -> str:
     """Render the whole page in one self-contained file."""
-    try:
-        import jinja2
-    except ImportError:
-        raise BufgymError(f"the report needs matplotlib and Jinja: {install('report')}") from None
+    jinja2 = library("jinja2", "report", "the report")
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_asset),
         autoescape=True,
@@ -36,7 +33,7 @@ def html(run: SuiteRun, summary: Summary) -> str:
     drawn = [chart for chart in (draw(context) for draw in CHARTS) if chart is not None]
     cells = list(dict.fromkeys((row["scenario"], row["capacity"]) for row in run.rows))
     template = "summary" if summary.scores is None else "scores"
-    return environment.get_template(f"{template}.html.jinja").render(
+    rendered: str = environment.get_template(f"{template}.html.jinja").render(
         charts={chart.id: chart for chart in drawn},
         css=_asset("page.css"),
         manifest=run.manifest,
@@ -50,11 +47,8 @@ def html(run: SuiteRun, summary: Summary) -> str:
         resamples=RESAMPLES,
         versus=REFERENCE,
         threshold=f"{DISCRIMINATIVE:.0%}".replace("%", " %"),
-        places=tables.ranking(run, summary),
-        cells=[
-            (title(cell, run.abouts), tables.ranking(run, summary, standings))
-            for cell, standings in summary.cells.items()
-        ],
+        places=places(summary),
+        cells=[(title(cell, run.abouts), places(summary, found)) for cell, found in summary.cells.items()],
         best=next((s for s in summary.overall[:1] if s.ranked and not math.isnan(s[summary.rank_by].value)), None),
         reference=None if summary.scores is None else summary.standings.get(REFERENCE),
         heat=None if summary.scores is None else tables.heat_map(summary.scores),
@@ -62,6 +56,7 @@ def html(run: SuiteRun, summary: Summary) -> str:
         colour=context.colour,
         episode=run.timeline,
     )
+    return rendered
 
 
 def _asset(name: str) -> str:

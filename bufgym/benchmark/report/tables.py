@@ -2,41 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from html import escape as escape
 from typing import NamedTuple
 
 from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.score import CellScore, Scores, Standing
-from bufgym.benchmark.summary import Summary, pair, title
-from bufgym.benchmark.summary import plain as blocks
-from bufgym.benchmark.table import SCORE, UPPER_BOUND, Table, invalid, score
+from bufgym.benchmark.summary import Summary, places, table_of, title
+from bufgym.benchmark.table import SCORE, UPPER_BOUND, Table, score
 
 NOTHING_SCORED = (
     "Nothing is scored here: on these episodes Drop Oldest's regret is under 1 % in every cell, so there is nothing to"
     " be gained. More --seeds or another --capacity may have some."
 )
-
-
-class Ranked(NamedTuple):
-    """One line of a ranking."""
-
-    rank: int | None  # 1 for the best; None for a policy that is not ranked
-    policy: str
-    values: list[tuple[str, str]]  # (value, interval) as text, a pair for each quantity of the summary
-    reason: str  # why it is not ranked; empty if it is
-
-
-def ranking(run: SuiteRun, summary: Summary, standings: Sequence[Standing] | None = None) -> list[Ranked]:
-    """Ranked policies best first, then the others with the manifest's reasons; by default over all cells."""
-    places: list[Ranked] = []
-    for standing in summary.overall if standings is None else standings:
-        known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
-        reason = "" if standing.ranked else run.manifest["unranked"][standing.policy]
-        values = [pair(standing, quantity) for quantity in summary.quantities]
-        places.append(Ranked(len(places) + 1 if known else None, standing.policy, values, reason))
-    return places
 
 
 class HeatMap(NamedTuple):
@@ -49,7 +27,6 @@ class HeatMap(NamedTuple):
 
 
 def heat_map(scores: Scores) -> HeatMap:
-    """All cells, in the order of the standings."""
     by_policy: dict[str, list[CellScore]] = {}
     for cell in scores.cells:
         by_policy.setdefault(cell.policy, []).append(cell)
@@ -66,29 +43,22 @@ def heat_map(scores: Scores) -> HeatMap:
 
 def plain(run: SuiteRun, summary: Summary) -> str:
     """Write aligned text: the ranking, or a block for each cell if there are no scores, then the notes."""
-    unranked = run.manifest["unranked"]
-    notes = [f"{s.policy} has no rank: {unranked[s.policy]}." for s in summary.overall if not s.ranked]
-    notes += [*invalid(run.task.senders(run.rows)), *summary.notes]
+    notes = run.task.notes(run.rows, summary)
     if summary.scores is None:
-        return "\n".join([*intro(run), "", blocks(summary, run.abouts), "", *run.task.legend, *notes])
+        return "\n".join([*intro(run), "", table_of(summary, run.abouts, ["", *notes]).plain()])
     if not any(cell.discriminative for cell in summary.scores.cells):
         notes.append(NOTHING_SCORED)
     bound = [] if summary.scores.exact else [f"{UPPER_BOUND[0].upper()}{UPPER_BOUND[1:]}."]
-    lines = [
-        [place.policy, "-" if place.rank is None else str(place.rank), *_texts(place)]
-        for place in ranking(run, summary)
-    ]
+    lines = [[place.policy, place.place, *place.texts] for place in places(summary)]
     head = ["policy", "rank", *(quantity.title for quantity in summary.quantities)]
     return Table(head, [("", lines)], [f"{SCORE}.", *bound, *notes]).plain()
 
 
-def html(run: SuiteRun, summary: Summary) -> str:
-    """The ranking as an HTML table."""
-    return _ranking(run, summary, summary.overall, str).html()
+def html(summary: Summary) -> str:
+    return _ranking(summary, summary.overall, str).html()
 
 
 def intro(run: SuiteRun) -> list[str]:
-    """Describe the run in a few lines."""
     manifest = run.manifest
     lines = [f"Suite {manifest['suite']}, {manifest['split']}: {manifest['about']}.", manifest["episodes"]]
     if manifest["changes"]:
@@ -97,34 +67,25 @@ def intro(run: SuiteRun) -> list[str]:
     return lines
 
 
-def _texts(place: Ranked) -> list[str]:
-    return [" ".join(filter(None, texts)) for texts in place.values]
-
-
 # --- Markdown ---------------------------------------------------------------------------------------------------------
 
 
 def markdown(run: SuiteRun, summary: Summary) -> str:
     """The command, the ranking, then a table for each scenario or cell."""
-    out = ["```", run.manifest["command"], "```", "", _ranking(run, summary, summary.overall).markdown()]
+    out = ["```", run.manifest["command"], "```", "", _ranking(summary, summary.overall).markdown()]
     if summary.notes:
         out += ["", *(f"* {_plain(note)}" for note in summary.notes)]
-    if summary.scores is not None:
-        return "\n".join([*out, *_score_tables(summary.scores)]) + "\n"
     for cell, standings in summary.cells.items():
-        out += ["", f"{_plain(title(cell, run.abouts))}:", "", _ranking(run, summary, standings).markdown()]
-    return "\n".join(out) + "\n"
+        out += ["", f"{_plain(title(cell, run.abouts))}:", "", _ranking(summary, standings).markdown()]
+    return "\n".join([*out, *(_score_tables(summary.scores) if summary.scores else [])]) + "\n"
 
 
-def _ranking(
-    run: SuiteRun, summary: Summary, standings: Sequence[Standing], escaped: Callable[[str], str] | None = None
-) -> Table:
+def _ranking(summary: Summary, standings: Sequence[Standing], escaped: Callable[[str], str] | None = None) -> Table:
     names = ["#", "policy", *(quantity.title for quantity in summary.quantities)]
     lines = []
-    for place in ranking(run, summary, standings):
-        rank = "–" if place.rank is None else str(place.rank)
+    for place in places(summary, standings):
         policy = (escaped or _plain)(place.policy) + (f" ({place.reason})" if place.reason else "")
-        lines.append([rank, policy, *_texts(place)])
+        lines.append([place.place, policy, *place.texts])
     return Table(names, [("", lines)], left=2)
 
 

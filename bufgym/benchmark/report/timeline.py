@@ -29,10 +29,7 @@ def timeline(context: Context) -> Chart | None:
 
 
 def longest_gap(x: Sequence[float], received: Sequence[int]) -> tuple[int, int] | None:
-    """Find the consecutive messages received that are furthest apart in x, the first pair on ties.
-
-    Returns (from, to), or None with fewer than two messages.
-    """
+    """The consecutive messages received that are furthest apart in x, the first pair on ties; None with fewer."""
     return max(pairwise(received), key=lambda pair: x[pair[1]] - x[pair[0]], default=None)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import Quantity, Run, Summary, by_run, summarise
-from bufgym.benchmark.table import decimal, percent, score, signed
+from bufgym.benchmark.table import NOBODY, Unranked, decimal, percent, score, signed
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import TIE
@@ -89,7 +89,7 @@ class FleetTask(Task):
             ),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
         options: Any = {"rank_by": "gain", "baseline": self.baseline, "unranked": unranked, "against": against}
         return summarise(_runs(rows), _statistics, self.quantities(), **options)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from bufgym.benchmark.rows import RUNS, Row
 from bufgym.benchmark.score import REFERENCE, scores
 from bufgym.benchmark.summary import Quantity, Summary, difference
-from bufgym.benchmark.table import REGRET_AT_MOST, percent, score
+from bufgym.benchmark.table import NOBODY, REGRET_AT_MOST, Unranked, percent, score
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
 from bufgym.ground.errors import BufgymError
@@ -121,7 +121,7 @@ class QueueTask(Task):
             Quantity("improvement", f"better than {REFERENCE}", score, above, versus=REFERENCE, drawn=True),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
         scored = scores(rows, unranked, against)
         quantities = (*self.quantities(), *([difference(SHARE, against)] if against else []))
         if not scored.exact:

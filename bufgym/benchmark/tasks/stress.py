@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from bufgym.benchmark.bootstrap import UNKNOWN, Interval
 from bufgym.benchmark.episodes import Cell
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import REFERENCE, Scores, Standing
+from bufgym.benchmark.score import REFERENCE, Scores
 from bufgym.benchmark.summary import Quantity, Summary
-from bufgym.benchmark.table import mean
+from bufgym.benchmark.table import NOBODY, Unranked, mean
 from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
@@ -56,7 +56,7 @@ class StressTask(QueueTask):
     def quantities(self) -> tuple[Quantity, ...]:
         return (*_ratios(), *super().quantities())
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
         """Rank by the worst cell, smallest ratio first; the notes name that cell."""
         summary = QueueTask().summary(rows, unranked, against)
         assert summary.scores is not None
@@ -67,10 +67,8 @@ class StressTask(QueueTask):
             return not standing.ranked, math.isnan(worst), worst, standing.policy
 
         overall = [
-            Standing(
-                s.policy,
-                s.ranked,
-                {**s.values, "worst": _alone(found[s.policy].worst), "ratio": _alone(found[s.policy].mean)},
+            replace(
+                s, values={**s.values, "worst": _alone(found[s.policy].worst), "ratio": _alone(found[s.policy].mean)}
             )
             for s in sorted(summary.overall, key=place)
         ]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from bufgym.benchmark.rows import Layout, Row
 from bufgym.benchmark.summary import Quantity, Summary
+from bufgym.benchmark.table import NOBODY, Unranked, invalid
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
@@ -29,6 +30,8 @@ class Task(ABC):
     reference: ClassVar[str]  # second policy that a row of the leaderboard is compared with
     listed: ClassVar[tuple[str, ...]]  # quantities that the leaderboard lists, by key
     no_plan: ClassVar[str] = ""  # reason why a privileged policy can't take part; empty if it can
+    capacity: ClassVar[int] = 8  # L unless the caller says otherwise, messages
+    seeds: ClassVar[int] = 10  # episodes on each trace, likewise
     legend: ClassVar[tuple[str, ...]] = ()  # lines under a printed summary
 
     @abstractmethod
@@ -63,18 +66,17 @@ class Task(ABC):
         """Quantities that its summary shows."""
 
     @abstractmethod
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
-        """Compare every policy with the baseline.
-
-        Args:
-            rows: rows of ``run``.
-            unranked: policies that are shown but not ranked.
-            against: policy that every other is compared with in a further quantity, "against"; empty for none.
-        """
+    def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
+        """Compare every policy with the baseline, and with ``against`` in a further quantity of that name."""
 
     def senders(self, rows: Sequence[Row]) -> Sequence[Row]:
         """Select one row for each sender, for columns that all rows of a sender repeat."""
         return rows
+
+    def notes(self, rows: Sequence[Row], summary: Summary) -> list[str]:
+        """Lines under a printed summary: the legend, who has no rank, invalid decisions, and the summary's own."""
+        apart = [f"{s.policy} has no rank: {s.apart}." for s in summary.overall if not s.ranked]
+        return [*self.legend, *apart, *invalid(self.senders(rows)), *summary.notes]
 
     def describe(self, scenarios: Sequence[Any], episodes: int) -> str:
         """Describe the scenarios in one sentence; empty if their own descriptions do."""

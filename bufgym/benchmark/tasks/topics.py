@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
-from bufgym.benchmark.table import Column, Rows, Table, decimal, mean, percent, score, written
+from bufgym.benchmark.table import NOBODY, Column, RunRows, Table, Unranked, decimal, mean, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, names
@@ -54,6 +54,8 @@ class TopicsTask(Task):
     baseline = BASELINE
     reference = BASELINE
     listed = ("relative", "lost", "age_relative")
+    capacity = 32
+    seeds = 5
     no_plan = "a queue of its own, which no topic of a client has"
     legend = (
         "QoI: sum over topics of weight x H, mean over episodes; [low, high]: 95 % intervals, resampling links.",
@@ -100,7 +102,7 @@ class TopicsTask(Task):
             Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False),
         )
 
-    def summary(self, rows: Sequence[Row], unranked: Collection[str] = (), against: str = "") -> Summary:
+    def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:
         runs = by_run(rows, "topic", "weighted_qoi")
         priorities = {max(row["priority"] for row in run.values()) for run in runs.values()}
         first = f"priority {priorities.pop():g}" if len(priorities) == 1 else "first"
@@ -123,7 +125,6 @@ class TopicsTask(Task):
 
 
 def _rows(client: Client, senders: Senders, i: int) -> Result:
-    """Make the rows of each topic at sender ``i``."""
     sender, messages = np.asarray(senders.batch.senders)[i], received(senders, i)
     log = np.asarray(senders.batch.log[i])
     last_us = int(np.asarray(senders.batch.arrivals[i])["arrival_us"][sender["arrivals"] - 1])
@@ -153,7 +154,6 @@ def _rows(client: Client, senders: Senders, i: int) -> Result:
 
 
 def _folded(copies: Sequence[TopicOutcome]) -> Row:
-    """Average a topic's copies over the consumers."""
     outcomes = [asdict(copy) for copy in copies]
     means: Row = {name: mean([outcome[name] for outcome in outcomes]) for name in _OUTCOME}
     return {**means, "arrived": int(means["arrived"])}
@@ -165,7 +165,7 @@ def _folded(copies: Sequence[TopicOutcome]) -> Row:
 _seconds, _one_digit = (partial(decimal, digits=digits) for digits in (2, 1))
 
 
-def _numbers(topics: Rows) -> list[float]:
+def _numbers(topics: RunRows) -> list[float]:
     """Numbers of one run for ``_statistics``: QoI, no_drop messages lost, age of the first topics and of the others,
     messages late, delivered with a deadline and delivered in all, seconds."""
     highest = max(row["priority"] for row in topics)
@@ -211,16 +211,16 @@ def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Num
 TOPIC_COLUMNS = (
     Column("topic", "topic", str),
     Column("priority", "priority", "{:g}".format),
-    Column("QoI", "qoi", "{:.2f}".format),
-    *(Column(name, name, "{:.1f}".format) for name in ("arrived", "limited", "lost", "delivered", "late")),
-    Column("age mean (s)", "mean_age_s", "{:.3f}".format),
-    Column("age peak (s)", "peak_age_s", "{:.3f}".format),
-    Column("delay mean (s)", "mean_sojourn_s", "{:.3f}".format),
-    Column("delay p95 (s)", "p95_sojourn_s", "{:.3f}".format),
+    Column("QoI", "qoi", _seconds),
+    *(Column(name, name, _one_digit) for name in ("arrived", "limited", "lost", "delivered", "late")),
+    Column("age mean (s)", "mean_age_s", score),
+    Column("age peak (s)", "peak_age_s", score),
+    Column("delay mean (s)", "mean_sojourn_s", score),
+    Column("delay p95 (s)", "p95_sojourn_s", score),
 )
 
 
-def by_topic(rows: Rows, policy: str) -> str:
+def by_topic(rows: RunRows, policy: str) -> str:
     """Write each topic's mean outcome over episodes under one policy as aligned text, a block for each cell."""
     cells: dict[tuple[str, int], dict[str, list[Mapping[str, Any]]]] = {}
     for row in rows:
@@ -233,7 +233,7 @@ def by_topic(rows: Rows, policy: str) -> str:
         (
             title(cell, {}),
             [
-                [topic, *(written(mean([row[c.key] for row in outcomes]), c) for c in TOPIC_COLUMNS[1:])]
+                [topic, *(c.write(mean([row[c.key] for row in outcomes])) for c in TOPIC_COLUMNS[1:])]
                 for topic, outcomes in topics.items()
             ],
         )

@@ -65,6 +65,8 @@ class OwnTerm(RewardTerm):
     ``TOPIC_REWARD_TERMS``."""
     compile: bool = False
     """As in ``OwnField``."""
+    built_in: bool = False
+    """Whether it is bufgym's own, whose name stays taken."""
 
     @property
     def parameter_array(self) -> NDArray[np.float64]:
@@ -123,6 +125,7 @@ def reward_term(
     memory: Mapping[str, float] | None = None,
     one_queue: bool = False,
     compile: bool = False,
+    built_in: bool = False,
 ) -> Callable[[Function], Function]:
     """Register the decorated function ``f(step, memory)`` as the reward term ``name``; it comes back unchanged.
 
@@ -137,9 +140,9 @@ def reward_term(
 
     def add(function: Function) -> Function:
         _check_function("reward term", name, function, 2)
-        settings = {"parameters": dict(parameters or {}), "memory": dict(memory or {})}
-        text = modules.first_line(function)
-        OWN_TERMS[name] = OwnTerm(name, unit, text, function=function, one_queue=one_queue, compile=compile, **settings)
+        settings: Any = {"parameters": dict(parameters or {}), "memory": dict(memory or {}), "one_queue": one_queue}
+        settings |= {"compile": compile, "built_in": built_in}
+        OWN_TERMS[name] = OwnTerm(name, unit, modules.first_line(function), function=function, **settings)
         return function
 
     return add
@@ -174,7 +177,7 @@ def _found(text: str, entries: Mapping[str, Entry], what: str) -> Entry | None:
 def _check_name(what: str, name: str, built_in: Any, entries: Mapping[str, Any]) -> None:
     check_name(what, name)
     taken = entries.get(name)
-    if name in built_in or (taken is not None and taken.function.__module__.startswith("bufgym.")):
+    if name in built_in or getattr(taken, "built_in", False):
         raise BufgymError(f"{what} {name!r}: a built-in {what} has this name")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, quaternions
 from bufgym.traces.trace import Float64Array, Int64Array
@@ -43,7 +43,6 @@ class Camera:
 
     @property
     def fov_deg(self) -> float:
-        """Horizontal field of view, degrees."""
         return float(np.degrees(2 * np.arctan(self.width / (2 * self.fx))))
 
     @property
@@ -52,11 +51,7 @@ class Camera:
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def every(self, stride: int) -> Camera:
-        """The camera of every ``stride``-th pixel of every ``stride``-th row, the first among them.
-
-        Raises:
-            BufgymError: a stride that does not divide width and height.
-        """
+        """The camera of every ``stride``-th pixel of every ``stride``-th row, the first among them."""
         if stride < 1 or self.width % stride or self.height % stride:
             raise BufgymError(f"stride = {stride}: must divide {self.width} x {self.height}")
         small = {name: getattr(self, name) / stride for name in ("fx", "fy", "cx", "cy")}
@@ -80,11 +75,7 @@ class Sequence(ABC):
 
     @abstractmethod
     def depth(self, k: int) -> Depth:
-        """Of frame k.
-
-        Raises:
-            BufgymError: the frame is missing, truncated or of another size; the message names the file.
-        """
+        """Of frame k."""
 
     @abstractmethod
     def image(self, k: int) -> Image:

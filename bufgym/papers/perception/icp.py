@@ -45,11 +45,8 @@ def unproject(depth: NDArray[np.float32], far_m: float, lens: NDArray[np.float64
 def orient(vertices: Any, eye: Any, same_surface: float, normals: Any) -> None:
     """Normals towards ``eye`` from the points at the four neighbours; NaN where one is missing or on another surface.
 
-    Args:
-        vertices: float32[height, width, 3].
-        eye: float64[3], where they are seen from.
-        same_surface: how far the neighbours may be from a point, as a share of its distance.
-        normals: float32[height, width, 3], written.
+    Neighbours on one surface are nearer to a point than the share ``same_surface`` of its distance. ``vertices`` and
+    ``normals``, which is written, are float32[height, width, 3].
     """
     height, width = vertices.shape[0], vertices.shape[1]
     for v in range(height):

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception import tsdf
 from bufgym.papers.perception.frames import Camera, Sequence
 from bufgym.traces.trace import Float64Array
@@ -36,11 +36,7 @@ _BOX_STRIDE: Final = 8  # step between the frames and pixels that measure the bo
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Positions of the voxels.
-
-    Raises:
-        BufgymError: no voxel, or too many.
-    """
+    """Positions of the voxels."""
 
     origin_m: tuple[float, float, float]  # centre of the first voxel, world coordinates, m
     shape: tuple[int, int, int]  # voxels along x, y and z
@@ -94,7 +90,6 @@ class Map:
 
     @staticmethod
     def empty(grid: VoxelGrid) -> Map:
-        """Make an empty map."""
         return Map(grid, np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32))
 
     def add(
@@ -113,10 +108,7 @@ class Map:
 def fuse(sequence: Sequence, frames: Iterable[int], grid: VoxelGrid | None = None) -> Map:
     """Fuse these frames into a map, in the given order with their true poses.
 
-    Args:
-        sequence: the recording; `Sequence.reduced` to about 160x120 is fast and fine enough for the default voxels.
-        frames: indices of the frames that arrived.
-        grid: by default `grid_of` the whole recording, so that maps of different frames are comparable.
+    ``grid`` is by default that of the whole recording, so that maps of different frames are comparable.
     """
     result = Map.empty(grid or grid_of(sequence))
     for k in frames:
@@ -146,11 +138,7 @@ def distances(points: Float64Array, reference: Float64Array) -> Float64Array:
 
 
 def map_error(found: Map, reference: Map) -> MapError:
-    """Measure the map's distance from the reference, usually the map of all frames.
-
-    Raises:
-        BufgymError: one of the two has no surface.
-    """
+    """Measure the map's distance from the reference, usually the map of all frames."""
     clouds = {"map": found.points(), "reference": reference.points()}
     for name, cloud in clouds.items():
         if not len(cloud):

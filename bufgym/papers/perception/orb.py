@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.ground.libraries import library
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
-from bufgym.papers.extra import library
 from bufgym.papers.perception.frames import Image, Sequence
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode
@@ -73,7 +73,8 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode) -> Policy:
         return victim
 
     about = "ORBBuf by what two images have in common; it sees the images, as no other policy does."
-    return Policy("orbbuf-images", on_arrival, about=about, source="ORBBuf [wang2021orbbuf], ORB features by OpenCV")
+    source = "ORBBuf [wang2021orbbuf], ORB features by OpenCV"
+    return Policy("orbbuf-images", on_arrival, about=about, source=source, built_in=True)
 
 
 COMPARED: Final = 3

@@ -23,7 +23,7 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8, read_whole
-from bufgym.papers.extra import library
+from bufgym.ground.libraries import library
 from bufgym.papers.perception.frames import Camera, Depth, Image, Sequence
 from bufgym.traces.formats.text import open_text
 from bufgym.traces.formats.trajectories import read_poses, seconds
@@ -106,11 +106,7 @@ def _unzipped(file: zipfile.Path) -> bytes:
 
 
 def open_sequence(path: str | PathLike[str]) -> Sequence:
-    """Open the recording in a folder, whose files tell the layout: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives.
-
-    Raises:
-        BufgymError: no such folder, none of these layouts, a missing list or pose file; the message names the file.
-    """
+    """Open the recording in a folder, whose files tell the layout: TUM RGB-D, 7-Scenes, or 7-Scenes in zip archives."""
     folder = Path(path)
     if not folder.is_dir():
         raise BufgymError(f"{folder}: no such folder")

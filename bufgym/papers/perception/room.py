@@ -87,15 +87,7 @@ class MadeUpRoom(Sequence):
 
 
 def made_up_room(seed: int, *, frames: int = 794) -> MadeUpRoom:
-    """Make a recording of a made-up room, 640x480; `Sequence.reduced` renders fewer pixels.
-
-    Args:
-        seed: seed of furniture, texture and noise.
-        frames: number of frames, 30 a second; by default as many as AFR's recording has.
-
-    Raises:
-        BufgymError: a seed below 0, less than 2 frames.
-    """
+    """Make a recording of a made-up room, 640x480, 30 frames a second; by default as long as AFR's."""
     if frames < 2:
         raise BufgymError(f"frames = {frames}: must be at least 2")
     rng = stream(seed)

@@ -33,12 +33,10 @@ class Stage:
 
     @cached_property
     def grid(self) -> mapping.VoxelGrid:
-        """VoxelGrid of every map."""
         return mapping.grid_of(self.sequence)
 
     @cached_property
     def reference(self) -> mapping.Map:
-        """The map of all frames."""
         return self.map_of(range(len(self.sequence)))
 
     @cached_property
@@ -63,7 +61,6 @@ class Stage:
 
     @cached_property
     def coverage(self) -> views.Coverage:
-        """Coverage of the scene."""
         return views.Coverage(self.small)
 
     def episode(self, trace: Trace, k: int) -> Episode:
@@ -73,12 +70,10 @@ class Stage:
         return streams.episode(self.whole, streams.sizes(self.whole), link, seed=k)
 
     def kept(self, policy: str, trace: Trace, k: int, L: int) -> tuple[int, ...]:
-        """Play a policy; return the frames that arrive."""
         one = self.episode(trace, k)
         return streams.received(orb.orbbuf_by(self.similar, one) if policy == IMAGES else policy, one, L)
 
     def map_of(self, kept: Sequence[int]) -> mapping.Map:
-        """Build the map of these frames with their true poses."""
         return mapping.fuse(self.sequence, kept, self.grid)
 
     def track_of(self, kept: Sequence[int]) -> tracking.Track:
@@ -86,7 +81,6 @@ class Stage:
         return tracking.track(self.sequence, kept, self.grid, smooth=self.smooth)
 
     def mapped(self, kept: Sequence[int]) -> dict[str, Any]:
-        """Measure the error of the map of these frames with their true poses."""
         return _errors(mapping.map_error(self.map_of(kept), self.reference))
 
     def tracked(self, kept: Sequence[int]) -> dict[str, Any]:

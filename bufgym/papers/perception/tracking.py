@@ -53,8 +53,6 @@ MOST_ERROR_DEG: Final = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Result of tracking."""
-
     poses: Float64Array
     """float64[m, 4, 4], the poses found for the frames that arrived, camera to world; NaN from the failure on."""
     where: int | None  # the frame (index of the sequence) at which tracking failed; None if it never did
@@ -62,12 +60,10 @@ class Track:
 
     @property
     def failed(self) -> bool:
-        """Whether it failed at all."""
         return self.where is not None
 
 
 def smoothed(depth: Depth) -> Depth:
-    """Smooth a depth image for its normals."""
     result = np.empty_like(depth)
     icp.smooth(depth, SMOOTH_RADIUS, SAME_SURFACE / 2, result)
     return result
@@ -79,16 +75,10 @@ def track(
     grid: VoxelGrid | None = None,
     smooth: Callable[[int], Depth] | None = None,
 ) -> Track:
-    """Follow the camera through the frames that arrived, until that fails.
+    """Follow the camera through the frames that arrived, in order, until that fails.
 
-    Args:
-        sequence: the recording; `Sequence.reduced` to about 160x120 is meant.
-        frames: indices of the frames that arrived, in order.
-        grid: grid of the model; by default `grid_of` the whole recording.
-        smooth: returns `smoothed` of frame k, for callers that cache it.
-
-    Raises:
-        BufgymError: no frame, or frames that are not in order.
+    ``sequence`` is meant to be reduced to about 160x120. ``smooth`` returns `smoothed` of frame k, for callers that
+    keep it.
     """
     arrived = np.array(list(frames), np.int64)
     if not len(arrived) or (np.diff(arrived) <= 0).any() or arrived[0] < 0 or arrived[-1] >= len(sequence):
@@ -148,7 +138,6 @@ class Tracker:
         return pose
 
     def add(self, depth: Depth, pose: Float64Array) -> None:
-        """Fuse a frame at a known pose."""
         self.pose, self._hint = pose, np.ascontiguousarray(depth[:: self._stride, :: self._stride])
         self.model.add(depth, self._camera, pose, MOST_WEIGHT)
 

@@ -34,12 +34,8 @@ LEAST_VIEWS: Final = 3
 def _all_shares(depths: Any, poses: Any, lens: Any, stride: int, result: Any) -> None:
     """Write the part of frame j that frame i has seen, for every i and each later j; 0 if frame i measured none of it.
 
-    Args:
-        depths: float32[frames, height, width], m.
-        poses: float64[frames, 4, 4], camera to world.
-        lens: float64[4], fx, fy, cx, cy of all, pixels.
-        stride: step between the pixels and rows of frame j that are looked for.
-        result: float32[frames, frames], written.
+    ``depths`` are in m, ``poses`` take a camera to the world, ``stride`` is the step between the pixels of frame j that
+    are looked for, and ``result`` is float32[frames, frames].
     """
     height, width = depths.shape[1], depths.shape[2]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -111,11 +107,7 @@ class Coverage:
     """
 
     def __init__(self, sequence: Sequence, least_views: int = LEAST_VIEWS) -> None:
-        """Look at every frame of the sequence once.
-
-        Raises:
-            BufgymError: no cell was seen by so many frames.
-        """
+        """Look at every frame of the sequence once."""
         cells = [np.unique(_cells(sequence, k)) for k in range(len(sequence))]
         every, number, views = np.unique(np.concatenate(cells), return_inverse=True, return_counts=True)
         frame = np.repeat(np.arange(len(cells)), [len(rows) for rows in cells])

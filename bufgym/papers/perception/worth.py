@@ -43,7 +43,6 @@ SCALE: Final = 0.25
 
 @functools.cache
 def recording() -> Sequence:
-    """Make the recording of the room, not yet rendered."""
     return made_up_room(SEED, frames=FRAMES)
 
 
@@ -63,7 +62,6 @@ def mapping() -> Uplink:
 
 
 def coverage_of(frames: NDArray[np.int64]) -> float:
-    """Part of the scene that these frames have seen."""
     return scene().coverage.share(frames)
 
 

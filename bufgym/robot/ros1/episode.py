@@ -54,13 +54,13 @@ def play(
         tempfile.TemporaryDirectory() as logs,
         programs.running(
             viewer=partial(_view, logs), camera=partial(_publish, logs, policy, episode, capacity, value)
-        ) as begun,
+        ) as workers,
     ):
-        return asyncio.run(_play(begun, episode))
+        return asyncio.run(_play(workers, episode))
 
 
-async def _play(begun: Sequence[programs.Worker], episode: Episode) -> list[Received]:
-    viewer, camera = begun
+async def _play(workers: Sequence[programs.Worker], episode: Episode) -> list[Received]:
+    viewer, camera = workers
     camera.tell(await viewer.told())  # where the master is
     link = ShapedLink(episode.link, await viewer.told(), back=True)
     try:

@@ -62,12 +62,12 @@ def play(
     warm(PolicyQueue(policy, capacity, value=value))
     with programs.running(
         receive=_receive, send=partial(_send, policy, capacity, value), viewer=_view, camera=partial(_publish, episode)
-    ) as begun:
-        return asyncio.run(_play(begun, episode))
+    ) as workers:
+        return asyncio.run(_play(workers, episode))
 
 
-async def _play(begun: Sequence[programs.Worker], episode: Episode) -> list[Received]:
-    receiving, sending, viewer, camera = begun
+async def _play(workers: Sequence[programs.Worker], episode: Episode) -> list[Received]:
+    receiving, sending, viewer, camera = workers
     link = ShapedLink(episode.link, ("127.0.0.1", await receiving.told()))
     try:
         sending.tell(await link.listen())

@@ -42,6 +42,11 @@ class SuiteScenario:
         return {label: setting.scenario for label, setting in settings.items()}
 
     @property
+    def about(self) -> str:
+        """The suite and the split."""
+        return f"Scenarios of the suite {self.suite}, {self.split}: {', '.join(self.members)}."
+
+    @property
     def value(self) -> Value:
         """V of the first scenario; every episode brings its own."""
         return next(iter(self.members.values())).value
