@@ -38,8 +38,6 @@ MEMORY = 10
 """Generations over which the strategy's mean is averaged, exponentially."""
 
 
-# --- how candidates are evaluated ------------------------------------------------------------------------------------
-
 Evaluate = Callable[[Sequence[GuidedWeights], int], list[tuple[float, int]]]
 """(candidates, part of the training episodes) -> (fitness, decisions) of each, in their order."""
 
@@ -88,9 +86,6 @@ def _objective(settings: Settings, folder: Path, seed: int) -> Objective:
 def _evaluated(objective: Objective, candidate: GuidedWeights, part: int) -> tuple[float, int]:
     fitness = objective.fitness(candidate.policy(objective.name), part)
     return fitness, objective.decisions(part)
-
-
-# --- the search ------------------------------------------------------------------------------------------------------
 
 
 @dataclass

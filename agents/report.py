@@ -113,9 +113,6 @@ def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **resu
     return {"qoi": qoi[agent_name(best)], "drop-oldest": qoi["drop-oldest"], "held_out": results["held_out"]}
 
 
-# --- on many topics, or with many robots -----------------------------------------------------------------------------
-
-
 RIVALS: dict[str, Callable[[], list[Policy]]] = {"topics": topics.rivals, "fleet": fleet.rivals}
 """Kind -> the fixed policies for comparison."""
 
@@ -129,9 +126,6 @@ def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
     text = summary.table_of(task.summary(rows)).plain()
     (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
-
-
-# --- on one environment ----------------------------------------------------------------------------------------------
 
 
 def report_environment(
@@ -210,9 +204,6 @@ def table(entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Seq
         numbers = [format(entry[name] * factor, spec) for _, name, factor, spec in COLUMNS]
         lines.append([entry["policy"], score, *numbers, difference])
     return "\n".join([*aligned(lines), "score: 0 is Drop Oldest, 1 the clairvoyant", *told_once(alike)])
-
-
-# --- on a suite ------------------------------------------------------------------------------------------------------
 
 
 def report_suite(

@@ -66,9 +66,6 @@ class Run:
         return self.reached if self.best is max else -self.reached
 
 
-# --- the run's folder ------------------------------------------------------------------------------------------------
-
-
 def prepare(settings: Settings) -> Path:
     """The run's folder: made for a new run, checked against these settings for a resumed one."""
     settings.checked()
@@ -149,9 +146,6 @@ def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settin
         if waiting:
             print(f"a seed's process ended before its training did: {len(waiting)} seeds go on", file=sys.stderr)
     return [runs[seed] for seed in seeds]
-
-
-# --- a seed's curves -------------------------------------------------------------------------------------------------
 
 
 class Record:

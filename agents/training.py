@@ -180,9 +180,6 @@ def training_env(settings: Settings) -> VecEnv:
     )
 
 
-# --- learners --------------------------------------------------------------------------------------------------------
-
-
 def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
     """Make an untrained actor and critic; without masks an invalid action does what a queue does."""
     masked = settings.algo == "maskable-ppo"

@@ -127,9 +127,6 @@ def settings(policy: str) -> list[str]:
     return [policy, *(setting.name for setting in made if setting.parameters != default.parameters)]
 
 
-# --- the search ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Tried:
     """One setting on the validation episodes."""
@@ -245,9 +242,6 @@ def _overall(scored: Scores, policy: str) -> tuple[Interval, Interval]:
         return standing["score"], standing["regret"]
     regrets = [cell.regret for cell in scored.cells if cell.policy == policy]
     return standing["score"], Interval(*(math.fsum(part) / len(regrets) for part in zip(*regrets, strict=True)))
-
-
-# --- what was chosen -------------------------------------------------------------------------------------------------
 
 
 def plain(choices: Sequence[Choice]) -> str:

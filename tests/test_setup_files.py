@@ -96,9 +96,6 @@ def test_stages_name_programs_and_rules_that_there_are(tier: str) -> None:
             assert os.access(REPO / stage.command[0], os.X_OK)
 
 
-# -------------------- stages
-
-
 def run(stage: Any, log: Path | None = None) -> tuple[str, str]:
     result = stages.carry_out(stage, log)
     return result.outcome, result.remark
@@ -161,8 +158,6 @@ def test_a_night_ends_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert stages.main("nightly", []) == 1
     assert "tale          TOO SLOW" in (tmp_path / "build" / "nightly" / "summary.txt").read_text()
 
-
-# -------------------- lines of kernels
 
 KERNELS = '''
 @kernel

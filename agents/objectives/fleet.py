@@ -36,9 +36,6 @@ def fleet_of(suite: str, split: str) -> FleetScenario:
     return fleet
 
 
-# --- episodes --------------------------------------------------------------------------------------------------------
-
-
 class FleetEpisodes:
     """Cells full of robots with one L, with AFR's result on every robot."""
 
@@ -86,9 +83,6 @@ def validation_episodes(suite: str, capacities: Sequence[int]) -> list[FleetEpis
     drawn = [(sweep.setting(shard.label, shard.trace).scenario, shard.seeds) for shard in sweep.shards()]
     episodes = [draw(robots, seed) for robots, seeds in drawn for seed in seeds]
     return [FleetEpisodes(drawn[0][0], episodes, L) for L in capacities]
-
-
-# --- the objective ---------------------------------------------------------------------------------------------------
 
 
 class FleetObjective(Objective):

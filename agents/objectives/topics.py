@@ -53,9 +53,6 @@ TINY = 1e-9
 """Least age, to divide by."""
 
 
-# --- episodes --------------------------------------------------------------------------------------------------------
-
-
 class Reached(NamedTuple):
     """Results of a policy, summed over episodes.
 
@@ -142,9 +139,6 @@ def varied(client: Client, rng: np.random.Generator) -> Client:
     kept[rng.permutation(len(kept))[:3]] = True
     streams = tuple(stream for stream, is_kept in zip(client.streams, kept, strict=True) if is_kept)
     return replace(client, streams=streams, scale=float(np.exp(rng.uniform(*np.log(SCALES)))))
-
-
-# --- the objective ---------------------------------------------------------------------------------------------------
 
 
 class TopicsObjective(Objective):

@@ -116,9 +116,6 @@ def _are_numbers(entries: Any) -> bool:
     return isinstance(entries, list) and all(isinstance(number, int | float) for number in entries)
 
 
-# --- the manifest ----------------------------------------------------------------------------------------------------
-
-
 def claim(out: Path, manifest: dict[str, Any]) -> None:
     """Write the manifest into the folder; raise an error if another run's rows are in it."""
     out.mkdir(parents=True, exist_ok=True)

@@ -120,9 +120,6 @@ def _in_full(interval: Interval) -> str:
     return f"{interval.value:.6f} [{interval.low:.6f}, {interval.high:.6f}]"
 
 
-# --- the file --------------------------------------------------------------------------------------------------------
-
-
 def write(board: Sequence[Entry], path: Path) -> None:
     """Write a CSV file, and beside it the same as Markdown."""
     if path.suffix != ".csv":

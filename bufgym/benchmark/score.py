@@ -112,9 +112,6 @@ class Scores:
         return all(cell.exact for cell in self.cells)
 
 
-# --- the statistics --------------------------------------------------------------------------------------------------
-
-
 def regret(h: Numbers, best: Numbers) -> Numbers:
     """Compute 1 - sum H / sum H_clairvoyant from the two sums; NaN if the clairvoyant's is 0 or unknown."""
     return 1 - ratio(h, best, best > 0)
@@ -164,9 +161,6 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
     standings.sort(key=lambda s: (not s.ranked, math.isnan(s["score"].value), -s["score"].value, s.policy))
     return Scores(standings, cell_scores)
-
-
-# --- resampling: row 0 is always the sample itself, the others are its resamples --------------------------------------
 
 
 @dataclass(frozen=True)

@@ -137,9 +137,6 @@ def summarise(
     return Summary(quantities, rank_by, standings(cells), {cell: standings([cell]) for cell in cells}, baseline)
 
 
-# --- as text ---------------------------------------------------------------------------------------------------------
-
-
 class Place(NamedTuple):
     rank: int | None  # 1 for the best; None for a policy that is not ranked
     policy: str

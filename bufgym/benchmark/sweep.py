@@ -161,9 +161,6 @@ def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Ro
         return number, error if place is None else BufgymError(f"{place}: {type(error).__name__}: {error}")
 
 
-# --- the folder ------------------------------------------------------------------------------------------------------
-
-
 def run_sweep(
     sweep: Sweep,
     out: Path,
@@ -287,9 +284,6 @@ def _read(file: Path, shard: Shard) -> list[Row]:
     if len(rows) != expected or any(tuple(row) != columns for row in rows):
         raise BufgymError(f"{file}: {len(rows)} rows where {expected} of {len(columns)} columns were written; {again}")
     return rows
-
-
-# --- where it runs ---------------------------------------------------------------------------------------------------
 
 
 def _spread(

@@ -21,8 +21,6 @@ NOBODY: Unranked = MappingProxyType({})
 NONE = "–"
 """No number."""
 
-# --- numbers ---------------------------------------------------------------------------------------------------------
-
 
 def decimal(number: float, digits: int, unit: str = "") -> str:
     """Format with a true minus sign, but none before a zero; NaN is ``NONE``."""
@@ -52,9 +50,6 @@ def mean(numbers: Sequence[float | None]) -> float:
     """Mean without None and NaN; NaN if nothing is left."""
     known = [number for number in numbers if number is not None and not math.isnan(number)]
     return math.fsum(known) / len(known) if known else math.nan
-
-
-# --- lines -----------------------------------------------------------------------------------------------------------
 
 
 class Table(NamedTuple):
@@ -116,9 +111,6 @@ def invalid(rows: RunRows) -> list[str]:
         if row.get("invalid"):
             counts[row["policy"]] = counts.get(row["policy"], 0) + row["invalid"]
     return [f"note: {policy} gave {count} invalid decisions" for policy, count in counts.items()]
-
-
-# --- means by policy and capacity ------------------------------------------------------------------------------------
 
 
 class Column(NamedTuple):

@@ -157,9 +157,6 @@ def _drop_output() -> None:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
-# --- what went wrong, in one line ------------------------------------------------------------------------------------
-
-
 def _failed(message: str, code: int = 2) -> int:
     with contextlib.suppress(OSError):
         kind = "error: " if code == 2 else ""

@@ -25,8 +25,6 @@ OPTIONS = Parameter(
 )
 """How all options are: a list takes one word or more, the last of two equal ones counts, and none has a --no-option."""
 
-# --- types of options ------------------------------------------------------------------------------------------------
-
 
 def checked(convert: Callable[[str], Any], holds: Callable[[Any], bool], rule: str) -> Parameter:
     """The type of an option: ``convert`` reads the text, ``holds`` tests the value, errors name ``rule``."""
@@ -66,9 +64,6 @@ PolicyFile: TypeAlias = Annotated[
     Parameter(help="Python file that registers policies of your own; its code is run, so use only files you trust"),
 ]
 """The option ``--policy-file``; ``load_policies`` runs the file."""
-
-
-# --- groups of options -----------------------------------------------------------------------------------------------
 
 
 @Parameter(name="*", group=Group.create_ordered("A suite: frozen episodes, scored, with a report"))
@@ -176,9 +171,6 @@ def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-# --- policies --------------------------------------------------------------------------------------------------------
-
-
 def policy_specs(texts: Sequence[str] | None) -> list[str]:
     """List the policies of ``--policies``, separated by commas or spaces; empty if it was not given.
 
@@ -219,9 +211,6 @@ def load_policies(path: str | None) -> None:
     """Run the user's Python file, which registers policies."""
     if path is not None:
         modules.run_file(path, "--policy-file")
-
-
-# --- output ----------------------------------------------------------------------------------------------------------
 
 
 def columns(lines: Sequence[Sequence[str]]) -> str:

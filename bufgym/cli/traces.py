@@ -26,9 +26,6 @@ Format = Annotated[str | None, Parameter(help="The files' format, where it is no
 Column = Annotated[str | None, Parameter(help="Of UCC files (DL_bitrate, UL_bitrate), or which run of a list.")]
 
 
-# --- info ------------------------------------------------------------------------------------------------------------
-
-
 def info(files: Files, /, *, format: Format = None, column: Column = None) -> int:
     """Print statistics of bandwidth traces; exit code 2 if one is not sound."""
     from bufgym import traces
@@ -67,9 +64,6 @@ def validate(files: Files, /, *, format: Format = None, column: Column = None) -
     if len(files) > 1:
         print(f"{len(files) - failed} of {len(files)} files are sound")
     return 1 if failed else 0
-
-
-# --- convert ---------------------------------------------------------------------------------------------------------
 
 
 def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format = None, column: Column = None) -> None:

@@ -67,9 +67,6 @@ class Step(NamedTuple):
     """float64[parameters], read-only: the term's settings, in the order of its registration."""
 
 
-# --- fields ----------------------------------------------------------------------------------------------------------
-
-
 @kernel
 def last_arrival(batch: Batch, i: int) -> Any:
     """The arrival that waits for a decision; where the socket asks, the latest arrival."""
@@ -141,9 +138,6 @@ class OwnFields:
                 arriving = bool(batch.senders["waiting"][i] == ARRIVAL_WAITS)
                 arrival = python_arrival(records, i, 0 if arriving else 1)
                 write_in_python(place, python_view(records, i), arrival, arriving, output.flat[i])
-
-
-# --- reward terms ----------------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -232,8 +226,6 @@ class OwnTerms:
         self._marks[:, DROPS] = senders["rejected"] + senders["evicted"]
         self._marks[:, UNTIL] = senders["now_us"]
 
-
-# --- compiled once for all functions ---------------------------------------------------------------------------------
 
 _python_step_of: Any = getattr(step_of, "py_func", step_of)
 

@@ -24,9 +24,6 @@ _AHEAD = 8
 """Rows to prefetch ahead: far enough for memory to answer in time, near enough for the answer to be in cache still."""
 
 
-# --- rows with a link each -------------------------------------------------------------------------------------------
-
-
 @kernel
 def advance(batch: Batch, i: int) -> None:
     """Run row ``i`` to its next decision, or to the end of its episode."""
@@ -76,9 +73,6 @@ def step_rows(
             write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
         else:
             write_guided(batch, i, sender.waiting == NOTHING_WAITS, output, guide)
-
-
-# --- rows that share the link of a cell ------------------------------------------------------------------------------
 
 
 @kernel

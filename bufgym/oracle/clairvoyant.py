@@ -144,9 +144,6 @@ def _fits(c: Ints, size: Ints, capacity: int, max_bytes: int, ends: int, leaves:
     return bool(e <= ends)
 
 
-# --- as a policy -----------------------------------------------------------------------------------------------------
-
-
 def privileged(episode: Episode, capacity: int, max_bytes: int, v: Value) -> Floats:
     """The plan as a policy's memory: 1 for each message to keep."""
     limit = None if max_bytes >= UNLIMITED_BYTES else max_bytes

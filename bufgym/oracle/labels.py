@@ -101,9 +101,6 @@ def plan_of(labels: Labels) -> tuple[Ints, float]:
     return np.searchsorted(labels.first, np.array(way[::-1]), side="right") - 1, gain
 
 
-# --- bounds ----------------------------------------------------------------------------------------------------------
-
-
 @kernel
 def after(p: Problem, i: int, e: int) -> float:
     """Look up ``future`` of message i that ends at byte e."""
@@ -142,9 +139,6 @@ def guided(p: Problem, plan: Ints) -> tuple[int, float]:
         length += 1
         i, e = chosen, chosen_e
         gain += chosen_gain
-
-
-# --- labels ----------------------------------------------------------------------------------------------------------
 
 
 @kernel

@@ -37,9 +37,6 @@ ENCODINGS: Final = ("ros1", "cdr", "robofleet", "robofleet-bare", "json", "json-
 _TIME: Final = "builtin_interfaces/msg/Time"
 
 
-# --- messages --------------------------------------------------------------------------------------------------------
-
-
 def _laser_scan(uniform: np.random.Generator, beams: int = 1080) -> Content:
     """A scan of 270 degrees."""
     ranges = uniform.uniform(0.1, 30.0, beams).astype(np.float32)
@@ -115,9 +112,6 @@ def content(kind: str, seed: int = 0, frame_id: str | None = None, **parameters:
     name = KINDS[kind].frame_id if frame_id is None else frame_id
     built = KINDS[kind].build(np.random.Generator(np.random.PCG64(seed)), **parameters)
     return {"header": {"seq": 4711, "stamp": stamp, "frame_id": name}, **built}
-
-
-# --- encodings -------------------------------------------------------------------------------------------------------
 
 
 def encode(kind: str, message: Content, encoding: str, topic: str = "/robot/topic") -> bytes:

@@ -43,8 +43,6 @@ WIDTH = 120
 """Width of the printed text in letters."""
 
 
-# --- options ---------------------------------------------------------------------------------------------------------
-
 Rule = Callable[[str, Any], Any]
 """Checks an option, given its name and value; raises a BufgymError that names it."""
 
@@ -78,9 +76,6 @@ RULES_BY_KIND = {
     "Sequence[float]": several(above_0),
 }
 """Annotation of an option -> its rule."""
-
-
-# --- the protocol ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -160,9 +155,6 @@ def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:
     wrapper = textwrap.TextWrapper(WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
     paragraphs = text.format(**facts).split("\n\n")
     return [line for paragraph in paragraphs for line in wrapper.wrap(" ".join(paragraph.split()))]
-
-
-# --- pictures --------------------------------------------------------------------------------------------------------
 
 
 def save_picture(reproduction: Figure, rows: FigureRows, path: Path) -> Path:

@@ -211,9 +211,6 @@ def follow(buffer: Buffer, arrival: Arrival, memory: Memory, base: Numbers, outp
     return price_dp.decide(buffer, arrival, rule, numbers, a)
 
 
-# --- an agent whose outputs are linear in the inputs -----------------------------------------------------------------
-
-
 @kernel
 def heaviness(buffer: Buffer, arrival: Arrival, memory: Memory) -> float:
     """h of the module's text; 0 until the link has carried anything."""

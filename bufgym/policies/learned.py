@@ -82,9 +82,6 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return decide(buffer, arrival, memory)
 
 
-# --- weights ---------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Weights:
     """A slot scorer for one queue: the fields that it reads, and its networks."""

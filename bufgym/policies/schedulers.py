@@ -15,8 +15,6 @@ from bufgym.ground.modules import first_line
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, is_first
 from bufgym.policies.registry import Arrival, Memory, built_in
 
-# --- what a newcomer drives out --------------------------------------------------------------------------------------
-
 
 @kernel
 def topic_of(buffer: Buffer, message: Any) -> Any:
@@ -87,9 +85,6 @@ def make_room(buffer: Buffer, arrival: Arrival) -> int:
         return ACCEPT
     own = oldest(buffer, arrival, True)
     return own if own != REJECT else oldest_of_lowest(buffer, arrival)
-
-
-# --- which message goes next -----------------------------------------------------------------------------------------
 
 
 @built_in("fifo", for_topics=True, source="first come, first served over all topics")

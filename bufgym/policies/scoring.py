@@ -143,9 +143,6 @@ def score(scorer: Scorer, which: int, common: float, k: int, scratch: Scratch) -
     return common + own
 
 
-# --- weights ---------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Network:
     """The weights of one network, float32."""

@@ -103,9 +103,6 @@ def load_shipped(name: str, path: Path) -> Policy:
     return policy
 
 
-# --- writing ---------------------------------------------------------------------------------------------------------
-
-
 def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
     """Write a learned policy, whole or not at all.
 
@@ -159,9 +156,6 @@ def _sha256(fields: Sequence[str], tensors: Tensors) -> str:
         state.update(f"{name}{list(tensors[name].shape)}".encode())
         state.update(tensors[name].tobytes())
     return state.hexdigest()
-
-
-# --- reading ---------------------------------------------------------------------------------------------------------
 
 
 def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:

@@ -84,8 +84,6 @@ class RobotClient(Session):
         if topics:
             self.change(policy)
 
-    # --- what it publishes --------------------------------------------------------------------------------------------
-
     def change(self, policy: str | Policy) -> None:
         """Change the policy from now on; messages already queued go first, under the previous policy."""
         log, number = self._log, self._changes
@@ -144,8 +142,6 @@ class RobotClient(Session):
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         return [*super()._works(), self._send_all(), self._leave_all()]
-
-    # --- out ----------------------------------------------------------------------------------------------------------
 
     async def _send_all(self) -> None:
         """Send what the queues hand out, in order, after the messages that the last connection left."""

@@ -56,8 +56,6 @@ class Connection:
         self.subscriptions: dict[str, Subscription] = {}
         self.identity = Identity(plain_address(socket.remote_address[0]))
 
-    # --- in -----------------------------------------------------------------------------------------------------------
-
     async def serve(self, greeted: Callable[[], None]) -> None:
         """Serve the client from hello to the end; call ``greeted`` after the hello."""
         try:
@@ -291,8 +289,6 @@ class Connection:
     def _ack(self, number: int) -> None:
         self._outbox.acked(number)
         self._hub.settled(self._hub.store.acked(self.session, number))
-
-    # --- out ----------------------------------------------------------------------------------------------------------
 
     @property
     def sent(self) -> int:

@@ -120,8 +120,6 @@ class Hub:
         self.peers: Others | None = None
         """The other relays, if it shares topics with any."""
 
-    # --- who is here --------------------------------------------------------------------------------------------------
-
     def join(self, member: Member) -> None:
         """Add a member that has said hello; end any other connection of its session."""
         other = self.members.get(member.session)
@@ -158,8 +156,6 @@ class Hub:
         self._dropped += old.dropped if old else 0
         self._routes.clear()
         return old is not None
-
-    # --- messages -----------------------------------------------------------------------------------------------------
 
     def is_no_drop(self, topic: str) -> bool:
         """Whether the topic is lossless."""
@@ -232,8 +228,6 @@ class Hub:
         for sender, seq, receivers, lost in messages:
             if sender in self.members:
                 self.members[sender].tell("delivered", seq=seq, receivers=receivers, lost=lost)
-
-    # --- once a second ------------------------------------------------------------------------------------------------
 
     def status(self) -> dict[str, int]:
         """The relay's counts."""

@@ -112,9 +112,6 @@ def _is_loopback(host: str | None) -> bool:
         return False
 
 
-# --- certificates ----------------------------------------------------------------------------------------------------
-
-
 def server_context(tls: Tls) -> ssl.SSLContext:
     """Set up TLS for the relay; clients are asked for certificates if an authority for them is given."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

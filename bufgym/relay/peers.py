@@ -111,8 +111,6 @@ class Peers:
     def _goes(self, verb: Any, topic: str) -> bool:
         return not topic.startswith(f"/{OWN}/") and self.permissions.allow(verb, topic)
 
-    # --- ordinary messages --------------------------------------------------------------------------------------------
-
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message of this relay."""
         if not frame.message.no_drop and self._goes("receive", frame.message.topic):
@@ -148,8 +146,6 @@ class Peers:
             await self._note(error)
             return None
         return message if self._goes("send", message.topic) else None
-
-    # --- what may not be lost -----------------------------------------------------------------------------------------
 
     async def hold(self, sender: Mailbox, message: wire.Message) -> bool | None:
         """Give a no_drop message to the other relays; return whether they may have it, None if NATS does not answer."""
@@ -189,8 +185,6 @@ class Peers:
                     await heard.nak(delay=_RETRY_S)
                     return
         await heard.ack()
-
-    # --- what a member has besides ------------------------------------------------------------------------------------
 
     def wake(self) -> None:
         """Do nothing; no message is held for it."""

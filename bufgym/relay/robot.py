@@ -100,8 +100,6 @@ class Robot:
         """Put the robot's prefix before a topic's name."""
         return f"/robots/{self.name}/{name.lstrip('/')}"
 
-    # --- what it says -------------------------------------------------------------------------------------------------
-
     def publish(self, topic: str, payload: bytes, encoding: str, type: str = "", stamp_us: int | None = None) -> None:
         """Put a message of the source's topic into the queue, from any thread."""
         stream = self._streams[topic]
@@ -140,8 +138,6 @@ class Robot:
             "policies": self._policies,
             **self.source.status(),
         }
-
-    # --- what it does -------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
         """Run until the source has no more, or until cancelled."""

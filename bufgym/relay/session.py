@@ -152,8 +152,6 @@ class Session:
         if self.connected.is_set():
             self._tasks.begin(self._say_it("subscribe", **fields))
 
-    # --- its connection -----------------------------------------------------------------------------------------------
-
     async def run(self) -> None:
         """Connect, and again whenever the connection ends, until cancelled.
 
@@ -270,8 +268,6 @@ class Session:
         """Measure ``round_trip_s``."""
         if self._connection is not None:
             self.round_trip_s = await (await self._connection.ping())
-
-    # --- in -----------------------------------------------------------------------------------------------------------
 
     async def _take_all(self) -> None:
         async for frame in self._connection:

@@ -102,8 +102,6 @@ class Store:
             if session.temporary:  # left by a relay that was killed
                 self.forget(session)
 
-    # --- sessions -----------------------------------------------------------------------------------------------------
-
     def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Mailbox:
         """Open the session of this name; a new session begins at the client's numbers.
 
@@ -154,8 +152,6 @@ class Store:
             else:
                 session.durable[id] = pattern
                 self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
-
-    # --- messages -----------------------------------------------------------------------------------------------------
 
     def hold(self, sender: Mailbox, seq: int, topic: str, frame: bytes, receivers: Sequence[Mailbox]) -> None:
         """Store the sender's message number ``seq`` on disk for these receivers.
@@ -221,8 +217,6 @@ class Store:
     def close(self) -> None:
         """Close the file; everything is on disk already."""
         self._db.close()
-
-    # --- on disk ------------------------------------------------------------------------------------------------------
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:

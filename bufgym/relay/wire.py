@@ -152,8 +152,6 @@ def _utf8_bytes(what: str, name: str) -> int:
         raise WireError(f"{what} {name!r}: must be UTF-8") from None
 
 
-# --- JSON ------------------------------------------------------------------------------------------------------------
-
 Number = Annotated[int, Meta(ge=0, le=MAX_SEQ)]
 _MESSAGE: Final = {
     "topic": str,

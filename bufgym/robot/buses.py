@@ -28,9 +28,6 @@ CONNECT_S: Final = 1.0
 """Time for a Zenoh receiver to answer."""
 
 
-# --- Zenoh ------------------------------------------------------------------------------------------------------------
-
-
 class ZenohBus:
     """A Zenoh session. Its full queue blocks the sender; by default it would drop."""
 
@@ -79,9 +76,6 @@ class ZenohBus:
 
     def close(self) -> None:
         self._session.close()
-
-
-# --- MQTT -------------------------------------------------------------------------------------------------------------
 
 
 class MqttBus:

@@ -123,9 +123,6 @@ def check_messages(mark: str) -> None:
             raise BufgymError(f"{package}: is the other ROS's here: each ROS wants a Python of its own")
 
 
-# --- what the programs do -------------------------------------------------------------------------------------------
-
-
 def publish_in_time(
     episode: Episode, began_s: float, move: Callable[[int, float], None], show: Callable[[int, int], None]
 ) -> None:

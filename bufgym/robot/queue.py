@@ -138,8 +138,6 @@ class PolicyQueue:
         """Messages dropped so far."""
         self._tell(settings(self.policy, capacity, value, max_bytes, decide_at, topics, window, ends_us))
 
-    # --- in ----------------------------------------------------------------------------------------------------------
-
     def put(
         self, message: Any, size_bytes: int, x: float | None = None, topic: int = 0, at_us: int | None = None
     ) -> int:
@@ -190,8 +188,6 @@ class PolicyQueue:
                     self._row.close()
                 self._settle(self._stamp(None), None)
 
-    # --- out ----------------------------------------------------------------------------------------------------------
-
     def get(self, timeout_s: float | None = None) -> Item | None:
         """Wait for the next message that the socket dequeues; None once the queue is closed and empty.
 
@@ -236,8 +232,6 @@ class PolicyQueue:
             self._tell({"event": "gone", "us": now_us, "seq": item.seq, "carried": carried})
             self._settle(now_us, None)
 
-    # --- how it is ----------------------------------------------------------------------------------------------------
-
     def __len__(self) -> int:
         """Messages queued."""
         with self._lock:
@@ -248,8 +242,6 @@ class PolicyQueue:
         """Messages dequeued by the socket that have not left."""
         with self._lock:
             return len(self._ready) + len(self._away)
-
-    # --- within the lock ----------------------------------------------------------------------------------------------
 
     @property
     def _drained(self) -> bool:

@@ -75,8 +75,6 @@ class LiveRow:
         batch.arrivals["arrival_us"][0, self.sender["next"] :] = NOT_YET
         self._first_knot = int(self.sender["first_knot"])
 
-    # --- what happened ------------------------------------------------------------------------------------------------
-
     def put(self, now_us: int, size_bytes: int, x: float, topic: int, uniform: float) -> int:
         """Add a message; return its ``seq``."""
         if self.sender["next"] + 1 >= self.room:
@@ -114,8 +112,6 @@ class LiveRow:
         self.sender["arrivals"] = self.sender["next"]
         self._advance()
 
-    # --- what it holds ------------------------------------------------------------------------------------------------
-
     @property
     def queued(self) -> list[int]:
         """List ``seq`` of the queued messages, the oldest first."""
@@ -152,8 +148,6 @@ class LiveRow:
         """Bytes of messages in the socket that the link has not begun to carry."""
         waiting = self.batch.order[0, int(self.sender["transmitted"]) + 1 : int(self.sender["dequeued"])]
         return int(self.batch.arrivals["size_bytes"][0, waiting].sum())
-
-    # --- its arrays ---------------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
         """Process everything that is due."""

@@ -84,8 +84,6 @@ class ShapedLink:
         for one in self._sockets:
             one.close()
 
-    # --- connections --------------------------------------------------------------------------------------------------
-
     async def _accept(self, listening: socket.socket) -> None:
         while True:
             near, _ = await asyncio.get_running_loop().sock_accept(listening)
@@ -153,8 +151,6 @@ class ShapedLink:
         while piece := await loop.sock_recv(receiver, 65_536):
             await asyncio.sleep(self._link.propagation_us / 1e6 / self._speed)
             await loop.sock_sendall(sender, piece)
-
-    # --- time and bytes -----------------------------------------------------------------------------------------------
 
     def _now_s(self) -> float:
         """The link's time."""

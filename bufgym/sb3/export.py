@@ -46,9 +46,6 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
     return files.save(out, weights, notes if policy.for_topics else {**notes, "regret": regrets(policy)})
 
 
-# --- weights ---------------------------------------------------------------------------------------------------------
-
-
 def read_policy(path: StrPath) -> BasePolicy:
     """Read the policy network from a saved model's zip, for any algorithm.
 
@@ -94,9 +91,6 @@ def _network(perceptron: nn.Sequential) -> Network:
 
 def _array(parameter: Any) -> NDArray[np.float32]:
     return np.array(parameter.detach().cpu().numpy(), np.float32)
-
-
-# --- what the file says of the agent ---------------------------------------------------------------------------------
 
 
 def regrets(policy: Policy) -> dict[str, float]:

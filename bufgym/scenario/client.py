@@ -219,9 +219,6 @@ class Client:
         return np.maximum(1, size)
 
 
-# --- configurations --------------------------------------------------------------------------------------------------
-
-
 def robofleet_example() -> tuple[Stream, ...]:
     """The topics of Robofleet's example client configuration.
 

@@ -26,8 +26,6 @@ _PERIOD_WEIGHT, _SERVICE_WEIGHT = 1 / 8, 1 / 16
 # Sending time over which the link's rate is averaged, us.
 _SHORT_US, _MEDIUM_US, _LONG_US = 100_000, 500_000, 2_000_000
 
-# --- at an arrival ----------------------------------------------------------------------------------------------------
-
 
 @kernel
 def arrive(batch: Batch, i: int) -> int:
@@ -212,9 +210,6 @@ def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
         remove(batch, i, 0)
     else:
         sender.socket = CLEARED
-
-
-# --- choices of a scheduler ------------------------------------------------------------------------------------------
 
 
 @kernel

@@ -55,9 +55,6 @@ def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
     return float(rules.weight * value(batch.v[rules.v_start :], x - before_x))
 
 
-# --- a topic's past ---------------------------------------------------------------------------------------------------
-
-
 @kernel
 def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None:
     """Record that ``message`` has arrived, and was enqueued or not."""
@@ -114,9 +111,6 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     rules.aged += area
     sender.aged += rules.weight * area
     rules.aged_us = until_us
-
-
-# --- limits and rights ------------------------------------------------------------------------------------------------
 
 
 @kernel

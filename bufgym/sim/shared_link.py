@@ -100,9 +100,6 @@ def least(numbers: NDArray[np.int64]) -> int:
     return smallest
 
 
-# --- capacity --------------------------------------------------------------------------------------------------------
-
-
 @kernel
 def settle(batch: Batch, shares: Shares, c: int) -> None:
     """Give every busy sender the whole bytes that its share has come to by ``tick_us``."""
@@ -149,9 +146,6 @@ def finish_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: in
     cell.row = c * cell.robots + robot
     shares.goals[c, robot] = FOREVER
     finish_transmission(batch, cell.row, at_us)
-
-
-# --- what comes next -------------------------------------------------------------------------------------------------
 
 
 @kernel

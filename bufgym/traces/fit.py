@@ -138,9 +138,6 @@ def _rounded_quantiles(values: Float64Array, probabilities: Sequence[float]) -> 
     return tuple(float(round(q)) for q in np.quantile(values, probabilities))
 
 
-# --- memory ----------------------------------------------------------------------------------------------------------
-
-
 def _with_memory(link: LinkParameters, rows: Rates) -> LinkParameters:
     """The link with shares, stay and memory whose generated rates are correlated most like the `rows`."""
     real, pairs = autocorrelation(rows, LAGS_S)
@@ -176,9 +173,6 @@ def _fit_memory(target: Float64Array, pairs: Float64Array, place: float) -> tupl
             best = float(errors[k])
             chosen = (round(float(level[k]), 2), stay_s, round(float(memory), 2))
     return chosen
-
-
-# --- outages ---------------------------------------------------------------------------------------------------------
 
 
 def _fit_outages(rows: Rates) -> OutageParameters | None:
@@ -245,9 +239,6 @@ def _posterior(lengths_s: Float64Array, share: float, short_s: float, long_s: fl
 
 def _three_digits(value: float) -> float:
     return float(f"{value:.3g}")
-
-
-# --- statistics of recordings ----------------------------------------------------------------------------------------
 
 
 def centred(rows: Rates) -> list[Float64Array]:

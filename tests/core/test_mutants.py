@@ -20,9 +20,6 @@ V = qoi.exponential(0.5)
 """V(1) = 1/2, V(2) = 3/4, V(3) = 7/8."""
 
 
-# --- what a finished run is checked for -------------------------------------------------------------------------------
-
-
 def finished() -> Senders:
     """L = 2, a byte a us for 20 us, messages of 10 bytes: 0 and 2 are sent, 3 not all, 4 and 5 wait, 1 is dropped."""
     episode = Episode(messages(np.array([0, 1, 2, 3, 15, 25]), 10), Link(trace([(0, 0), (20, 20)], "stop")))
@@ -87,9 +84,6 @@ def test_a_run_is_searched_for_everything_a_policy_may_not_write(finding, write)
     assert audit.touched(*given) == finding
 
 
-# --- the clairvoyant's beam ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("capacity", "max_bytes", "width", "plan"),
     [
@@ -109,9 +103,6 @@ def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
     length, gain = beam.search(p, room, beam.new_states(3, width), work)
     assert work[:length][::-1].tolist() == plan
     assert gain == {2: 0.75, 3: 1.0}[length]
-
-
-# --- policies --------------------------------------------------------------------------------------------------------
 
 
 def test_webrtc_starts_a_new_pattern_when_the_bucket_gets_too_full_and_not_while_it_is():

@@ -48,9 +48,6 @@ def test_recordings_take_turns(tmp_path: Path) -> None:
     assert sum(len(bags.read_bag(file).size_bytes) for file in files) < 50
 
 
-# --- recordings piece by piece, for the page -------------------------------------------------------------------------
-
-
 def every(topic: str) -> bool:
     return True
 
@@ -92,9 +89,6 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
             piece(tmp_path, name, 0, 1, every)
     with pytest.raises(BufgymError, match=r"recording own\.mcap: must be an MCAP file"):
         piece(tmp_path, "own.mcap", 0, 1, every)
-
-
-# --- the audit log ---------------------------------------------------------------------------------------------------
 
 
 def entries(folder: Path) -> list[dict[str, object]]:

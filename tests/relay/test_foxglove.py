@@ -71,9 +71,6 @@ async def test_a_client_of_foxglove_sees_the_fleet(corner: Corner, monkeypatch: 
     assert 0 < json.loads(came[f"{robot}/status"])["battery"] <= 1
 
 
-# --- the relay's own ------------------------------------------------------------------------------------------------
-
-
 async def test_a_relay_shows_what_its_rules_allow() -> None:
     """Of what a robot sends, who connects to the relay's own server sees what rules with ``foxglove`` let it see."""
     viewer = Viewer()

@@ -150,9 +150,6 @@ async def test_the_keys_come_over_http_no_more_often_than_they_may(issuer: Issue
         identity.Verifier(Tokens(ISSUER, "fleet", "http://issuer.test/jwks.json"))
 
 
-# --- certificates ----------------------------------------------------------------------------------------------------
-
-
 HERE = x509.IPAddress(ipaddress.ip_address("127.0.0.1"))
 
 

@@ -176,9 +176,6 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
         await robot.came(2, b"2")
 
 
-# --- the relay is killed ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.nightly
 async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two senders with five commands unanswered each; the relay is killed under load, ``BUFGYM_KILLS`` times."""

@@ -27,9 +27,6 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "RETRY_S", 0.01)
 
 
-# --- what is not answered --------------------------------------------------------------------------------------------
-
-
 async def test_a_refused_number_is_used_again() -> None:
     """Window 3: 1 is acked, 2 refused, 3 and 4 come back as out of order, and go again as 2 and 3."""
     unanswered = Unanswered()
@@ -67,9 +64,6 @@ async def test_after_a_reconnect_what_the_relay_lacks_goes_again() -> None:
     unanswered.give_up("the client has ended")
     with pytest.raises(BufgymError, match="has ended"):
         await futures[3]
-
-
-# --- over real connections -------------------------------------------------------------------------------------------
 
 
 @contextlib.asynccontextmanager

@@ -29,9 +29,6 @@ pytest.importorskip("PIL", reason="no Pillow here: the extra relay")
 CONFIG = settings(policies=("drop-oldest",))
 
 
-# --- the made-up room ------------------------------------------------------------------------------------------------
-
-
 def test_rays_by_hand() -> None:
     """From (-3, 0), looking along x: the table in the middle begins at x = -1.4; behind is the room's wall at -6."""
     pose = Pose(-3.0, 0.0, 0.0)
@@ -54,9 +51,6 @@ def test_the_camera_sees_ceiling_wall_and_floor() -> None:
     top, middle, bottom = (frame[row, PICTURE[0] // 2].astype(int) for row in (0, PICTURE[1] // 2, -1))
     assert top.min() > 150 and middle[0] > middle[2] + 8 and bottom.max() < 130  # light; warm; dark tiles
     assert jpeg(frame)[:3] == b"\xff\xd8\xff"
-
-
-# --- how a queue is --------------------------------------------------------------------------------------------------
 
 
 def test_a_queue_told_by_hand() -> None:
@@ -90,9 +84,6 @@ def test_a_queue_told_by_hand() -> None:
     assert monitor.state()["policy"] == "drop-oldest" and monitor.state()["left"] == 4
 
 
-# --- messages of ROS -------------------------------------------------------------------------------------------------
-
-
 def test_messages_read_as_they_were_made() -> None:
     made = odometry(1_500_000, "r", Pose(1.0, -2.0, 0.5), 0.25)
     read = ros_messages.read(made, ODOMETRY)
@@ -108,8 +99,6 @@ def test_messages_read_as_they_were_made() -> None:
     assert ros_messages.modern(b"?", "my_msgs/msg/Own", "ros1") == ("ros1", b"?")
     assert "float32[] ranges" in (ros_messages.definition(SCAN) or "")
 
-
-# --- at a relay ------------------------------------------------------------------------------------------------------
 
 Came = dict[str, list[wire.Message]]
 

@@ -51,8 +51,6 @@ def test_addresses_are_taken_as_they_are_meant() -> None:
     assert plain_address("fe80::1%eth0") == "fe80::1"
 
 
-# --- random configurations -------------------------------------------------------------------------------------------
-
 ADDRESSES = ["10.0.0.1", "10.0.0.2", "10.0.1.1", "192.168.0.1"]
 RANGES = [*ADDRESSES, "10.0.0.0/24", "10.0.0.0/8", "0.0.0.0/0"]
 EMAILS = ["a@x.org", "b@x.org"]

@@ -79,9 +79,6 @@ def test_mistakes_are_told(words: list[str], fault: str, capsys: pytest.CaptureF
     assert fault in capsys.readouterr().err
 
 
-# --- what ``view`` says of a log, by hand ----------------------------------------------------------------------------
-
-
 def story() -> Bench:
     """Six puts, a tenth of a second apart, into a queue of two behind a socket that one message leaves at 0.65 s."""
     bench = Bench("drop-oldest", 2, value=qoi.exponential(0.5))

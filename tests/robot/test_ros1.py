@@ -33,9 +33,6 @@ REPO = Path(__file__).resolve().parents[2]
 FADE = REPO / "examples" / "ros1" / "fade.py"
 
 
-# --- in ROS ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.nightly
 def test_a_policy_in_an_untouched_node(ros: dict[str, str]) -> None:
     """6 s with a fade of 1.5 s. Over 20 s, quiet machine: H 1.47 times that of rospy's own queue, the gap a tenth."""
@@ -131,9 +128,6 @@ def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> N
     assert ended_thread(connection)
 
 
-# --- the connection, without ROS -------------------------------------------------------------------------------------
-
-
 class Transport:
     """What rospy's TCPROSTransport is to a queue, on a pair of TCP sockets."""
 
@@ -211,9 +205,6 @@ def test_what_sending_raised_is_told_at_the_next_message(transport: Transport) -
         connection.write_data(b"b")
     transport.close()
     assert ended_thread(connection)
-
-
-# --- x ---------------------------------------------------------------------------------------------------------------
 
 
 def test_x_by_hand() -> None:

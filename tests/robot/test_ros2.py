@@ -32,9 +32,6 @@ def run(*words: object) -> str:
     return played(where, *words)
 
 
-# --- in ROS ----------------------------------------------------------------------------------------------------------
-
-
 @in_ros
 @pytest.mark.nightly
 def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
@@ -64,9 +61,6 @@ def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None
 def test_an_episode_through_the_relay_is_that_of_the_simulator(tmp_path: Path) -> None:
     run(*VALIDATE, "ros2", "--out", tmp_path)
     assert as_simulated(tmp_path)
-
-
-# --- what the relay says of a topic ----------------------------------------------------------------------------------
 
 
 def test_a_topic_goes_with_each_of_its_messages() -> None:

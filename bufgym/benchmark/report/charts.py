@@ -104,9 +104,6 @@ def _lanes_height(names: Sequence[str]) -> float:
     return 0.8 + 0.2 * max(len(names), 3)
 
 
-# --- ranking ---------------------------------------------------------------------------------------------------------
-
-
 def ranking(context: Context) -> Chart | None:
     """Draw a dot and an interval for each policy; None if no policy has a value of the ranking quantity."""
     quantities = {quantity.key: quantity for quantity in context.summary.quantities}
@@ -160,9 +157,6 @@ def _dots(context: Context, axes: Any, names: list[str], quantity: Quantity, sec
     compared = known.get(quantity.versus or context.summary.baseline)
     if compared is not None:
         axes.axvline(compared.value, color=PALETTE["axis"], zorder=0.5)
-
-
-# --- regret against something -----------------------------------------------------------------------------------------
 
 
 def capacities(context: Context) -> Chart | None:
@@ -263,9 +257,6 @@ def _log_axis(axes: Any, side: str, low: float, high: float, title: str, write: 
     axes.set(**{f"{side}scale": "log", f"{side}lim": (low, high), f"{side}label": title})
     axes.set(**{f"{side}ticks": ticks, f"{side}ticklabels": [write(tick) for tick in ticks]})
     axes.tick_params(axis=side, which="minor", length=0, labelbottom=False, labelleft=False)
-
-
-# --- costs besides information: delay at the sender, age at the server ------------------------------------------------
 
 
 LONG = 8.0

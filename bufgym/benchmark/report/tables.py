@@ -67,9 +67,6 @@ def intro(run: SuiteRun) -> list[str]:
     return lines
 
 
-# --- Markdown ---------------------------------------------------------------------------------------------------------
-
-
 def markdown(run: SuiteRun, summary: Summary) -> str:
     """The command, the ranking, then a table for each scenario or cell."""
     out = ["```", run.manifest["command"], "```", "", _ranking(summary, summary.overall).markdown()]

@@ -138,8 +138,6 @@ class QueueTask(Task):
         return {**timeline(policies, setting.scenario, row), "about": setting.about}
 
 
-# --- one episode in full: what each policy delivered and dropped on the very same link -------------------------------
-
 _STEP_S = 0.25  # between the points of the curve of the link's capacity
 
 

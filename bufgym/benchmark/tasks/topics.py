@@ -121,9 +121,6 @@ class TopicsTask(Task):
         return f"{many} of {client.duration_s:g} s; n_T = {windows}, {acks}, {consumers}."
 
 
-# --- rows ------------------------------------------------------------------------------------------------------------
-
-
 def _rows(client: Client, senders: Senders, i: int) -> Result:
     sender, messages = np.asarray(senders.batch.senders)[i], received(senders, i)
     log = np.asarray(senders.batch.log[i])
@@ -157,9 +154,6 @@ def _folded(copies: Sequence[TopicOutcome]) -> Row:
     outcomes = [asdict(copy) for copy in copies]
     means: Row = {name: mean([outcome[name] for outcome in outcomes]) for name in _OUTCOME}
     return {**means, "arrived": int(means["arrived"])}
-
-
-# --- the summary -----------------------------------------------------------------------------------------------------
 
 
 _seconds, _one_digit = (partial(decimal, digits=digits) for digits in (2, 1))
@@ -205,8 +199,6 @@ def _statistics(ours: Numbers, base: Numbers, weights: Numbers) -> dict[str, Num
         "rate_hz": share(delivered, seconds),
     }
 
-
-# --- one policy, topic by topic --------------------------------------------------------------------------------------
 
 TOPIC_COLUMNS = (
     Column("topic", "topic", str),

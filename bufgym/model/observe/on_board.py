@@ -18,8 +18,6 @@ from bufgym.model.link import FOREVER  # noqa: F401 (in generated lines)
 from bufgym.model.observe.declare import Field, divide_row, made, squash, writer  # noqa: F401 (in generated lines)
 from bufgym.model.observe.own import OWN_FIELDS, OwnField
 
-# --- the link --------------------------------------------------------------------------------------------------------
-
 
 @kernel
 def mean_bytes(buffer: Buffer, arrival: Any) -> float:
@@ -58,9 +56,6 @@ def size_spread(buffer: Buffer, arrival: Any) -> float:
         total += off
         squares += off * off
     return math.sqrt(min(max((squares - total * total / n) / n, 0.0), 1.0))
-
-
-# --- each slot -------------------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -104,8 +99,6 @@ def mean_per_byte(buffer: Buffer, arrival: Any) -> float:
         total += merged_per_byte(buffer, arrival, k)
     return total / (len(buffer.slots) + 1)
 
-
-# --- the tables ------------------------------------------------------------------------------------------------------
 
 _CONTEXT = (
     Field("rate_short", "context", "link", "g/(g+r), r = demand",

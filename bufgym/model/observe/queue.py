@@ -20,9 +20,6 @@ from bufgym.model.qoi import EXPONENTIAL, merging_loss, value
 ROUNDING = 1e-12
 
 
-# --- slots -----------------------------------------------------------------------------------------------------------
-
-
 class Slot(NamedTuple):
     """A queued message or the newcomer, beside its neighbours."""
 
@@ -105,9 +102,6 @@ def _write_slots(buffer: Buffer, arrival: Any, even_lost: float, rows: NDArray[n
         )  # fmt: skip
         _write(buffer, arrival, slot, np.uint64(column), rows)
         gain, from_us, from_x = next_gain, at_us, x
-
-
-# --- context ---------------------------------------------------------------------------------------------------------
 
 
 class Newcomer(NamedTuple):

@@ -81,9 +81,6 @@ def tracked_part(frames: NDArray[np.int64]) -> float:
     return float(reached[-1] - frames[0]) / (FRAMES - 1)
 
 
-# --- the same as rewards ---------------------------------------------------------------------------------------------
-
-
 def _arrived(step: Any) -> NDArray[np.int64]:
     """Indices of the frames transmitted, int64[frames]."""
     n = len(step.log)

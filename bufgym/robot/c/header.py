@@ -155,9 +155,6 @@ def _calls(policy: Policy, capacity: int, value: Value, max_bytes: int | None) -
     return recorded(policy, episodes, capacity, value, max_bytes)
 
 
-# --- C text ----------------------------------------------------------------------------------------------------------
-
-
 def _part(name: str) -> str:
     return (_PARTS / name).read_text(encoding="utf-8")
 

@@ -109,9 +109,6 @@ def fetch_dataset(
         lock.release()
 
 
-# --- one file ---------------------------------------------------------------------------------------------------------
-
-
 def _downloaded(remote: Remote, folder: Path, note: Callable[[str], None]) -> Fetched:
     target = folder / remote.path
     if target.is_file():

@@ -69,9 +69,6 @@ def _regular(path: Path) -> Path:
     return path
 
 
-# --- MCAP ------------------------------------------------------------------------------------------------------------
-
-
 def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
     """Every message of an MCAP file, or of all in a folder; adds every topic to ``types``, even without messages."""
     for file_path in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
@@ -166,9 +163,6 @@ def _type(schema: str) -> str:
     return f"{package}/msg/{name}" if name and "/" not in name else schema
 
 
-# --- rosbag2 ---------------------------------------------------------------------------------------------------------
-
-
 def rosbag2(path: Path, types: dict[str, str]) -> Iterator[Message]:
     """Every message of a rosbag2's folder, or of one of its SQLite files, which may have any name."""
     if not path.is_dir():
@@ -251,9 +245,6 @@ def _sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
             if not isinstance(logged_ns, int) or not isinstance(data, bytes):
                 raise ValueError("a message's time must be a whole number, and its data bytes")
             yield channels[number], logged_ns, data
-
-
-# --- ROS 1 -----------------------------------------------------------------------------------------------------------
 
 
 def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:

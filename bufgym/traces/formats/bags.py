@@ -126,9 +126,6 @@ def messages(path: StrPath) -> Iterator[Message]:
         yield from SOURCES[kind](Path(path), {})
 
 
-# --- the three kinds -------------------------------------------------------------------------------------------------
-
-
 def _kind(path: Path) -> str:
     """ "mcap", "ros1", "rosbag2", or "" for anything else."""
     with os_errors(path, "opened"):

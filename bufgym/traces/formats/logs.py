@@ -109,9 +109,6 @@ def read_sabre(path: StrPath) -> Knots:
     return intervals.knots(path)
 
 
-# --- JSON ------------------------------------------------------------------------------------------------------------
-
-
 def read_json(path: StrPath) -> Any:
     """The file's JSON, whose numbers are finite."""
     with open_text(path) as file:

@@ -19,8 +19,6 @@ from bufgym.traces.formats.tables import MAX_MBIT_PER_S
 from bufgym.traces.formats.text import Line, open_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 
-# --- nuttcp ----------------------------------------------------------------------------------------------------------
-
 MAX_INTERVAL_S: Final = 3600
 """Longest interval of a speed test, s; a longer one does not measure a changing link."""
 
@@ -58,8 +56,6 @@ def read_nuttcp(path: StrPath) -> Knots:
     return intervals.knots(path, f"{len(intervals)} intervals")
 
 
-# --- iperf3 ----------------------------------------------------------------------------------------------------------
-
 # Of one interval to the next; both are the same clock, written with six decimals.
 _MAX_STEP_S: Final = 1e-3
 
@@ -95,8 +91,6 @@ def read_iperf3(path: StrPath) -> Knots:
         previous_s = end_s
     return intervals.knots(path, f"measured by the {' and the '.join(sorted(sides)) or 'nobody'}")
 
-
-# --- lists of runs ---------------------------------------------------------------------------------------------------
 
 MAX_RUNS: Final = 16
 RUNS: Final = tuple(f"run {number}" for number in range(1, MAX_RUNS + 1))

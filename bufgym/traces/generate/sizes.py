@@ -166,9 +166,6 @@ def _lognormal(normal: Float64Array, cv: float) -> Float64Array:
     return np.asarray(np.exp(spread * normal - spread**2 / 2), np.float64)
 
 
-# --- recorded sequences ----------------------------------------------------------------------------------------------
-
-
 def recorded() -> list[str]:
     """Names of the shipped sequences."""
     found = []
