@@ -3,8 +3,6 @@
 Results are in runs/NAME/. After a kill, the same command with ``--resume`` goes on from the last checkpoint.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from cyclopts import App, Parameter

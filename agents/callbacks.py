@@ -1,7 +1,5 @@
 """Work between a learner's updates: checkpoints, the learning curve, validation, a progress bar."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ joblib's Ray backend (``bufgym.benchmark.cluster``) makes new processes at every
 may wait for one another for ever. So training calls a cluster directly.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

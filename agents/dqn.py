@@ -8,8 +8,6 @@ values it. Q is the sum of a state value and a score for each slot (after Wang e
 little difference beside all the reward still to come.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The picture of a training run: learning curves on the left, every policy's score on the right."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path

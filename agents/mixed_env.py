@@ -8,8 +8,6 @@ Padding costs next to nothing, as the slot network does not score empty slots (`
 Without masks, evicting a padded slot does the same as any invalid action: accept if there is room, else reject.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

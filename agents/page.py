@@ -1,7 +1,5 @@
 """Shared parts of the pages about trained agents: commands, tables, and the form of numbers."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run's folder: its settings, one folder a seed with the seed's curves, and the results of each finished seed."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import csv
 import dataclasses

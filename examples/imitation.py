@@ -16,8 +16,6 @@ visited, and the network learns from all states so far. Two points are special h
   and the network learns their mean. That is worth more than AFR, but even a perfect pupil would not reach a score of 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Walls are straight and upright, so a ray in the plane says all: how far, on whic
 ``python examples/made_up_robot.py [ws://HOST:PORT]`` for one robot at a relay; ``fleet_demo.py`` has several.
 """
 
-from __future__ import annotations
-
 import asyncio
 import io
 import math

@@ -17,8 +17,6 @@ Proximal policy optimisation (Schulman et al. 2017) with generalised advantage e
   camera's motion.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from dataclasses import dataclass

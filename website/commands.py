@@ -1,7 +1,5 @@
 """The page of the command line, from its commands."""
 
-from __future__ import annotations
-
 from bufgym import cli
 
 

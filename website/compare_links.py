@@ -7,8 +7,6 @@ beyond it (a Monte Carlo test; A. C. Davison and D. V. Hinkley, "Bootstrap Metho
 table of the Kolmogorov-Smirnov statistic would.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal

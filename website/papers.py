@@ -1,7 +1,5 @@
 """The list of papers, data sets and systems, from docs/references.bib."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

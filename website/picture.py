@@ -1,7 +1,5 @@
 """A picture of several policies on the same episode: a lane for each, with the messages that the server has seen."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

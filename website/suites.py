@@ -1,7 +1,5 @@
 """Page of suites from their registry."""
 
-from __future__ import annotations
-
 from bufgym.scenario.suites import SUITES
 from website.markdown import table
 

@@ -1,7 +1,5 @@
 """Tutorials as pages and notebooks, each made from one Python file in docs/tutorials."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "tutorials"

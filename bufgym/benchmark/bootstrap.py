@@ -3,8 +3,6 @@
 A statistic is computed for the sample and for each of its resamples at once: row 0 is always the sample itself.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence

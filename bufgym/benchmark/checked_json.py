@@ -1,7 +1,5 @@
 """Reader of untrusted JSON files; its errors name the file, the field and the rule."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

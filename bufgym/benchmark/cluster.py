@@ -1,7 +1,5 @@
 """Parallel execution through joblib: processes or threads of this machine, or a Ray or Dask cluster."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Iterable, Iterator

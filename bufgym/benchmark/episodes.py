@@ -1,7 +1,5 @@
 """Rows of a benchmark as arrays, checked that every policy met the same episodes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ A file's policy is named after the file's stem, a function's after the function.
 because names also come from other people's leaderboards and results.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterable

@@ -5,8 +5,6 @@ mean of the cells' values, so a ratio over all cells is a mean of ratios, not a 
 paired bootstrap over links that ``score`` describes: one draw serves all policies and all cells.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

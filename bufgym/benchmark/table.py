@@ -1,7 +1,5 @@
 """The one writer of tables, as text, Markdown and HTML, and the table of ``bufgym bench``."""
 
-from __future__ import annotations
-
 import html
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Choices of ``python -m agents.tune`` in ``tuned.json``: ``bufgym bench --suite`` uses them as variants."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -5,8 +5,6 @@ it is called, and heavy modules inside the function that needs them. A user's mi
 line on stderr and exit code 2. Ctrl-C gives exit code 130.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

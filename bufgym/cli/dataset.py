@@ -1,7 +1,5 @@
 """``bufgym dataset make``: episodes as a data set."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``bufgym list``: environments, scenarios, suites, policies and more, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 

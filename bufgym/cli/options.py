@@ -1,7 +1,5 @@
 """What commands share: types and groups of options, what goes together, policies by name and from files, columns."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence

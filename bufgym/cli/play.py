@@ -1,7 +1,5 @@
 """``bufgym play``: a policy decides, in the terminal or in a film."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """``bufgym report``, ``leaderboard``, ``validate``, ``perf`` and ``warmup``."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``bufgym topics`` and ``bufgym fleet``: names for ``bufgym bench`` with a suite of that kind, or one's own client."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated
 

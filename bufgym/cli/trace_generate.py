@@ -3,8 +3,6 @@
 A link's options are the parameters of the function that makes it, without their units.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable, Mapping

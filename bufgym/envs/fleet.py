@@ -1,7 +1,5 @@
 """``pettingzoo.ParallelEnv``: robots that share one cell, each with a send buffer of its own."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Rows whose senders are the robots of cells, and the batch of them from which one shared policy learns."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@
 (``bufgym.policies.guided``), which learns of every decision.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Forms of an observation; each is a view of the flat row of numbers that kernels write."""
 
-from __future__ import annotations
-
 import sys
 from collections import OrderedDict
 from collections.abc import Callable, Sequence

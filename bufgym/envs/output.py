@@ -1,7 +1,5 @@
 """What a step hands out: the arrays of n rows, and the kernels that write rewards, masks and observations into them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

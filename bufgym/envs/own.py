@@ -4,8 +4,6 @@ Compiled functions are values of one function type, as policies are, so these ke
 Other functions run in ordinary Python. Row i of a batch and the single environment call the same function.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast

@@ -3,8 +3,6 @@
 ``Rows`` has a link for each sender; in ``fleet_rows`` the robots of a cell share one.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """``gymnasium.Env``: one sender."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import gymnasium as gym

@@ -6,8 +6,6 @@ single environment is a batch of one row. Row i of a batch equals the single env
 as both run the same code.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

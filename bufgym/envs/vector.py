@@ -1,7 +1,5 @@
 """``gymnasium.vector.VectorEnv``: n senders stepped by one compiled call, the native form of the environment."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, cast
 

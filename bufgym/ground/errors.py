@@ -4,8 +4,6 @@
 other exception that escapes is a bug in bufgym.
 """
 
-from __future__ import annotations
-
 import difflib
 import importlib.metadata
 import os

@@ -1,7 +1,5 @@
 """Files: written whole or not at all, read with size limits, and found where bufgym ships them."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 import tomllib

@@ -1,7 +1,5 @@
 """Processes that work for this one: they end with it, and one of them may compile in its place."""
 
-from __future__ import annotations
-
 import functools
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Work that several threads share."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

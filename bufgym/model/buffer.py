@@ -5,8 +5,6 @@ order. Slot 0, the head, is the oldest queued message; it is at column ``first``
 ``slots[first - 1]``, and popping it moves nothing in memory.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shared rules for numbers; each function raises a BufgymError that names the parameter and the broken rule."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """Field descriptions of named tuples, in the place where ``help`` finds them."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import textwrap

@@ -8,8 +8,6 @@ bytes. Messages pass on positions, not times, so rounding errors never add up.
 After the trace's end the link may *loop* to its beginning, *hold* the last segment's rate or *stop* for good.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -9,8 +9,6 @@ never exceeds 1, and is concave. The coordinate is the frame index, for the pape
 motion of the camera, for motion-based QoI. The same V serves both.
 """
 
-from __future__ import annotations
-
 import inspect
 import math
 from collections.abc import Callable, Sequence

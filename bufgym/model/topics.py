@@ -5,8 +5,6 @@ The terms come from Robofleet [sikand2021robofleet]: a topic has a priority, may
 A topic may also have a deadline, after which its messages count as late.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -6,8 +6,6 @@ function of e it is a falling staircase. Message i's staircase follows from all 
 backward sweep over the episode (``find_steps``) finds all of them exactly. ``from_queue`` adds the queued messages.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

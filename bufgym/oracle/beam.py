@@ -6,8 +6,6 @@ state that have not begun by then. States are ranked by their gain, less the pri
 programme (``programme``) promises.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

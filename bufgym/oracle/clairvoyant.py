@@ -13,8 +13,6 @@ room for i if and only if
 ``unequal.py`` finds a good set and a close upper bound.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -7,8 +7,6 @@ and s - t later messages were there before byte u_t. Plans without this conditio
 meet it anyway. If not, ``forced`` finds the best.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

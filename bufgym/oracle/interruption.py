@@ -8,8 +8,6 @@ after message 0, as the paper does: compare them with H - 1 of a run.
 longest interruption holds all shorter ones, and some 400 decisions give the mean over T without sampling noise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -19,8 +19,6 @@ there, it looks further down, at last from the gain of a plan that ``future`` it
 Sizes are equal here; ``unequal`` handles others.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Distance of H from the best: regret, and the score between Drop Oldest and the clairvoyant."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

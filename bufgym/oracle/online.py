@@ -12,8 +12,6 @@ Sets without message t + 1 come before those with it, so values after t arrivals
 The decision on message t + 1 is numbered by the set of L + 1 messages; one of them must go.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 ``labels`` takes its bounds from it for equal sizes, ``unequal`` its prices and its bound for others.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

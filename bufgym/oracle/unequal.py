@@ -18,8 +18,6 @@ leaves room. Steps have Polyak's length towards the best plan known, and are hal
 round gives a bound; the least of all is returned.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bufgym.ground.kernel import Floats, Ints, kernel

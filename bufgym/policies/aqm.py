@@ -4,8 +4,6 @@ Both drop early to tell TCP senders to slow down. A camera does not slow down, s
 drops.
 """
 
-from __future__ import annotations
-
 import math
 
 from bufgym.ground.kernel import kernel

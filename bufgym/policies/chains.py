@@ -10,8 +10,6 @@ less the best chain through k. Both come from one pass from the end and one from
 ``SPAN`` - 1 messages.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

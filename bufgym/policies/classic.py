@@ -1,7 +1,5 @@
 """Drop rules of today's middleware and network queues, which decide by position alone."""
 
-from __future__ import annotations
-
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.policies.registry import Arrival, Memory, built_in

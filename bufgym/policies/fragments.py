@@ -12,8 +12,6 @@ of the program. Afterwards the link counts as free, and the next message measure
 about one message in `rate_memory_s` arrives that in reality would not.
 """
 
-from __future__ import annotations
-
 import math
 
 from bufgym.ground.kernel import kernel

@@ -4,8 +4,6 @@ Dropping slot k merges its two gaps into one; the smaller the merged gap, the le
 motion gaps the robot's odometry.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bufgym.ground.kernel import kernel

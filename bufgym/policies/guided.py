@@ -18,8 +18,6 @@ until the link has carried anything.
     outputs <- (1 - plain) (W_light + h W_heavy) inputs
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple

@@ -10,8 +10,6 @@ The numbers are ``BASE`` + W c, linear in the inputs c (``INPUTS``, with lg as i
 ``no_drop`` messages go first in any case, as in Robofleet, and are lost only if the queue holds nothing else.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar

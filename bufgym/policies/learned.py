@@ -12,8 +12,6 @@ motion, is among the fields that it may read.
 The file is safetensors with JSON metadata: reading it runs nothing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 

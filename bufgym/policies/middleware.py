@@ -4,8 +4,6 @@ Most keep the newest messages or reject the newcomer, as `drop-oldest` and `drop
 here so that their users find them in a table. None knows the worth of a message.
 """
 
-from __future__ import annotations
-
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import drop_newest, drop_oldest, keep_first, keep_last
 from bufgym.policies.registry import Arrival, ClientSettings, Memory, built_in

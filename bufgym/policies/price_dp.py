@@ -31,8 +31,6 @@ Under B a newcomer that takes the place of several messages goes itself, unless 
 room for it.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

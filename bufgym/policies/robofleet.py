@@ -11,8 +11,6 @@ Robofleet's queue of ``no_drop`` messages has no limit. Here it has the sender's
 schedulers. On a sender with a single topic, both clients keep one slot, and native ROS drops its oldest.
 """
 
-from __future__ import annotations
-
 import math
 
 from bufgym.ground.kernel import kernel

@@ -1,7 +1,5 @@
 """Policies that sample the stream, whatever the queue holds."""
 
-from __future__ import annotations
-
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.policies.classic import keep_last, uniform_draw
 from bufgym.policies.registry import Arrival, Memory, built_in

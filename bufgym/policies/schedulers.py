@@ -5,8 +5,6 @@
 message of each topic. On a sender with a single topic, each is a queue that drops its oldest message.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

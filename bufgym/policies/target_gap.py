@@ -39,8 +39,6 @@ The numbers are the policy's parameters. ``python -m agents.tune SUITE --policie
 again. The other constants are structural, and are not tuned.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -10,8 +10,6 @@ lost this way. The remaining room should fill up within ``HORIZON_US``, since me
 are sent too; so the messages lie a little closer. If the robot knows that the stream ends earlier, they do by then.
 """
 
-from __future__ import annotations
-
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import Buffer
 from bufgym.model.observe.on_board import mean_bytes

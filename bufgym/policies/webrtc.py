@@ -9,8 +9,6 @@ socket drains (``fragments.ahead_of_newcomer``), and nothing is dropped until th
 pauses the encoder, so every frame is dropped. These messages have no key frames: each counts as a delta frame.
 """
 
-from __future__ import annotations
-
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first

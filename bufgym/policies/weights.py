@@ -17,8 +17,6 @@ layer]. The names ``accept.*`` follow. An agent that guides a rule has the one t
 The author may add notes: the training command, seeds, suite, scores. A file is accepted whole or refused.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

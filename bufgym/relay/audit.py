@@ -3,8 +3,6 @@
 A client that is refused the same thing a thousand times a second makes one line a second, with the count.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections import Counter, deque

@@ -1,7 +1,5 @@
 """A recording played as a robot: its messages are sent again with their recorded spacing."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path

@@ -11,8 +11,6 @@ system has acked its last byte. After a reconnect, messages still on their way a
 numbers.
 """
 
-from __future__ import annotations
-
 import asyncio
 import ssl
 import time

@@ -1,7 +1,5 @@
 """``bufgym relay``: a fleet's server, its robots, and a viewer."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal

@@ -3,8 +3,6 @@
 Whatever no rule allows is denied, so a configuration without rules serves nobody.
 """
 
-from __future__ import annotations
-
 import ipaddress
 from pathlib import Path
 from typing import Annotated, Any, Final

@@ -1,7 +1,5 @@
 """One client's connection: its identity and its checked requests. Its ``outbox`` sends to it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

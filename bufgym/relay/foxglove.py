@@ -4,8 +4,6 @@ Foxglove and Lichtblick connect to it as to any robot. Messages of ROS go throug
 pictures become CompressedImage, and poses also transforms, so that the map shows every robot where it is.
 """
 
-from __future__ import annotations
-
 import asyncio
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Members of a relay and the routing between them, without sockets."""
 
-from __future__ import annotations
-
 import functools
 import json
 import time

@@ -1,7 +1,5 @@
 """Proofs of identity: JSON web tokens checked against an issuer's keys, and clients' certificates."""
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import json

@@ -1,7 +1,5 @@
 """State of a robot's queue in numbers that fit into a message, computed from its records as they happen."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Sequence

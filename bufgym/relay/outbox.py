@@ -3,8 +3,6 @@
 The relay's answers go first, then no_drop messages while fewer than n_T are unacked, then messages from the queues.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import deque
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """The relay's page over HTTP on the same port; it serves the files of one folder and nothing else."""
 
-from __future__ import annotations
-
 import email.utils
 import mimetypes
 from http import HTTPStatus

@@ -4,8 +4,6 @@ Python's own ``re`` can take exponential time on an expression such as ``(a+)+$`
 this, such as back references and look-around. Its syntax is at https://github.com/google/re2/wiki/Syntax.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any, Final
 

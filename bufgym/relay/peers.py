@@ -7,8 +7,6 @@ A no_drop message goes into a JetStream stream before it is acked. Each relay ta
 own receivers. NATS keeps it until every relay has taken it, also one that is away.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import ssl

@@ -1,7 +1,5 @@
 """Limits of one identity over all its connections."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ A recorder's file is a plain sequence of MCAP records, which may still grow. The
 times is kept, so that a piece from its middle can be read directly.
 """
 
-from __future__ import annotations
-
 import base64
 import bisect
 import io

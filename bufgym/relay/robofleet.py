@@ -11,8 +11,6 @@ Robofleet's clients receive only messages of Robofleet's clients: flatbuffers ar
 encodings.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import struct

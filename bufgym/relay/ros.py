@@ -4,8 +4,6 @@ A message that others publish on ``/robots/NAME/to/TOPIC``, in CDR and with its 
 the robot was told to receive that topic.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Messages of ROS in CDR and in ROS 1's encoding, read and converted without ROS (the library ``rosbags``)."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import math

@@ -5,8 +5,6 @@ for each rule of the identity, by address, address range or e-mail: if the rule 
 denied
 """
 
-from __future__ import annotations
-
 import ipaddress
 import math
 from collections.abc import Sequence

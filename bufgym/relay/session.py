@@ -3,8 +3,6 @@
 This is all that a viewer needs. ``client.RobotClient`` adds a queue for a robot's messages.
 """
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 import json

@@ -1,7 +1,5 @@
 """Robofleet's server rule for a receiver with bytes pending, as a policy."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer

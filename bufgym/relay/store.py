@@ -6,8 +6,6 @@ once however often it is sent again, and a killed relay resumes where it was. Sp
 room is refused to its sender.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence

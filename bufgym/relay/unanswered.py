@@ -4,8 +4,6 @@ The relay takes number k only after k - 1, and answers each once, in order. A re
 messages under way are answered, the messages behind the refused one are sent again from that number on.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import deque
 from dataclasses import dataclass

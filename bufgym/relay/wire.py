@@ -5,8 +5,6 @@ and sender in UTF-8, then the payload. In JSON the same message is an object who
 where the encoding is ``json``, and base64 of the payload where it is not.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

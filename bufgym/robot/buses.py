@@ -8,8 +8,6 @@
 Both send and receive reliably, drop nothing themselves, and are given the next message when the window of acks allows.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

@@ -1,7 +1,5 @@
 """``bufgym live send``, ``receive`` and ``link``: the two ends of a real link, and the link."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import sys

@@ -4,8 +4,6 @@ A frame is handed over as it is, so its bytes cost nothing here. Between two fra
 more the busier it is with other things. So the same is also measured without pauses.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 

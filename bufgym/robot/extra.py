@@ -1,7 +1,5 @@
 """Libraries of the extras ``live`` and ``zenoh``, imported where they are used."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

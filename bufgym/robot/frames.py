@@ -5,8 +5,6 @@ of the next message that it expects. So after a broken connection no message is 
 again. Each message (DATA) is then answered by an ACK with its number. A sender that has sent all says GOODBYE.
 """
 
-from __future__ import annotations
-
 import struct
 from typing import Final, NamedTuple
 

@@ -12,8 +12,6 @@ need the extra ``live``.
 | dropped | seq, why: rejected, evicted for another, limited, dropped at the head |
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager

@@ -1,7 +1,5 @@
 """By how much a policy beats another on real sockets, and by how much in the simulator, over the same episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

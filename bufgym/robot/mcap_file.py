@@ -1,7 +1,5 @@
 """One writer of MCAP files, for logs, received messages and a relay's recordings (extra ``live``)."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any, Final

@@ -3,8 +3,6 @@
 For the same poses the sum equals that of ``bufgym.traces.motion_from_poses`` over a recording.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

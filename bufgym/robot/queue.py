@@ -12,8 +12,6 @@ The program puts messages in. A transport takes out each message that the socket
 The message that ``get`` returns has left the queue and can't be dropped any more; the next one follows after ``gone``.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import threading

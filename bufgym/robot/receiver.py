@@ -1,7 +1,5 @@
 """The receiving end: takes messages from any number of senders, acks each, and delivers none twice."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import inspect

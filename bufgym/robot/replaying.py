@@ -1,7 +1,5 @@
 """Replay of a live queue's log in the simulator: the same arrivals over the link that the log measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

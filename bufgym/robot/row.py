@@ -11,8 +11,6 @@ again. Two rules make that exact:
 Memory is bounded: settled messages are forgotten when their columns are needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Runs on real sockets compared with the same runs in the simulator, as numbers and as a file."""
 
-from __future__ import annotations
-
 import json
 import statistics
 from collections.abc import Sequence

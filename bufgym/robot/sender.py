@@ -1,7 +1,5 @@
 """The sending end: sends a ``PolicyQueue``'s messages, reports when each has left, and reconnects by itself."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 from collections import deque

@@ -5,8 +5,6 @@ delayed. Its own buffers are small, so that it hides no queue. Normally the send
 ``back`` the receiver connects to the sender, as a ROS 1 subscriber does.
 """
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import time

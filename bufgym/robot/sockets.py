@@ -5,8 +5,6 @@ send buffer, and TCP_NOTSENT_LOWAT limits unsent bytes in the kernel. ``unacked_
 peer's kernel has not acked.
 """
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import struct

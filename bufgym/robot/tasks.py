@@ -1,7 +1,5 @@
 """Asyncio tasks that belong to one end of a connection and end with it."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Coroutine
 from typing import Any

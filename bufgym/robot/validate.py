@@ -1,7 +1,5 @@
 """The same episodes on real sockets and in the simulator, side by side."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import time

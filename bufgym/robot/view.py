@@ -1,7 +1,5 @@
 """Text view of a live queue, made from its log's records as they happen or from a log file."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Iterable
 from typing import Final

@@ -1,7 +1,5 @@
 """A trained agent as a file of weights that bufgym runs without torch (``bufgym.policies.weights``)."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -11,8 +11,6 @@ features) and on the link (the context), not on the number of its slot. One set 
     MaskablePPO("MultiInputPolicy", env, policy_kwargs={"features_extractor_class": SlotExtractor})
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

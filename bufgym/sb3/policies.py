@@ -1,7 +1,5 @@
 """``as_policy``: any trained model of stable-baselines3 or sb3-contrib as a policy for runs and benchmarks."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Sequence
 from pathlib import Path

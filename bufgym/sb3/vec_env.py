@@ -9,8 +9,6 @@ it a ``gymnasium.vector.VectorEnv`` instead, so a compiled batch stays one call:
     model = MaskablePPO("MultiInputPolicy", make_vec_env("bufgym/Uplink-v0", 256, seed=0), batch_size=4096)
 """
 
-from __future__ import annotations
-
 import inspect
 import time
 from collections.abc import Mapping, Sequence

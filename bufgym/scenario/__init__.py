@@ -5,8 +5,6 @@ moves, which link carries them. Arrivals, link and policies draw from separate r
 two policy seeds) meet the same episode: common random numbers.
 """
 
-from __future__ import annotations
-
 from bufgym.scenario.arrivals import messages
 from bufgym.scenario.client import Client, Stream, read_client, robofleet_example
 from bufgym.scenario.episode import Episode, Scenario, Streams

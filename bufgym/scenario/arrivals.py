@@ -1,7 +1,5 @@
 """The messages of an episode, MESSAGE[n]: how they are made, and the rules that they keep."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

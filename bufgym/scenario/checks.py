@@ -1,7 +1,5 @@
 """Rules that parameters of scenarios share; each function raises a BufgymError that names the parameter."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ Each ``Stream`` publishes one topic. The ``Client`` sends them all over one link
 There are Robofleet's example client, and clients from TOML files.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping

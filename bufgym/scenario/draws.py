@@ -1,7 +1,5 @@
 """Draws that uplinks and clients share: shipped recordings, places on them, and message sizes."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, cast
 

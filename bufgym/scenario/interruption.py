@@ -1,7 +1,5 @@
 """One interruption of unknown length: the model of the AFR paper [wang2022afr]."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, field
 from typing import Any, ClassVar

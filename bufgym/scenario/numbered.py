@@ -1,7 +1,5 @@
 """Episodes by seed, the same in a row of a benchmark and in the reset of an environment; and from a fixed pool."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The one registry of scenarios, by name."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace

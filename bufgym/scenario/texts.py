@@ -1,7 +1,5 @@
 """Words that scenarios describe themselves with (``about``)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A camera stream, or a robot's recording, over real or synthetic links."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Compiled policies see the sender's own records, which spares a copy at every dec
 So every benchmark run is checked at its end: a policy that changed a message or a topic's rules has no result.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

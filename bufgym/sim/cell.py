@@ -1,7 +1,5 @@
 """Fleets that hold episodes, and the run of a policy on every robot of a cell."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Carrying out decisions: at an arrival, at the head of the queue, and on the message to dequeue."""
 
-from __future__ import annotations
-
 from bufgym.ground.kernel import at, kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push, running_mean
 from bufgym.sim import rules

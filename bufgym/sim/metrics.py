@@ -4,8 +4,6 @@ A time of transmission is the time at which a message's last byte crossed the li
 propagation delay later.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

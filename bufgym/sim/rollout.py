@@ -3,8 +3,6 @@
 Both run senders with links of their own (``shares`` is None) and robots that share the link of a cell.
 """
 
-from __future__ import annotations
-
 import functools
 from contextlib import nullcontext, suppress
 from time import perf_counter

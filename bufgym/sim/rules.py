@@ -8,8 +8,6 @@ A single queue ignores the messages' topic numbers and reads row 0 of the topic 
 its limits never bind; the sender's record has the score instead. That saves a tenth of a rollout's time.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from bufgym.ground.kernel import at, kernel

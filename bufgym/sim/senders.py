@@ -1,7 +1,5 @@
 """Senders that hold episodes, and the run of a policy on episodes of one queue or of several topics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast

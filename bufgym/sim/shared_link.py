@@ -8,8 +8,6 @@ stays with the cell (in ``position``) and is shared among all who are busy from 
 or given twice.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any, NamedTuple, cast
 

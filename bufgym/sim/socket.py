@@ -1,7 +1,5 @@
 """The socket: dequeueing, transmission, acks, and receipt at the server."""
 
-from __future__ import annotations
-
 from bufgym.ground.kernel import at, kernel
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable

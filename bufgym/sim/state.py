@@ -1,7 +1,5 @@
 """Arrays of a batch of senders, which the caller owns and the kernels change in place."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any, NamedTuple, cast
 

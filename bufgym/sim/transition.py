@@ -4,8 +4,6 @@
 Otherwise it holds the cells of ``bufgym.sim.shared_link``. Numba compiles each case separately.
 """
 
-from __future__ import annotations
-
 from bufgym.ground.kernel import at, kernel
 from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell

@@ -1,7 +1,5 @@
 """A policy's view of its sender."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from bufgym.ground.kernel import at, kernel, stretch

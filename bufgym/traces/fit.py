@@ -17,8 +17,6 @@ Everything is searched on grids or by a fixed number of steps and rounded, so th
 With under 10 outages, their lengths and rates are taken over all modes together, and gaps have a single distribution.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -5,8 +5,6 @@ times rho^lag, by least squares; the rest of the variance is drawn anew. Long tr
 memory, so rho is known to no more than a few per cent.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Final

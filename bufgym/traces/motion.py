@@ -5,8 +5,6 @@ view + translation / scene scale. One unit is a view that shows nothing of the o
 it on board, and it is the scalar over which Quantity of Information is counted.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 

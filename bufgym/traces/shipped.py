@@ -1,7 +1,5 @@
 """The traces and motion recordings that come with bufgym, by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bufgym.ground import files

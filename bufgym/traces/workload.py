@@ -1,7 +1,5 @@
 """What a robot sends: arrival time, size, topic and coordinate x of each message."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple

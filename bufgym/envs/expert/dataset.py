@@ -1,7 +1,5 @@
 """Minari data sets of bufgym's environments (extra ``dataset``), recorded from the native batch."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import tempfile

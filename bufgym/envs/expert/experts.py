@@ -1,7 +1,5 @@
 """Policies as experts: the action that a policy would choose in an environment's state."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

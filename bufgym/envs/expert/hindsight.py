@@ -1,7 +1,5 @@
 """The clairvoyant as an expert: the value of every action in the state that an environment is in."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

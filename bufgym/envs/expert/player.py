@@ -1,7 +1,5 @@
 """A fixed policy as the player of an environment, decision by decision."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

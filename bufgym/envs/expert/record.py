@@ -1,7 +1,5 @@
 """Episodes of a policy, recorded from the native batch for data sets."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 

@@ -7,8 +7,6 @@ demand, so messages must wait or be dropped where the capacity is below half hei
 With several topics each has a lane and a letter of its own; letters tell queued messages apart.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from bufgym.envs.render.image import rgb_array

@@ -1,7 +1,5 @@
 """The robots of one cell as text and as an image, a line for each."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

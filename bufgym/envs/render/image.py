@@ -1,7 +1,5 @@
 """One sender as an image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

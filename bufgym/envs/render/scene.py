@@ -1,7 +1,5 @@
 """The content of a picture of one sender, read from the sender's arrays."""
 
-from __future__ import annotations
-
 import string
 from typing import Any, NamedTuple
 

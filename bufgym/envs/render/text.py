@@ -1,7 +1,5 @@
 """One sender as lines of text."""
 
-from __future__ import annotations
-
 import bisect
 import itertools
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """A notice on stderr when compiling takes long."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from typing import Any, cast

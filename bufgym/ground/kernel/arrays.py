@@ -4,8 +4,6 @@ The caller guarantees that indices are >= 0 and slices lie inside the array. Num
 every index and the ends of every slice, which is a fifth of a rollout's instructions.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numba

@@ -1,7 +1,5 @@
 """Storage of machine code: a file for each kernel, set of argument types, and state of all that it calls."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import hashlib

@@ -4,8 +4,6 @@ The *closure* of a kernel is its own code, the kernels that it calls, theirs, an
 Comments, docstrings and line numbers are not part of it, nor is anything that no kernel calls.
 """
 
-from __future__ import annotations
-
 import enum
 import functools
 import hashlib

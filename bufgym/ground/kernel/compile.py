@@ -1,7 +1,5 @@
 """The one decorator for compiled functions, and what runs them."""
 
-from __future__ import annotations
-
 import functools
 import threading
 from collections.abc import Callable

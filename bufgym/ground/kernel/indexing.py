@@ -1,7 +1,5 @@
 """Code of the functions of ``arrays`` in kernels: without the checks that Numba adds to every index."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """Long work in kernels that answers Ctrl-C."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait

@@ -4,8 +4,6 @@ A kernel and its source give the same results bit for bit. So a kernel over few 
 runs as plain Python, a thousand times slower, until its machine code is on disk.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import os

@@ -1,7 +1,5 @@
 """A pass of the compiler: fields of named tuples that are None are known to be None at compile time."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 from numba import types

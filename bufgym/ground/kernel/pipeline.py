@@ -10,8 +10,6 @@ No entry from Python into parts: about 3 s. Bundles by address: 0.6 to 2.0 s. Bu
 ns, within what such runs differ by. Fetching ahead: about 30 ns. ``njit`` alone, with references counted: 15.5 s.
 """
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 from llvmlite import binding

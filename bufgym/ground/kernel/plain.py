@@ -3,8 +3,6 @@
 Results are equal bit for bit. Compiling takes longer, and again in each process, as no code is kept.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from typing import Any, TypeVar, cast

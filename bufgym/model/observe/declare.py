@@ -4,8 +4,6 @@ A field's number is an expression of what the kernel that writes it has at hand.
 line for every field of a table.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any

@@ -13,8 +13,6 @@ message dequeued last to its last arrival, divided by one more than its queued m
 units of the largest weight. Further fields describe the topics.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from bufgym.model.observe.queue import CONTEXT_FIELDS, SLOT_FIELDS

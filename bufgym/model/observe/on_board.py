@@ -4,8 +4,6 @@ They describe the link's rate as the robot's own socket shows it, bytes beside w
 gaps counted in messages or per byte.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -20,8 +20,6 @@ Fields and terms take part only where they are named. Text that has to stand alo
 imports the module that registers them. ``compile=True`` promises that Numba can compile the function.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace

@@ -4,8 +4,6 @@ A slot's number is made of its ``Slot``, a context's of the ``Newcomer``: what s
 Several topics have the same fields; ``topics`` only fills in other neighbours.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

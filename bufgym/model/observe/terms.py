@@ -5,8 +5,6 @@ Each is a cost, hence negative: a weight > 0 rewards less of it. Steps are ``buf
 counts them for each topic; one queue has the weight 1 and a deadline of its own.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

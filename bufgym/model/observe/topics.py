@@ -1,7 +1,5 @@
 """Fields with several topics: the fields of one queue, with neighbours of the same topic, and ``TOPIC_FIELDS``."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Calls of a program in an episode with the simulator's decisions, the reference for the header's C."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

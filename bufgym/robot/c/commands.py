@@ -1,7 +1,5 @@
 """``bufgym export``: agents as files of weights, policies in C."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Builder of a policy's header from parts in C and the policy's numbers as constants."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from pathlib import Path

@@ -13,8 +13,6 @@ or, for an unmodified node,
 ``publish``, and ``queue_size=0`` is unbounded. Both, and the topics of ``UNTOUCHED``, stay rospy's.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import threading

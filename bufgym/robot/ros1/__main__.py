@@ -1,7 +1,5 @@
 """``python -m bufgym.robot.ros1 --policy afr NODE.py ARGS`` runs a rospy node with its queues under a policy."""
 
-from __future__ import annotations
-
 import argparse
 import runpy
 import sys

@@ -5,8 +5,6 @@ nothing can be dropped any more. This one takes one message at a time from a ``P
 subscriber's system has acked nearly all of it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

@@ -6,8 +6,6 @@ An ordinary node, unaware of any policy, publishes camera and odometry. The poli
 Everything runs in real time.
 """
 
-from __future__ import annotations
-
 import asyncio
 import importlib
 import math

@@ -1,7 +1,5 @@
 """``bufgym ros2``: a relay between two ROS 2 networks over one uplink that a policy rules."""
 
-from __future__ import annotations
-
 import contextlib
 
 from bufgym.cli.options import Count, PolicyFile, one_policy

@@ -6,8 +6,6 @@ Node and viewer are ordinary nodes in two DDS domains. The relay has x from the 
 real time.
 """
 
-from __future__ import annotations
-
 import asyncio
 import importlib
 import math

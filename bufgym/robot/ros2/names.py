@@ -3,8 +3,6 @@
 It takes some 60 bytes. Every message has it, so that either end may restart at any time.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 import struct

@@ -7,8 +7,6 @@
 message of many packets again and again on a lossy link. Over a fade 38 of 600 frames arrived that way.
 """
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable

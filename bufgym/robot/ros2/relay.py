@@ -6,8 +6,6 @@ Each end is one asyncio program; the robot's subscriptions run in a thread of rc
 way through a second pair with ``no_drop`` topics.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator

@@ -9,8 +9,6 @@ gets the next version.
 of robots. Messages of one queue have equal sizes, so that the clairvoyant's bound is exact, but for ``cameras``.
 """
 
-from __future__ import annotations
-
 from bufgym.ground.errors import unknown
 from bufgym.scenario.suites import cameras, recorded, shared_uplinks, stress, synthetic
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite

@@ -4,8 +4,6 @@ Equal sizes are the control: a rule that sees no bytes is at its best there. Eac
 motion at two loads, once with L messages and once with room for the bytes of eight.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bufgym.model import qoi

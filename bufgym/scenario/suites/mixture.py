@@ -1,7 +1,5 @@
 """The scenarios of a suite as one: ``bufgym/Suite-v0``."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Suites over recorded links and camera motion, from a folder that the user names (``--data``)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Suites in which several streams share an uplink: the topics of one client, the robots of one cell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

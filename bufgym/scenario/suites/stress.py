@@ -4,8 +4,6 @@ Other suites measure a policy where a robot usually is; this one asks whether it
 and few, because a factor of two matters here, not a per cent.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The parts of a suite: a name, scenarios in three splits, capacities, and a number of episodes."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass

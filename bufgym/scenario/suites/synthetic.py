@@ -1,7 +1,5 @@
 """Suites over made-up links: LTE, generated like recordings, blackouts, steady, switching, one interruption."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

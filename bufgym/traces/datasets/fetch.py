@@ -8,8 +8,6 @@ process fetches at a time; the others wait and then find the files.
     <cache>/ucc-5g/5G-production-dataset/...     unpacked
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -5,8 +5,6 @@ of the published file, because none of these publishers states one. A file that 
 no known checksum.
 """
 
-from __future__ import annotations
-
 import functools
 import tomllib
 from dataclasses import dataclass

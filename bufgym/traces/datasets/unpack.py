@@ -4,8 +4,6 @@ Only plain files and folders are unpacked. Links, devices, and names that lead o
 that an archive states is checked before a byte is written, and the libraries read no more than it.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import shutil

@@ -1,7 +1,5 @@
 """Errors about files, in the form that all readers and writers share."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike

@@ -1,7 +1,5 @@
 """Intervals that follow each other, each with its length and its bytes: what the readers of measurements share."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterable
 from typing import Final, NamedTuple

@@ -22,8 +22,6 @@ Limits beyond which a number counts as a mistake: 10**7 s in all, 86,400 s from 
 interval, 10**6 Mbit/s. `text.py` has the limits of text files.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Prediction using LSTM Neural Networks", PAM 2019 (extended: [mei2020realtime]); 
 Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from datetime import datetime

@@ -9,8 +9,6 @@ line, and no packet is through before its time. The trace lasts as long as its l
 line "1" is a steady 12 Mbit/s, as in mahimahi.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -6,8 +6,6 @@ github.com/minarady1/wifi_for_industrial_robotics (iperf3); M. Ghoshal et al., "
 of 5G mmWave Networks", 5G-MeMU 2022 (lists).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import Final

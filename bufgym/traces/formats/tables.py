@@ -1,7 +1,5 @@
 """Readers of simple tables: bufgym's CSV, the Belgium log, Mbit/s over time, rates over time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

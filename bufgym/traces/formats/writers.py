@@ -4,8 +4,6 @@
 `difference` says how much.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

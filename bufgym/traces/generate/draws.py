@@ -5,8 +5,6 @@ the last bit by IEEE 754, and results are rounded to whole bytes. Where a logari
 may differ between C libraries; the rounding removes the difference.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

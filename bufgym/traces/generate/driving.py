@@ -1,7 +1,5 @@
 """Motion of a robot that drives around, from a seed: uniform doubles only, rounded to millionths (see `draws`)."""
 
-from __future__ import annotations
-
 from typing import Final, Literal, TypeAlias
 
 import numpy as np

@@ -11,8 +11,6 @@ buffer is about. One deviation is a shortcoming: 10 s apart the generated rates 
 most of the real ones.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from dataclasses import dataclass

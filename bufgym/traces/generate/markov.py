@@ -22,8 +22,6 @@ Fitted to: 30 Belgium 4G logs [vanderhooft2016http2] for the ways of moving; the
 docs/generators-uplink.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from typing import Final

@@ -4,8 +4,6 @@
 and of uplinks; each states its command.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import re

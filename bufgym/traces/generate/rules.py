@@ -3,8 +3,6 @@
 The ramp of Robofleet's Fig. 5 is `ramp(100e6 / 8, 4e6 / 8, 15)`: 100 to 4 Mbit/s in 15 s [sikand2021robofleet].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import Final

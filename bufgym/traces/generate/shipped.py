@@ -3,8 +3,6 @@
 The models are in `lte.py` and `driving.py`; this file states which seeds and parameters are shipped.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Final

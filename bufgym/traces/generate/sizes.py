@@ -14,8 +14,6 @@ coefficient of variation of the part drawn anew, and those named above. Each law
 is divided by its own mean, not by that of the sequence drawn.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Mapping
