@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
@@ -21,7 +21,8 @@ Layout = Mapping[str, type]
 
 def columns_of(outcome: type) -> dict[str, type]:
     """The fields of a dataclass of statistics as columns."""
-    return {field.name: {"int": int, "float": float, "str": str}[str(field.type)] for field in fields(outcome)}
+    kinds = get_type_hints(outcome)
+    return {field.name: kinds[field.name] for field in fields(outcome)}
 
 
 RUNS: Layout = {
