@@ -213,7 +213,7 @@ def view_type() -> Any:
         "topics": numba.types.Array(numba.from_dtype(TOPIC), 1, "C"),
         **{name: real for name, kind in get_type_hints(Buffer).items() if kind is float},
     }
-    return numba.types.NamedTuple([types.get(name, numba.types.int64) for name in Buffer._fields], Buffer)
+    return cast(Any, numba.types).NamedTuple([types.get(name, numba.types.int64) for name in Buffer._fields], Buffer)
 
 
 @functools.cache

@@ -161,7 +161,7 @@ TRIED = (0, 68)
 def try_out() -> None:
     """With a later Numba, run a kernel inside another. Raises an error where Numba's private parts differ."""
     if tuple(map(int, str(numba.__version__).split(".")[:2])) > TRIED:
-        inner = kernel(lambda array: array[1])
-        outer = kernel(lambda array: inner(array))
+        inner: Any = kernel(lambda array: array[1])
+        outer: Any = kernel(lambda array: inner(array))
         if outer(np.arange(3)) != 1:
             raise ValueError("a wrong result")
