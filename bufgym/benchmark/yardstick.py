@@ -15,10 +15,7 @@ from bufgym.ground.kernel import Ints, kernel
 
 Reals = NDArray[np.float32]
 
-PERIOD_US = 33_333
-SIZE_BYTES = 230_000
-KNOTS, KNOT_US = 64, 500_000
-SLOT_FIELDS, CONTEXT_FIELDS = 9, 11
+PERIOD_US, SIZE_BYTES, KNOTS, KNOT_US, SLOT_FIELDS, CONTEXT_FIELDS = 33_333, 230_000, 64, 500_000, 9, 11
 QUEUED, NOW_US, FINISH_US, LEFT, LEFT_US, SEED = range(6)
 ONE, TWO, TINY, STEEP, SECOND, STRIDE, KEPT = np.array([1, 2, 1e-9, 3, 1e-6, 0.01, 0.95], np.float32)
 
@@ -26,10 +23,7 @@ ONE, TWO, TINY, STEEP, SECOND, STRIDE, KEPT = np.array([1, 2, 1e-9, 3, 1e-6, 0.0
 class Bare(NamedTuple):
     """n queues. Place 0 has the message that left last, then the s queued ones, the newcomer, the expected next one."""
 
-    at_s: Reals  # [n, L + 3]
-    x: Reals
-    size: Reals
-    gain: Reals  # V of the step from the place before it, 1 - exp(-STEEP dx)
+    places: Reals  # [n, 4, L + 3]: time, x, size, and V of the step from the place before, 1 - exp(-STEEP dx)
     previous: Reals  # [n, 3]: time and x of the arrival before the newcomer, and the running mean of departures
     state: Ints  # [n, 6]: QUEUED to SEED
     link: Ints  # [n, KNOTS], bytes a second
@@ -37,52 +31,45 @@ class Bare(NamedTuple):
     @classmethod
     def new(cls, n: int, capacity: int) -> Bare:
         """Empty queues, and links of 0.1 to 4 MB/s."""
-        at_s, x, size, gain = np.zeros((4, n, capacity + 3), np.float32)
         state, link = np.zeros((n, 6), np.int64), np.random.default_rng(0).integers(100_000, 4_000_000, (n, KNOTS))
         state[:, SEED] = np.arange(n)
-        return cls(at_s, x, size, gain, np.zeros((n, 3), np.float32), state, link)
+        return cls(np.zeros((n, 4, capacity + 3), np.float32), np.zeros((n, 3), np.float32), state, link)
 
 
 @kernel
 def _finish_us(bare: Bare, i: int, begins_us: int) -> int:
     rate = bare.link[i, (begins_us // KNOT_US) % KNOTS]
-    return int(begins_us + 1_000_000 * int(bare.size[i, 1]) // rate)
+    return int(begins_us + 1_000_000 * int(bare.places[i, 2, 1]) // rate)
 
 
 @kernel
 def _close(bare: Bare, i: int, first: int, last: int) -> None:
-    for p in range(first, last):
-        bare.at_s[i, p], bare.x[i, p] = bare.at_s[i, p + 1], bare.x[i, p + 1]
-        bare.size[i, p], bare.gain[i, p] = bare.size[i, p + 1], bare.gain[i, p + 1]
+    for column in bare.places[i]:
+        for p in range(first, last):
+            column[p] = column[p + 1]
 
 
 @kernel
 def _move(bare: Bare, i: int, action: int, capacity: int) -> None:
     """One decision, the link until the next arrival, and the newcomer."""
-    at_s, x, gain, state = bare.at_s[i], bare.x[i], bare.gain[i], bare.state[i]
+    at, state, last = bare.places[i], bare.state[i], bare.previous[i]
+    at_s, x, size, gain = at[0], at[1], at[2], at[3]
     s = state[QUEUED]
     if action < s:
         _close(bare, i, action + 1, s + 1)
         gain[action + 1] = ONE - np.exp(-STEEP * (x[action + 1] - x[action]))
-        if action == 0:
-            state[FINISH_US] = _finish_us(bare, i, state[NOW_US])
-    elif action == capacity + 1 and s < capacity:
-        s += 1
-        if s == 1:
-            state[FINISH_US] = _finish_us(bare, i, state[NOW_US])
-    state[NOW_US] += PERIOD_US
-    state[LEFT] = 0
+    enqueues = action == capacity + 1 and s < capacity
+    s += enqueues
+    if action == 0 or (enqueues and s == 1):
+        state[FINISH_US] = _finish_us(bare, i, state[NOW_US])
+    state[NOW_US], state[LEFT] = state[NOW_US] + PERIOD_US, 0
     while s > 0 and state[FINISH_US] <= state[NOW_US]:
         _close(bare, i, 0, s)
         s -= 1
-        state[LEFT] += 1
-        state[LEFT_US] = state[FINISH_US]
-        if s > 0:
-            state[FINISH_US] = _finish_us(bare, i, state[LEFT_US])
-    state[QUEUED] = s
-    state[SEED] = (state[SEED] * 1103515245 + 12345) % 2147483648
-    last = bare.previous[i]
-    at_s[s + 1], bare.size[i, s + 1] = np.float32(state[NOW_US]) * SECOND, np.float32(SIZE_BYTES)
+        state[LEFT], state[LEFT_US] = state[LEFT] + 1, state[FINISH_US]
+        state[FINISH_US] = _finish_us(bare, i, state[LEFT_US])
+    state[QUEUED], state[SEED] = s, (state[SEED] * 1103515245 + 12345) % 2147483648
+    at_s[s + 1], size[s + 1] = np.float32(state[NOW_US]) * SECOND, np.float32(SIZE_BYTES)
     x[s + 1] = last[1] + STRIDE * np.float32(state[SEED] // 65536 % 8)
     at_s[s + 2], x[s + 2] = TWO * at_s[s + 1] - last[0], TWO * x[s + 1] - last[1]
     gain[s + 1] = ONE - np.exp(-STEEP * (x[s + 1] - x[s]))
@@ -98,7 +85,8 @@ def _squash(length: Any, reference: Any) -> Any:
 @kernel
 def observe(bare: Bare, i: int, flat: Reals, mask: NDArray[np.int8]) -> None:
     """Write all numbers of queue ``i``: slot fields of L + 1 columns each, the context, the mask."""
-    at_s, x, size, gain, out = bare.at_s[i], bare.x[i], bare.size[i], bare.gain[i], flat[i]
+    at, out = bare.places[i], flat[i]
+    at_s, x, size, gain = at[0], at[1], at[2], at[3]
     s, width, last = bare.state[i, QUEUED], mask.shape[1] - 1, bare.previous[i]
     even_s, even_x = (at_s[s + 1] - at_s[0]) / np.float32(width), (x[s + 1] - x[0]) / np.float32(width)
     even, share = ONE - np.exp(-STEEP * even_x), ONE / np.float32(s + 1)

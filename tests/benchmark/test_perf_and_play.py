@@ -73,15 +73,16 @@ def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:
         assert not ended
     buffer, arrival = python_view(named(env.rows.senders.batch), 0), python_arrival(named(env.rows.senders.batch), 0)
     bare, s = yardstick.Bare.new(1, 4), len(buffer.slots)
+    at_s, x, size, gain = bare.places[0]
     zero = buffer.dequeued_arrival_us
     rows = [*buffer.slots, arrival]
-    bare.at_s[0, 1 : s + 2] = [(row.arrival_us - zero) * 1e-6 for row in rows]
-    bare.x[0, 0], bare.x[0, 1 : s + 2] = buffer.dequeued_x, [row.x for row in rows]
-    bare.size[0, 1 : s + 2] = [row.size_bytes for row in rows]
+    at_s[1 : s + 2] = [(row.arrival_us - zero) * 1e-6 for row in rows]
+    x[0], x[1 : s + 2] = buffer.dequeued_x, [row.x for row in rows]
+    size[1 : s + 2] = [row.size_bytes for row in rows]
     bare.previous[0, :2] = (buffer.previous_us - zero) * 1e-6, buffer.previous_x
-    bare.at_s[0, s + 2] = 2 * bare.at_s[0, s + 1] - bare.previous[0, 0]
-    bare.x[0, s + 2] = 2 * bare.x[0, s + 1] - bare.previous[0, 1]
-    bare.gain[0, 1:] = 1 - np.exp(-yardstick.STEEP * np.diff(bare.x[0]))
+    at_s[s + 2] = 2 * at_s[s + 1] - bare.previous[0, 0]
+    x[s + 2] = 2 * x[s + 1] - bare.previous[0, 1]
+    gain[1:] = 1 - np.exp(-yardstick.STEEP * np.diff(x))
     bare.state[0, yardstick.QUEUED] = s
     mine, mask = np.zeros((1, 56), np.float32), np.zeros((1, 6), np.int8)
     yardstick.observe(bare, 0, mine, mask)

@@ -214,7 +214,7 @@ def test_a_branch_that_needs_a_missing_field_is_not_compiled() -> None:
 
 
 @needs_compilation
-def test_a_bundle_made_in_a_kernel_is_handed_on_by_address() -> None:
+def test_a_named_tuple_made_in_a_kernel_is_handed_on() -> None:
     """Its fields stay as they were when it was made, the arrays that they name do not."""
 
     @kernel

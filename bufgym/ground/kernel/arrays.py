@@ -23,12 +23,12 @@ def records(shape: int | tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     return zeros if JIT else zeros.view(np.recarray)
 
 
-Bundle = TypeVar("Bundle", bound=NamedTuple)
+Arrays = TypeVar("Arrays", bound=NamedTuple)
 
 
-def named(arrays: Bundle) -> Bundle:
+def named(arrays: Arrays) -> Arrays:
     """The same memory, as records whose fields read as attributes in plain Python too."""
-    made: Bundle = cast(Any, type(arrays))(
+    made: Arrays = cast(Any, type(arrays))(
         *(array.view(np.recarray) if isinstance(array, np.ndarray) and array.dtype.names else array for array in arrays)
     )
     return made
