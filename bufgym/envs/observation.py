@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.observe import OWN_FIELDS, Field, own_field
 
 Observation = Any
@@ -69,7 +69,7 @@ class ObservationForm:
             if name not in known:
                 found = own_field(name)
                 if found is None:
-                    raise BufgymError(f"fields: unknown field {name!r}; known: {', '.join([*known, *OWN_FIELDS])}")
+                    raise unknown("field", name, [*known, *OWN_FIELDS], place="fields")
                 own[found.name], names[k] = found, found.name
         if not names:
             raise BufgymError("fields: choose at least one field to observe")

@@ -3,6 +3,7 @@
 ``Rows`` has a link for each sender; in ``fleet_rows`` the robots of a cell share one.
 """
 
+import inspect
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,7 @@ from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import step_rows
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.kernel import code_for
 from bufgym.ground.threads import Threads
 from bufgym.model.checks import is_number, whole
@@ -50,12 +51,12 @@ def reward_weights(
 ) -> tuple[NDArray[np.float64], tuple[OwnTerm, ...]]:
     """float64[reward terms] from one term's name or from weights by name, and the named terms that are in no table."""
     tables = [term.name for term in terms_for(several_topics)]
-    known = ", ".join([*tables, *(name for name in OWN_TERMS if name not in tables)])
+    known = [*tables, *(name for name in OWN_TERMS if name not in tables)]
     if not isinstance(reward, str | Mapping):
-        raise BufgymError(f"reward = {reward!r}: must be the name of a term ({known}) or weights by name")
+        raise BufgymError(f"reward = {reward!r}: must be the name of a term ({', '.join(known)}) or weights by name")
     weights = {reward: 1.0} if isinstance(reward, str) else dict(reward)
     if not weights:
-        raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {known}")
+        raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {', '.join(known)}")
     own: dict[str, OwnTerm] = {}
     for name, weight in weights.items():
         if not (is_number(weight) and np.isfinite(weight)):
@@ -64,7 +65,7 @@ def reward_weights(
             continue
         term = own_term(name) if isinstance(name, str) else None
         if term is None:
-            raise BufgymError(f"reward = {reward!r}: unknown term {name!r}; known: {known}")
+            raise unknown("term", name, known, place=f"reward = {reward!r}")
         if several_topics and term.one_queue:
             raise BufgymError(f"reward = {reward!r}: {name!r} is for one queue; each topic has settings of its own")
         own[name] = term
@@ -87,8 +88,9 @@ NUMBERED = ("scenario", "trace", "seed")
 
 
 def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
-    if unknown := [name for name in names if name not in NUMBERED]:
-        raise BufgymError(f"episode: {unknown[0]!r} is unknown; known: {', '.join(NUMBERED)}")
+    for name in names:
+        if name not in NUMBERED:
+            raise unknown("entry", name, NUMBERED, place="episode")
     return names
 
 
@@ -123,7 +125,7 @@ class Rows:
             raise BufgymError(f"info = {info!r}: must be one of {', '.join(map(repr, INFOS))}")
         self.shows_all, self.is_steady = info in ("full", "steady"), info == "steady"
         self.shows_mask = info != "none" and actions == "slots"
-        self.scenario = scenarios.get(scenario, **parameters)
+        self.scenario = scenarios.get(scenario, (*OPTIONS, *CALLED), **parameters)
         topics = self.scenario.topics
         self.senders = Senders(
             n,
@@ -336,3 +338,9 @@ class Rows:
             self.seed(i, seeding.np_random()[0])
             return self._next_episode(i)
         return self._draw(streams), streams.policy
+
+
+OPTIONS = tuple(inspect.getfullargspec(Rows).kwonlyargs)
+"""Names of the options of every environment."""
+CALLED = ("capacity", "render_mode", "max_episode_steps", "autoreset_mode")
+"""Names of further arguments of environments and of ``gym.make``."""

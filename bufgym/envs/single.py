@@ -1,5 +1,6 @@
 """``gymnasium.Env``: one sender."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -7,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import NUMBERED, Rows, check_render_mode
-from bufgym.ground.errors import BufgymError
+from bufgym.envs.rows import NUMBERED, OPTIONS, Rows, check_render_mode
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.scenario import Scenario
 
 _ROW = np.zeros(1, np.int64)
@@ -87,11 +88,21 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         scenario: str | Scenario = "lte",
         capacity: int = 8,
         *,
+        max_bytes: int | None = None,
+        decide_at: str = "arrival",
+        reward: str | Mapping[str, float] = "retained",
+        actions: str = "slots",
+        fields: str | Sequence[str] | None = None,
+        observation: str = "dict",
+        info: str = "full",
         render_mode: str | None = None,
-        **options: Any,
+        bound: bool = False,
+        pool: int | None = None,
+        **parameters: Any,
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        self.rows = Rows(1, scenario, capacity, **options)
+        options = {name: value for name, value in locals().items() if name in OPTIONS}
+        self.rows = Rows(1, scenario, capacity, **options, **parameters)
         self.observation_space = self.rows.observation_space
         self.action_space = self.rows.action_space
         self._action = np.zeros(1, np.int64)
@@ -106,7 +117,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         options = options or {}
         for name in options:
             if name not in ("episode", *NUMBERED):
-                raise BufgymError(f"options[{name!r}]: unknown; known: episode, {', '.join(NUMBERED)}")
+                raise unknown("entry", name, ("episode", *NUMBERED), place="options")
         if "episode" in options and len(options) > 1:
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
         self.rows.reset(_ROW, [options.get("episode", options or None)])

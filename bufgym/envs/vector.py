@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation, Reused
 from bufgym.envs.rows import Rows, check_render_mode
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
 
@@ -102,7 +102,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         options = options or {}
         for name in options:
             if name not in ("reset_mask", "episodes"):
-                raise BufgymError(f"options[{name!r}]: unknown; known: reset_mask (bool[n]), episodes (one a row)")
+                raise unknown("entry", name, ("reset_mask", "episodes"), place="options")
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + i for i in range(self.num_envs)]

@@ -221,23 +221,36 @@ def fill(buffer: Buffer) -> float:
 
 
 @kernel
+def of_topic(slots: NDArray[Any], k: int, topic: int, step: int) -> int:
+    """The next slot on this topic from ``k`` on in steps of 1 or -1; -1 or ``len(slots)`` if there is none."""
+    k += step
+    while 0 <= k < len(slots) and item(slots, k).topic != topic:
+        k += step
+    return k
+
+
+@kernel
 def before(buffer: Buffer, k: int, topic: int) -> int:
     """The slot before slot ``k`` on the same topic, or -1 if there is none."""
-    j = k - 1
-    if len(buffer.topics) > 1:
-        while j >= 0 and item(buffer.slots, j).topic != topic:
-            j -= 1
-    return j
+    return of_topic(buffer.slots, k, topic, -1) if len(buffer.topics) > 1 else k - 1
 
 
 @kernel
 def after(buffer: Buffer, k: int, topic: int) -> int:
     """The slot after slot ``k`` on the same topic, or ``len(buffer.slots)``."""
-    j = k + 1
-    if len(buffer.topics) > 1:
-        while j < len(buffer.slots) and item(buffer.slots, j).topic != topic:
-            j += 1
-    return j
+    return of_topic(buffer.slots, k, topic, 1) if len(buffer.topics) > 1 else k + 1
+
+
+@kernel
+def could_fit(spare_bytes: int, slots: NDArray[Any], topics: NDArray[Any]) -> bool:
+    """Whether ``spare_bytes`` would not be negative if every droppable message went."""
+    k = 0
+    while spare_bytes < 0 and k < len(slots):
+        slot = item(slots, k)
+        if len(topics) == 1 or item(topics, slot.topic).no_drop == 0:
+            spare_bytes += slot.size_bytes
+        k += 1
+    return spare_bytes >= 0
 
 
 @kernel
@@ -261,7 +274,7 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
     at_us, x, topic = message.arrival_us, message.x, message.topic
     from_us, from_x = at_us, x
     follows = not by_topic or (arriving and arrival.topic == topic)  # whether the arrival is the next message
-    j = before(buffer, k, topic) if by_topic else k - 1
+    j = before(buffer, k, topic)
     if j >= 0:
         from_us, from_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
     elif follows:
@@ -273,7 +286,7 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
     if k == s:
         step_us, step_x = at_us - buffer.previous_us, x - buffer.previous_x
         return back_us, step_us, back_x, step_x, back_x + step_x
-    j = after(buffer, k, topic) if by_topic else k + 1
+    j = after(buffer, k, topic)
     if j == s and not follows:
         past = item(buffer.topics, topic)
         step_us = max(past.previous_us - at_us, 0) + past.step_us

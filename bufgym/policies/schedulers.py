@@ -10,7 +10,7 @@ from typing import Any
 
 from bufgym.ground.kernel import kernel
 from bufgym.ground.modules import first_line
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, is_first
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, could_fit, has_space, is_first
 from bufgym.policies.registry import Arrival, Memory, built_in
 
 
@@ -34,22 +34,14 @@ def fits(buffer: Buffer, arrival: Arrival) -> bool:
 
 
 @kernel
-def could_fit(buffer: Buffer, arrival: Arrival) -> bool:
-    """Whether the newcomer's bytes would fit if every droppable message went."""
-    spare_bytes, k = buffer.max_bytes - buffer.backlog_bytes - arrival.size_bytes, 0
-    while spare_bytes < 0 and k < len(buffer.slots):
-        if topic_of(buffer, buffer.slots[k]).no_drop == 0:
-            spare_bytes += buffer.slots[k].size_bytes
-        k += 1
-    return bool(spare_bytes >= 0)
-
-
-@kernel
 def makes_room(buffer: Buffer, arrival: Arrival, k: int) -> bool:
     """Whether slot ``k`` may be dropped for the newcomer, which fits then or after further drops."""
     slot, topic = buffer.slots[k], topic_of(buffer, arrival)
     within_limit = same_topic(buffer, slot, arrival) or topic.queued < topic.limit
-    return bool(topic_of(buffer, slot).no_drop == 0 and within_limit and could_fit(buffer, arrival))
+    spare_bytes = buffer.max_bytes - buffer.backlog_bytes - arrival.size_bytes
+    return bool(
+        topic_of(buffer, slot).no_drop == 0 and within_limit and could_fit(spare_bytes, buffer.slots, buffer.topics)
+    )
 
 
 @kernel

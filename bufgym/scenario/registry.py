@@ -1,7 +1,7 @@
 """The one registry of scenarios, by name."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -79,8 +79,10 @@ def checked(scenario: Any, name: str) -> Scenario:
     return cast(Scenario, scenario)
 
 
-def get(spec: str | Scenario, **overrides: Any) -> Scenario:
+def get(spec: str | Scenario, options: Iterable[str] = (), /, **overrides: Any) -> Scenario:
     """The scenario of that name, or ``spec`` itself, with changed parameters; BufgymError for unknown ones.
+
+    ``options`` are the caller's other arguments, which an unknown parameter may have been meant for.
 
     A name that ends in .toml names a client's configuration (``read_client``). ``module:function`` is imported (see
     ``bufgym.ground.modules``); it is a scenario or makes one without arguments.
@@ -101,7 +103,8 @@ def get(spec: str | Scenario, **overrides: Any) -> Scenario:
     known = parameters(spec)
     for name in overrides:
         if name not in known:
-            raise unknown("parameter", name, known, "" if known else " (it is no dataclass)", type(spec).__name__)
+            also = "" if known else " (it is no dataclass)"
+            raise unknown("parameter", name, [*known, *options], also, type(spec).__name__)
     return replace(spec, **overrides)  # type: ignore[type-var]
 
 

@@ -1,7 +1,7 @@
 """Carrying out decisions: at an arrival, at the head of the queue, and on the message to dequeue."""
 
-from bufgym.ground.kernel import at, kernel
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, push, running_mean
+from bufgym.ground.kernel import at, kernel, stretch
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, of_topic, push, running_mean
 from bufgym.sim import rules
 from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import (
@@ -115,7 +115,7 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
     arriving = at(batch.arrivals, i, sender.next).topic
     if rules.no_drop(batch, i, topic) or (topic != arriving and rules.at_limit(batch, i, arriving)):
         return False
-    return rules.could_fit(batch, i)
+    return rules.can_fit(batch, i)
 
 
 @kernel
@@ -189,7 +189,9 @@ def remove(batch: Batch, i: int, k: int) -> None:
     at(batch.log, i, place_of(batch, i, gone)).dropped_us = sender.now_us
     if batch.several is not None:
         at(batch.topics, i, gone.topic).queued -= 1
-    j = rules.kept_after(batch, i, k, gone.topic)
+    j = k + 1
+    if batch.several is not None:
+        j = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, gone.topic, 1)
     if j < sender.occupancy:
         behind = at(batch.slots, i, sender.first + j)
         merged = rules.gain_behind(batch, i, k, gone.topic, behind.x)
@@ -217,7 +219,8 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
     if not 0 <= k < sender.occupancy:
         return False
     topic = at(batch.slots, i, sender.first + k).topic
-    return rules.kept_before(batch, i, k, topic) < 0 and rules.sendable(batch, i, k)
+    older = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
+    return older < 0 and rules.sendable(batch, i, k)
 
 
 @kernel

@@ -10,31 +10,10 @@ its limits never bind; the sender's record has the score instead. That saves a t
 
 from typing import Any
 
-from bufgym.ground.kernel import at, kernel
+from bufgym.ground.kernel import at, kernel, stretch
+from bufgym.model.buffer import could_fit, of_topic
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
-
-
-@kernel
-def kept_before(batch: Batch, i: int, k: int, topic: int) -> int:
-    """The slot before slot ``k`` on the same topic, or -1."""
-    sender = batch.senders[i]
-    j = k - 1
-    if batch.several is not None:
-        while j >= 0 and at(batch.slots, i, sender.first + j).topic != topic:
-            j -= 1
-    return j
-
-
-@kernel
-def kept_after(batch: Batch, i: int, k: int, topic: int) -> int:
-    """The slot after slot ``k`` on the same topic, or the occupancy."""
-    sender = batch.senders[i]
-    j = k + 1
-    if batch.several is not None:
-        while j < sender.occupancy and at(batch.slots, i, sender.first + j).topic != topic:
-            j += 1
-    return j
 
 
 @kernel
@@ -46,7 +25,7 @@ def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
             return 0.0
         return value(batch.v[sender.v_start :], x - at(batch.slots, i, sender.first + k - 1).x)
     rules = at(batch.topics, i, topic)
-    j = kept_before(batch, i, k, topic)
+    j = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
     if j < 0 and rules.dequeued == 0:
         return 0.0
     before_x = at(batch.slots, i, sender.first + j).x if j >= 0 else rules.dequeued_x
@@ -139,17 +118,13 @@ def no_drop(batch: Batch, i: int, topic: int) -> bool:
 
 
 @kernel
-def could_fit(batch: Batch, i: int) -> bool:
+def can_fit(batch: Batch, i: int) -> bool:
     """Whether the present arrival's bytes would fit if every droppable message went."""
     sender = batch.senders[i]
     spare_bytes = sender.max_bytes - sender.backlog_bytes - at(batch.arrivals, i, sender.next).size_bytes
-    k = 0
-    while spare_bytes < 0 and k < sender.occupancy:
-        slot = at(batch.slots, i, sender.first + k)
-        if not no_drop(batch, i, slot.topic):
-            spare_bytes += slot.size_bytes
-        k += 1
-    return bool(spare_bytes >= 0)
+    return could_fit(
+        spare_bytes, stretch(batch.slots, i, sender.first, sender.occupancy), stretch(batch.topics, i, 0, sender.topics)
+    )
 
 
 @kernel
@@ -158,7 +133,7 @@ def refuge(batch: Batch, i: int) -> int:
     sender = batch.senders[i]
     best = -1
     lowest = 0.0
-    if not could_fit(batch, i):
+    if not can_fit(batch, i):
         return best
     for k in range(sender.occupancy):
         slot = at(batch.slots, i, sender.first + k)

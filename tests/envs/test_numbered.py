@@ -121,7 +121,10 @@ def suite_env(**arguments: Any) -> Any:
         (lambda suite: suite.reset(options={"number": 3}), "known: episode, scenario, trace, seed"),
         (lambda _: SenderEnv("lte", L).reset(options={"scenario": "lte", "seed": 0}), "only the episodes of a suite"),
         (lambda _: SenderEnv("lte", L).reset(options={"seed": 0}), r"trace = None: must be 0..7 or one of lte"),
-        (lambda _: SenderVectorEnv(1, "lte").reset(options={"episodes": [{"label": 1}]}), "'label' is unknown"),
+        (
+            lambda _: SenderVectorEnv(1, "lte").reset(options={"episodes": [{"label": 1}]}),
+            "unknown entry .label.; known",
+        ),
         (lambda _: suite_env(suite="topics-v1"), "suite topics-v1 is one of topics"),
         (lambda _: suite_env(suite="lte-v9"), "unknown suite 'lte-v9'"),
         (lambda _: suite_env(split="all"), "split = 'all': must be one of train, validation, test"),
