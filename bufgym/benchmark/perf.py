@@ -39,7 +39,6 @@ TOPICS = "bufgym/Topics-v0"
 POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")
 NATIVE = "vector_entry_point"
 SEED = 1
-YARDSTICK = "yardstick"
 FELL, BEFORE = 0.15, 5
 """A ratio fell if it is lower by more than this share than the median of so many runs before."""
 
@@ -75,12 +74,10 @@ class Sizes:
 
 
 Clock = Callable[[], float]
-"""By default time of the processor, which other programs add little to."""
+Work = Callable[[], Any]
 
 
-def best_s(
-    repeats: int, prepare: Callable[[], Any], work: Callable[[], Any], clock: Clock = time.process_time
-) -> float:
+def best_s(repeats: int, prepare: Work, work: Work, clock: Clock = time.process_time) -> float:
     """Shortest time of ``work`` over the repeats, s. ``prepare`` runs before each, untimed."""
     times = []
     for _ in range(repeats):
@@ -124,24 +121,16 @@ class _Meter:
         self.sizes, (self._work, self._steps) = sizes, yardstick.passes(max(sizes.batches), sizes.capacity)
         told = f"steps a second of bufgym.benchmark.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
         self._work()  # compiled, or loaded from disk, before the clock starts
-        self.yardstick = self.figure(YARDSTICK, told, self._steps, "steps", lambda: None, self._work)
+        self.yardstick = self.figure("yardstick", told, self._steps, "steps", lambda: None, self._work)
 
     def figure(
-        self,
-        name: str,
-        told: str,
-        count: int,
-        unit: str,
-        prepare: Callable[[], Any],
-        work: Callable[[], Any],
-        clock: Clock = time.process_time,
+        self, name: str, told: str, count: int, unit: str, prepare: Work, work: Work, clock: Clock = time.process_time
     ) -> Measurement:
         """``count`` of ``unit`` in the time of ``work``."""
-        pairs = [
-            (best_s(5, lambda: None, self._work, clock), best_s(1, prepare, work, clock))
-            for _ in range(self.sizes.repeats)
-        ]
-        bare_s, work_s = map(min, zip(*pairs, strict=True))
+        bare_s = work_s = float("inf")
+        for _ in range(self.sizes.repeats):
+            bare_s = min(bare_s, best_s(5, lambda: None, self._work, clock))
+            work_s = min(work_s, best_s(1, prepare, work, clock))
         return Measurement(name, count / work_s, f"{unit}/s", count / work_s * bare_s / self._steps, told)
 
     def of_env(self, name: str, told: str, env: Any, steps: int, single: bool = False, **options: Any) -> Measurement:
@@ -242,7 +231,7 @@ def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
 
     Ratios are compared with those of the last runs of the same sizes.
     """
-    told = json.loads(json.dumps(asdict(sizes)))
+    told = json.loads(json.dumps(asdict(sizes)))  # as the file has it
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
         before = [line["ratios"] for line in lines if line["sizes"] == told][-BEFORE:]
