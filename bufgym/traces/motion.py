@@ -92,7 +92,7 @@ class Motion:
 
         Past the end the recording begins again and its total is carried on, so the coordinate never decreases.
         """
-        times = np.ascontiguousarray(time_us, np.int64)
+        times = np.asarray(time_us, np.int64)
         coordinate = np.empty(times.shape)
         if (negative := _coordinates(self.time_us, self.coordinate, times.ravel(), coordinate.ravel())) < 0:
             raise self._broken(f"time_us = {negative}: must be >= 0")

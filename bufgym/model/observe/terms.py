@@ -11,10 +11,10 @@ from typing import Any
 from bufgym.model.observe.fields import REWARD_TERMS, RewardTerm
 from bufgym.model.observe.own import OWN_TERMS, reward_term
 
-_term = functools.partial(reward_term, compile=True, built_in=True)
+built_in = functools.partial(reward_term, compile=True, built_in=True)
 
 
-@_term("delay", unit="s")
+@built_in("delay", unit="s")
 def delay(step: Any, memory: Any) -> float:
     "minus the time from its arrival to the server, of each message that reaches it"
     total_us = 0
@@ -23,7 +23,7 @@ def delay(step: Any, memory: Any) -> float:
     return -total_us / 1e6
 
 
-@_term("energy", unit="MB")
+@built_in("energy", unit="MB")
 def energy(step: Any, memory: Any) -> float:
     "minus the megabytes that the link has carried; its weight is the price of a megabyte"
     total_bytes = 0
@@ -32,7 +32,7 @@ def energy(step: Any, memory: Any) -> float:
     return -total_bytes / 1e6
 
 
-@_term("late", unit="messages", parameters={"deadline_s": 1.0}, one_queue=True)
+@built_in("late", unit="messages", parameters={"deadline_s": 1.0}, one_queue=True)
 def late(step: Any, memory: Any) -> float:
     "minus the weight of each message that reaches the server after its deadline; one queue: deadline_s, by default 1 s"
     count = 0
@@ -43,7 +43,7 @@ def late(step: Any, memory: Any) -> float:
     return -float(count)
 
 
-@_term("age", unit="s^2", memory={"newest_us": -1.0, "until_us": 0.0}, one_queue=True)
+@built_in("age", unit="s^2", memory={"newest_us": -1.0, "until_us": 0.0}, one_queue=True)
 def age(step: Any, memory: Any) -> float:
     "minus the weighted mean age of information at the server, integrated over time from the first arrival to the last"
     if len(step.messages) == 0:
