@@ -248,8 +248,6 @@ def started(**arguments: Any) -> SenderEnv:
         (lambda: reward_term("retained")(dropped), "reward term 'retained': a built-in reward term has this name"),
         (lambda: reward_term("delay")(dropped), "reward term 'delay': a built-in reward term has this name"),
         (lambda: reward_term("mine")(waited), r"must be a function \(step, memory\)"),
-        (lambda: SenderEnv(fields=["rank", "waitd"]), "unknown field 'waitd'; known: .*wait"),
-        (lambda: SenderEnv(reward="dely"), "unknown term 'dely'; known: delivered, retained, delay"),
         (lambda: SenderEnv(reward={"late:deadline=1": 1}), "reward term late: unknown parameter 'deadline'"),
         (lambda: SenderEnv(reward={"late:deadline_s=0": 1}), "deadline_s = 0.0: must be a number > 0"),
         (lambda: SenderEnv(reward={"delay": "much"}), "the weight of 'delay' must be a finite number"),
