@@ -56,7 +56,6 @@ def test_the_module_runs_as_a_command_and_opens_no_heavy_module() -> None:
         ("trace plot lte-synthetic-0 --out x.doc", "x.doc"),
         ("play --env Moon-v0", "'Moon-v0'"),
         ("play --out film.mp4", "film.mp4: must end in .gif"),
-        ("reproduce fig99", "'fig99'"),
     ],
 )
 def test_bad_commands(command: str, naming: str, capsys: Capsys) -> None:
@@ -197,7 +196,6 @@ def test_a_users_mistake_is_shown_where_it_is(trace: str, tmp_path: Path, text: 
         ("--bytes 1.5", "1.5"),
         ("--seconds 1e9", "duration_s = 1000000000.0: must be at most"),
         ("--jitter 2", "jitter = 2"),
-        ("--trace no-such.csv", "no-such.csv"),
         ("--t-max 5", "--t-max needs --interruption"),
         ("--interruption --trace x.csv", "--trace cannot go with --interruption"),
         ("--nonsense", "--nonsense"),

@@ -106,7 +106,6 @@ def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Caps
         ("topics --config x.toml --suite topics-v1", "--suite cannot go with --config"),
         ("bench --by-topic afr", "--by-topic needs several topics"),
         ("bench --window 2", "--window needs --suite, --scenario or --config"),
-        ("bench --suite lte-v1 --window 2", "unknown parameter 'window'"),
         ("bench --scenario topics --max-bytes 9", "--max-bytes is for one queue"),
         ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
         ("fleet --robots 257", "robots = 257: must be a whole number from 1 to 256"),

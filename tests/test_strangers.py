@@ -75,7 +75,6 @@ ROW = dict(zip(leaderboard.COLUMNS, CELLS, strict=True))
     ("data", "rule"),
     [
         ({"rank": "first"}, "line 2: rank = 'first': must be a number"),
-        ({"suite": "no-such"}, "line 2: suite = no-such: must be a suite"),
         ({"quantity": "luck"}, "line 2: quantity = luck: must be one of"),
         ({"value": "0.5,0.6"}, "line 2: value = '0.5,0.6': must be a number"),
         ({"command": "x" * 200_000}, "no rows that can be read: field larger"),

@@ -246,7 +246,6 @@ GUIDED = {"algo": "guided", "suite": "interruption-v1"}
         ({"env": "bufgym/Topics-v0"}, "env = 'bufgym/Topics-v0': a scheduler learns from a suite of topics"),
         ({"gamma": 1.5}, "gamma = 1.5: must be <= 1"),
         ({"batch_size": 1}, "batch_size = 1: must be >= 2"),
-        ({"suite": "no-such"}, "unknown suite 'no-such'"),
         ({"suite": "lte-v1", "capacities": "0"}, "capacities = '0': must be whole numbers >= 1"),
         ({"suite": "lte-v1", "capacities": "5,x"}, "capacities = '5,x': must be whole numbers such as"),
         ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),

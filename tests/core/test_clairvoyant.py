@@ -14,8 +14,9 @@ from bufgym.benchmark.run import draw
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
+from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
-from bufgym.oracle import clairvoyant, integer, labels, programme
+from bufgym.oracle import beam, clairvoyant, integer, labels, programme
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
@@ -282,3 +283,25 @@ def test_bounds_coarse_grids_and_little_room_lose_nothing(module, setting, numbe
     best = [without_bounds(*problem) for problem in problems]
     monkeypatch.setattr(module, setting, number)
     assert [labels.best(*problem)[1] for problem in problems] == pytest.approx(best, abs=EXACT)
+
+
+@kernels
+@pytest.mark.parametrize(
+    ("capacity", "max_bytes", "width", "plan"),
+    [
+        (2, UNLIMITED_BYTES, 4, [0, 1, 2]),
+        (1, UNLIMITED_BYTES, 4, [0, 2]),  # while 0 crosses until 10, one can wait: V(2)
+        (3, 20, 4, [0, 1, 2]),
+        (3, 19, 4, [0, 2]),
+        (2, UNLIMITED_BYTES, 1, [0, 1, 2]),  # of the ways to send 2 the best one is remembered, not the last
+    ],
+)
+def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
+    """Three messages of 10 bytes arrive at bytes 0, 1 and 2 of the link."""
+    c, size, far = np.arange(3), np.full(3, 10), np.full(3, 100)
+    p = programme.new_problem(c, size, far, np.zeros(3, np.int64), np.arange(3.0), V.array, 2**62, 1)
+    room = programme.Room(capacity, max_bytes, np.zeros((2, 200)), np.zeros((2, 4)), p.future)
+    work = np.empty(3, np.int64)
+    length, gain = beam.search(p, room, beam.new_states(3, width), work)
+    assert work[:length][::-1].tolist() == plan
+    assert gain == {2: 0.75, 3: 1.0}[length]

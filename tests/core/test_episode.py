@@ -208,7 +208,6 @@ def test_the_cell_grows_with_the_robots() -> None:
         (lambda: FleetScenario(257), "robots = 257"),
         (lambda: FleetScenario(2, "lte"), "'lte' is not a bufgym.scenario Uplink"),
         (lambda: FleetScenario.of(2, "interruption"), "needs an Uplink"),
-        (lambda: FleetScenario.of(2, "lte", wheels=4), "unknown parameter 'wheels'"),
         (lambda: FleetEpisode((), STEADY), "robots = 0"),
         (lambda: FleetEpisode((messages(np.array([0]), 1)[:0],), STEADY), "robot 0: an episode needs at least one"),
         (lambda: run_fleet(policies.get("afr"), [], 2, V), "no episode"),

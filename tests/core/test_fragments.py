@@ -154,6 +154,16 @@ def test_webrtc_leaks_and_follows():
 
 
 @kernels
+def test_webrtc_starts_a_new_pattern_when_the_bucket_gets_too_full_and_not_while_it_is():
+    """1 byte/us: the bucket holds 500 kB, and 40 ms leak 40 kB."""
+    memory = dropper(TARGET=1.0)
+    for level, count, above in ((600_000, 0, 1), (600_000, 3, 1), (540_000, 3, 1), (539_000, 3, 0), (541_000, 0, 1)):
+        memory[[webrtc.LEVEL, webrtc.COUNT]] = level, 3.0
+        webrtc.leak(memory, 40_000.0)
+        assert (memory[webrtc.LEVEL], memory[webrtc.COUNT], memory[webrtc.ABOVE]) == (level - 40_000, count, above)
+
+
+@kernels
 def test_webrtc_a_large_frame_is_spread():
     # 30 kB on average; 100 kB is more than three times that: over half a second of 40 ms frames, 13, it fills the
     # bucket by 1/13 each.

@@ -182,7 +182,6 @@ def test_bench_with_a_file_and_with_modules(module: str, capsys: pytest.CaptureF
     for more, message in (
         (["--fps", "10"], "--fps cannot go with a scenario of your own"),
         (["--suite", "lte-v1"], "--scenario-file cannot go with --suite"),
-        (["--scenario", "ten"], "unknown scenario 'ten'"),
     ):
         assert main([*command, *more]) == 2
         assert message in capsys.readouterr().err

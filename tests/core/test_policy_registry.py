@@ -137,9 +137,6 @@ def test_parameters():
 @pytest.mark.parametrize(
     ("spec", "rule"),
     [
-        ("nobody", "unknown policy 'nobody'; known: .*afr"),
-        ("lifo", "unknown policy 'lifo'; did you mean 'fifo'"),
-        ("afr:speed=2", "policy afr: unknown parameter 'speed'; known: none"),
         ("decimate:every=0", "policy decimate: every = 0.0: must be a number > 0"),
         *((f"decimate:every={wrong}", f"every = {wrong}: must be a number > 0") for wrong in ("-1.0", "nan", "inf")),
         ("decimate:every", "'every' is not of the form parameter=number"),

@@ -16,26 +16,24 @@ from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.policies import ACCEPT, Policy, get
 from bufgym.scenario import Episode, FleetEpisode, Streams, Uplink, messages
-from bufgym.sim import run
+from bufgym.sim import Senders, audit, run
 from bufgym.sim.cell import run_fleet
+from bufgym.sim.state import NEVER
 from bufgym.traces import Trace
 
 V = qoi.exponential()
 EPISODE = Episode(messages(np.arange(40) * 1_000, 4_000), Link(Trace.constant(1e6, 10)))
 
-NOT_ONCE = "not every message was sent, dropped or queued exactly once"
-NOT_AS_DRAWN = "a message that arrived is not as the episode has it"
-NOT_H = "H is not that of the messages that were received"
 WRITES = {
-    "buffer.slots[0].seq = buffer.slots[len(buffer.slots) - 1].seq": NOT_ONCE,
-    "buffer.slots[0].seq = 10**9": NOT_ONCE,
-    "arrival.seq = -(10**9)": NOT_AS_DRAWN,
-    "buffer.slots[len(buffer.slots) - 1].x -= 0.5": NOT_H,
-    "buffer.slots[len(buffer.slots) - 1].gain = 1.0": NOT_H,
-    "arrival.x *= 1000": NOT_AS_DRAWN,
-    "arrival.size_bytes = 1": NOT_AS_DRAWN,
-    "buffer.slots[0].size_bytes = 1": "the queue's bytes are not those of its messages",
-    "buffer.topics[0].limit = 10**6": "a topic's rules are not as they were",
+    "buffer.slots[0].seq = buffer.slots[len(buffer.slots) - 1].seq": audit.LOG,
+    "buffer.slots[0].seq = 10**9": audit.LOG,
+    "arrival.seq = -(10**9)": audit.ARRIVAL,
+    "buffer.slots[len(buffer.slots) - 1].x -= 0.5": audit.QOI,
+    "buffer.slots[len(buffer.slots) - 1].gain = 1.0": audit.QOI,
+    "arrival.x *= 1000": audit.ARRIVAL,
+    "arrival.size_bytes = 1": audit.ARRIVAL,
+    "buffer.slots[0].size_bytes = 1": audit.BYTES,
+    "buffer.topics[0].limit = 10**6": audit.TOPIC,
 }
 """What a policy writes, and what is said of it."""
 
@@ -93,7 +91,7 @@ def test_h_of_several_topics_is_added_up_again() -> None:
     senders = run(policy, [two_topics(10_000)], 3, V, topics=rules)
     senders.check_untouched(policy)
     senders.batch.senders["delivered_gain"] += 1e-3
-    with pytest.raises(BufgymError, match=NOT_H):
+    with pytest.raises(BufgymError, match=audit.QOI):
         senders.check_untouched(policy)
 
 
@@ -119,3 +117,50 @@ def test_honest_policies_are_not_accused() -> None:
     episodes.append(Episode(messages(np.arange(40) * 1_000, 4_000), ends))
     for name in ("drop-oldest", "codel", "afr", "random", "drop-newest"):
         run(get(name), episodes, 5, lte.value).check_untouched(get(name))
+
+
+def finished() -> Senders:
+    """L = 2, a byte a us for 20 us, messages of 10 bytes: 0 and 2 are sent, 3 not all, 4 and 5 wait, 1 is dropped."""
+    episode = Episode(
+        messages(np.array([0, 1, 2, 3, 15, 25]), 10),
+        Link(Trace("ends", np.array([0, 20]), np.array([0, 20]), after="stop")),
+    )
+    senders = Senders(1, 2, V, max_messages=6)
+    senders.load(0, episode)
+    senders.run(get("drop-oldest"))
+    return senders
+
+
+FIELDS = ("seq", "arrival_us", "size_bytes", "topic", "x", "uniform")
+RULES = ("priority", "weight", "period_us", "limit", "no_drop", "deadline_us", "v_start")
+COUNTS = ("dequeued", "evicted", "rejected", "next")
+FORGERIES = [
+    *((audit.ARRIVAL, "arrivals", field, k, 1) for field in FIELDS for k in (0, 5)),
+    *((audit.QUEUED, "slots", field, k, 1) for field in FIELDS for k in (2, 3)),
+    *((audit.QUEUED, "slots", "seq", k, amount) for k, amount in ((2, -100), (3, 100))),
+    *((audit.QUEUED, "log", field, k, 40) for field in ("dequeued_us", "dropped_us") for k in (4, 5)),
+    *((audit.BYTES, "senders", "backlog_bytes", 0, amount) for amount in (1, -1)),
+    (audit.LOG, "log", "dropped_us", 0, 7),  # was sent
+    (audit.LOG, "log", "dropped_us", 1, NEVER),  # was not sent either
+    (audit.LOG, "log", "dequeued_us", 2, 1),  # came at 2
+    *((audit.LOG, "senders", field, 0, amount) for field in COUNTS for amount in (1, -1)),
+    *((audit.TOPIC, "topics", field, 0, 1) for field in RULES),
+    *((audit.QOI, "senders", "delivered_gain", 0, amount) for amount in (1e-6, -1e-6)),
+    ("", "senders", "delivered_gain", 0, 1e-10),  # rounding
+]
+"""What is found, and what was written: a time into the log, or something added to the k-th entry of a table."""
+
+
+@pytest.mark.kernels
+def test_a_run_is_searched_for_everything_a_policy_may_not_write() -> None:
+    for finding, table, field, k, amount in FORGERIES:
+        senders = finished()
+        given = senders.batch, 0, senders.episodes[0], senders.topic_table
+        assert audit.touched(*given) == ""
+        rows = np.asarray(getattr(senders.batch, table))
+        entries = (rows if table == "senders" else rows[0])[field]
+        entries[k] = amount if table == "log" else entries[k] + amount
+        assert audit.touched(*given) == finding, (table, field, k, amount)
+    senders = finished()
+    senders.batch.slots[0, 3] = senders.batch.slots[0, 2]  # one message twice
+    assert audit.touched(senders.batch, 0, senders.episodes[0], senders.topic_table) == audit.QUEUED

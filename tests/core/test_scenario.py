@@ -178,8 +178,6 @@ def test_other_rates_jitters_and_sizes_meet_the_same_motion_and_link(changes, mo
             lambda: check_messages(messages(np.arange(2), 5, np.array([1.0, 0.5]))),
             "message 1: x = 0.5: must be a finite number",
         ),
-        (lambda: scenario.get("moon"), "unknown scenario 'moon'; known: interruption, lte"),
-        (lambda: scenario.get("interruption", speed=3), "Interruption: unknown parameter 'speed'; known: "),
         (lambda: Streams.seeded(-1), "seed = -1"),
     ],
 )

@@ -174,7 +174,6 @@ def test_pictures_have_a_line_and_a_bar_for_every_robot():
     [
         (lambda: FleetEnv(reward="all"), "reward = 'all': must be 'team'"),
         (lambda: FleetEnv(term="speed"), "unknown term 'speed'"),
-        (lambda: FleetEnv(fields=["colour"]), "unknown field 'colour'"),
         (lambda: FleetEnv(observation="flat", mask_in_observation=True), "'flat' has no place for it"),
         (lambda: begun().step({"robot_0": 0, "robot_1": 1.7}), "actions['robot_1'] = 1.7: must be a whole number"),
         (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),

@@ -126,7 +126,6 @@ def suite_env(**arguments: Any) -> Any:
             "unknown entry .label.; known",
         ),
         (lambda _: suite_env(suite="topics-v1"), "suite topics-v1 is one of topics"),
-        (lambda _: suite_env(suite="lte-v9"), "unknown suite 'lte-v9'"),
         (lambda _: suite_env(split="all"), "split = 'all': must be one of train, validation, test"),
         (lambda _: suite_env(suite="lte-belgium-v1"), "needs a folder of recordings"),
         (lambda _: gym.make("bufgym/Topics-v0", bound=True), "bound = True: the clairvoyant is known for one queue"),
@@ -209,7 +208,6 @@ def test_text_may_name_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ({"value": "linear:3"}, "V = 'linear:3': unknown kind 'linear'"),
         ({"traces": "nowhere"}, "nowhere: no such file, and no shipped trace"),
         ({"motion": ["drive-0", "nowhere"]}, "nowhere: no such file"),
         ({"value": 3}, "value = 3: must be a bufgym.model.qoi Value, a function"),

@@ -256,7 +256,6 @@ WHOLE = r"must be a whole number in 0\.\.5 \(L = 4\)"
     ("act", "says"),
     [
         (lambda: SenderEnv(capacity=0), "capacity = 0"),
-        (lambda: SenderEnv(scenario="moon"), "unknown scenario 'moon'"),
         (lambda: SenderEnv(reward="fame"), "unknown term 'fame'"),
         (lambda: SenderEnv(reward={"delivered": math.nan}), "finite"),
         (lambda: SenderEnv(reward={}), "at least one term"),
@@ -264,7 +263,6 @@ WHOLE = r"must be a whole number in 0\.\.5 \(L = 4\)"
         (lambda: SenderEnv(fields="rank"), "must be a list of names"),
         (lambda: SenderEnv(decide_at="noon"), "decide_at = 'noon'"),
         (lambda: SenderEnv(max_bytes=0), "max_bytes = 0"),
-        (lambda: SenderEnv(colour="red"), "unknown parameter 'colour'"),
         (lambda: SenderEnv(render_mode="human"), "render_mode = 'human'"),
         *(
             (lambda action=action: begun().step(action), rf"action = .*: {WHOLE}")

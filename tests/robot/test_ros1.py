@@ -93,7 +93,6 @@ def topics(monkeypatch: pytest.MonkeyPatch) -> Any:
     ("options", "words"),
     [
         (["none.py"], "none.py: no such file"),
-        (["--policy", "nonsense", __file__], "unknown policy 'nonsense'"),
         (["--policy", "/camera=nobody", __file__], "unknown policy 'nobody'"),
         (["--value", "round:1", __file__], "round"),
     ],
