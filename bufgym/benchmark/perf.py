@@ -62,7 +62,7 @@ class Sizes:
 
     capacity: int = 16  # L, messages
     batches: tuple[int, ...] = (1024, 64, 16)  # environments in a batch
-    decisions: int = 300_000  # of each batch
+    decisions: int = 1_000_000  # of each batch: episodes end and begin
     single_steps: int = 20_000  # of the single environment
     episodes: int = 1000  # of a fixed-policy rollout
     repeats: int = 3  # of each figure; the best one counts

@@ -34,7 +34,9 @@ def between(name: str, number: Any, low: float, high: float, unit: str = "") -> 
 
 def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, symbol: str = "") -> int:
     """Check that ``number`` is whole and within the limits; return it as an int. The message shows ``symbol``."""
-    is_whole = isinstance(number, (int, np.integer)) and not isinstance(number, bool)  # faster than int | np.integer
+    if type(number) is int and number >= least and (most is None or number <= most):
+        return number  # nearly always
+    is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
     if not is_whole or number < least or (most is not None and number > most):
         bounds = f">= {least}" if most is None else f"from {least} to {most}"
         raise BufgymError(f"{name} = {number!r}: {symbol and f'{symbol} '}must be a whole number {bounds}")

@@ -164,20 +164,21 @@ class Uplink:
             arrivals = messages(arrival_us, int(self.size_bytes))
         moving = self._move(arrivals, rng)
         if self.sizes != EQUAL:
-            arrivals["size_bytes"] = drawn(self.sizes, len(arrivals), self.size_bytes, own, moving)
+            along = moving and Moving(moving[0], arrivals["arrival_us"] + moving[1])
+            arrivals["size_bytes"] = drawn(self.sizes, len(arrivals), self.size_bytes, own, along)
         elif self.size_cv:
             arrivals["size_bytes"] = sizes(len(arrivals), self.size_bytes, self.size_cv, own)
         return arrivals
 
-    def _move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> Moving | None:
+    def _move(self, arrivals: NDArray[Any], rng: np.random.Generator) -> tuple[Motion, int] | None:
         """Give these messages the x of a recording, if there are any, from a random place on."""
         if not self.motion:
             return None
         motion, start_us = place(self.motion, rng, self.random_offset)
-        time_us = arrivals["arrival_us"] + start_us
-        x = motion.at(time_us)
-        arrivals["x"] = x - x[0]
-        return Moving(motion, time_us)
+        x = arrivals["x"]
+        motion.follow(arrivals["arrival_us"], start_us, x)
+        x -= x[0]
+        return motion, start_us
 
     def _jitter(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """float64[n], uniform draws for the jitter of the frames; empty without jitter."""

@@ -94,17 +94,23 @@ class Motion:
         """
         times = np.asarray(time_us, np.int64)
         coordinate = np.empty(times.shape)
-        if (negative := _coordinates(self.time_us, self.coordinate, times.ravel(), coordinate.ravel())) < 0:
-            raise self._broken(f"time_us = {negative}: must be >= 0")
+        self.follow(times.ravel(), 0, coordinate.ravel())
         return coordinate
+
+    def follow(self, time_us: Int64Array, start_us: int, coordinate: Float64Array) -> None:
+        """Write the coordinate at each of ``time_us``, counted from ``start_us`` on, into ``coordinate``."""
+        if (negative := _follow(self.time_us, self.coordinate, time_us, start_us, coordinate)) < 0:
+            raise self._broken(f"time_us = {negative}: must be >= 0")
 
 
 @kernel
-def _coordinates(knot_us: Int64Array, y: Float64Array, time_us: Int64Array, coordinate: Float64Array) -> int:
-    """Write ``Motion.at`` of each time into ``coordinate``; return the first negative time, or 0."""
+def _follow(
+    knot_us: Int64Array, y: Float64Array, time_us: Int64Array, start_us: int, coordinate: Float64Array
+) -> int:
+    """Do what ``Motion.follow`` says; return the first negative time, or 0."""
     duration_us, j = knot_us[-1], 0
     for k in range(len(time_us)):
-        t, gone = time_us[k], 0.0
+        t, gone = start_us + time_us[k], 0.0
         if t < 0:
             return int(t)
         if t >= duration_us:
