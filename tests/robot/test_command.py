@@ -70,7 +70,6 @@ def test_validate_prints_both_side_by_side(tmp_path: Path, capsys: pytest.Captur
     [
         (["send", "robot"], "robot: must be HOST:PORT"),
         (["link", "--trace", "lte-synthetic-0", "--to", "robot:99999"], "robot:99999: must be HOST:PORT"),
-        (["replay", "none.mcap"], "none.mcap: No such file"),
         (["view", "none.mcap"], "none.mcap: No such file"),
     ],
 )
