@@ -144,6 +144,11 @@ def test_exact_wherever_the_result_is_below_2_to_the_62(after):
     assert checked > 3_000
 
 
+def test_information_by_hand():
+    assert qoi.exponential(0.5).information([0, 1, 3, 3]) == 1 + 1 / 2 + 3 / 4  # the last is the same view again
+    assert qoi.saturating(4).information([0, 1, 10]) == 1 + 1 / 4 + 1
+
+
 @given(VALUES, st.lists(st.integers(0, 40), max_size=20))
 def test_information_agrees_with_twin(v, steps):
     x = (np.cumsum(steps) / 8).tolist()
