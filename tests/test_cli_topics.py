@@ -39,13 +39,9 @@ def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: Capsys) -> No
     out = tmp_path / "rows.csv"
     words = "--scale .01 --trace lte-synthetic-0 --seeds 2 --policies fifo,edf --capacity 2,4 --window 3 --by-topic edf"
     text = shown(["topics", "--config", config, *words.split(), "--out", out], capsys)
-    assert f"The client of {config}." in text
-    assert "2 episodes of 2 s; n_T = 3, acks 40 ms after a message is transmitted, 1 consumer." in text
-    assert "mine: 2 topics over lte-synthetic-0 x 0.01, L = 2\n" in text and "mean of these 2\n" in text
-    assert "age, priority 20 (s)" in text
-    assert "edf, topic by topic: means over episodes" in text and "\ncommands " in text
-    assert f"24 rows in {out}" in text
+    assert "lte-synthetic-0 x 0.01, L = 2\n" in text and "edf, topic by topic" in text and "\ncommands " in text
     rows = read_rows(out, ROWS)
+    assert len(rows) == 24
     # The baseline runs whether named or not.
     assert [row["policy"] for row in rows[:12:4]] == ["fifo", "edf", "robofleet"]
     assert {row["capacity"] for row in rows} == {2, 4} and {row["window"] for row in rows} == {3}
@@ -73,10 +69,7 @@ def test_bench_is_the_one_door(config: str, tmp_path: Path, capsys: Capsys, monk
 def test_the_suite_runs_by_default(capsys: Capsys) -> None:
     words = "topics --split validation --seeds 1 --policies robofleet --consumers 2"
     text = shown(words.split(), capsys)
-    assert text.startswith("Suite topics-v1, validation: ")
-    assert "18 episodes of 60 s; n_T = 1 and 5, " in text and "2 consumers" in text
-    assert "Not the suite as it is: consumers = 2." in text
-    assert all(f"\n{label}: Robofleet's example client" in text for label in ("scarce", "half", "ample"))
+    assert "18 episodes of 60 s; n_T = 1 and 5, " in text and "Not the suite as it is: consumers = 2." in text
     lines = [line.split() for line in text.splitlines() if line.startswith("robofleet ")]
     assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
 
@@ -150,16 +143,12 @@ def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
     text = shown([*BENCH, "--policies", "drop-oldest,drop-newest,clairvoyant", "--drops", "drops.csv"], capsys)
     lines = text.splitlines()
     # By topic: two messages each, 1 s between the two, 2 s apart.
-    assert lines[0] == "w.csv (time_s,bytes,topic,x)"
     assert ["/camera", "2", "0.500", "2,000", "1,000", "50.0%"] in [line.split() for line in lines]
-    assert "4 messages, 4,000 bytes in 3.000 s, 1,333 bytes/s" in lines
-    assert "Played over outage, from the trace's start; all topics share one queue." in lines
     # H: messages 0 and 3 give 1 + V(2) = 1.865; 0 and 1 give 1 + V(0) = 1.
     first, _, second = text.partition("dropped of")
     table = {line.split()[0]: line.split() for line in first.splitlines() if line}
     assert table["drop-oldest"][1:6] == ["1", "1.865", "0.00%", "2.0", "2.0"]
     assert table["drop-newest"][1:6] == ["1", "1.000", "46.37%", "2.0", "2.0"]
-    assert "note: L = 1: the clairvoyant's QoI is 1.865; regret is measured against it" in lines
     # Best QoI first, as above; Drop Oldest drops one of each topic, Drop Newest as well.
     shares = {line.split()[0]: line.split()[1:] for line in second.splitlines()[1:4]}
     assert list(shares) == ["drop-oldest", "drop-newest", "clairvoyant"]
@@ -169,7 +158,7 @@ def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
         "drop-oldest,1,outage,0,1,1.0,/odom,1000,0.0,2.0",
         "drop-oldest,1,outage,0,2,2.0,/camera,1000,1.0,3.0",
     ]
-    assert "6 dropped messages in drops.csv" in lines
+    assert len(Path("drops.csv").read_text().splitlines()) == 1 + 6
 
 
 @pytest.mark.parametrize(
@@ -206,8 +195,7 @@ def test_a_bag_becomes_a_csv_that_plays_the_same(drive: Path, capsys: Capsys) ->
     chosen = ["--odom", "/odom", "--topics", "/camera/*"]
     words = "--odom /odom --topics /camera/*,/status -o drive.csv"
     text = shown(["trace", "from-bag", drive, *words.split()], capsys)
-    assert "drive.mcap (mcap, motion from /odom: 60 degrees, 2 m)" in text
-    assert "x: camera motion of 2.000 fields of view" in text
+    assert "motion of 2.000 fields of view" in text
     assert Path("drive.csv").read_text().splitlines()[:4] == [
         "time_s,bytes,topic,x",
         "0.000000,109,/camera/left,0.0",

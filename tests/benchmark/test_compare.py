@@ -28,12 +28,10 @@ def test_a_scenario_by_name_or_made_and_policies_of_each_kind() -> None:
     assert done.rows == rows and bufgym.compare(["afr", stubborn], made, capacity=[2, 4], seeds=3).rows == unnamed
     # The score needs Drop Oldest on the same episodes, though it is no row.
     head, *lines = done.table().splitlines()
-    assert head.split()[:5] == ["policy", "L", "score", "QoI", "regret"] and "drop-oldest" not in done.table()
+    assert head.split()[:5] == ["policy", "L", "score", "QoI", "regret"]
     assert [line.split()[0] for line in lines if line] == ["afr", "stubborn", "afr", "stubborn", "score:"]
     assert done.table("markdown").startswith("| policy | L |") and str(done).startswith("interruption\n\n")
-    page = done._repr_html_()
-    assert page.startswith("<p>interruption</p>\n<table>") and page.count("<tr>") == 5 and ">stubborn</td>" in page
-    assert "score: 0 is Drop Oldest" in done.table() and "<p>score: 0 is Drop Oldest" in page
+    assert done._repr_html_().count("<tr>") == 5
 
 
 def test_the_paired_difference_to_a_policy() -> None:
@@ -42,14 +40,12 @@ def test_the_paired_difference_to_a_policy() -> None:
     done = bufgym.compare("min-gap", "interruption", against="decimate:every=2", **options)
     assert {row["policy"] for row in done.rows} == {"min-gap", "decimate:every=2", "afr"}
     lines = [line.split() for line in done.table().split("\n\n")[-1].splitlines()]
-    assert " ".join(lines[0]) == "policy regret / afr's regret / afr's, minus decimate:every=2's"
     shares = {line[0]: line[1:] for line in lines[1:5]}
     assert set(shares) == {"min-gap", "decimate:every=2", "afr", "drop-oldest"} and shares["afr"][0] == "–"
     assert shares["decimate:every=2"][-1] == "–"
     less = float(shares["min-gap"][0]) - float(shares["decimate:every=2"][0])
     assert float(shares["min-gap"][3].replace("−", "-")) == pytest.approx(less, abs=0.0011)
     assert "| min-gap |" in done.table("markdown").split("\n\n")[-2] and done.html.count("<table>") == 2
-    assert "ratio of sums" in done.table()
     suite = bufgym.compare("afr", "interruption-v1", against="afr", capacity=4, seeds=3, progress=False)
     assert "minus afr's" in suite.table()
     fleet = bufgym.compare(
@@ -62,9 +58,7 @@ def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
     endless = policies.Policy("mine", policies.get("drop-oldest").on_arrival, unbounded=True)
     done = bufgym.compare([endless, "drop-oldest"], "interruption", seeds=2, t_max=20)
     assert done.unranked == {"mine": "its queue is unbounded"}
-    lines = done.table().splitlines()
-    assert [line.split()[0] for line in lines[1:3]] == ["drop-oldest", "mine"]
-    assert "note: mine does not compete: its queue is unbounded" in lines
+    assert [line.split()[0] for line in done.table().splitlines()[1:3]] == ["drop-oldest", "mine"]
 
 
 def test_a_suite_by_name() -> None:

@@ -37,23 +37,15 @@ def drawn(page: str) -> list[str]:
 def test_the_ranking_in_markdown(folder: Path) -> None:
     """All episodes are alike, so every interval is a point. (95 - 80) / (100 - 80) = 0.75, and so on."""
     lines = report.markdown(folder).splitlines()
-    assert lines[:3] == ["```", MANIFEST["command"], "```"]
-    versus = "regret / afr's | better than afr | regret / afr's, minus afr's"
-    at = lines.index(f"| # | policy | score | IQM | regret, at most | {versus} |")
-    zero, half, one = "0.000 [0.000, 0.000]", "0.500 [0.500, 0.500]", "1.000 [1.000, 1.000]"
-
-    def plus(n: int) -> str:
-        return f"+{n}.000 [+{n}.000, +{n}.000]"
-
-    def minus(number: str) -> str:
-        return re.sub(r"(\d\.)", "−\\1", number)
-
-    assert [line.strip("| ").split(" | ") for line in lines[at + 2 : at + 7]] == [
-        ["1", "&lt;b&gt;", *["0.750 [0.750, 0.750]"] * 2, "5.00 % [5.00, 5.00]", half, one, minus(half)],
-        ["2", "afr", *[half] * 2, "10.0 % [10.0, 10.0]", "–", "–", "–"],
-        ["3", "drop-oldest", *[zero] * 2, "20.0 % [20.0, 20.0]", "2.000 [2.000, 2.000]", zero, plus(1)],
-        ["4", "random", *[minus(one)] * 2, "40.0 % [40.0, 40.0]", "4.000 [4.000, 4.000]", zero, plus(3)],
-        ["–", "clairvoyant (it knows the future)", *[one] * 2, "0.000 % [0.000, 0.000]", zero, one, minus(one)],
+    at = next(k for k, line in enumerate(lines) if line.startswith("| # | policy | score | IQM | regret"))
+    values = [[cell.partition(" [")[0] for cell in line.strip("| ").split(" | ")] for line in lines[at + 2 : at + 7]]
+    # Score, interquartile mean, regret in %, regret / AFR's, how often better than AFR, the regret's difference.
+    assert values == [
+        ["1", "&lt;b&gt;", "0.750", "0.750", "5.00 %", "0.500", "1.000", "−0.500"],
+        ["2", "afr", "0.500", "0.500", "10.0 %", "–", "–", "–"],
+        ["3", "drop-oldest", "0.000", "0.000", "20.0 %", "2.000", "0.000", "+1.000"],
+        ["4", "random", "−1.000", "−1.000", "40.0 %", "4.000", "0.000", "+3.000"],
+        ["–", "clairvoyant (it knows the future)", "1.000", "1.000", "0.000 %", "0.000", "1.000", "−1.000"],
     ]
     # By default the others are compared with the best rule: a policy that is not registered is none.
     assert "minus random's" in report.plain(folder, "random") and "minus" not in report.plain(folder)
@@ -67,7 +59,6 @@ def test_cells_are_marked_where_they_are_not_discriminative_or_the_bound_is_not_
     cells = {"short": "L = 2 | L = 4", "long": "L = 2† | L = 4†", "good": "L = 2\\* | L = 4\\*"}  # as in the manifest
     found = [text.index(f"Score, {name}:\n\n| policy | {marked} |") for name, marked in cells.items()]
     assert found == sorted(found)
-    assert "Drop Oldest loses under 1 % there" in text and "upper bound" in text
     rows = [dict(row, certified=True) for row in inputs.read(folder).rows if row["scenario"] == "short"]
     text = report.markdown(make(folder.with_name("short"), rows=rows))
     assert "†" not in text and "\\*" not in text and "good" not in text
@@ -78,8 +69,7 @@ def test_the_page_says_what_was_run_and_how_to_run_it_again(folder: Path) -> Non
     assert path == folder / "report.html"
     page = path.read_text(encoding="utf-8")
     told = ["Two outages and a good link.", "2026-05-01", "bench --suite tiny-v1 --out &lt;here&gt;", "Out for 20 s."]
-    told += ['<html lang="en">', "<title>bufgym: tiny-v1, test</title>", "not ranked: it knows the future"]
-    assert all(words in page for words in [*told, "Drop Oldest loses under 1 % there"])
+    assert all(words in page for words in [*told, "not ranked: it knows the future"])
     assert page.count(' flat"') == 2 * len(QOI)  # both capacities of the good link
     assert drawn(page) == ["ranking", "capacities", "outages", "delays", "timeline"]
     assert report.write(folder).read_text(encoding="utf-8") == page and len(page) < 8e6

@@ -3,26 +3,11 @@
 import math
 from fractions import Fraction
 
+import naive_queues as queues
 from naive_fragments import BestEffort, FrameDropper, Reliable, ZenohDrop
-from naive_queues import (
-    ACCEPT,
-    REJECT,
-    Codel,
-    FoxgloveBacklog,
-    KeepLast,
-    Lifespan,
-    Policy,
-    Red,
-    Rosbridge,
-    Spaced,
-    drop_newest,
-    drop_random,
-    one_of,
-    uniform_of,
-)
 
 
-class Reservoir(Policy):
+class Reservoir(queues.Policy):
     """Algorithm R: the n-th item takes a place of its own with probability L / n."""
 
     n = 0
@@ -32,14 +17,16 @@ class Reservoir(Policy):
         if not again:
             self.n = max(self.n, s) + 1  # what came unasked is all there
         if self.sender.fits(newcomer):
-            return ACCEPT
-        return one_of([*range(s), *[REJECT] * (0 if again else self.n - s)], uniform_of(newcomer, self.sender))
+            return queues.ACCEPT
+        return queues.one_of(
+            [*range(s), *[queues.REJECT] * (0 if again else self.n - s)], queues.uniform_of(newcomer, self.sender)
+        )
 
     def departed(self, queue):
         self.n = len(queue)
 
 
-class Decimate(Policy):
+class Decimate(queues.Policy):
     """Arrivals 1, 4, 7, ... enter a queue that drops its oldest."""
 
     n = 0
@@ -48,11 +35,11 @@ class Decimate(Policy):
         if self.sender.evictions == 0:
             self.n += 1
             if self.n not in range(1, self.n + 1, 3):
-                return REJECT
-        return ACCEPT if self.sender.fits(newcomer) else 0
+                return queues.REJECT
+        return queues.ACCEPT if self.sender.fits(newcomer) else 0
 
 
-class Afr(Policy):
+class Afr(queues.Policy):
     """AFR: dropping rate r, counter c, dropping position p."""
 
     def __init__(self, as_released=True):
@@ -83,10 +70,10 @@ class Afr(Policy):
         if self.sender.evictions == 0:
             self.c += 1
             if self.c < self.gap():
-                return REJECT
+                return queues.REJECT
             self.c = math.fmod(self.c - self.gap(), 1)
         if self.sender.fits(newcomer):
-            return ACCEPT
+            return queues.ACCEPT
         self.end_pass(queue)
         victim = self.p
         self.p += 1
@@ -116,12 +103,12 @@ def min_gap(key):
         *gaps, own = gaps_left(sender, queue, newcomer, key)
         again = sender.evictions > 0
         if not gaps or (not again and own < min(gaps)):
-            return REJECT
+            return queues.REJECT
         excess = sum(m["bytes"] for m in [*queue, newcomer]) - sender.max_bytes
         freed = sum(m["bytes"] for m, gap in zip(queue, gaps, strict=True) if gap <= own)
-        return gaps.index(min(gaps)) if again or freed >= excess else REJECT
+        return gaps.index(min(gaps)) if again or freed >= excess else queues.REJECT
 
-    return Policy(full)
+    return queues.Policy(full)
 
 
 def orbbuf(v):
@@ -134,7 +121,7 @@ def orbbuf(v):
         similar = [1 - v(c["x"] - a["x"]) for a, c in zip(older, older[2:], strict=False)]
         return similar.index(max(similar))
 
-    return Policy(full)
+    return queues.Policy(full)
 
 
 def spread(key, share, discount):
@@ -144,12 +131,12 @@ def spread(key, share, discount):
         L = len(queue)
         even = share * (newcomer[key] - sender.last_dequeued[key]) / (L + 1)
         if newcomer[key] - queue[-1][key] < even and sender.evictions == 0:
-            return REJECT
+            return queues.REJECT
         gaps = gaps_left(sender, queue, newcomer, key)[:L]
         counted = [gap * (1 - discount * (1 - k / L)) for k, gap in enumerate(gaps)]
         return counted.index(min(counted))
 
-    return Policy(full)
+    return queues.Policy(full)
 
 
 def greedy_qoi(v):
@@ -164,9 +151,9 @@ def greedy_qoi(v):
         x = [m["x"] for m in [sender.last_dequeued, *queue, newcomer]]
         gain = v(x[-1] - x[-2])
         added = [gain - loss(b - a, c - b) for a, b, c in zip(x, x[1:], x[2:], strict=False)]
-        return added.index(max(added)) if max(added) > 0 else REJECT
+        return added.index(max(added)) if max(added) > 0 else queues.REJECT
 
-    return Policy(full)
+    return queues.Policy(full)
 
 
 class LinearAlpha(Afr):
@@ -183,11 +170,11 @@ class LinearAlpha(Afr):
     def count(self, queue, newcomer):
         if self.r == 1 and self.sender.fits(newcomer):
             self.c = 0
-            return ACCEPT
+            return queues.ACCEPT
         return super().count(queue, newcomer)
 
 
-class Steady(Policy):
+class Steady(queues.Policy):
     """Of the numbers m, 2m, 4m, ... (m odd) the last few are kept: s + 1 if m = 1, else s - floor(log2 m)."""
 
     first = 0
@@ -206,30 +193,30 @@ class Steady(Policy):
         places = [self.place(m["seq"] - self.first + 1, self.sender.capacity) for m in [*queue, newcomer]]
         place = places.pop()
         if place is None:
-            return REJECT
+            return queues.REJECT
         if place in places:
             return places.index(place)
-        return ACCEPT if self.sender.fits(newcomer) else 0
+        return queues.ACCEPT if self.sender.fits(newcomer) else 0
 
 
-class Anything(Policy):
+class Anything(queues.Policy):
     """A policy that decides at random, invalid decisions included: -2 accept, -1 reject, 0 .. L + 1 a slot."""
 
     def decide(self, queue, newcomer):
-        return one_of([ACCEPT, REJECT, *range(self.sender.capacity + 2)], newcomer["uniform"])
+        return queues.one_of([queues.ACCEPT, queues.REJECT, *range(self.sender.capacity + 2)], newcomer["uniform"])
 
 
 def twins(v):
     """What makes the twin of each built-in policy, by name."""
     return {
-        "drop-oldest": lambda: Policy(lambda sender, queue, newcomer: 0),
-        "drop-newest": lambda: Policy(drop_newest),
-        "replace-newest": lambda: Policy(lambda sender, queue, newcomer: len(queue) - 1),
-        "latest-only": lambda: KeepLast(1),
-        "random": lambda: Policy(drop_random),
+        "drop-oldest": lambda: queues.Policy(lambda sender, queue, newcomer: 0),
+        "drop-newest": lambda: queues.Policy(queues.drop_newest),
+        "replace-newest": lambda: queues.Policy(lambda sender, queue, newcomer: len(queue) - 1),
+        "latest-only": lambda: queues.KeepLast(1),
+        "random": lambda: queues.Policy(queues.drop_random),
         "reservoir": Reservoir,
         "decimate": Decimate,
-        "keyframe": lambda step=0.05: Spaced("x", step),
+        "keyframe": lambda step=0.05: queues.Spaced("x", step),
         "afr": Afr,
         "afr-paper": lambda: Afr(as_released=False),
         "linear-alpha": LinearAlpha,
@@ -240,22 +227,22 @@ def twins(v):
         "paced-motion-gap": lambda pace=0.7, discount=0.35: spread("x", pace, discount),
         "orbbuf": lambda: orbbuf(v),
         "greedy-qoi": lambda: greedy_qoi(v),
-        "ros-keep-last": lambda depth=10: KeepLast(depth),
-        "dds-keep-all": lambda: Policy(drop_newest),
-        "lifespan": Lifespan,
-        "time-filter": lambda separation_s=0.1: Spaced("us", separation_s * 1e6),
+        "ros-keep-last": lambda depth=10: queues.KeepLast(depth),
+        "dds-keep-all": lambda: queues.Policy(queues.drop_newest),
+        "lifespan": queues.Lifespan,
+        "time-filter": lambda separation_s=0.1: queues.Spaced("us", separation_s * 1e6),
         "zenoh-drop": ZenohDrop,
         "ros2-best-effort": BestEffort,
         "ros2-reliable-udp": Reliable,
         "webrtc-frame-dropper": FrameDropper,
-        "zenoh-ring": KeepLast,
-        "foxglove-sdk": lambda depth=1024: KeepLast(depth),
-        "foxglove-backlog": FoxgloveBacklog,
-        "rosbridge": Rosbridge,
-        "codel": Codel,
-        "red": Red,
-        **dict.fromkeys(["fifo", "strict-priority", "age-greedy", "edf", "ros-native"], KeepLast),
-        **dict.fromkeys(["robofleet", "robofleet-literal", "robofleet-released"], lambda: KeepLast(1)),
+        "zenoh-ring": queues.KeepLast,
+        "foxglove-sdk": lambda depth=1024: queues.KeepLast(depth),
+        "foxglove-backlog": queues.FoxgloveBacklog,
+        "rosbridge": queues.Rosbridge,
+        "codel": queues.Codel,
+        "red": queues.Red,
+        **dict.fromkeys(["fifo", "strict-priority", "age-greedy", "edf", "ros-native"], queues.KeepLast),
+        **dict.fromkeys(["robofleet", "robofleet-literal", "robofleet-released"], lambda: queues.KeepLast(1)),
         "test-anything": Anything,
     }
 

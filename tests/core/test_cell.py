@@ -4,23 +4,11 @@ import itertools
 import math
 from dataclasses import replace
 
+import cases
 import naive
 import naive_policies
 import numpy as np
 import pytest
-from cases import (
-    VALUES,
-    cases,
-    decide_anything,
-    drawn_messages,
-    log,
-    order,
-    same,
-    trace,
-    traces,
-    twin_log,
-    twin_messages,
-)
 from hypothesis import given
 from hypothesis import strategies as st
 from naive_cell import Cell
@@ -30,7 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.model.link import Link
-from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
+from bufgym.scenario import FleetEpisode, FleetScenario, Streams
 from bufgym.sim import run
 from bufgym.sim.cell import run_fleet
 from bufgym.sim.metrics import outcome
@@ -50,49 +38,24 @@ def hesitant(buffer, memory):
 
 
 ACCEPTS = policies.Policy("test-accept", accept, compile=True)
-HESITANT = policies.Policy("test-hesitant", decide_anything, on_send=hesitant, memory={"asked": 0.0}, compile=True)
+HESITANT = policies.Policy(
+    "test-hesitant", cases.decide_anything, on_send=hesitant, memory={"asked": 0.0}, compile=True
+)
 POLICIES = [p for p in (*map(policies.get, policies.names()), HESITANT) if p.privileged is None and not any(p.work)]
 
 
 @kernels
-@pytest.mark.parametrize(
-    ("robots", "crossed"),
-    [
-        # Two that send at once take twice as long.
-        ([[(0, 1_000)], [(0, 1_000)]], [{0: 2_000}, {0: 2_000}]),
-        # A is alone until 500 and has 500 bytes left; then each gets half a byte a microsecond: A crosses at 1500.
-        # B has had 500 by then and the link for itself: its other 500 bytes cross at 2000.
-        ([[(0, 1_000)], [(500, 1_000)]], [{0: 1_500}, {0: 2_000}]),
-        # A: 100 and then 100; B: 300. Both get 100 by 200; A's second has its 100 by 400, B its second 100 too; B alone
-        # needs 100 more: 500.
-        ([[(0, 100), (0, 100)], [(0, 300)]], [{0: 200, 1: 400}, {0: 500}]),
-        # By 3 us the link has carried 3 bytes: A and B have one each, one is left over. C joins; the three of them need
-        # 3 x 4 more for A and B to have their 5: byte 2 + 12 = 14. C has had 4 of its 10 and ends at byte 5 + 5 + 10.
-        ([[(0, 5)], [(0, 5)], [(3, 10)]], [{0: 14}, {0: 14}, {0: 20}]),
-        # A is done at 10; what the link could carry until 100 is gone. B and A's second start at 100 together.
-        ([[(0, 10), (100, 10)], [(100, 10)]], [{0: 10, 1: 120}, {0: 120}]),
-    ],
-)
-def test_shares_by_hand(robots, crossed):
-    """``robots``: the messages of each, (arrival us, bytes); ``crossed``: {sequence number: when}, of each."""
-    arrivals = tuple(messages(*np.array(mine, np.int64).T) for mine in robots)
-    link = Link(trace([(0, 0), (1_000_000, 1_000_000)], "loop"))  # 1 byte a microsecond
-    fleet = run_fleet(ACCEPTS, [FleetEpisode(arrivals, link)], 8, V)
-    assert [log(fleet.senders, i)["transmitted_us"] for i in range(len(robots))] == crossed
-
-
-@kernels
-@given(cases(max_messages=25), VALUES, st.sampled_from(POLICIES))
+@given(cases.cases(max_messages=25), cases.VALUES, st.sampled_from(POLICIES))
 def test_one_robot_is_a_sender_bit_for_bit(case, v, policy):
     episode = FleetEpisode((case.episode.arrivals,), case.episode.link)
     limits = {"max_bytes": case.max_bytes, "decide_at": case.decide_at}
     fleet = run_fleet(policy, [episode], case.capacity, v, **limits)
     alone = run(policy, [episode.episode(0)], case.capacity, v, **limits)
-    assert same(fleet.senders, alone)
+    assert cases.same(fleet.senders, alone)
 
 
 @kernels
-@given(cases(max_messages=15), st.integers(2, 3), st.sampled_from(POLICIES))
+@given(cases.cases(max_messages=15), st.integers(2, 3), st.sampled_from(POLICIES))
 def test_robots_that_are_alike_fare_as_one_on_its_share(case, n, policy):
     # N times the capacity, N times the demand: at the same times, to the microsecond (on links that have carried whole
     # bytes at every whole microsecond: a link that begins anew in the middle of a byte drops the rest of that byte).
@@ -103,26 +66,26 @@ def test_robots_that_are_alike_fare_as_one_on_its_share(case, n, policy):
         knots = [(0, 0)]
         for us, rate in rates:
             knots.append((knots[-1][0] + us, knots[-1][1] + us * rate * robots))
-        return Link(trace(knots, link.trace.after), link.offset_us, link.propagation_us)
+        return Link(cases.trace(knots, link.trace.after), link.offset_us, link.propagation_us)
 
     fleet = run_fleet(policy, [FleetEpisode((case.episode.arrivals,) * n, links(n))], case.capacity, V)
     alone = run(policy, [FleetEpisode((case.episode.arrivals,), links(1)).episode(0)], case.capacity, V)
     for i in range(n):
-        assert log(fleet.senders, i) == log(alone)
-        assert order(fleet.senders, i) == order(alone)
+        assert cases.log(fleet.senders, i) == cases.log(alone)
+        assert cases.order(fleet.senders, i) == cases.order(alone)
 
 
 @st.composite
 def cells(draw):
     """(episode of 1..4 robots, its knots, L, B); arrivals may come so late that the cell falls idle."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    knots, after = draw(traces())
-    link = Link(trace(knots, after), draw(st.integers(0, 3 * knots[-1][0])), draw(st.integers(0, 30_000)))
+    knots, after = draw(cases.traces())
+    link = Link(cases.trace(knots, after), draw(st.integers(0, 3 * knots[-1][0])), draw(st.integers(0, 30_000)))
     together = draw(st.booleans())
     robots, n = [], draw(st.integers(1, 15))
     largest = draw(st.sampled_from([2, 40, 4_000]))
     for _ in range(draw(st.integers(1, 4))):
-        arrivals = drawn_messages(rng, n, largest, robots[0]["arrival_us"] if together and robots else None)
+        arrivals = cases.drawn_messages(rng, n, largest, robots[0]["arrival_us"] if together and robots else None)
         robots.append(arrivals)
         n = n if together else int(rng.integers(1, 16))
     max_bytes = draw(st.one_of(st.none(), st.integers(1_000, 15_000)))
@@ -132,7 +95,7 @@ def cells(draw):
 def twin(episode, knots, policy, capacity, max_bytes=None, decide_at="arrival", whole=True):
     link = naive.Link(knots, episode.link.trace.after, episode.link.offset_us)
     cell = Cell(link, [policy() for _ in episode.arrivals], capacity, max_bytes, decide_at, whole)
-    return cell.run([twin_messages(arrivals) for arrivals in episode.arrivals])
+    return cell.run([cases.twin_messages(arrivals) for arrivals in episode.arrivals])
 
 
 class TwinAccept(naive.Policy):
@@ -159,15 +122,15 @@ def test_the_whole_byte_twin_agrees_exactly(drawn, decide_at):
 
     def look(buffer, arrival, memory):
         seen[int(memory[0])].append((buffer.now_us, buffer.left_bytes))
-        return decide_anything(buffer, arrival, memory)
+        return cases.decide_anything(buffer, arrival, memory)
 
     limits = {"max_bytes": max_bytes, "decide_at": decide_at}
     memory = np.arange(episode.robots, dtype=np.float64)[:, None]
     fleet = run_fleet(policies.Policy("test-look", look), [episode], capacity, V, memory=memory, **limits)
     slow = twin(episode, knots, TwinLook, capacity, max_bytes, decide_at)
     for i, robot in enumerate(slow.robots):
-        assert log(fleet.senders, i) == twin_log(robot)
-        assert order(fleet.senders, i) == robot.order
+        assert cases.log(fleet.senders, i) == cases.twin_log(robot)
+        assert cases.order(fleet.senders, i) == robot.order
         told = outcome(fleet.senders, i)
         assert told.arrived == told.delivered + told.in_transmission + told.buffered + told.dropped
         assert told.qoi == pytest.approx(naive.information(V, [episode.arrivals[i]["x"][k] for k in robot.order]))
@@ -189,12 +152,12 @@ def test_processor_sharing_itself_within_a_few_bytes(drawn):
     per_us = max(math.ceil((b - a) / (t - s)) for (s, a), (t, b) in itertools.pairwise(knots))
     bound = (2 + per_us) * slow.starts + len(slow.robots) + 2 * per_us
     for i, robot in enumerate(slow.robots):
-        ours = log(fleet.senders, i)["transmitted_us"]
+        ours = cases.log(fleet.senders, i)["transmitted_us"]
         # By position, not by time: an outage stretches the last byte to any length.
         for k in ours.keys() & robot.transmitted.keys():
             assert abs(slow.link.bytes_by(ours[k]) - slow.link.bytes_by(robot.transmitted[k])) <= bound
         assert len(ours.keys() ^ robot.transmitted.keys()) <= 1  # the last one may miss the end of a link that stops
-        assert order(fleet.senders, i) == sorted(ours)
+        assert cases.order(fleet.senders, i) == sorted(ours)
 
 
 def drawn_episodes(robots, count=2, **parameters):
@@ -207,7 +170,7 @@ def test_a_python_policy_does_what_the_compiled_one_does(name):
     made, episodes = drawn_episodes(3)
     compiled = policies.get(name)
     python = replace(compiled, name="test-python", compile=False)
-    assert same(
+    assert cases.same(
         run_fleet(compiled, episodes, 4, made.value).senders, run_fleet(python, episodes, 4, made.value).senders
     )
 
@@ -232,7 +195,7 @@ def test_cells_of_a_batch_know_nothing_of_each_other():
     for again in (0, 1):  # and a fleet can be loaded again
         for c in range(2):
             for i, row in enumerate(both.rows(c)):
-                assert log(both.senders, row) == log(alone[c ^ again].senders, i)
+                assert cases.log(both.senders, row) == cases.log(alone[c ^ again].senders, i)
             both.load(c, episodes[1 - c])
         both.run(afr)
 
@@ -242,4 +205,4 @@ def test_policies_remember_each_robot_for_itself():
     made, (episode, _) = drawn_episodes(2, size_bytes=900_000)
     twins = FleetEpisode((episode.arrivals[0], episode.arrivals[0], episode.arrivals[1]), episode.link)
     fleet = run_fleet(policies.get("afr"), [twins], 4, made.value)
-    assert log(fleet.senders, 0) == log(fleet.senders, 1) != log(fleet.senders, 2)
+    assert cases.log(fleet.senders, 0) == cases.log(fleet.senders, 1) != cases.log(fleet.senders, 2)

@@ -33,30 +33,6 @@ def line(times, *, sizes=10, x=None, knots=((0, 0), (1_000, 1_000)), after="loop
 
 
 @kernels
-def test_by_hand():
-    # L = 1. Message 0 crosses until 10. Of 1, 2 and 3, which arrive meanwhile, one can wait; the others are lost.
-    plan = clairvoyant(line([0, 1, 2, 3]), 1, V)
-    # 0 and 3 leave a gap of 3 and nothing after it: V(3) = 7/8. 0 and 1: V(1) = 1/2.
-    assert plan.qoi == 1.875
-    assert plan.kept.tolist() == [True, False, False, True]
-    assert plan.certified
-    # L = 2: gaps of 1 + 2 or 2 + 1, 1/2 + 3/4.
-    assert clairvoyant(line([0, 1, 2, 3]), 2, V).qoi == 2.25
-
-
-@kernels
-def test_it_gives_up_the_first_message_for_better_ones():
-    # The link rests until 100. What it took at 0 cannot be dropped any more, unless it was never accepted: x = 0 and
-    # x = 0 are the same picture, so the clairvoyant sends the second of them or neither is missed.
-    episode = line([0, 1, 2], x=[0, 0, 5], knots=((0, 0), (100, 0), (200, 100)), after="stop", sizes=60)
-    # 100 bytes carry one message of 60: every plan has H = 1.
-    assert clairvoyant(episode, 2, V).qoi == 1
-    # 120 bytes carry two: 0 or 1, and then 2: 1 + V(5).
-    episode = line([0, 1, 2], x=[0, 0, 5], knots=((0, 0), (100, 0), (200, 120)), after="stop", sizes=60)
-    assert clairvoyant(episode, 2, V).qoi == 1 + V(5)
-
-
-@kernels
 def test_one_message_and_nothing_that_can_be_delivered():
     plan = clairvoyant(line([0]), 1, V)
     assert (plan.qoi, plan.kept.tolist(), plan.certified) == (1.0, [True], True)

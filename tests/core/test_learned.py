@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import VALUES, cases, log, newcomer, queue_of, same
+from cases import VALUES, cases, log, same
 from gap_cases import fits
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,38 +15,27 @@ from bufgym import cli, policies
 from bufgym import scenario as scenarios
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
-from bufgym.model import qoi
+from bufgym.model import observe, qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.model.observe import (
-    CONTEXT_FIELDS,
-    FIELDS,
-    ON_BOARD_FIELDS,
-    ON_BOARD_SLOT_FIELDS,
-    SLOT_FIELDS,
-    observe,
-    observe_on_board,
-    observe_on_board_slots,
-)
 from bufgym.policies import learned
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Interruption
 from bufgym.sim import run
-from tests.conftest import COMPILED
 
 kernels = pytest.mark.kernels
 V = qoi.exponential(0.618)
 SHIPPED = files.shipped("agents", "agents/pretrained", "*.safetensors")
-SLOT_NAMES = [field.name for field in (*SLOT_FIELDS, *ON_BOARD_SLOT_FIELDS)]
-CONTEXT_NAMES = [field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS)]
+SLOT_NAMES = [field.name for field in (*observe.SLOT_FIELDS, *observe.ON_BOARD_SLOT_FIELDS)]
+CONTEXT_NAMES = [field.name for field in (*observe.CONTEXT_FIELDS, *observe.ON_BOARD_FIELDS)]
 
 
 @st.composite
 def weights(draw):
     """Any fields in any order; no, one or two hidden layers."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    on_board = draw(st.sets(st.sampled_from([field.name for field in ON_BOARD_SLOT_FIELDS]), min_size=1))
+    on_board = draw(st.sets(st.sampled_from([field.name for field in observe.ON_BOARD_SLOT_FIELDS]), min_size=1))
     others = draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=6, unique=True))
     fields = tuple(dict.fromkeys([*others, *(sorted(on_board) if draw(st.booleans()) else [])]))
     widths = draw(st.sampled_from([(), (1,), (3,), (4, 2), (2, 5)]))
@@ -59,9 +48,9 @@ def twin(made):
     def on_arrival(buffer, arrival, memory):
         s, L = len(buffer.slots), buffer.capacity
         slots, context = np.zeros((len(SLOT_NAMES), L + 1)), np.zeros(len(CONTEXT_NAMES))
-        observe(buffer, arrival, slots[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)])
-        observe_on_board_slots(buffer, arrival, slots[len(SLOT_FIELDS) :])
-        observe_on_board(buffer, arrival, context[len(CONTEXT_FIELDS) :])
+        observe.observe(buffer, arrival, slots[: len(observe.SLOT_FIELDS)], context[: len(observe.CONTEXT_FIELDS)])
+        observe.observe_on_board_slots(buffer, arrival, slots[len(observe.SLOT_FIELDS) :])
+        observe.observe_on_board(buffer, arrival, context[len(observe.CONTEXT_FIELDS) :])
 
         def features(k):
             seen = dict(zip(SLOT_NAMES, slots[:, k], strict=True)) | dict(zip(CONTEXT_NAMES, context, strict=True))
@@ -112,25 +101,6 @@ def test_the_twin_counts_as_one_does_by_hand():
     # A second layer: relu(5 * 1 + 0 * 9 + 2) = 7; score = -3 * 7 + 7 * 3 + 0.5
     second = (np.float32([[1], [9]]), np.float32([2]))
     assert score(replace(net, layers=(*net.layers, second), out=np.float32([-3])), [3.0]) == 0.5
-
-
-@kernels
-@pytest.mark.skipif(COMPILED, reason="compiling for a queue by hand takes 10 s, and others compare both")
-@pytest.mark.parametrize("hidden", [0, 1, 2])
-def test_what_a_hidden_layer_lets_through_decides(hidden):
-    """relu(relu(rank)) is largest for the newcomer, relu(relu(1 - rank)) for the oldest; relu(-rank) is 0 for all,
-    and of equals the oldest goes."""
-    one = np.float32([[1]]), np.float32([0])
-
-    def choice(weight, bias):
-        first = np.float32([[weight]]), np.float32([bias])
-        net = Network(np.float32([0]), np.float32([0]), (first, one)[:hidden], np.float32([1] if hidden else []))
-        made = Weights(("rank",), net if hidden else replace(net, skip=np.float32([weight])), net)
-        policy = learned.policy("by-hand", made)
-        return policy.on_arrival(queue_of(2, 2, policy.parameter_array), newcomer(), policy.new_memory(1, 2)[0])
-
-    assert [choice(1, 0), choice(-1, 1)] == [REJECT, 0]
-    assert choice(-1, 0) == 0
 
 
 def start(fields, seen):
@@ -204,7 +174,7 @@ def test_export_takes_over_what_the_run_noted(tmp_path):
     assert {key: metadata[key] for key in noted} == noted
     policy = policies.load(out)
     assert (policy.name, policy.summary) == ("one", "Random.")
-    assert weights.widths == (8, 8) and set(weights.fields) == {field.name for field in FIELDS}
+    assert weights.widths == (8, 8) and set(weights.fields) == {field.name for field in observe.FIELDS}
     notes.write_text("{", encoding="utf-8")
     with pytest.raises(BufgymError, match=r"notes\.json: cannot be read"):
         exported(model, tmp_path / "two.safetensors", "--name", "two")

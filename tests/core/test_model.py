@@ -5,14 +5,14 @@ import math
 import naive
 import numpy as np
 import pytest
-from cases import VALUES, queue_of, trace, traces
+from cases import VALUES, trace, traces
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import records
 from bufgym.model import link, qoi
-from bufgym.model.buffer import MESSAGE, arrival_gain, evict, gaps, loss, motion_gaps, push, row_width
+from bufgym.model.buffer import MESSAGE, evict, push, row_width
 from bufgym.model.link import FOREVER, KnotStore, Link, position_at, segment, time_of
 
 pytestmark = pytest.mark.kernels
@@ -43,35 +43,6 @@ def test_the_buffer_agrees_with_a_list(L, actions):
     assert (slots["seq"][0] == 0).all()
 
 
-def buffer(times_us, x, v=None, **known):
-    """A buffer that holds messages with these arrival times and coordinates."""
-    held = queue_of(len(x), len(x))._replace(**{"v": (v or qoi.exponential(0.5)).array, "dequeued": 1, **known})
-    held.slots["arrival_us"], held.slots["x"] = times_us, x
-    return held
-
-
-def message(us, x):
-    made = records(1, MESSAGE)
-    made["arrival_us"], made["x"] = us, x
-    return made[0]
-
-
-def test_gaps_by_hand():
-    # Sent: at 0. Queued: at 10 and 30. The newcomer comes at 60; the arrival before it came at 45 and was rejected.
-    held = buffer([10, 30], [1.0, 1.5], previous_us=45, previous_x=3.0)
-    newcomer = message(60, 5.0)
-    assert [gaps(held, newcomer, True, k)[:2] for k in range(3)] == [(10, 20), (20, 30), (30, 15)]
-    assert [motion_gaps(held, newcomer, k) for k in range(3)] == [(1.0, 0.5), (0.5, 3.5), (3.5, 2.0)]
-    # V = 1 - 0.5^d: slot 0 loses V(1) + V(0.5) - V(1.5) = (1 - 0.5^1)(1 - 0.5^0.5)
-    assert loss(held, newcomer, 0) == pytest.approx(0.5 * (1 - 0.5**0.5))
-    assert arrival_gain(held, newcomer) == 1 - 0.5**3.5
-
-
-def test_gain_of_a_newcomer_to_an_empty_buffer():
-    assert arrival_gain(buffer([], [], dequeued_x=2.0), message(9, 3.0)) == 0.5
-    assert arrival_gain(buffer([], [], dequeued=0), message(9, 3.0)) == 0  # the very first message is the 1 in H
-
-
 # 1000 bytes in the first 10 ms, nothing for 10 ms, then 3000 bytes in 10 ms: 0.1, 0 and 0.3 bytes a microsecond.
 KNOTS = [(0, 0), (10_000, 1_000), (20_000, 1_000), (30_000, 4_000)]
 
@@ -82,33 +53,6 @@ def carrying(knots, after):
     first, last, code, *_ = store.place(trace(knots, after), 1)
     where = (store.us, store.bytes, first, last, code, first)
     return lambda t: position_at(*where, t)[0], lambda position: time_of(*where, position)[0]
-
-
-def test_inside_the_trace():
-    carried, first_time = carrying(KNOTS, "stop")
-    assert carried(0) == 0
-    assert carried(15) == 1  # 1.5 bytes, rounded down
-    assert carried(10_000) == carried(19_999) == 1_000  # the outage
-    assert carried(25_000) == 2_500
-    assert first_time(1) == 10  # 0.1 bytes a microsecond
-    assert first_time(1_000) == 10_000  # the last byte before the outage
-    assert first_time(1_001) == 20_004  # 1 byte at 0.3 a microsecond: 3.33 us, so the 4th
-    assert first_time(4_000) == 30_000
-
-
-def test_after_the_end():
-    carried, first_time = carrying(KNOTS, "loop")
-    assert carried(30_000 + 15_000) == 4_000 + 1_000
-    assert first_time(8_000) == 60_000  # the very end of the second lap
-    assert first_time(8_001) == 60_010
-    carried, first_time = carrying(KNOTS, "hold")
-    assert carried(40_000) == 4_000 + 3_000
-    assert first_time(4_000 + 3_001) == 40_004
-    carried, first_time = carrying(KNOTS, "stop")
-    assert carried(10**9) == 4_000
-    assert first_time(4_001) == FOREVER
-    # Holding a rate of 0 carries nothing either.
-    assert carrying([*KNOTS, (31_000, 4_000)], "hold")[1](4_001) == FOREVER
 
 
 @given(traces(), st.integers(0, 400_000), st.integers(1, 60_000))
@@ -132,13 +76,6 @@ def test_a_hint_changes_nothing(case, hint, point):
     assert segment(us, 0, last, min(hint, last - 1), point) == segment(us, 0, last, 0, point)
     k = segment(us, 0, last, 0, point)
     assert us[k] <= point < us[k + 1]
-
-
-def test_nothing_is_lost_to_rounding():
-    # 3 bytes in 7 us: messages of 1 byte end at ceil(7/3), ceil(14/3), 7, ... and after 3 million of them at 7 s.
-    _, first_time = carrying([(0, 0), (7, 3)], "loop")
-    assert [first_time(k) for k in range(1, 7)] == [3, 5, 7, 10, 12, 14]
-    assert first_time(3_000_000) == 7_000_000
 
 
 def test_traces_are_stored_once():
@@ -208,14 +145,8 @@ def test_exact_wherever_the_result_is_below_2_to_the_62(after):
 
 
 def test_information_by_hand():
-    # Frames 0, 1, 3 with V = 1 - 0.5^d: 1 + 1/2 + 3/4.
-    assert qoi.exponential(0.5).information([0, 1, 3]) == 2.25
-    # Turning on the spot, 4 frames to a new view: 1 + 1/4 + 1 (a gap of 9 shows no more than one of 4).
-    assert qoi.saturating(4).information([0, 1, 10]) == 2.25
-    v = qoi.exponential()
-    assert v.information([]) == 0
-    assert v.information([7.5]) == 1
-    assert v.information([3, 3]) == 1  # the same view again
+    assert qoi.exponential(0.5).information([0, 1, 3, 3]) == 1 + 1 / 2 + 3 / 4  # the last is the same view again
+    assert qoi.saturating(4).information([0, 1, 10]) == 1 + 1 / 4 + 1
 
 
 @given(VALUES, st.lists(st.integers(0, 40), max_size=20))

@@ -12,16 +12,8 @@ from test_sender import MS, V, line
 
 from bufgym import policies
 from bufgym import scenario as scenarios
+from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.model.observe import (
-    CONTEXT_FIELDS,
-    ON_BOARD_FIELDS,
-    ON_BOARD_SLOT_FIELDS,
-    SLOT_FIELDS,
-    observe,
-    observe_on_board,
-    observe_on_board_slots,
-)
 from bufgym.scenario import draw
 from bufgym.sim import rollout, run
 
@@ -37,16 +29,6 @@ def recorder(seen):
         return ACCEPT
 
     return policies.Policy("recorder", on_arrival)
-
-
-def test_the_links_rate_by_hand():
-    # 1 MB/s, messages of 50 kB at 0, 20, 60 and 200 ms. By 20 ms the link carried 20 kB in 20 ms; by 60 ms 40 kB more;
-    # at 100 ms it had sent both, and stood idle from then on: in the last 140 ms it carried 40 kB in 40 ms.
-    seen = []
-    line([0, 20, 60, 200], sizes=[50_000, 50_000, 1, 50_000], capacity=4).run(recorder(seen))
-    assert [(b, us) for b, us, *_ in seen] == [(0, 0), (20_000, 20 * MS), (40_000, 40 * MS), (40_001, 40 * MS + 1)]
-    assert seen[0][2:] == (0, 0, 0)
-    np.testing.assert_allclose(seen[3][2:], 1e6)
 
 
 def test_the_links_rate_follows_a_change():
@@ -77,9 +59,9 @@ def seen(**known):
     arrival = newcomer()
     arrival["size_bytes"], arrival["x"] = 1_000, 4.0
     buffer = queue_of(0, 3)._replace(period_us=1e4, **known)
-    numbers = {field.name: field.function(buffer, arrival) for field in ON_BOARD_FIELDS}
-    table = np.zeros(len(ON_BOARD_FIELDS))
-    observe_on_board(buffer, arrival, table)
+    numbers = {field.name: field.function(buffer, arrival) for field in observe.ON_BOARD_FIELDS}
+    table = np.zeros(len(observe.ON_BOARD_FIELDS))
+    observe.observe_on_board(buffer, arrival, table)
     assert dict(zip(numbers, table, strict=True)) == numbers
     return numbers
 
@@ -136,13 +118,13 @@ def test_a_rollout_of_its_own_does_the_same(monkeypatch):
         assert logs[0] == logs[1], name
 
 
-NUMBERS = [field.name for field in ON_BOARD_SLOT_FIELDS]
-OTHERS = [field.name for field in SLOT_FIELDS]
+NUMBERS = [field.name for field in observe.ON_BOARD_SLOT_FIELDS]
+OTHERS = [field.name for field in observe.SLOT_FIELDS]
 
 
 def rows_of(buffer, arrival):
     rows = np.zeros((len(NUMBERS), buffer.capacity + 1))
-    observe_on_board_slots(buffer, arrival, rows)
+    observe.observe_on_board_slots(buffer, arrival, rows)
     return rows
 
 
@@ -154,7 +136,7 @@ def test_gaps_in_messages_by_hand():
     def on_arrival(buffer, arrival, memory):
         seen.append((buffer.dequeued_seq, rows_of(buffer, arrival)))
         s = len(buffer.slots)
-        one_by_one = [[f.function(buffer, arrival, k) for k in range(s + 1)] for f in ON_BOARD_SLOT_FIELDS]
+        one_by_one = [[f.function(buffer, arrival, k) for k in range(s + 1)] for f in observe.ON_BOARD_SLOT_FIELDS]
         np.testing.assert_array_equal(seen[-1][1][:, [*range(s), buffer.capacity]], one_by_one)
         return ACCEPT if arrival.seq in (0, 1, 4) else REJECT
 
@@ -176,7 +158,7 @@ def test_a_coordinate_that_counts_messages_has_the_same_gaps(case):
     def on_arrival(buffer, arrival, memory):
         if arrival.seq > 0:  # the first of all has no step behind it
             slots = np.zeros((len(OTHERS), buffer.capacity + 1))
-            observe(buffer, arrival, slots, np.zeros(len(CONTEXT_FIELDS)))
+            observe.observe(buffer, arrival, slots, np.zeros(len(observe.CONTEXT_FIELDS)))
             of_x = [slots[OTHERS.index(name)] for name in ("motion_before", "motion_merged")]
             np.testing.assert_allclose(rows_of(buffer, arrival)[:2], of_x, rtol=1e-6)
         return ANYTHING.on_arrival(buffer, arrival, memory)

@@ -75,20 +75,6 @@ def test_laws_are_those_that_lengths_are_drawn_from(name, parameters):
     assert (np.abs(drawn - p) <= 4.5 * np.sqrt(p * (1 - p) / n)).all()
 
 
-@kernels
-def test_by_hand():
-    v = qoi.exponential(0.5)
-    # L = 1, T = 1 or 2 alike. Keep 1 throughout: gaps 1, 1 and then 1, 2. Or 2 for 1: gaps 1, 1 and then 2, 1. A tie:
-    # (1/2 + 1/2 + 1/2 + 3/4) / 2; the oldest goes.
-    made = online_optimum(1, [0, 0.5, 0.5], v, objective="qoi")
-    assert made.value == 1.125
-    assert made.decision([1, 2]) == 0
-    # T = 1, 2, 3 alike. 2 is the best to have at T = 3 (gaps 2, 2), and from 2 on it is kept.
-    made = online_optimum(1, [0, 1 / 3, 1 / 3, 1 / 3], v, objective="qoi")
-    assert made.value == pytest.approx((1 + 1.25 + 1.5) / 3)
-    assert [made.decision([1, 2]), made.decision([2, 3])] == [0, REJECT]
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     ("L", "t_max", "optimum", "afr"),

@@ -56,16 +56,6 @@ def by_hand(buffer, arrival, price, end_x):
 
 
 @kernels
-def test_a_message_is_worth_its_information_less_its_bytes():
-    # 0 was sent, 1 waits, 2 comes, the end is at 3. Free bytes: with 1 three steps of 1/2, without it 3/4 + 1/2.
-    free = advantages(*queue((1.0, 100), now=2.0), 0.0, 3.0)
-    assert free == pytest.approx([-0.25, -0.25])
-    # At 1/400 QoI a byte each message costs 1/4, so the best chains are equal; a message twice as large is better gone.
-    assert advantages(*queue((1.0, 100), now=2.0), 1 / 400, 3.0) == pytest.approx([0.0, 0.0])
-    assert advantages(*queue((1.0, 200), now=2.0), 1 / 400, 3.0) == pytest.approx([0.25, -0.125])
-
-
-@kernels
 @given(st.integers(0, 2**32), st.integers(0, 6))
 def test_advantages_are_those_of_all_chains(seed, s):
     rng = np.random.default_rng(seed)

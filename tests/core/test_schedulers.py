@@ -113,27 +113,6 @@ def test_the_common_drop_rule(name):
     assert dropped(played(name, "0 A, 1 B, 2 B, 3 A, 4 B", limited)) == [1]
 
 
-@pytest.mark.parametrize("name", ["fifo", "strict-priority", "age-greedy", "edf", "robofleet", "robofleet-released"])
-def test_no_drop_makes_its_way(name):
-    # L = 2. N ranks lowest, and yet 3 and 4 take the places of A and B; 5, of C, may not take theirs.
-    senders = played(name, "0 C, 1 B, 2 A, 3 N, 4 N, 5 C", topics(priority=0.5), capacity=2)
-    assert dropped(senders) == [2, 1, 5]
-    # A buffer full of N: the next is lost, for nothing can go, and that shows.
-    senders = played(name, "0 C, 1 N, 2 N, 3 N", topics(), capacity=2)
-    assert dropped(senders) == [3]
-    assert count(senders, "invalid") == 0
-
-
-def test_bytes():
-    # B = 3000 bytes. 4 needs 1000 more than are free: of its own topic 2 (500) goes, too little, then 3 (1500).
-    senders = played(
-        "fifo", "0 A, 1 A 500, 2 B 500, 3 B 1500, 4 B 1500, 5 A 3000", topics(), max_bytes=3_000, capacity=9
-    )
-    # 5 needs all of B: 1 of its own topic goes, but 4 ranks above it, and so 5 is rejected.
-    assert dropped(senders) == [2, 3, 1, 5]
-    assert count(senders, "invalid") == 0
-
-
 ROBOFLEET = "0 A, 10 B, 20 A, 30 B, 40 N, 50 N"
 LIMITED = topics({"rate_limit_hz": 10.0})
 OPEN = {"blocked_ms": 0}

@@ -48,25 +48,6 @@ def test_a_departure_makes_room_for_the_arrival_at_its_instant(third_us, dropped
 
 
 @kernels
-def test_a_link_that_stops_keeps_what_it_has():
-    # 2500 bytes, then nothing ever: message 2 stays in transmission, message 3 in the buffer.
-    senders = line([0, 0, 0, 1], knots=((0, 0), (2_500, 2_500)), after="stop")
-    senders.run(policies.get("drop-oldest"))
-    told = outcome(senders, 0)
-    assert (told.arrived, told.delivered, told.in_transmission, told.buffered, told.dropped) == (4, 2, 1, 1, 0)
-    assert log(senders)["dequeued_us"] == {0: 0, 1: 1 * MS, 2: 2 * MS}
-
-
-@kernels
-def test_start_offset():
-    # The link rests for 5 ms; starting 3 ms into the trace, the first message waits 2 ms and crosses in 1.
-    arrivals = messages(np.array([0]), 1_000)
-    link = Link(trace([(0, 0), (5 * MS, 0), (10 * MS, 5_000)], "hold"), offset_us=3 * MS, propagation_us=7)
-    senders = run(policies.get("drop-oldest"), [Episode(arrivals, link)], 1, V)
-    assert log(senders)["transmitted_us"] == {0: 3 * MS}
-
-
-@kernels
 def test_what_the_policy_sees():
     views = []
 
@@ -216,19 +197,6 @@ def played(name, sizes, limit, **more):
     policy = policies.get(name) if isinstance(name, str) else name
     episode, limits = blocked(sizes, limit)
     return run(policy, [episode], **limits, **more)
-
-
-@kernels
-def test_evicts_until_the_newcomer_fits():
-    # B = 2500. Message 0 is in transmission; 1, 2, 3 (1000, 1000, 500) are queued. 4 (2000) needs both of the oldest.
-    sizes = [100, 1_000, 1_000, 500, 2_000]
-    senders = played("drop-oldest", sizes, 2_500)
-    assert log(senders)["dropped_us"] == {1: 0, 2: 0}
-    assert order(senders) == [0, 3, 4]
-    assert outcome(senders, 0).invalid == 0
-    # The tail first: 3, then 2; beside 1 (1000) there is still no room.
-    assert order(played("replace-newest", sizes, 2_500)) == [0, 4]
-    assert order(played("drop-newest", sizes, 2_500)) == [0, 1, 2, 3]
 
 
 @kernels

@@ -7,7 +7,7 @@ from cases import log, order, trace
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, gaps
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.checks import check_window
 from bufgym.model.link import FOREVER, Link
 from bufgym.model.topics import Topic, check_topics
@@ -144,15 +144,6 @@ def test_an_impossible_answer_keeps_what_has_room(answer, topics, invalid):
     assert (order(senders), senders.batch.senders[0]["invalid"]) == ([0], invalid)
 
 
-def test_a_topic_is_sent_in_order():
-    # Slots while 0 is in transmission: 1 (a), 2 (b), 3 (a), 4 (b). Asked for slot 2 (3, not a's oldest): impossible,
-    # the oldest goes. Then 2 (b) and 3 (a), 4 wait: slot 1 (3) goes first, then the rest.
-    topics = (Topic("a"), Topic("b"))
-    senders = after_run(episode([0] * 5, [0, 0, 1, 0, 1]), topics, on_send=scripted(0, 2, 1, 0, 0))
-    assert order(senders) == [0, 1, 3, 2, 4]
-    assert senders.batch.senders[0]["invalid"] == 1
-
-
 def test_holding_until_the_next_arrival_or_pong():
     # 0 is held back at 0 ms; at 5 ms message 1 arrives, both wait, the scheduler holds again; nothing else is to come
     # after 7 ms, so that the third HOLD is impossible and 0 goes. At its crossing 1 goes, then 2.
@@ -178,19 +169,6 @@ def test_flushing_no_drop():
         assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 3: 0, 2: 53 * MS}
 
 
-def test_the_first_message_of_a_held_queue_is_evicted():
-    # Message 0 was held back and goes: 1 (x = 3) is now the first of all and adds no V. So with topics and without.
-    for topics in ((), (Topic("only"),)):
-        senders = after_run(
-            episode([0, 0, 0], x=[1, 3, 4]),
-            topics,
-            on_arrival=lambda b, a, m: 0 if a.seq == 2 else ACCEPT,
-            on_send=scripted(HOLD, HOLD, 0, 0),
-        )
-        assert order(senders) == [1, 2]
-        assert senders.batch.senders[0]["delivered_gain"] == senders.batch.senders[0]["retained_gain"] == 0.5
-
-
 def test_age_of_information_and_lateness():
     # Messages of a come at 0 and 4 ms, cross at 1 and 5 ms, are received at 3 and 7 ms. From 0 to 7 ms the age grows
     # from 0 to 7 ms (the first is 3 ms old when it is received): 24.5 ms^2. Then it is 3 ms; the last arrival, b's at
@@ -206,53 +184,6 @@ def test_age_of_information_and_lateness():
     assert senders.batch.topics[0, 0]["aged"] == pytest.approx(38e-6, rel=1e-12)
     senders = after_run(played, (Topic("a", weight=2, deadline_s=0.002999), Topic("b")))
     assert senders.batch.senders[0]["late"] == 4
-
-
-def test_gaps_of_a_topic_of_which_nothing_was_sent():
-    # Neither the origin of time nor that of x counts: b's first message, its second, and a newcomer of a third topic.
-    seen = []
-
-    def note(buffer, arrival, memory):
-        if arrival.seq == 4:
-            seen.append([gaps(buffer, arrival, True, k)[:4] for k in range(4)])
-        return ACCEPT
-
-    topics = (Topic("a"), Topic("b"), Topic("c"))
-    for from_ms, from_x in ((0, 0), (70, 9)):
-        played = episode(np.array([0, 0, 0, 0.25, 0.5]) + from_ms, [0, 1, 0, 1, 2], x=np.arange(5.0) + from_x)
-        after_run(played, topics, on_arrival=note)
-    # Slots: 1 (b), 2 (a), 3 (b), newcomer 4 (c). b: 250 us and 2 from 1 to 3, one more such step is expected after 3.
-    # a: at the same time as 0 and 2 on in x; likewise.
-    expected = [(0, 250, 0, 2), (0, 0, 2, 2), (250, 250, 2, 2), (0, 0, 0, 0)]
-    assert seen == [expected, expected]
-
-
-def test_the_step_expected_after_a_message_begins_at_the_arrival_that_was_rejected_behind_it():
-    # b: 1 is kept at 0, 2 at 250 us is rejected; the newcomer is a's. One more step of 250 us is expected after 2, so
-    # 500 us after 1. In x b goes from 1 to 4, so 7 is next.
-    seen = []
-
-    def note(buffer, arrival, memory):
-        seen.append([gaps(buffer, arrival, True, k)[:4] for k in range(len(buffer.slots))])
-        return REJECT if arrival.seq == 2 else ACCEPT
-
-    after_run(episode([0, 0, 0.25, 0.5], [0, 1, 1, 0], x=[0, 1, 4, 5]), (Topic("a"), Topic("b")), on_arrival=note)
-    assert seen[3] == [(0, 500, 0, 6)]
-
-
-def test_gaps_behind_a_message_that_was_held_back():
-    # Nothing was sent before 0, which waits; 1 came 3 ms after it and was rejected, 2 comes 4 ms after that. The gap
-    # before 0 is none, and not back from 1. So with topics and without.
-    for topics in ((), (Topic("only"),)):
-        seen = []
-
-        def note(buffer, arrival, memory, seen=seen):
-            between = [gaps(buffer, arrival, True, k)[:2] for k in range(len(buffer.slots) + 1)]
-            seen.append((buffer.dequeued_arrival_us, buffer.dequeued_x, between))
-            return REJECT if arrival.seq == 1 else ACCEPT
-
-        after_run(episode([1, 4, 8], x=[5, 6, 7]), topics, on_arrival=note, on_send=scripted(HOLD, HOLD, HOLD, 0))
-        assert seen[2] == (1 * MS, 5, [(0, 7 * MS), (7 * MS, 4 * MS)])
 
 
 def test_a_rate_limit_comes_before_no_drop():

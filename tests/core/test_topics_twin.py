@@ -18,16 +18,7 @@ from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
-from bufgym.sim.decisions import (
-    answer_dequeue,
-    answer_send,
-    can_evict,
-    can_hold,
-    can_reject,
-    can_send,
-    decide,
-    has_room,
-)
+from bufgym.sim import decisions
 from bufgym.sim.rollout import python_view
 from bufgym.sim.rules import age_until
 from bufgym.sim.socket import credit
@@ -53,8 +44,10 @@ def test_agrees_with_twin_event_by_event(case):
             agree_on_gaps(senders, twin)
         if event == "send":
             can = [twin.sendable(m) for m in twin.slots()]
-            assert [can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can] + [False] * (L + 1 - len(can))
-            assert can_hold(batch, 0) == twin.may_hold()
+            assert [decisions.can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can] + [False] * (
+                L + 1 - len(can)
+            )
+            assert decisions.can_hold(batch, 0) == twin.may_hold()
 
     senders, twin = case.beside_its_twin(check)
     agree_on_log(senders, twin)
@@ -112,8 +105,8 @@ def agree_on_gaps(senders, twin):
     assert (buffer.dequeued_arrival_us, buffer.dequeued_x) == (reference["us"], reference["x"])
     gain = twin.gain(twin.lane(newcomer), [last, newcomer]) if last else 0.0
     assert arrival_gain(buffer, arrival) == pytest.approx(gain, abs=1e-12)
-    assert has_room(senders.batch, 0) == twin.fits(newcomer)
-    assert can_reject(senders.batch, 0) == (not twin.must_keep(newcomer))
+    assert decisions.has_room(senders.batch, 0) == twin.fits(newcomer)
+    assert decisions.can_reject(senders.batch, 0) == (not twin.must_keep(newcomer))
     evictable = twin.evictable(newcomer)
     for k, message in enumerate([*slots, newcomer]):
         lane = twin.lane(message)
@@ -127,7 +120,7 @@ def agree_on_gaps(senders, twin):
         if k < len(slots):
             assert slot_after(buffer, k, lane) == min([j for j in own if j > k], default=len(slots))
             assert is_first(buffer, k) == (k == own[0])
-            assert can_evict(senders.batch, 0, k) == (message in evictable)
+            assert decisions.can_evict(senders.batch, 0, k) == (message in evictable)
 
 
 def agree_on_log(senders, twin):
@@ -167,14 +160,14 @@ def test_what_the_masks_allow_is_carried_out_and_invariants_hold(case, chance):
         now_us = int(sender["now_us"])
         hold(case, senders)
         if event == DECISION:
-            possible = [k for k in range(L) if can_evict(batch, 0, k)]
-            possible += [REJECT] * can_reject(batch, 0) + [ACCEPT] * has_room(batch, 0)
-            assert decide(batch, 0, chance.choice(possible))
+            possible = [k for k in range(L) if decisions.can_evict(batch, 0, k)]
+            possible += [REJECT] * decisions.can_reject(batch, 0) + [ACCEPT] * decisions.has_room(batch, 0)
+            assert decisions.decide(batch, 0, chance.choice(possible))
         elif event == SEND:
-            possible = [k for k in range(L) if can_send(batch, 0, k)] + [HOLD] * can_hold(batch, 0)
-            assert answer_send(batch, 0, chance.choice(possible))
+            possible = [k for k in range(L) if decisions.can_send(batch, 0, k)] + [HOLD] * decisions.can_hold(batch, 0)
+            assert decisions.answer_send(batch, 0, chance.choice(possible))
         elif event == DEQUEUE:
-            answer_dequeue(batch, 0, chance.random() < 0.5)
+            decisions.answer_dequeue(batch, 0, chance.random() < 0.5)
     assert sender["invalid"] == 0 or not everyone
     assert sender["next"] == len(case.case.twin_messages)
     assert next_event(batch, None, 0) == END  # and stays there

@@ -13,16 +13,7 @@ from cases import Case, cases
 from hypothesis import strategies as st
 
 from bufgym import policies
-from bufgym.model import qoi
-from bufgym.model.observe import (
-    CONTEXT_FIELDS,
-    SLOT_FIELDS,
-    TOPIC_CONTEXT_FIELDS,
-    TOPIC_SLOT_FIELDS,
-    observe,
-    observe_topic_context,
-    observe_topic_slots,
-)
+from bufgym.model import observe, qoi
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
 from bufgym.sim import Senders
@@ -149,8 +140,8 @@ class TopicCase:
         return drop_some(buffer, None) if event == "dequeue" else None
 
 
-SLOT_NAMES = [field.name for field in SLOT_FIELDS + TOPIC_SLOT_FIELDS]
-CONTEXT_NAMES = [field.name for field in CONTEXT_FIELDS + TOPIC_CONTEXT_FIELDS]
+SLOT_NAMES = [field.name for field in observe.SLOT_FIELDS + observe.TOPIC_SLOT_FIELDS]
+CONTEXT_NAMES = [field.name for field in observe.CONTEXT_FIELDS + observe.TOPIC_CONTEXT_FIELDS]
 
 
 def observed(buffer: Any, arrival: Any, arriving: bool) -> dict[str, Any]:
@@ -158,11 +149,11 @@ def observed(buffer: Any, arrival: Any, arriving: bool) -> dict[str, Any]:
     slots = np.full((len(SLOT_NAMES), buffer.capacity + 1), np.nan)
     context = np.full(len(CONTEXT_NAMES), np.nan)
     if len(buffer.topics) == 1:
-        slots, context = slots[: len(SLOT_FIELDS)], context[: len(CONTEXT_FIELDS)]
-        observe(buffer, arrival, slots, context)
+        slots, context = slots[: len(observe.SLOT_FIELDS)], context[: len(observe.CONTEXT_FIELDS)]
+        observe.observe(buffer, arrival, slots, context)
     else:
-        observe_topic_slots(buffer, arrival, arriving, slots)
-        observe_topic_context(buffer, arrival, arriving, context)
+        observe.observe_topic_slots(buffer, arrival, arriving, slots)
+        observe.observe_topic_context(buffer, arrival, arriving, context)
     return dict(zip(SLOT_NAMES, slots, strict=False)) | dict(zip(CONTEXT_NAMES, context, strict=False))
 
 

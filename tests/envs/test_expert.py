@@ -59,43 +59,6 @@ def check_values(env: SenderEnv, values: np.ndarray) -> None:
     assert (np.isnan(values[0]) == ~env.action_masks()).all()
 
 
-@pytest.mark.kernels
-def test_by_hand() -> None:
-    # One byte a microsecond, 10 bytes a message, L = 1: while 0 crosses (until 10), 1, 2 and 3 arrive.
-    episode = Episode(messages(np.array([0, 1, 2, 3]), 10), Link(trace([(0, 0), (1_000, 1_000)])))
-    env = playing(episode, 1)
-    know = expert.clairvoyant(env)
-    # Accept 0: later one of the three follows, the last: V(3) = 7/8. Reject it: 1 crosses at once, then 3: V(2) = 3/4.
-    assert know.values().tolist() == [[pytest.approx(np.nan, nan_ok=True), 1.75, 1.875]]
-    assert know.actions().tolist() == [2]
-    env.step(2)
-    assert know.values()[0, 1:].tolist() == [1.875, 1.875]  # 1 can still be evicted
-    env.step(2)
-    # Now 1 is queued, 2 arrives. Whatever happens, 3 can take the place.
-    assert know.values()[0, :2].tolist() == [1.875, 1.875]
-    env.step(1)
-    # 3 arrives: evict 1 for it, V(3); or keep 1, V(1).
-    assert know.values()[0, :2].tolist() == [1.875, 1.5]
-    assert know.regrets()[0, :2].tolist() == [0.0, 0.375]
-    assert know.actions().tolist() == [0]
-
-
-@pytest.mark.kernels
-def test_a_queue_that_cannot_be_emptied() -> None:
-    # x: 1 and 2 show what 0 showed; 120 bytes are carried in all, so of what is queued behind 0 one more crosses.
-    episode = Episode(
-        messages(np.array([0, 1, 2, 30]), 60, np.array([0.0, 0.0, 0.0, 9.0])),
-        Link(trace([(0, 0), (20, 60), (40, 60), (100, 120)], "stop")),
-    )
-    env = playing(episode, 2)
-    know = expert.clairvoyant(env)
-    env.step(3)
-    values = know.values()
-    # With 1 queued the socket sends it at 20, before 3 arrives: nothing is left for 3. Rejected, 3 crosses.
-    assert values[0, 2:].tolist() == [1 + V(9), 1.0]
-    check_values(env, values)
-
-
 @st.composite
 def episodes(draw: Any) -> tuple[Episode, int]:
     """A few messages of 4 bytes over a link of fits and starts, and L."""

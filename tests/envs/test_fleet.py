@@ -30,11 +30,6 @@ SMALL: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 600_000
 PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
 
 
-def oldest_goes(mask: np.ndarray) -> int:
-    """What drop-oldest does: accept where there is room, else evict slot 0."""
-    return L + 1 if mask[L + 1] else 0
-
-
 @pytest.mark.parametrize(("robots", "mask_in_observation"), [(1, False), (3, True)])
 def test_pettingzoo_has_nothing_to_say(robots, mask_in_observation, capsys):
     def make():
@@ -85,7 +80,8 @@ def test_an_episode_is_the_rollout_of_the_same_policy(reward):
     own = dict.fromkeys(env.agents, 0.0)
     ticks = 0
     while env.agents:
-        actions = {agent: oldest_goes(infos[agent]["action_mask"]) for agent in env.agents}
+        # What drop-oldest does: accept where there is room, else evict slot 0.
+        actions = {agent: L + 1 if infos[agent]["action_mask"][L + 1] else 0 for agent in env.agents}
         _, rewards, _, truncated, infos = env.step(actions)
         ticks += 1
         for agent, rewarded in rewards.items():

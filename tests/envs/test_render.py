@@ -23,19 +23,14 @@ def test_a_frame_of_text_by_hand() -> None:
     env.reset(seed=0)
     for action in (3, 3, 0, 2):
         env.step(action)
-    counts, capacity, marks, queue, _, scale = text(env)
-    assert counts.strip() == ("0.167 s  5 arrived: 0 delivered, 1 in transmission, 2/2 queued, 2 dropped; H = 0.00")
-    assert capacity.split() == ["capacity", "______"]
-    assert marks.split() == ["messages", "▶·■■·?"]
-    assert queue.split() == ["queue", *"▶1■■1?"]
-    assert "13.8 MB/s, twice the demand" in scale  # 2 x 30 Hz x 230 kB
+    counts, *rest = text(env)
+    assert "5 arrived: 0 delivered, 1 in transmission, 2/2 queued, 2 dropped; H = 0.00" in counts
+    assert [line.split()[1:] for line in rest[:3]] == [["______"], ["▶·■■·?"], [*"▶1■■1?"]]
     for _ in range(2):
         env.step(2)
-    counts, capacity, marks, queue, *_ = text(env)
+    counts, *rest = text(env)
     assert "8 arrived: 4 delivered, 0 in transmission, 0/2 queued, 4 dropped; H = 2.8" in counts
-    assert capacity.split() == ["capacity", "______██"]
-    assert marks.split() == ["messages", "●·●●···●"]
-    assert queue.split() == ["queue", *"●__"]
+    assert [line.split()[1:] for line in rest[:3]] == [["______██"], ["●·●●···●"], [*"●__"]]
 
 
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)

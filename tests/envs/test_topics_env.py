@@ -103,30 +103,6 @@ def test_an_episode_of_three_topics_by_hand() -> None:
         assert info["action_mask"].tolist() == [bool(each) for each in mask]
         assert seen["socket_asks"] == [who == SOCKET_WAITS]
         assert seen["occupied"].tolist()[-1] == (who == ARRIVAL_WAITS)
-        if k == 7:
-            # Command 6 at 9 ms; queued are command 2, pose 3 and image 4; pose 0 was sent.
-            assert seen["priority"].tolist() == [0.5, 1, 0.25, 0.5]
-            assert seen["weight"].tolist() == [0.25, 1, 0.5, 0.25]
-            assert seen["no_drop"].tolist() == [1, 0, 0, 1]
-            assert seen["oldest"].tolist() == [1, 1, 1, 0]
-            assert seen["own"].tolist() == [1, 0, 0, 1]
-            assert seen["rank"].tolist() == [0.25, 0.5, 0.75, 1]
-            assert seen["queued"].tolist() == pytest.approx([1 / 3] * 4)
-            assert seen["waited"].tolist() == pytest.approx([0.007 / 1.007, 0.005 / 1.005, 0.003 / 1.003, 0])
-            assert seen["silence"].tolist() == pytest.approx([0.009 / 1.009] * 4)
-            assert seen["lateness"].tolist() == pytest.approx([0, 5 / 15, 0, 0])
-            # In units of the largest weight: pose V(4) = 1; the newcomer V(7) = 1 of weight 0.5.
-            assert seen["gain"].tolist() == [0, 1, 0, 0.25]
-            mean = (1 + 0.25) / 4
-            assert seen["gain_per_byte"].tolist() == pytest.approx([0, 1 / (1 + mean), 0, 0.25 / (0.25 + mean)])
-            assert seen["size"].tolist() == [0.5] * 4
-            assert seen["in_flight"] == [0.5] and seen["busy"] == [1] and seen["left"].tolist() == pytest.approx([0.1])
-            # Pose 3 stands between 0 (4 ms before) and what is expected 4 + 4 ms after it, one more step than 5 was.
-            # V(4) + V(8) - V(12) = 1; the even gap is (8 - 0) / 2 = 4: it loses V(4) + V(4) - V(8) = 1, too.
-            assert seen["loss"][1] == 1
-            assert seen["relative_loss"][1] == 0.5
-            assert seen["time_before"][1] == 0.5
-            assert seen["time_merged"][1] == pytest.approx((4 + 8) / (4 + 8 + 2 * 4))
         seen, _, ended, _, info = env.step(action)
         assert info["reward_terms"]["retained"] == pytest.approx(retained), k
         assert info["reward_terms"]["delivered"] == pytest.approx(delivered), k
@@ -223,21 +199,13 @@ def test_a_frame_of_text_has_a_lane_a_topic() -> None:
     env = SenderEnv(BY_HAND, 3)
     env.reset(options={"episode": three_topics()})
     env.step(4)
-    assert text(env)[-2].endswith("the socket asks")
-    assert "0 arrived" not in text(env)[0] and "1 arrived: 0 delivered, 0 in transmission, 1/3 queued" in text(env)[0]
     for action in (0, 4, 4, 4, 0):
         env.step(action)
-    counts, _, pose, image, command, queue, legend, _ = text(env)
+    counts, _, pose, image, command, queue, *_ = text(env)
     assert "5 arrived: 0 delivered, 1 in transmission, 3/3 queued, 1 dropped; H = 0.00" in counts
     lane = len("a pose          ")
-    assert [line[:lane].split() for line in (pose, image, command)] == [["a", "pose"], ["b", "image"], ["c", "command"]]
     assert [line[lane:] for line in (pose, image, command)] == ["▶  ■ ?", " ·  ■ ", "  ■   "]
     assert queue.split() == ["queue", "a", "c", "a", "b", "a"]
-    assert legend.endswith("an arrival asks")
-    for action in (3, 1, 1, 0):
-        env.step(action)
-    # At 30 ms 0 and 4 have reached the server: the ones of pose and image.
-    assert "3 delivered" in text(env)[0] and "H = 3.00" in text(env)[0]
 
 
 @pytest.mark.parametrize(("topics", "capacity"), [(2, 200), (8, 1), (30, 32)])

@@ -156,17 +156,6 @@ def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, steps
         assert any({ARRIVAL_WAITS, SOCKET_WAITS} <= kinds for kinds in questions)
 
 
-@kernels
-def test_the_step_that_begins_an_episode_ends_none() -> None:
-    """T = 3 never fills L = 8, so nothing is asked: an episode ends with its first step. With NEXT_STEP the step after
-    it begins the next, and that one ends with the step after that."""
-    envs = SenderVectorEnv(2, Interruption(law="fixed", t_max=3), 8, decide_at="overflow", autoreset_mode="NextStep")
-    envs.reset(seed=0)
-    steps = [envs.step(np.zeros(2, np.int64)) for _ in range(4)]
-    assert [step[2].tolist() for step in steps] == [[True] * 2, [False] * 2] * 2
-    assert [step[1].tolist() for step in steps[1::2]] == [[0.0, 0.0]] * 2
-
-
 @pytest.mark.parametrize("case", ["fading", "topics"])
 def test_threads_change_nothing(case: str) -> None:
     """Three rows in two threads are what they are in one, and more threads than rows are as many."""

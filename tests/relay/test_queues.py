@@ -8,7 +8,6 @@ from bufgym.relay import policies
 from bufgym.relay.config import POLICIES, Config
 from bufgym.relay.patterns import MAX_CHARACTERS, pattern
 from bufgym.relay.quota import Bucket, Quotas
-from bufgym.relay.server import serve_forever
 from bufgym.relay.subscriber import Subscription, next_lane
 
 
@@ -133,11 +132,6 @@ def test_quotas_are_remembered_for_a_while() -> None:
     now_s = 161.0
     quotas.tidy()
     assert quotas.of("a") is not quota
-
-
-async def test_a_policy_that_there_is_not() -> None:
-    with pytest.raises(BufgymError, match="unknown policy 'newest'"):
-        await serve_forever(settings(policies=("newest",)))
 
 
 async def test_a_port_that_is_taken() -> None:

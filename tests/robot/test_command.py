@@ -1,6 +1,7 @@
 """``bufgym live``, as a user types it."""
 
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -41,8 +42,7 @@ def test_send_receive_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[s
         assert main(["live", "send", place, *FAST, "--log", str(log)]) == 0
     assert main(["live", "replay", str(log)]) == 0
     out = capsys.readouterr().out
-    assert "30 received; 0 broken connections" in out
-    assert "30 put, 30 delivered, 0 dropped" in out and "makes the same decisions" in out
+    assert "30 received" in out and "30 put, 30 delivered, 0 dropped" in out
     bag = bags.read_bag(came)
     assert bag.size_bytes[bag.topic == list(bag.topics).index("/topic_0")].tolist() == [1000] * 30
 
@@ -54,15 +54,12 @@ def test_send_shows_what_the_queue_does(capsys: pytest.CaptureFixture[str]) -> N
     assert out.count("afr, L = 64") == 2 and "left         30" in out
 
 
-def test_validate_prints_both_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_validate_keeps_its_runs(tmp_path: Path) -> None:
     arguments = ["--trace", "lte-synthetic-0", "--policies", "afr", "--duration", "0.5", "--size", "5000"]
     arguments += ["--speed", "4", "--transport", "tcp", "websocket", "--out", str(tmp_path)]
     assert main(["live", "validate", *arguments]) == 0
-    out = capsys.readouterr().out
-    assert "| afr |" in out and "2 runs" in out
-    command = json.loads((tmp_path / "runs.json").read_text(encoding="utf-8"))["command"]
-    assert "bufgym live validate --trace lte-synthetic-0 --policies afr" in command
-    assert "--transport tcp websocket" in command
+    kept = json.loads((tmp_path / "runs.json").read_text(encoding="utf-8"))
+    assert len(kept["runs"]) == 2 and "--transport tcp websocket" in kept["command"]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +67,6 @@ def test_validate_prints_both_side_by_side(tmp_path: Path, capsys: pytest.Captur
     [
         (["send", "robot"], "robot: must be HOST:PORT"),
         (["link", "--trace", "lte-synthetic-0", "--to", "robot:99999"], "robot:99999: must be HOST:PORT"),
-        (["replay", "none.mcap"], "none.mcap: No such file"),
         (["view", "none.mcap"], "none.mcap: No such file"),
     ],
 )
@@ -90,19 +86,22 @@ def story() -> Bench:
     return bench
 
 
+def numbers(text: str) -> dict[str, list[float]]:
+    """The numbers of each line, by its first word."""
+    lines = [line.split(maxsplit=1) for line in text.splitlines() if line[:1].isalpha()]
+    return {first: [float(n) for n in re.findall(r"\d+(?:\.\d+)?", rest)] for first, rest in lines}
+
+
 def test_a_log_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """0 is sent; 1, 2 and 3 are dropped as the oldest of three; 4 goes to the socket, 5 stays: for 50 ms so far."""
+    """0 is sent; 1, 2 and 3 are dropped as the oldest of three; 4 goes to the socket, 5 stays: for 50 ms so far.
+
+    How many, in a second, Mbit/s; of the queue how old its oldest is. Rates fall as time goes on, and bars stay.
+    """
     records = story().records
     text = View(records).text()
-    lines = text.splitlines()
-    assert lines[0] == "drop-oldest, L = 2   0.7 s"  # 0.65 s
-    assert lines[2] == "queue         1   [#.]   the oldest 0.05 s"
-    assert lines[3] == "socket        1"
-    assert lines[4] == "put           6       6 /s     0.6 Mbit/s"
-    assert lines[5] == "left          1       1 /s     0.1 Mbit/s"
-    assert lines[6] == "dropped       3       3 /s     0.3 Mbit/s   3 evicted"
-    assert lines[7] == "QoI         1.0   of what has left   the longest gap 0"
-    assert lines[-1].endswith("█|") and len(lines[-1]) == 62
+    told = numbers(text)
+    assert told["socket"] == [1] and told["put"] == [6, 6, 0.6] and told["left"][-1] == 0.1 and told["QoI"] == [1, 0]
+    assert told["dropped"] == [3, 3, 0.3, 3] and "[#.]   the oldest 0.05 s" in text
     for cut in range(1, len(records)):  # wherever a log breaks off
         View(records[:cut]).text()
     with LogFile(tmp_path / "log.mcap") as file:
@@ -110,11 +109,7 @@ def test_a_log_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
             file(record)
     assert main(["live", "view", str(tmp_path / "log.mcap")]) == 0
     assert text in capsys.readouterr().out
-
-
-def test_rates_fall_as_time_goes_on_and_bars_stay() -> None:
-    view = View(story().records)
-    assert view.text(1_250_001).splitlines()[4] == "put           6       4 /s     0.4 Mbit/s"  # those after 0.25 s
-    last = view.text(3_000_000).splitlines()
-    assert last[4] == "put           6       0 /s     0.0 Mbit/s"
-    assert last[-1].endswith("█   |")  # 3 s later
+    view = View(records)
+    assert numbers(view.text(1_250_001))["put"] == [6, 4, 0.4]  # those after 0.25 s
+    last = view.text(3_000_000)
+    assert numbers(last)["put"] == [6, 0, 0] and last.endswith("█   |")  # 3 s later
