@@ -104,9 +104,7 @@ class Motion:
 
 
 @kernel
-def _follow(
-    knot_us: Int64Array, y: Float64Array, time_us: Int64Array, start_us: int, coordinate: Float64Array
-) -> int:
+def _follow(knot_us: Int64Array, y: Float64Array, time_us: Int64Array, start_us: int, coordinate: Float64Array) -> int:
     """Do what ``Motion.follow`` says; return the first negative time, or 0."""
     duration_us, j = knot_us[-1], 0
     for k in range(len(time_us)):
