@@ -45,6 +45,7 @@ async def beside(*works: Coroutine[Any, Any, Any]) -> AsyncIterator[list[asyncio
 
 
 async def until(holds: Callable[[], Any]) -> None:
-    """Return once ``holds()``."""
-    while not holds():
-        await asyncio.sleep(0.002)
+    """Return once ``holds()``, within a minute."""
+    async with asyncio.timeout(60):
+        while not holds():
+            await asyncio.sleep(0.002)

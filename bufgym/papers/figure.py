@@ -17,7 +17,7 @@ from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_type_hints
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
@@ -69,11 +69,11 @@ def several(rule: Rule) -> Rule:
     return check
 
 
-RULES_BY_KIND = {
-    "int": whole(),
-    "float": above_0,
-    "Sequence[int]": several(whole()),
-    "Sequence[float]": several(above_0),
+RULES_BY_KIND: dict[Any, Rule] = {
+    int: whole(),
+    float: above_0,
+    Sequence[int]: several(whole()),
+    Sequence[float]: several(above_0),
 }
 """Annotation of an option -> its rule."""
 
@@ -88,8 +88,9 @@ class Figure(ABC):
 
     def __post_init__(self) -> None:
         own = ChainMap(*(vars(kind).get("RULES", {}) for kind in type(self).__mro__))
+        kinds = get_type_hints(type(self))
         for option in fields(self):
-            if rule := own.get(option.name, RULES_BY_KIND.get(str(option.type))):
+            if rule := own.get(option.name, RULES_BY_KIND.get(kinds[option.name])):
                 rule(option.name, getattr(self, option.name))
 
     @abstractmethod

@@ -18,7 +18,10 @@ MESSAGES = 60
 
 
 def wait(holds: Callable[[], bool]) -> None:
+    ends_s = time.monotonic() + 60
     while not holds():
+        if time.monotonic() > ends_s:
+            raise TimeoutError(f"60 s, and still not so: line {sys._getframe(1).f_lineno}")
         time.sleep(0.001)
 
 

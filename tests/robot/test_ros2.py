@@ -46,7 +46,9 @@ def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
 def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None:
     numbers = [str(k) for k in range(100)]
     seen = json.loads(run(REPO / "tests/robot/ros2_session.py", tmp_path).splitlines()[-1])
-    assert seen["came"] == {"camera": numbers, "status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
+    pictures = seen["came"].pop("camera")
+    assert len(pictures) >= 90 and pictures == [number for number in numbers if number in pictures]  # best effort
+    assert seen["came"] == {"status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
     assert seen["told"][1] == "/commands: std_msgs/msg/String, reliable"
     assert seen["best_effort"] and seen["by"] == "bufgym_receive" and seen["faults"] == []
     log = read_log(tmp_path / "log.mcap")
