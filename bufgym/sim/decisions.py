@@ -219,7 +219,9 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
     if not 0 <= k < sender.occupancy:
         return False
     topic = at(batch.slots, i, sender.first + k).topic
-    older = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
+    older = k - 1
+    if batch.several is not None:
+        older = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
     return older < 0 and rules.sendable(batch, i, k)
 
 
