@@ -44,10 +44,6 @@ def client(**more: Any) -> Client:
     return Client(streams, (link,), **(given | more))
 
 
-def episodes_of(count: int = 2, **more: Any) -> topics.ClientEpisodes:
-    return topics.ClientEpisodes(client(**more), 6, count, np.random.default_rng(1))
-
-
 def test_weights_are_a_vector_and_back() -> None:
     search = Evolution.around(SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32)), 0.1, 0)
     vector = np.arange(len(search.average), dtype=float)
@@ -76,7 +72,7 @@ def test_reached_is_what_the_metrics_say() -> None:
         policies.get("fifo"),
         SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32)).policy("plain"),
     ):
-        of = episodes_of()
+        of = topics.ClientEpisodes(client(), 6, 2, np.random.default_rng(1))
         assert of.reached(policy) == pytest.approx(by_metrics(policy, of), rel=1e-9)
         assert of.reached(policy) == of.reached(policy)
     assert of.decisions == sum(len(episode.arrivals) for episode in of.episodes)

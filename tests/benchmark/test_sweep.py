@@ -25,11 +25,6 @@ WORDS = ["bench", "--suite", "interruption-v1", "--policies", ",".join(THREE), "
 """The same as ``TINY``, typed."""
 
 
-def rows_in(out: Path, form: str = "csv") -> str:
-    """All rows to the last bit: repr shows every one, and tells NaN from None."""
-    return repr(read_rows(out / f"rows.{form}"))
-
-
 @pytest.fixture(scope="module")
 def expected() -> str:
     chosen = [policies.get(name) for name in THREE]
@@ -42,7 +37,7 @@ def expected() -> str:
 @pytest.mark.parametrize("backend", ["sequential", "threading", "loky"])
 def test_the_rows_are_those_of_the_experiment(tmp_path: Path, backend: str, expected: str) -> None:
     rows = sweep.run_sweep(TINY, tmp_path, jobs=2, backend=backend, form="csv")
-    assert repr(rows) == rows_in(tmp_path) == expected
+    assert repr(rows) == repr(read_rows(tmp_path / "rows.csv")) == expected  # which tells NaN from None
     assert sorted(path.name for path in tmp_path.iterdir()) == ["manifest.json", "rows.csv", "timeline.json"]
 
 

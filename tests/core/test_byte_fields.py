@@ -74,21 +74,6 @@ def test_gap_per_byte():
     assert next(f for f in ON_BOARD_SLOT_FIELDS if f.name == "gap_per_byte").function(still, arrival, 0) == 0
 
 
-def test_small_and_large_messages_no_longer_look_alike():
-    # 1 MB/s: a link that carries a message of 10 kB in each of 10 ms, and a thousandth of one of 10 MB.
-    known = {"long_rate_bytes_per_s": 1e6}
-    small = seen([10_000] * 4, arrival_bytes=1e4, **known)
-    large = seen([10_000_000] * 4, arrival_bytes=1e7, **known)
-    assert small["bytes_in_period"] == [0.5] * 4
-    assert (small["newcomer_bytes"], small["load"]) == (0.5, 0.5)
-    for name in ("newcomer_bytes", "load"):
-        assert large[name] == pytest.approx(1_000 / 1_001)
-    assert large["bytes_in_period"] == pytest.approx([1_000 / 1_001] * 4)
-    # Beside each other they are alike, in both.
-    assert small["size_spread"] == large["size_spread"] == 0
-    assert small["gap_per_byte"] == large["gap_per_byte"] == [0.5] * 4
-
-
 def test_what_arrives_counts_although_it_is_not_kept():
     # The policy keeps messages of 1000 bytes alone; half of those that arrive have 9000.
     loads = []

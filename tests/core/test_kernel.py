@@ -192,16 +192,12 @@ print(int(rows.cells["number"].sum()) + 6)
     assert run(tmp_path, source=source, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
 
 
-def _no_kernel(numbers: Any) -> int:
-    return len({str(number) for number in numbers})
-
-
 @needs_compilation
 def test_a_branch_that_needs_a_missing_field_is_not_compiled() -> None:
     @kernel
     def inner(numbers: Numbers) -> int:
         if numbers.several is not None:
-            return _no_kernel(numbers.of)
+            return len({str(number) for number in numbers.of})
         return len(numbers.of)
 
     @kernel

@@ -71,29 +71,16 @@ TIMED = topics(1.0, {"deadline_s": 0.05}, {"deadline_s": 0.02})
         ("fifo", "0 A, 1 C, 2 B, 3 A, 4 C, 5 N", topics(), [0, 1, 2, 3, 4, 5]),
         # B and C are equal: first in, first out among them, before all of A.
         ("strict-priority", "0 A, 1 A, 2 C, 3 A, 4 B, 5 C", topics(1, 2, 2), [0, 2, 4, 5, 1, 3]),
-        # A starves for as long as one C comes each ms: at 101, 102, 103 there is always one.
-        ("strict-priority", "0 A, 1 A, 2 C, 101.5 C, 102.5 C", topics(), [0, 2, 3, 4, 1]),
         # At 101 ms: of A 0 was sent, which came at 0: age 101. B was never sent, its oldest came at 10: 91. C: 3 x 31 =
         # 93. So A's next, 2, which leaves no A. At 102: B 92, C 3 x 32 = 96. Then both of B.
         ("age-greedy", "0 A, 10 B, 20 A, 30 B, 70 C", WEIGHTED, [0, 2, 4, 1, 3]),
-        # Sending one that came late makes the topic young, whenever it is sent: at 101 B's oldest came at 10, A's
-        # newest sent at 0. At 102 A's newest sent came at 99: age 3. B's oldest came at 10: 92.
-        ("age-greedy", "0 A, 10 B, 11 B, 99 A, 99 A", WEIGHTED, [0, 3, 1, 2, 4]),
-        # Nothing was sent of either, both came at 10: the oldest.
-        ("age-greedy", "0 A, 10 C, 10 B", topics(1, 1, 1), [0, 1, 2]),
-        ("age-greedy", "0 A, 10 B, 10 C", WEIGHTLESS, [0, 1, 2]),
         # Due: 1 never, 2 at 60, 3 at 70, 4 at 55, 5 at 65. All are late when the link opens, and are sent all the same.
         ("edf", "0 A, 5 A, 10 B, 20 B, 35 C, 45 C", TIMED, [0, 4, 2, 5, 3, 1]),
-        # Neither C nor B was sent: both wait since time 0. C came first, B is the first topic.
-        ("robofleet", "0 A, 1 C, 2 B", topics(0.1, 1, 1), [0, 2, 1]),
-        ("robofleet-released", "0 A, 1 C, 2 B", topics(0.1, 1, 1), [0, 2, 1]),
         # At 101 ms A (sent at 0) and B (never) wait alike: A, then B. At 103 ms A waits since 101, B since 102,
         # whenever what now waits of them arrived.
         ("robofleet", "0 A, 10 B, 20 A, 102.5 B, 102.6 A", topics(1, 1), [0, 2, 1, 4, 3]),
         # Round again: A (101), B (102), N, then of A alone; neither priority nor no_drop count.
         ("ros-native", "0 A, 1 A, 2 A, 3 A, 4 N, 5 B, 6 B", topics(), [0, 1, 5, 4, 2, 6, 3]),
-        # Who had nothing to send has waited longest: at 103 ms C goes (never sent from), then A (101), then B (102).
-        ("ros-native", "0 A, 1 A, 2 A, 3 B, 4 B, 102.5 C", topics(), [0, 1, 3, 5, 2, 4]),
     ],
 )
 def test_what_goes_next(name, script, rules, sent):
@@ -132,10 +119,6 @@ PONGS = {**OPEN, "window": 2, "ack_ms": 50}
         # 0 fills half of the window, and each arrival is a pass of its own: 1 goes, 2 finds two on their way and waits
         # for 0's pong at 51 ms, when 3 goes with it: no pass begins while the window is full.
         ("robofleet-released", "0 A, 1 N, 2 N, 3 N", topics(), PONGS, [], {0: 0, 1: 1, 2: 51, 3: 51}),
-        # As published, n_T holds for no_drop too: 0's pong comes at 51, 1's at 52.
-        ("robofleet", "0 A, 1 N, 2 N, 3 N", topics(), PONGS, [], {0: 0, 1: 1, 2: 51, 3: 52}),
-        # What waits for its turn is overwritten; A and B wait alike.
-        ("robofleet", "0 A, 10 B, 20 A, 101.5 B, 101.6 A", topics(1, 1), {}, [1], {0: 0, 2: 101, 3: 102, 4: 103}),
         # 10 Hz. At arrival: 40 and 80 come too soon after 0; then 160 and 200 after 120. Exactly 100 ms later is not
         # too soon: 220 is.
         (
@@ -156,16 +139,9 @@ PONGS = {**OPEN, "window": 2, "ack_ms": 50}
             [1, 4, 5],
             {0: 0, 2: 105, 3: 106, 6: 205},
         ),
-        # The released client sleeps until an arrival or a pong. 1 may go at 100 ms, but nothing happens then; nothing
-        # at all is to come, so it stays.
-        ("robofleet-released", "0 A, 40 A", LIMITED, OPEN, [], {0: 0}),
         # A publisher's queue of 2: 1 goes for 4. At 101 ms A was sent from at 0, and C never, which counts as 0 too: A,
         # the first topic; then C, then A again.
         ("ros-native", "0 A, 1 A, 2 A, 3 C, 4 A", topics({"limit": 2}), {}, [1], {0: 0, 2: 101, 3: 102, 4: 103}),
-        # Where L = 3 is too small for all queues, the oldest of any goes, whatever its rank; no N does.
-        ("ros-native", "0 A, 1 N, 2 C, 3 B, 4 A", topics(), {"capacity": 3}, [2], {0: 0, 4: 101, 3: 102, 1: 103}),
-        # Turns by message: 1, of 5000 bytes, makes B wait for 5 ms, 2 for one.
-        ("ros-native", "0 A, 1 A 5000, 2 A, 3 B, 4 B", topics(), {}, [], {0: 0, 1: 101, 3: 106, 2: 107, 4: 108}),
         # The link is free each ms. Who keeps to n_T = 1 waits for a pong 50 ms after each crossing; rivals do not.
         *((name, "0 A, 0 B, 0 C", topics(), PONGS | {"window": 1}, [], {0: 0, 1: 1, 2: 2}) for name in RIVALS),
         ("fifo", "0 A, 0 B, 0 C", topics(), PONGS | {"window": 1}, [], {0: 0, 1: 51, 2: 102}),

@@ -95,55 +95,6 @@ def test_10_hz_of_a_30_hz_stream_is_every_third():
     assert log(senders)["dropped_us"] == {0: 0, 2: 2 * MS}
 
 
-@pytest.mark.parametrize(
-    ("hooks", "invalid"), [({}, 0), ({"on_send": lambda b, m: 0}, 3), ({"on_send": lambda b, m: HOLD}, 1)]
-)
-def test_rate_limits_at_the_socket(hooks, invalid):
-    # 10 Hz: 0 goes at once. At 1 and 60 ms nothing may go, at 120 ms it may: 1, the oldest. It crosses at 121 ms, which
-    # is too soon for 2; no arrival or pong comes after that, so 2 and 3 stay.
-    topics = (Topic("status", rate_limit_hz=10), Topic("other"))
-    senders = after_run(episode([0, 1, 60, 120]), topics, client=ClientSettings(limit_at_send=True), **hooks)
-    held_first = invalid == 1  # who always holds must let one go when nothing is to come, 0 at 120 ms; then nothing may
-    assert log(senders)["dequeued_us"] == ({0: 120 * MS} if held_first else {0: 0, 1: 120 * MS})
-    assert log(senders)["dropped_us"] == {}
-    # Slot 0 is asked for in vain at 1, 60 and 121 ms. To hold is no mistake when nothing may go.
-    assert senders.batch.senders[0]["invalid"] == invalid
-
-
-def test_a_buffer_full_of_no_drop():
-    # 1 byte crosses and no more: command 0 is in transmission, 1 and 2 fill the buffer. Camera 3 can't evict them,
-    # whoever asks for it. Command 4 can't be kept either: it is lost, and shows as rejected.
-    topics = (Topic("command", no_drop=True), Topic("camera", priority=20))
-    blocked = {"knots": ((0, 0), (1, 1)), "after": "stop"}
-    senders = after_run(
-        episode([0] * 5, [0, 0, 0, 1, 0], **blocked),
-        topics,
-        capacity=2,
-        on_arrival=lambda b, a, m: 0 if a.seq > 2 else ACCEPT,
-    )
-    assert log(senders)["dropped_us"] == {3: 0, 4: 0}
-    assert (senders.batch.senders[0]["rejected"], senders.batch.senders[0]["invalid"]) == (2, 2)
-    # With droppable messages in the buffer it drives out the oldest of the lowest priority, though "reject" is said:
-    # 1 is camera, 2 and 3 status (priority 1), 4 the command.
-    topics = (Topic("command", no_drop=True), Topic("camera", priority=20), Topic("status"))
-    senders = after_run(
-        episode([0] * 5, [0, 1, 2, 2, 0], **blocked),
-        topics,
-        capacity=3,
-        on_arrival=lambda b, a, m: REJECT if a.seq == 4 else ACCEPT,
-    )
-    assert log(senders)["dropped_us"] == {2: 0}
-
-
-@pytest.mark.parametrize(
-    ("answer", "topics", "invalid"),
-    [(REJECT, (Topic("command", no_drop=True),), 1), (99, (Topic("command", no_drop=True),), 1), (-3, (), 1)],
-)
-def test_an_impossible_answer_keeps_what_has_room(answer, topics, invalid):
-    senders = after_run(episode([0]), topics, on_arrival=lambda b, a, m: answer)
-    assert (order(senders), senders.batch.senders[0]["invalid"]) == ([0], invalid)
-
-
 def test_holding_until_the_next_arrival_or_pong():
     # 0 is held back at 0 ms; at 5 ms message 1 arrives, both wait, the scheduler holds again; nothing else is to come
     # after 7 ms, so that the third HOLD is impossible and 0 goes. At its crossing 1 goes, then 2.
@@ -153,20 +104,6 @@ def test_holding_until_the_next_arrival_or_pong():
     # While a pong is to come, holding is possible: 1 is held back at 1 ms of its own accord until that of 0 at 11 ms.
     senders = after_run(episode([0, 0], window=2, ack_delay_us=10 * MS), on_send=scripted(0, HOLD, 0))
     assert log(senders)["dequeued_us"] == {0: 0, 1: 11 * MS}
-
-
-def test_flushing_no_drop():
-    # n_T = 1 and a pong 50 ms after. Commands 1 and 3 go though the window is full, one after the other; camera 2 waits
-    # for the pongs of all three: they come at 51, 52 and 53 ms.
-    topics = (Topic("command", no_drop=True), Topic("camera"))
-    for hooks in ({}, {"on_send": lambda buffer, memory: 0}):
-        senders = after_run(
-            episode([0] * 4, [1, 0, 1, 0], window=1, ack_delay_us=50 * MS),
-            topics,
-            client=ClientSettings(flush_no_drop=True),
-            **hooks,
-        )
-        assert log(senders)["dequeued_us"] == {0: 0, 1: 0, 3: 0, 2: 53 * MS}
 
 
 def test_age_of_information_and_lateness():
@@ -205,16 +142,6 @@ def test_a_rate_limit_comes_before_no_drop():
     # Where limits hold back at the socket, no_drop topics have none: Robofleet's released client.
     senders = after_run(episode([0, 50, 100]), command, client=ClientSettings(limit_at_send=True))
     assert log(senders)["dequeued_us"] == {0: 0, 1: 50 * MS, 2: 100 * MS}
-
-
-def test_a_rate_limit_since_the_last_sending():
-    # 10 Hz, and nothing crosses before 200 ms. Since the last one kept: 0, 2 and 4 pass. Since the last one sent: 0 was
-    # at 0 ms, so 2, 3 and 4 pass; 2 goes at 201 ms, and 5 at 250 ms comes too soon.
-    pose, times = (Topic("pose", rate_limit_hz=10), Topic("other")), [0, 50, 100, 150, 200, 250]
-    blocked = {"knots": ((0, 0), (200_000, 0), (1_200_000, 1_000_000)), "after": "hold"}
-    for client, dropped in (({}, {1, 3, 5}), ({"limit_since_sent": True}, {1, 5})):
-        senders = after_run(episode(times, **blocked), pose, client=ClientSettings(**client))
-        assert log(senders)["dropped_us"].keys() == dropped
 
 
 A_B = (Topic("a"), Topic("b"))

@@ -26,11 +26,7 @@ def path(tmp_path):
     return tmp_path / "small.safetensors"
 
 
-@pytest.mark.parametrize(
-    "before",
-    [made(*widths) for widths in [(), (1,), (16, 4), (256,)]],
-    ids=str,
-)
+@pytest.mark.parametrize("before", [made(*widths) for widths in [(), (1,), (16, 4), (256,)]], ids=str)
 def test_what_is_written_comes_back_bit_for_bit(path, before):
     assert weights.save(path, before, ABOUT) == path
     after, metadata = weights.read_any(path)

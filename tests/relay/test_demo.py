@@ -71,7 +71,6 @@ def test_a_call_in_another_process(capfd: pytest.CaptureFixture[str]) -> None:
         (["--bag", "none"], "none"),
         (["--ros", "2"], "--ros needs --config"),
         ([], "needs --bag or --ros"),
-        (["--to", "there:1", "--bag", "none"], "none"),
     ],
 )
 def test_the_command_names_what_is_wrong(
