@@ -21,6 +21,7 @@ from bufgym.relay.rules import NATS, Permissions
 from bufgym.relay.store import Mailbox
 from bufgym.relay.subscriber import Subscription, next_lane
 from bufgym.robot.extra import needs
+from bufgym.robot.tasks import Tasks
 
 MESSAGE: Final = "bufgym.relay.message"
 HOLD: Final = "bufgym.relay.hold"
@@ -50,7 +51,7 @@ class Peers:
         self.subscriptions: dict[str, Subscription] = {}
         self.sent = 0
         self._awake = asyncio.Event()
-        self._tasks: list[asyncio.Task[None]] = []
+        self._tasks = Tasks()
         self._nats: Any = None
 
     async def start(self) -> None:
@@ -73,7 +74,8 @@ class Peers:
             await self.close()
             raise BufgymError(f"nats: {where.url}: {error or type(error).__name__}") from None
         self._hub.join(self)
-        self._tasks = [asyncio.create_task(self._send_all()), asyncio.create_task(self._take_all())]
+        self._tasks.begin(self._send_all())
+        self._tasks.begin(self._take_all())
 
     async def _subscribed(self) -> Any:
         """Make the stream of no_drop messages unless another relay has, and this relay's place in it."""
@@ -96,9 +98,7 @@ class Peers:
 
     async def close(self) -> None:
         """Leave the others."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.end()
         self._hub.leave(self)
         if self._nats is not None:
             await self._nats.close()

@@ -16,7 +16,7 @@ from loop_cases import beside, until
 from relay_cases import Corner, client, nothing, process, relay, settings
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import session
+from bufgym.relay import backoff
 from bufgym.relay.config import Rule, StoreLimits
 from bufgym.relay.session import Session
 from bufgym.robot.sockets import free_port
@@ -179,7 +179,7 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
 @pytest.mark.nightly
 async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two senders with five commands unanswered each; the relay is killed under load, ``BUFGYM_KILLS`` times."""
-    monkeypatch.setattr(session, "RETRY_S", 0.05)
+    monkeypatch.setattr(backoff, "MOST_S", 0.05)
     port, uniform, took, back_s = free_port("127.0.0.1"), random.Random(0), list[list[int]](), list[float]()
     url = f"ws://127.0.0.1:{port}"
     receiver = Session(url, "robot")

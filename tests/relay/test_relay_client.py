@@ -13,7 +13,7 @@ from relay_cases import Corner, relay, settings
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
-from bufgym.relay import session
+from bufgym.relay import backoff
 from bufgym.relay.client import RobotClient
 from bufgym.relay.session import Session, security, token
 from bufgym.relay.unanswered import Unanswered
@@ -24,7 +24,7 @@ from bufgym.traces import Trace
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "RETRY_S", 0.01)
+    monkeypatch.setattr(backoff, "MOST_S", 0.01)
 
 
 async def test_a_refused_number_is_used_again() -> None:
