@@ -13,7 +13,7 @@ from bufgym.relay.patterns import pattern
 from bufgym.relay.quota import Quotas
 from bufgym.relay.recorder import Recorder
 from bufgym.relay.rules import Permissions
-from bufgym.relay.store import Mailbox, Settled, Store
+from bufgym.relay.store import Settled, Store, StoredSession
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError
 
@@ -55,7 +55,7 @@ class Outgoing:
 class Member(Protocol):
     """A connection that has said hello."""
 
-    session: Mailbox
+    session: StoredSession
     permissions: Permissions
     subscriptions: dict[str, Subscription]
     acks: bool  # whether its client acks no_drop messages; otherwise it gets them like all others
@@ -80,7 +80,7 @@ class Member(Protocol):
 class Others(Protocol):
     """The other relays that share topics with this one, see ``peers``."""
 
-    async def hold(self, sender: Mailbox, message: wire.Message) -> bool | None:
+    async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
         """Give a no_drop message to them; return whether they may have it, None if nobody answers."""
 
     async def close(self) -> None:
@@ -110,7 +110,7 @@ class Hub:
         self.store = Store(config.folder, config.store, config.limits.sessions)
         recorder = Recorder.of(config)
         self.own: list[Own] = [] if recorder is None else [recorder]
-        self.members: dict[Mailbox, Member] = {}
+        self.members: dict[StoredSession, Member] = {}
         self.received = 0
         self._sent = 0
         self._dropped = 0
@@ -147,13 +147,12 @@ class Hub:
         wanted = subscription.pattern.text if subscription.durable else None
         self.store.want(member.session, subscription.id, wanted)
 
-    def unsubscribe(self, member: Member, id: str) -> bool:
-        """Remove a subscription; return whether it existed."""
+    def unsubscribe(self, member: Member, id: str) -> None:
+        """Remove a subscription if there is one of this id."""
         self.store.want(member.session, id, None)
         old = member.subscriptions.pop(id, None)
         self._dropped += old.dropped if old else 0
         self._routes.clear()
-        return old is not None
 
     def is_no_drop(self, topic: str) -> bool:
         """Whether the topic is lossless."""
@@ -207,7 +206,7 @@ class Hub:
             if member is not sender and not member.acks:
                 member.offer(subscription, Outgoing(message))
 
-    def _holders(self, sender: Member, topic: str) -> list[Mailbox]:
+    def _holders(self, sender: Member, topic: str) -> list[StoredSession]:
         """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
         here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
         away = [

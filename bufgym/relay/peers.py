@@ -18,7 +18,7 @@ from bufgym.relay.config import DEFAULT_CAPACITY, Nats
 from bufgym.relay.hub import OWN, Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import NATS, Permissions
-from bufgym.relay.store import Mailbox
+from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription, next_lane
 from bufgym.robot.extra import needs
 from bufgym.robot.tasks import Tasks
@@ -46,7 +46,7 @@ class Peers:
             import nats
         self._library: Any = nats
         self._hub, self._settings = hub, settings
-        self.session: Mailbox = hub.store.open("nats", NATS, False, 0, 0)
+        self.session: StoredSession = hub.store.open("nats", NATS, False, 0, 0)
         self.permissions = Permissions(hub.config.rules, NATS)
         self.subscriptions: dict[str, Subscription] = {}
         self.sent = 0
@@ -145,7 +145,7 @@ class Peers:
             return None
         return message if self._goes("send", message.topic) else None
 
-    async def hold(self, sender: Mailbox, message: wire.Message) -> bool | None:
+    async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
         """Give a no_drop message to the other relays; return whether they may have it, None if NATS does not answer."""
         if not self._goes("receive", message.topic):
             return False
