@@ -12,6 +12,7 @@ from bufgym.relay import wire
 from bufgym.relay.hub import Hub
 from bufgym.relay.identity import Verifier, certificate_email
 from bufgym.relay.rules import Identity, plain_address
+from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError
 
 POLICY_VIOLATION: Final = 1008
@@ -25,6 +26,7 @@ class Caller:
         self.hub, self.socket = hub, socket
         self.identity = Identity(plain_address(socket.remote_address[0]))
         self.answers: deque[str] = deque()
+        self.subscriptions: dict[str, Subscription] = {}
         self._verifier, self._listens = verifier, listens
 
     async def prove(self, token: str | None) -> Identity:

@@ -4,7 +4,7 @@ import asyncio
 import secrets
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from functools import partial
 from typing import Any, Final
 
 from websockets.exceptions import WebSocketException
@@ -30,18 +30,13 @@ class Connection:
 
     acks = True
 
-    def __init__(
-        self,
-        caller: Caller,
-        admitted: Admitted,
-        session: StoredSession,
-        subscriptions: dict[str, Subscription],
-        quota: Quota,
-    ) -> None:
+    def __init__(self, caller: Caller, admitted: Admitted, session: StoredSession, quota: Quota) -> None:
         self._caller, self._admitted, self._quota = caller, admitted, quota
         self._hub, self._socket = caller.hub, caller.socket
-        self.session, self.permissions, self.subscriptions = session, admitted.permissions, subscriptions
+        self.session, self.permissions, self.subscriptions = session, admitted.permissions, caller.subscriptions
         self._outbox = Outbox(caller, self, admitted.form, admitted.received)
+        self._recordings = None if self._hub.config.folder is None else self._hub.config.folder / RECORDINGS
+        self.wake, self.sent = self._outbox.wake, 0
         self._ending: asyncio.Task[None] | None = None
 
     @staticmethod
@@ -94,15 +89,8 @@ class Connection:
                 case said:
                     await self._replay(said)
 
-    @property
-    def _recordings(self) -> Path | None:
-        folder = self._hub.config.folder
-        return None if folder is None else folder / RECORDINGS
-
     async def _replay(self, said: Mapping[str, Any]) -> None:
-        def may(topic: str) -> bool:
-            return self.permissions.allow("receive", topic)
-
+        may = partial(self.permissions.allow, "receive")
         asked = said["file"], said["from_us"], said["most_bytes"]
         try:
             part = await asyncio.to_thread(replay.piece, self._recordings, *asked, may)
@@ -115,8 +103,8 @@ class Connection:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""
         hub, who = self._hub, self._caller.identity
         try:
-            now_s, received = hub.clock(), self.session.received
-            new = protocol.check(message, received, self.permissions, self._quota, hub.is_no_drop, now_s)
+            no_drop, now_s, received = hub.is_no_drop(message.topic), hub.clock(), self.session.received
+            new = protocol.check(message, received, self.permissions, self._quota, no_drop, now_s)
             stamp_us = message.stamp_us or time.time_ns() // 1000
             message = message._replace(sender=self._admitted.name, stamp_us=stamp_us)
             if not message.no_drop:
@@ -154,18 +142,9 @@ class Connection:
         self._hub.subscribe(self, subscription)
         self.tell("subscribed", id=subscription.id, policy=subscription.policy.name, capacity=subscription.capacity)
 
-    @property
-    def sent(self) -> int:
-        """Messages that have gone to it."""
-        return self._outbox.sent
-
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """A message that its queues decide on."""
         subscription.offer(frame.message.topic, frame, frame.size_bytes)
-        self._outbox.wake()
-
-    def wake(self) -> None:
-        """The store has something for it."""
         self._outbox.wake()
 
     def tell(self, op: str, **fields: Any) -> None:
@@ -192,7 +171,7 @@ class Connection:
 async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], None]) -> None:
     """Serve a client from its hello to the end; call ``greeted`` after the hello."""
     hub, stage = caller.hub, "hello"
-    hello_s, subscriptions = hub.config.limits.hello_s, dict[str, Subscription]()
+    hello_s = hub.config.limits.hello_s
     try:
         try:
             async with asyncio.timeout(hello_s):
@@ -200,10 +179,10 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
         except TimeoutError:
             raise RefusedError("wrong", f"no hello within {hello_s:g} s") from None
         _, _, name, temporary, _, received, acked = admitted
-        with hub.quotas.connection(caller.identity.key, subscriptions) as quota:
+        with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
             session = hub.store.open(name, caller.identity, temporary, received, acked)
             stage = "frame"
-            await kind(caller, admitted, session, subscriptions, quota).run(greeted)
+            await kind(caller, admitted, session, quota).run(greeted)
     except BufgymError as error:
         caller.refuse(stage, error)
         await caller.close(stage)

@@ -1,10 +1,12 @@
 """Members of a relay and the routing between them, without sockets."""
 
+from __future__ import annotations
+
 import functools
 import json
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from bufgym.relay import wire
 from bufgym.relay.audit import Audit
@@ -16,6 +18,10 @@ from bufgym.relay.rules import Permissions
 from bufgym.relay.store import Settled, Store, StoredSession
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError
+
+if TYPE_CHECKING:
+    from bufgym.relay.foxglove import Window
+    from bufgym.relay.peers import Peers
 
 OWN: Final = "relay"
 """The relay's name as a sender, and the prefix of its topics."""
@@ -58,11 +64,8 @@ class Member(Protocol):
     session: StoredSession
     permissions: Permissions
     subscriptions: dict[str, Subscription]
+    sent: int  # number of messages sent to it
     acks: bool  # whether its client acks no_drop messages; otherwise it gets them like all others
-
-    @property
-    def sent(self) -> int:
-        """Number of messages sent to it."""
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message to its queues."""
@@ -77,26 +80,6 @@ class Member(Protocol):
         """Close it."""
 
 
-class Others(Protocol):
-    """The other relays that share topics with this one, see ``peers``."""
-
-    async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
-        """Give a no_drop message to them; return whether they may have it, None if nobody answers."""
-
-    async def close(self) -> None:
-        """End the connection to them."""
-
-
-class Own(Protocol):
-    """A receiver inside the relay, such as the recorder or the Foxglove server."""
-
-    def __call__(self, message: wire.Message) -> None:
-        """Take a message if a rule allows it."""
-
-    def close(self) -> None:
-        """Finish; no message follows."""
-
-
 class Hub:
     """State shared by the connections."""
 
@@ -109,13 +92,13 @@ class Hub:
         self.quotas = Quotas(config.limits, clock)
         self.store = Store(config.folder, config.store, config.limits.sessions)
         recorder = Recorder.of(config)
-        self.own: list[Own] = [] if recorder is None else [recorder]
+        self.own: list[Recorder | Window] = [] if recorder is None else [recorder]
         self.members: dict[StoredSession, Member] = {}
         self.received = 0
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
-        self.peers: Others | None = None
+        self.peers: Peers | None = None
         """The other relays, if it shares topics with any."""
 
     def join(self, member: Member) -> None:

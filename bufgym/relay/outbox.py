@@ -29,8 +29,6 @@ class Outbox:
         self._member, self._form = member, form
         self._sent_number = received
         self._in_flight: deque[int] = deque()
-        self.sent = 0
-        """Messages sent so far."""
 
     @property
     def full(self) -> bool:
@@ -94,4 +92,4 @@ class Outbox:
 
     async def _send(self, frame: Outgoing) -> None:
         await self._socket.send(frame.form(self._form))
-        self.sent += 1
+        self._member.sent += 1

@@ -102,14 +102,9 @@ def asked(data: bytes | str, max_bytes: int) -> wire.Message | dict[str, Any]:
 
 
 def check(
-    message: wire.Message,
-    received: int,
-    permissions: Permissions,
-    quota: Quota,
-    is_no_drop: Callable[[str], bool],
-    now_s: float,
+    message: wire.Message, received: int, permissions: Permissions, quota: Quota, no_drop: bool, now_s: float
 ) -> bool:
-    """Whether a message is new, when no_drop messages up to ``received`` were taken before.
+    """Whether a message is new, when no_drop messages up to ``received`` were taken before; ``no_drop`` is its topic.
 
     Raises RefusedError: its sender may not publish it.
     """
@@ -120,7 +115,7 @@ def check(
     if topic.startswith(f"/{OWN}/") or not permissions.allow("send", topic):
         raise RefusedError("unauthorized", f"topic {topic}: no rule allows to send there")
     quota.topic(topic)
-    if message.no_drop != is_no_drop(topic):
+    if message.no_drop != no_drop:
         raise RefusedError("wrong", f"topic {topic}: is {'not ' if message.no_drop else ''}no_drop here")
     if message.encoding == "json":
         if len(message.payload) > MAX_JSON_BYTES:

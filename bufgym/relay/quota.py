@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 from bufgym.relay.config import Limits
 from bufgym.relay.wire import RefusedError
@@ -27,20 +26,15 @@ class Bucket:
         return True
 
 
-@dataclass
 class Quota:
     """Use that one identity has made of its limits."""
 
-    limits: Limits
-    messages: Bucket = field(init=False)
-    bytes: Bucket = field(init=False)
-    connections: list[Mapping[str, object]] = field(default_factory=list)
-    """The subscriptions of each of its connections, by id."""
-    topics: set[str] = field(default_factory=set)
-    idle_since_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.messages, self.bytes = Bucket(self.limits.messages_per_s), Bucket(self.limits.bytes_per_s)
+    def __init__(self, limits: Limits, idle_since_s: float) -> None:
+        self.limits, self.idle_since_s = limits, idle_since_s
+        self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
+        self.topics: set[str] = set()
+        self.connections: list[Mapping[str, object]] = []
+        """The subscriptions of each of its connections, by id."""
 
     def message(self, size_bytes: int, now_s: float) -> None:
         """Count a published message.
@@ -83,7 +77,7 @@ class Quotas:
         if key not in self._quotas:
             if len(self._quotas) >= MAX_QUOTAS:
                 self.tidy(kept_s=0.0)
-            self._quotas[key] = Quota(self._limits, idle_since_s=self._clock())
+            self._quotas[key] = Quota(self._limits, self._clock())
         return self._quotas[key]
 
     @contextmanager

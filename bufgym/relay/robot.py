@@ -113,10 +113,7 @@ class Robot:
         """Take a pose, which gives the robot's location and x of the topics that move."""
         message = ros_messages.read(payload, type, encoding)
         self._odometry.take(message)
-        pose = message.pose
-        while hasattr(pose, "pose"):
-            pose = pose.pose
-        self._location = ros_messages.planar(pose)
+        self._location = ros_messages.planar(ros_messages.pose(message))
 
     def say(self, topic: str, data: Any) -> None:
         """Publish ``data`` as JSON."""

@@ -8,7 +8,7 @@ Robofleet.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from bufgym.relay.patterns import Pattern
@@ -96,12 +96,7 @@ class Subscription:
 
 def next_lane(subscriptions: Sequence[Subscription], now_s: float) -> Lane | None:
     """Choose the lane that sends next; None if nothing waits."""
-    ready = list(_ready(subscriptions, now_s))
+    ready = [
+        (one.priority * (now_s - lane.served_s), lane) for one in subscriptions for lane in one.lanes if lane.ready
+    ]
     return max(ready, key=lambda each: each[0])[1] if ready else None
-
-
-def _ready(subscriptions: Sequence[Subscription], now_s: float) -> Iterator[tuple[float, Lane]]:
-    for subscription in subscriptions:
-        for lane in subscription.lanes:
-            if lane.ready:
-                yield subscription.priority * (now_s - lane.served_s), lane
