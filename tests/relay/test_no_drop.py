@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 
 import pytest
-from loop_cases import beside, until
-from relay_cases import Corner, client, nothing, process, relay, settings
+from loop_cases import beside
+from relay_cases import Corner, client, nothing, process, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import backoff
@@ -68,7 +68,7 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
         async with corner.client(session="a") as robot, corner.client(session="b") as viewer:
             assert (await robot.subscribe(f"^{corner.command}$", durable=True))["op"] == "subscribed"
             await viewer.subscribe(f"^{corner.command}$")
-        await until(lambda: len(corner.hub.members) == 1)
+        await until("the others' ends", lambda: len(corner.hub.members) == 1)
         for seq, code in ((1, None), (2, None), (3, None), (4, None), (5, "store_full")):
             await operator.command(seq, corner.command)
             assert (await operator.next()).get("code") == code
@@ -89,7 +89,7 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
 
 async def test_the_same_session_takes_over(corner: Corner) -> None:
     async with corner.client() as operator, corner.client(session="a") as old, corner.client(session="a") as new:
-        await old.socket.wait_closed()
+        await wait("the end of the old", old.socket.wait_closed())
         assert old.socket.close_reason == "taken over by another connection"
         await new.subscribe(f"^{corner.command}$")
         await operator.command(1, corner.command)
@@ -103,7 +103,7 @@ async def test_the_name_of_a_session_belongs_to_who_uses_it(corner: Corner) -> N
             await robot.subscribe(f"^{corner.command}$", durable=True)
             async with corner.client(session="a", local="127.0.0.2") as thief:
                 assert thief.welcome["op"] == "welcome" and await nothing(thief, robot)
-        await until(lambda: len(corner.hub.members) == 1)
+        await until("the others' ends", lambda: len(corner.hub.members) == 1)
         await operator.command(1, corner.command)
         assert (await operator.next())["op"] == "ack"
         async with corner.client(session="a", local="127.0.0.2") as thief:
@@ -116,7 +116,7 @@ async def test_what_a_forgotten_session_had_to_get_is_told(corner: Corner) -> No
     async with corner.client() as operator:
         async with corner.client(session="a") as robot:
             await robot.subscribe(f"^{corner.command}$", durable=True)
-        await until(lambda: len(corner.hub.members) == 1)
+        await until("the others' ends", lambda: len(corner.hub.members) == 1)
         await operator.command(1, corner.command)
         assert (await operator.next())["op"] == "ack"
         corner.hub.store.sessions[corner.address, "a"].seen_s -= corner.hub.config.store.keep_s + 1
@@ -191,7 +191,7 @@ async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypat
         for number in itertools.count(first, 5):
             while (k, number) not in acked:
                 try:
-                    await senders[k].command(COMMAND, [k, number])
+                    await wait("an answer", senders[k].command(COMMAND, [k, number]))
                     acked.add((k, number))
                 except BufgymError as error:
                     assert re.search("no_receiver|store_full", str(error))
@@ -202,14 +202,14 @@ async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypat
             for kill in range(KILLS + 1):
                 began_s = time.monotonic()
                 await stack.enter_async_context(process(port, tmp_path))
-                await receiver.ready.wait()
+                await wait("the receiver", receiver.ready.wait())
                 back_s.append(time.monotonic() - began_s)
                 taken = len(took)
-                await until(lambda taken=taken: len(took) >= taken + 100)
+                await until("100 more", lambda taken=taken: len(took) >= taken + 100)
                 if kill < KILLS:
                     await asyncio.sleep(uniform.uniform(0.0, 0.3))
                     await stack.aclose()
         # What was acked to the senders arrives, and the rest of what they sent may.
-        await until(lambda: acked <= {(k, number) for k, number in took})
+        await until("what was acked", lambda: acked <= {(k, number) for k, number in took})
     assert len({(k, number) for k, number in took}) == len(took), "one came twice"
     print(f"{len(took)} commands, {KILLS} kills, the receiver is back after {[round(s, 2) for s in back_s[1:]]} s")

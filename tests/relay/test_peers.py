@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import ALL, Client, client, nothing, relay, settings
+from relay_cases import ALL, Client, client, nothing, relay, settings, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import Nats, Rule, Server, StoreLimits
@@ -29,17 +29,18 @@ async def nats_server(port: int, folder: Path) -> AsyncIterator[Any]:
     quiet = asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(str(NATS_SERVER), *words, stdout=quiet, stderr=quiet)
     try:
-        while True:
-            with contextlib.suppress(OSError):
-                _, writer = await asyncio.open_connection("127.0.0.1", port)
-                writer.close()
-                break
-            await asyncio.sleep(0.02)
+        async with within("NATS to listen"):
+            while True:
+                with contextlib.suppress(OSError):
+                    _, writer = await asyncio.open_connection("127.0.0.1", port)
+                    writer.close()
+                    break
+                await asyncio.sleep(0.02)
         yield process
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
-        await process.wait()
+        await wait("the end of NATS", process.wait())
 
 
 def shared(port: int, name: str, **changed: Any) -> contextlib.AbstractAsyncContextManager[Server]:
@@ -160,7 +161,7 @@ async def test_without_nats_commands_wait_and_the_rest_goes_on(tmp_path: Path, m
                 await operator.next()
         await stack.enter_async_context(nats_server(port, tmp_path))
         while True:
-            async with client(a.port, session="operator") as operator:
+            async with within("an ack over NATS"), client(a.port, session="operator") as operator:
                 assert operator.welcome["received"] == 0
                 await operator.command(1, command, stamp_us=1)
                 with contextlib.suppress(Exception):

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import pytest
-from relay_cases import Corner, client, nothing, relay, settings
+from relay_cases import Corner, client, nothing, relay, settings, wait
 
 from bufgym.relay import server as serving
 from bufgym.relay.config import Limits, Rule
@@ -14,7 +14,7 @@ from bufgym.relay.wire import Message
 def test_a_relay_listens_before_the_compiler_is_imported() -> None:
     """Robots come back to one that was killed as soon as it listens; the policies follow in a thread."""
     program = "import bufgym.relay.server, sys; print('numba' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.strip() == "False"
 
 
@@ -94,7 +94,7 @@ async def test_each_refusal_says_why() -> None:
         assert sum(entry.get("times", 1) for entry in written) == 40 - 8
         # Beyond the limit the connection ends.
         await one.put("/open/a", bytes(200_001))
-        await one.socket.wait_closed()
+        await wait("its end", one.socket.wait_closed())
 
 
 async def test_the_relay_tells_how_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
