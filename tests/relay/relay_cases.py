@@ -97,10 +97,18 @@ class Client:
         said: dict[str, Any] = await self.next()
         return said
 
-    async def came(self, seq: int, payload: bytes) -> None:
-        """The next message is this one, no_drop."""
-        message = await self.next()
-        assert (message.seq, bytes(message.payload), message.no_drop) == (seq, payload, True)
+    async def acked(self, topic: str, *seqs: int, **fields: Any) -> None:
+        """Send commands of these numbers; the relay acks each."""
+        for seq in seqs:
+            await self.command(seq, topic, **fields)
+            assert await self.next() == {"op": "ack", "seq": seq}
+
+    async def came(self, *seqs: int, payload: bytes | None = None) -> None:
+        """The next messages have these numbers and, unless it is given, payload; they are no_drop."""
+        for seq in seqs:
+            message = await self.next()
+            expected = (seq, b"%d" % seq if payload is None else payload, True)
+            assert (message.seq, bytes(message.payload), message.no_drop) == expected
 
 
 async def nothing(*clients: Client) -> bool:

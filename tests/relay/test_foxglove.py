@@ -91,7 +91,7 @@ async def test_a_relay_shows_what_its_rules_allow() -> None:
                 await robot.command(seq, "/robots/r/stop")
                 while not any(said.get("op") == "ack" for said in await robot.rest()):
                     pass
-                await other.came(seq, b"%d" % seq)
+                await other.came(seq)
                 await other.say("ack", seq=seq)
         assert server.hub.status()["refused"] == 0
     assert viewer.came["/robots/r/text"] == b"hello" and viewer.channels["/robots/r/text"]["encoding"] == "raw"

@@ -34,9 +34,8 @@ async def test_acks_end_to_end(corner: Corner) -> None:
         refused = await operator.next()
         assert (refused["code"], refused["seq"]) == ("no_receiver", 1)
         await robot.subscribe(f"^{corner.command}$")
-        await operator.command(1, corner.command)  # a refused number was not used
-        assert await operator.next() == {"op": "ack", "seq": 1}
-        await robot.came(1, b"1")
+        await operator.acked(corner.command, 1)  # a refused number was not used
+        await robot.came(1)
         assert held.held == 1
         await robot.say("ack", seq=1)
         assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 0}
@@ -50,16 +49,13 @@ async def test_acks_end_to_end(corner: Corner) -> None:
 async def test_no_more_than_the_window_are_on_their_way(corner: Corner) -> None:
     async with corner.client() as operator, corner.client() as robot:
         await robot.subscribe(f"^{corner.command}$")
-        for seq in range(1, 5):
-            await operator.command(seq, corner.command)
-            assert (await operator.next())["op"] == "ack"
-        await robot.came(1, b"1")
-        await robot.came(2, b"2")
+        await operator.acked(corner.command, 1, 2, 3, 4)
+        await robot.came(1, 2)
         assert await nothing(operator, robot)
         await robot.say("ack", seq=2)
-        await robot.came(3, b"3")
+        await robot.came(3)
         await robot.say("ack", seq=9)
-        await robot.came(4, b"4")
+        await robot.came(4)
         assert "must be at most 4" in (await robot.next())["why"]
 
 
@@ -73,15 +69,14 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
             await operator.command(seq, corner.command)
             assert (await operator.next()).get("code") == code
         async with corner.client(session="a") as robot:
-            await robot.came(1, b"1")
-            await robot.came(2, b"2")
+            await robot.came(1, 2)
         async with corner.client(session="a", received=3) as robot:
-            await robot.came(4, b"4")
+            await robot.came(4)
             assert [(await operator.next())["op"] for _ in range(3)] == ["delivered"] * 3
             await robot.say("ack", seq=4)
             assert (await operator.next())["seq"] == 4
             await operator.command(5, corner.command)
-            await robot.came(5, b"5")
+            await robot.came(5)
         # It had not asked to be waited for.
         async with corner.client(session="b") as viewer:
             assert await nothing(viewer)
@@ -93,7 +88,7 @@ async def test_the_same_session_takes_over(corner: Corner) -> None:
         assert old.socket.close_reason == "taken over by another connection"
         await new.subscribe(f"^{corner.command}$")
         await operator.command(1, corner.command)
-        await new.came(1, b"1")
+        await new.came(1)
 
 
 async def test_the_name_of_a_session_belongs_to_who_uses_it(corner: Corner) -> None:
@@ -104,12 +99,11 @@ async def test_the_name_of_a_session_belongs_to_who_uses_it(corner: Corner) -> N
             async with corner.client(session="a", local="127.0.0.2") as thief:
                 assert thief.welcome["op"] == "welcome" and await nothing(thief, robot)
         await until("the others' ends", lambda: len(corner.hub.members) == 1)
-        await operator.command(1, corner.command)
-        assert (await operator.next())["op"] == "ack"
+        await operator.acked(corner.command, 1)
         async with corner.client(session="a", local="127.0.0.2") as thief:
             assert await nothing(thief)
         async with corner.client(session="a") as robot:
-            await robot.came(1, b"1")
+            await robot.came(1)
 
 
 async def test_what_a_forgotten_session_had_to_get_is_told(corner: Corner) -> None:
@@ -117,8 +111,7 @@ async def test_what_a_forgotten_session_had_to_get_is_told(corner: Corner) -> No
         async with corner.client(session="a") as robot:
             await robot.subscribe(f"^{corner.command}$", durable=True)
         await until("the others' ends", lambda: len(corner.hub.members) == 1)
-        await operator.command(1, corner.command)
-        assert (await operator.next())["op"] == "ack"
+        await operator.acked(corner.command, 1)
         corner.hub.store.sessions[corner.address, "a"].seen_s -= corner.hub.config.store.keep_s + 1
         corner.hub.tick()
         assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1}
@@ -131,8 +124,7 @@ async def test_a_right_that_was_withdrawn(tmp_path: Path) -> None:
     async with relay(settings(folder=tmp_path)) as server, client(server.port, session="o") as operator:
         async with client(server.port, session="a") as robot:
             await robot.subscribe("command$", durable=True)
-        await operator.command(1, COMMAND)
-        assert (await operator.next())["op"] == "ack"
+        await operator.acked(COMMAND, 1)
     rules = (Rule(address="127.0.0.1", send=True), Rule(address="127.0.0.1", receive=True, topic="/other"))
     async with (
         relay(settings(folder=tmp_path, rules=rules)) as server,
@@ -162,9 +154,7 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
     async with relay(settings(folder=tmp_path / "killed")) as server, client(server.port, session="o") as operator:
         async with client(server.port, session="a") as robot:
             await robot.subscribe("command$", durable=True)
-        for seq in (1, 2):
-            await operator.command(seq, COMMAND)
-            assert (await operator.next())["op"] == "ack"
+        await operator.acked(COMMAND, 1, 2)
         shutil.copytree(tmp_path / "killed", tmp_path / "next")
     async with (
         relay(settings(folder=tmp_path / "next")) as server,
@@ -172,8 +162,7 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
         client(server.port, session="a") as robot,
     ):
         assert operator.welcome["received"] == 2
-        await robot.came(1, b"1")
-        await robot.came(2, b"2")
+        await robot.came(1, 2)
 
 
 @pytest.mark.nightly
