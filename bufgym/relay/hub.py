@@ -6,6 +6,7 @@ import functools
 import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from bufgym.relay import wire
@@ -33,11 +34,11 @@ MAX_JSON_BYTES: Final = 2**20
 """Size limit of a text frame and of a JSON payload, which take time to read."""
 
 
+@dataclass(eq=False)
 class Outgoing:
     """An outgoing message; each of its forms is made once for all receivers."""
 
-    def __init__(self, message: wire.Message) -> None:
-        self.message = message
+    message: wire.Message
 
     @functools.cached_property
     def binary(self) -> bytes:
@@ -157,11 +158,11 @@ class Hub:
         if route is None:
             if len(self._routes) >= MAX_ROUTES:
                 self._routes.clear()
-            route = self._routes[topic] = [
-                (member, wanted)
-                for member in self.members.values()
-                if (wanted := matching(member, topic)) is not None and member.permissions.allow("receive", topic)
-            ]
+            route = self._routes[topic] = []
+            for member in self.members.values():
+                wanted = next((each for each in member.subscriptions.values() if each.pattern.part(topic)), None)
+                if wanted is not None and member.permissions.allow("receive", topic):
+                    route.append((member, wanted))
         return route
 
     def hold(self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None) -> None:
@@ -243,8 +244,3 @@ class Hub:
 @functools.lru_cache(MAX_ROUTES)
 def _any_whole(patterns: tuple[str, ...], topic: str) -> bool:
     return any(pattern(text).whole(topic) for text in patterns)
-
-
-def matching(member: Member, topic: str) -> Subscription | None:
-    """Find the member's first subscription that matches this topic."""
-    return next((each for each in member.subscriptions.values() if each.pattern.part(topic)), None)

@@ -12,9 +12,8 @@ import ssl
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from bufgym.ground.errors import BufgymError
@@ -35,8 +34,7 @@ _MAX_FRAME_BYTES: Final = 2**26
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
 
 
-@dataclass(frozen=True)
-class Wish:
+class Wish(NamedTuple):
     """A subscription that is asked of the relay."""
 
     pattern: re.Pattern[str]
