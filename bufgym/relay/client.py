@@ -85,13 +85,9 @@ class RobotClient(Session):
     def change(self, policy: str | Policy) -> None:
         """Change the policy from now on; messages already queued go first, under the previous policy."""
         log, number = self._log, self._changes
+        own = None if log is None else lambda record: log(number, record)
         queue = PolicyQueue(
-            policy,
-            self._capacity,
-            topics=self._topics,
-            window=self._window,
-            value=self._value,
-            log=None if log is None else lambda record: log(number, record),
+            policy, self._capacity, topics=self._topics, window=self._window, value=self._value, log=own
         )
         self._changes += 1
         queue.left_bytes = self._left_bytes

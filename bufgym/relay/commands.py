@@ -117,13 +117,9 @@ async def foxglove(
     Args:
         topics: Topics to show, a regular expression.
     """
-    await _bridge(session.to, name, port, topics, **session.settings()).run()
-
-
-def _bridge(url: str, name: str, port: int, topics: str = "^/", **settings: Any) -> Any:
     from bufgym.relay.foxglove import Bridge
     from bufgym.relay.session import Session
 
-    bridge = Bridge(Session(url, name, say=say, **settings), port, pattern=topics)
-    live.say(f"ws://{bridge.address}: Foxglove, Lichtblick -> {url}; Ctrl-C ends it")
-    return bridge
+    bridge = Bridge(Session(session.to, name, say=say, **session.settings()), port, pattern=topics)
+    live.say(f"ws://{bridge.address}: Foxglove, Lichtblick -> {session.to}; Ctrl-C ends it")
+    await bridge.run()

@@ -89,9 +89,7 @@ class Screen:
 
         if _TRANSFORMS not in self._channels:
             self._channels[_TRANSFORMS] = FrameTransformChannel("/tf", context=self._context)
-        pose = message.pose
-        while hasattr(pose, "pose"):
-            pose = pose.pose
+        pose = ros_messages.pose(message)
         place, turn = pose.position, pose.orientation
         self._channels[_TRANSFORMS].log(
             FrameTransform(

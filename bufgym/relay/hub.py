@@ -1,10 +1,13 @@
 """Members of a relay and the routing between them, without sockets."""
 
+from __future__ import annotations
+
 import functools
 import json
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from bufgym.relay import wire
 from bufgym.relay.audit import Audit
@@ -13,9 +16,13 @@ from bufgym.relay.patterns import pattern
 from bufgym.relay.quota import Quotas
 from bufgym.relay.recorder import Recorder
 from bufgym.relay.rules import Permissions
-from bufgym.relay.store import Mailbox, Settled, Store
+from bufgym.relay.store import Settled, Store, StoredSession
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError
+
+if TYPE_CHECKING:
+    from bufgym.relay.foxglove import Window
+    from bufgym.relay.peers import Peers
 
 OWN: Final = "relay"
 """The relay's name as a sender, and the prefix of its topics."""
@@ -27,11 +34,11 @@ MAX_JSON_BYTES: Final = 2**20
 """Size limit of a text frame and of a JSON payload, which take time to read."""
 
 
+@dataclass(eq=False)
 class Outgoing:
     """An outgoing message; each of its forms is made once for all receivers."""
 
-    def __init__(self, message: wire.Message) -> None:
-        self.message = message
+    message: wire.Message
 
     @functools.cached_property
     def binary(self) -> bytes:
@@ -55,14 +62,11 @@ class Outgoing:
 class Member(Protocol):
     """A connection that has said hello."""
 
-    session: Mailbox
+    session: StoredSession
     permissions: Permissions
     subscriptions: dict[str, Subscription]
+    sent: int  # number of messages sent to it
     acks: bool  # whether its client acks no_drop messages; otherwise it gets them like all others
-
-    @property
-    def sent(self) -> int:
-        """Number of messages sent to it."""
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message to its queues."""
@@ -77,26 +81,6 @@ class Member(Protocol):
         """Close it."""
 
 
-class Others(Protocol):
-    """The other relays that share topics with this one, see ``peers``."""
-
-    async def hold(self, sender: Mailbox, message: wire.Message) -> bool | None:
-        """Give a no_drop message to them; return whether they may have it, None if nobody answers."""
-
-    async def close(self) -> None:
-        """End the connection to them."""
-
-
-class Own(Protocol):
-    """A receiver inside the relay, such as the recorder or the Foxglove server."""
-
-    def __call__(self, message: wire.Message) -> None:
-        """Take a message if a rule allows it."""
-
-    def close(self) -> None:
-        """Finish; no message follows."""
-
-
 class Hub:
     """State shared by the connections."""
 
@@ -109,13 +93,13 @@ class Hub:
         self.quotas = Quotas(config.limits, clock)
         self.store = Store(config.folder, config.store, config.limits.sessions)
         recorder = Recorder.of(config)
-        self.own: list[Own] = [] if recorder is None else [recorder]
-        self.members: dict[Mailbox, Member] = {}
+        self.own: list[Recorder | Window] = [] if recorder is None else [recorder]
+        self.members: dict[StoredSession, Member] = {}
         self.received = 0
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
-        self.peers: Others | None = None
+        self.peers: Peers | None = None
         """The other relays, if it shares topics with any."""
 
     def join(self, member: Member) -> None:
@@ -147,13 +131,12 @@ class Hub:
         wanted = subscription.pattern.text if subscription.durable else None
         self.store.want(member.session, subscription.id, wanted)
 
-    def unsubscribe(self, member: Member, id: str) -> bool:
-        """Remove a subscription; return whether it existed."""
+    def unsubscribe(self, member: Member, id: str) -> None:
+        """Remove a subscription if there is one of this id."""
         self.store.want(member.session, id, None)
         old = member.subscriptions.pop(id, None)
         self._dropped += old.dropped if old else 0
         self._routes.clear()
-        return old is not None
 
     def is_no_drop(self, topic: str) -> bool:
         """Whether the topic is lossless."""
@@ -175,11 +158,11 @@ class Hub:
         if route is None:
             if len(self._routes) >= MAX_ROUTES:
                 self._routes.clear()
-            route = self._routes[topic] = [
-                (member, wanted)
-                for member in self.members.values()
-                if (wanted := matching(member, topic)) is not None and member.permissions.allow("receive", topic)
-            ]
+            route = self._routes[topic] = []
+            for member in self.members.values():
+                wanted = next((each for each in member.subscriptions.values() if each.pattern.part(topic)), None)
+                if wanted is not None and member.permissions.allow("receive", topic):
+                    route.append((member, wanted))
         return route
 
     def hold(self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None) -> None:
@@ -207,7 +190,7 @@ class Hub:
             if member is not sender and not member.acks:
                 member.offer(subscription, Outgoing(message))
 
-    def _holders(self, sender: Member, topic: str) -> list[Mailbox]:
+    def _holders(self, sender: Member, topic: str) -> list[StoredSession]:
         """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
         here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
         away = [
@@ -261,8 +244,3 @@ class Hub:
 @functools.lru_cache(MAX_ROUTES)
 def _any_whole(patterns: tuple[str, ...], topic: str) -> bool:
     return any(pattern(text).whole(topic) for text in patterns)
-
-
-def matching(member: Member, topic: str) -> Subscription | None:
-    """Find the member's first subscription that matches this topic."""
-    return next((each for each in member.subscriptions.values() if each.pattern.part(topic)), None)

@@ -7,6 +7,7 @@ import ssl
 import time
 import urllib.request
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -24,8 +25,7 @@ AGAIN_S: Final = 1.0
 _FETCH_S: Final = 5.0
 
 
-def _unauthorized(why: str) -> RefusedError:
-    return RefusedError("unauthorized", why)
+_unauthorized: Final = partial(RefusedError, "unauthorized")
 
 
 class Verifier:
@@ -53,17 +53,10 @@ class Verifier:
         if len(token) > MAX_TOKEN_CHARACTERS:
             raise _unauthorized(f"token of {len(token)} characters: must be at most {MAX_TOKEN_CHARACTERS}")
         try:
-            kid = self._jwt.get_unverified_header(token).get("kid")
-            key = await self._key(kid)
-            claims = self._jwt.decode(
-                token,
-                key,
-                algorithms=list(self._tokens.algorithms),
-                audience=self._tokens.audience,
-                issuer=self._tokens.issuer,
-                leeway=self._tokens.leeway_s,
-                options={"require": ["exp", "iss", "aud"]},
-            )
+            key = await self._key(self._jwt.get_unverified_header(token).get("kid"))
+            known = {"audience": self._tokens.audience, "issuer": self._tokens.issuer, "leeway": self._tokens.leeway_s}
+            options = {"require": ["exp", "iss", "aud"]}
+            claims = self._jwt.decode(token, key, list(self._tokens.algorithms), options, **known)
         except (self._jwt.PyJWTError, ValueError, TypeError, OverflowError, RecursionError) as error:
             raise error if isinstance(error, RefusedError) else _unauthorized(f"token: {error}") from None
         email = claims.get("email")
@@ -125,11 +118,7 @@ def server_context(tls: Tls) -> ssl.SSLContext:
 
 def certificate_email(certificate: Mapping[str, Any] | None) -> str:
     """Read the e-mail from the subject alternative name or subject of a client's verified certificate, or ""."""
-    for kind, value in (certificate or {}).get("subjectAltName", ()):
-        if kind == "email" and isinstance(value, str) and value.isprintable():
-            return value
-    for names in (certificate or {}).get("subject", ()):
-        for kind, value in names:
-            if kind == "emailAddress" and value.isprintable():
-                return str(value)
-    return ""
+    found = certificate or {}
+    pairs = [*found.get("subjectAltName", ()), *(pair for names in found.get("subject", ()) for pair in names)]
+    texts = (value for kind, value in pairs if kind in ("email", "emailAddress") and isinstance(value, str))
+    return next((text for text in texts if text.isprintable()), "")

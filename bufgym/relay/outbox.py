@@ -5,13 +5,13 @@ The relay's answers go first, then no_drop messages while fewer than n_T are una
 
 import asyncio
 from collections import deque
-from typing import Any, Final
+from typing import Final
 
-from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import WebSocketException
 
 from bufgym.relay import wire
-from bufgym.relay.hub import Hub, Member, Outgoing
+from bufgym.relay.caller import Caller
+from bufgym.relay.hub import Member, Outgoing
 from bufgym.relay.subscriber import next_lane
 from bufgym.relay.wire import WireError
 
@@ -20,30 +20,20 @@ MAX_ANSWERS: Final = 4_096
 
 
 class Outbox:
-    """The only task that writes to a connection, and its answers waiting to be sent."""
+    """The only task that writes to a connection."""
 
-    def __init__(self, hub: Hub, socket: ServerConnection) -> None:
-        self._hub = hub
-        self._socket = socket
-        self._answers: deque[str] = deque()
+    def __init__(self, caller: Caller, member: Member, form: str, received: int) -> None:
+        """``form`` is that of its messages; the client has no_drop messages up to ``received``."""
+        self._hub, self._caller, self._socket = caller.hub, caller, caller.socket
         self._awake = asyncio.Event()
-        self._member: Member | None = None
-        self._form = "binary"
-        self._sent_number = 0
-        self._in_flight: deque[int] = deque()
-        self.sent = 0
-        """Messages sent so far."""
-
-    def begin(self, member: Member, form: str, received: int) -> None:
-        """Begin for a client that has said hello and has no_drop messages up to ``received``."""
         self._member, self._form = member, form
         self._sent_number = received
+        self._in_flight: deque[int] = deque()
 
-    def tell(self, op: str, **fields: Any) -> bool:
-        """Tell the client this before any message; return whether there is room for more."""
-        self._answers.append(wire.say(op, **fields))
-        self._awake.set()
-        return len(self._answers) <= MAX_ANSWERS
+    @property
+    def full(self) -> bool:
+        """Whether the client reads too few answers."""
+        return len(self._caller.answers) > MAX_ANSWERS
 
     def wake(self) -> None:
         """Look for something to send."""
@@ -71,17 +61,10 @@ class Outbox:
             self._socket.transport.abort()
             raise
 
-    async def answers(self) -> None:
-        """Send all of the relay's answers."""
-        while self._answers:
-            await self._socket.send(self._answers.popleft())
-
     async def one(self) -> bool:
         """Send the next message; return whether there was one."""
-        await self.answers()
+        await self._caller.send_answers()
         member = self._member
-        if member is None:
-            return False
         if self._sent_number < member.session.numbered and await self._no_drop(member):
             return True
         now_s = self._hub.clock()
@@ -109,4 +92,4 @@ class Outbox:
 
     async def _send(self, frame: Outgoing) -> None:
         await self._socket.send(frame.form(self._form))
-        self.sent += 1
+        self._member.sent += 1

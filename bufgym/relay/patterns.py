@@ -5,7 +5,7 @@ this, such as back references and look-around. Its syntax is at https://github.c
 """
 
 import functools
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
 
@@ -15,20 +15,19 @@ MAX_MEMORY_BYTES: Final = 2**18
 _KEPT: Final = 1024  # expressions kept compiled; viewers with the same expression share it
 
 
-class Pattern:
+class Pattern(NamedTuple):
     """A compiled expression."""
 
-    def __init__(self, text: str, compiled: Any) -> None:
-        self.text = text
-        self._compiled = compiled
+    text: str
+    compiled: Any
 
     def whole(self, topic: str) -> bool:
         """Whether it matches the whole topic, as rules do."""
-        return self._compiled.fullmatch(topic) is not None
+        return self.compiled.fullmatch(topic) is not None
 
     def part(self, topic: str) -> bool:
         """Whether it matches anywhere in the topic, as subscriptions do."""
-        return self._compiled.search(topic) is not None
+        return self.compiled.search(topic) is not None
 
 
 @functools.lru_cache(_KEPT)

@@ -18,9 +18,10 @@ from bufgym.relay.config import DEFAULT_CAPACITY, Nats
 from bufgym.relay.hub import OWN, Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import NATS, Permissions
-from bufgym.relay.store import Mailbox
+from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription, next_lane
 from bufgym.robot.extra import needs
+from bufgym.robot.tasks import Tasks
 
 MESSAGE: Final = "bufgym.relay.message"
 HOLD: Final = "bufgym.relay.hold"
@@ -45,12 +46,12 @@ class Peers:
             import nats
         self._library: Any = nats
         self._hub, self._settings = hub, settings
-        self.session: Mailbox = hub.store.open("nats", NATS, False, 0, 0)
+        self.session: StoredSession = hub.store.open("nats", NATS, False, 0, 0)
         self.permissions = Permissions(hub.config.rules, NATS)
         self.subscriptions: dict[str, Subscription] = {}
         self.sent = 0
         self._awake = asyncio.Event()
-        self._tasks: list[asyncio.Task[None]] = []
+        self._tasks = Tasks()
         self._nats: Any = None
 
     async def start(self) -> None:
@@ -73,7 +74,8 @@ class Peers:
             await self.close()
             raise BufgymError(f"nats: {where.url}: {error or type(error).__name__}") from None
         self._hub.join(self)
-        self._tasks = [asyncio.create_task(self._send_all()), asyncio.create_task(self._take_all())]
+        self._tasks.begin(self._send_all())
+        self._tasks.begin(self._take_all())
 
     async def _subscribed(self) -> Any:
         """Make the stream of no_drop messages unless another relay has, and this relay's place in it."""
@@ -96,9 +98,7 @@ class Peers:
 
     async def close(self) -> None:
         """Leave the others."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.end()
         self._hub.leave(self)
         if self._nats is not None:
             await self._nats.close()
@@ -145,7 +145,7 @@ class Peers:
             return None
         return message if self._goes("send", message.topic) else None
 
-    async def hold(self, sender: Mailbox, message: wire.Message) -> bool | None:
+    async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
         """Give a no_drop message to the other relays; return whether they may have it, None if NATS does not answer."""
         if not self._goes("receive", message.topic):
             return False
@@ -184,11 +184,7 @@ class Peers:
                     return
         await heard.ack()
 
-    def wake(self) -> None:
-        """Do nothing; no message is held for it."""
+    def _ignore(self, *words: Any, **fields: Any) -> None:
+        """Do nothing: the others are told nothing, no message is held for them, and they end with the relay."""
 
-    def tell(self, op: str, **fields: Any) -> None:
-        """Do nothing; it is told nothing."""
-
-    def end(self, why: str) -> None:
-        """Do nothing; it ends with the relay."""
+    wake = tell = end = _ignore

@@ -1,7 +1,7 @@
 """Limits of one identity over all its connections."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 from bufgym.relay.config import Limits
 from bufgym.relay.wire import RefusedError
@@ -26,20 +26,15 @@ class Bucket:
         return True
 
 
-@dataclass
 class Quota:
     """Use that one identity has made of its limits."""
 
-    limits: Limits
-    messages: Bucket = field(init=False)
-    bytes: Bucket = field(init=False)
-    connections: int = 0
-    subscriptions: int = 0
-    topics: set[str] = field(default_factory=set)
-    idle_since_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.messages, self.bytes = Bucket(self.limits.messages_per_s), Bucket(self.limits.bytes_per_s)
+    def __init__(self, limits: Limits, idle_since_s: float) -> None:
+        self.limits, self.idle_since_s = limits, idle_since_s
+        self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
+        self.topics: set[str] = set()
+        self.connections: list[Mapping[str, object]] = []
+        """The subscriptions of each of its connections, by id."""
 
     def message(self, size_bytes: int, now_s: float) -> None:
         """Count a published message.
@@ -58,17 +53,10 @@ class Quota:
                 raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
             self.topics.add(topic)
 
-    def connect(self) -> None:
-        """Count a connection."""
-        if self.connections >= self.limits.connections:
-            raise RefusedError("too_many", f"must be at most {self.limits.connections} connections")
-        self.connections += 1
-
-    def subscribe(self) -> None:
-        """Count a subscription."""
-        if self.subscriptions >= self.limits.subscriptions:
+    def subscribe(self, id: str, before: Mapping[str, object]) -> None:
+        """Check that a connection with these subscriptions may have one of this id."""
+        if id not in before and sum(map(len, self.connections)) >= self.limits.subscriptions:
             raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
-        self.subscriptions += 1
 
 
 KEPT_S = 60.0
@@ -89,17 +77,28 @@ class Quotas:
         if key not in self._quotas:
             if len(self._quotas) >= MAX_QUOTAS:
                 self.tidy(kept_s=0.0)
-            self._quotas[key] = Quota(self._limits, idle_since_s=self._clock())
+            self._quotas[key] = Quota(self._limits, self._clock())
         return self._quotas[key]
 
-    def left(self, quota: Quota) -> None:
-        """Note that a connection with this quota has ended."""
-        quota.connections -= 1
-        quota.idle_since_s = self._clock()
+    @contextmanager
+    def connection(self, key: str, subscriptions: Mapping[str, object]) -> Iterator[Quota]:
+        """Count a connection of an identity, with whatever subscriptions it gets, until the block ends.
+
+        Raises RefusedError: too many.
+        """
+        quota = self.of(key)
+        if len(quota.connections) >= self._limits.connections:
+            raise RefusedError("too_many", f"must be at most {self._limits.connections} connections")
+        quota.connections.append(subscriptions)
+        try:
+            yield quota
+        finally:
+            quota.connections = [each for each in quota.connections if each is not subscriptions]
+            quota.idle_since_s = self._clock()
 
     def tidy(self, kept_s: float = KEPT_S) -> None:
         """Forget quotas that have not been used for ``kept_s``."""
         now_s = self._clock()
         for key, quota in list(self._quotas.items()):
-            if quota.connections == 0 and now_s - quota.idle_since_s >= kept_s:
+            if not quota.connections and now_s - quota.idle_since_s >= kept_s:
                 del self._quotas[key]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from bufgym.relay import wire
 from bufgym.relay.config import Config, Rotation
@@ -42,16 +42,10 @@ class Recorder:
             self.close()
         if self._file is None:
             self._file = self._next()
-        self._file.write(
-            message.topic,
-            bytes(message.payload),
-            time.time_ns(),
-            max(0, message.stamp_us) * 1000,
-            encoding=message.encoding,
-            schema=message.type or ("object" if message.encoding == "json" else ""),
-            schema_encoding=SCHEMAS.get(message.encoding, ""),
-            seq=message.seq,
-        )
+        times_ns, encoding = (time.time_ns(), max(0, message.stamp_us) * 1000), message.encoding
+        schema = message.type or ("object" if encoding == "json" else "")
+        form: dict[str, Any] = {"encoding": encoding, "schema": schema, "schema_encoding": SCHEMAS.get(encoding, "")}
+        self._file.write(message.topic, bytes(message.payload), *times_ns, seq=message.seq, **form)
 
     def _next(self) -> McapFile:
         """Begin the next file and delete the oldest."""

@@ -13,16 +13,18 @@ encodings.
 
 import asyncio
 import json
+import secrets
 import struct
-import time
 from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import policies, wire
+from bufgym.relay import policies, protocol, wire
+from bufgym.relay.caller import Caller
 from bufgym.relay.config import DEFAULT_CAPACITY, SKIP_PENDING
 from bufgym.relay.connection import Connection
 from bufgym.relay.hub import ROBOFLEET, Outgoing
 from bufgym.relay.patterns import pattern
+from bufgym.relay.protocol import Admitted
 from bufgym.relay.rules import Permissions
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import WireError
@@ -72,41 +74,37 @@ def read(data: bytes) -> Flat:
     return flat._replace(topic=topic)
 
 
+def token(text: str) -> str | None:
+    """The token that a text frame names, if it names one."""
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError):
+        raise WireError("text: must be JSON") from None
+    found = said.get("id_token") if isinstance(said, dict) else None
+    return found if isinstance(found, str) else None
+
+
 class RobofleetConnection(Connection):
     """Connection of a client that Robofleet released."""
 
     acks = False
 
-    async def _hello(self) -> None:
+    @staticmethod
+    async def greet(caller: Caller) -> Admitted:
         """Admit the client by its address or certificate, or once it has sent its token; it sends no hello."""
-        self.identity = await self._identified(None)
-        while not Permissions(self._hub.config.rules, self.identity).rules:
-            data = await self._socket.recv()
-            if isinstance(data, str):
-                await self._signed_in(data)
-        self._admit({}, ROBOFLEET)
-
-    async def _signed_in(self, text: str) -> bool:
-        """Accept a token if it proves an identity."""
-        try:
-            said = json.loads(text)
-        except (ValueError, RecursionError):
-            raise WireError("text: must be JSON") from None
-        token = said.get("id_token") if isinstance(said, dict) else None
-        if not isinstance(token, str):
-            return False
-        self.identity = await self._identified(token)
-        asyncio.get_running_loop().call_later(
-            min(self.identity.until_s - time.time(), 2**20), lambda: self.end("the token has expired")
-        )
-        return True
+        identity, rules = await caller.prove(None), caller.hub.config.rules
+        while not Permissions(rules, identity).rules:
+            data = await caller.socket.recv()
+            if isinstance(data, str) and (proof := token(data)) is not None:
+                identity = await caller.prove(proof)
+        return protocol.admit({"form": ROBOFLEET}, identity, rules, secrets.token_hex(8))
 
     async def _read(self) -> None:
         while self._ending is None:
             data = await self._socket.recv()
             if isinstance(data, str):
-                before = self.identity
-                if await self._signed_in(data) and self.identity.key != before.key:
+                before, proof = self._caller.identity, token(data)
+                if proof is not None and (await self._caller.prove(proof)).key != before.key:
                     raise WireError("id_token: must be said first; connect again to be somebody else")
                 continue
             flat = read(data)
@@ -116,19 +114,17 @@ class RobofleetConnection(Connection):
             message = wire.Message(flat.topic, data, ROBOFLEET, flat.type)
             if self._hub.is_no_drop(flat.topic):
                 message = message._replace(no_drop=True, seq=self.session.received + 1)
-            await self._answer(message)
+            await self._publish(message)
 
     async def _ordered(self, flat: Flat) -> None:
         """Subscribe or unsubscribe; as at Robofleet's server, a client with bytes pending is skipped."""
         if not flat.subscribe:
-            if self._hub.unsubscribe(self, flat.pattern):
-                self._quota.subscriptions -= 1
+            self._hub.unsubscribe(self, flat.pattern)
             return
         try:
             chosen = pattern(flat.pattern)
             warmed = await asyncio.to_thread(policies.warm, SKIP_PENDING)
-            if flat.pattern not in self.subscriptions:
-                self._quota.subscribe()
+            self._quota.subscribe(flat.pattern, self.subscriptions)
         except BufgymError as error:
             self._refuse("subscribe", error)
             return
@@ -139,6 +135,3 @@ class RobofleetConnection(Connection):
         """Offer a message if it is a flatbuffer, the only encoding that the client reads."""
         if frame.message.encoding == ROBOFLEET:
             super().offer(subscription, frame)
-
-    def tell(self, op: str, **fields: Any) -> None:
-        """Say nothing, because the client would not understand."""

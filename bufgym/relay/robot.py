@@ -61,8 +61,6 @@ class Robot:
         source: Source,
         *,
         policy: str | Policy = "robofleet",
-        capacity: int = 32,
-        window: int = 1,
         value: Value | None = None,
         policies: Sequence[str] = POLICIES,
         **session: Any,
@@ -83,17 +81,8 @@ class Robot:
         self._location: dict[str, float] | None = None
         self._began_s = time.monotonic()
         self._pings = Tasks()
-        self.client = RobotClient(
-            url,
-            name,
-            topics=topics,
-            policy=policy,
-            capacity=capacity,
-            window=window,
-            value=value,
-            log=self.monitor,
-            **session,
-        )
+        settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
+        self.client = RobotClient(url, name, **settings)
         self.client.subscribe(f"^{self.topic('command')}$", self._command)
 
     def topic(self, name: str) -> str:
@@ -113,10 +102,7 @@ class Robot:
         """Take a pose, which gives the robot's location and x of the topics that move."""
         message = ros_messages.read(payload, type, encoding)
         self._odometry.take(message)
-        pose = message.pose
-        while hasattr(pose, "pose"):
-            pose = pose.pose
-        self._location = ros_messages.planar(pose)
+        self._location = ros_messages.planar(ros_messages.pose(message))
 
     def say(self, topic: str, data: Any) -> None:
         """Publish ``data`` as JSON."""

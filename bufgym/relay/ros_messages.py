@@ -41,6 +41,11 @@ def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
         raise BufgymError(f"message of {len(payload)} bytes: no {type} in {encoding}: {error}") from None
 
 
+def pose(message: Any) -> Any:
+    """Find the ``geometry_msgs/msg/Pose`` in a message of one of ``POSES``."""
+    return pose(message.pose) if hasattr(message, "pose") else message
+
+
 def planar(pose: Any) -> dict[str, float]:
     """Project a ``geometry_msgs/msg/Pose`` to the plane."""
     place, turn = pose.position, pose.orientation

@@ -19,7 +19,8 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import pages, policies, wire
+from bufgym.relay import connection, pages, policies, wire
+from bufgym.relay.caller import Caller
 from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
 from bufgym.relay.hub import Hub
@@ -127,11 +128,11 @@ class Accepted(ServerConnection):
             self.transport.abort()
             return
         self._inside = self._waits = True
-        connection = transport.get_extra_info("socket")
+        tcp = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
-            set_option(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
+            set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
             if self._door.hub.config.small_buffers:
-                small_buffers(connection)
+                small_buffers(tcp)
 
     def greeted(self) -> None:
         """Note that the client has said hello, or has gone."""
@@ -244,8 +245,9 @@ class Server:
 
     async def _serve(self, socket: ServerConnection) -> None:
         assert isinstance(socket, Accepted)
-        kind = Connection if _is_ours(socket.request) else RobofleetConnection
-        await kind(self.hub, socket, self._verifier).serve(socket.greeted)
+        ours = _is_ours(socket.request)
+        caller = Caller(self.hub, socket, self._verifier, listens=ours)
+        await connection.serve(Connection if ours else RobofleetConnection, caller, socket.greeted)
 
     def _subprotocol(self, socket: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
         if not _is_ours(socket.request):

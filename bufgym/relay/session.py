@@ -12,21 +12,20 @@ import ssl
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
 from bufgym.relay import wire
+from bufgym.relay.backoff import Backoff
 from bufgym.relay.unanswered import Unanswered
 from bufgym.relay.wire import RefusedError
 from bufgym.robot.sockets import connected, unacked_bytes
-from bufgym.robot.tasks import Tasks
+from bufgym.robot.tasks import Tasks, until_one_ends
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
-RETRY_S: Final = 0.5
 PATIENCE_S: Final = 5.0
 """Time to wait for a connection, and for the relay's welcome."""
 _MAX_TOKEN_BYTES: Final = 2**16
@@ -35,8 +34,7 @@ _MAX_FRAME_BYTES: Final = 2**26
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
 
 
-@dataclass(frozen=True)
-class Wish:
+class Wish(NamedTuple):
     """A subscription that is asked of the relay."""
 
     pattern: re.Pattern[str]
@@ -158,13 +156,15 @@ class Session:
         """
         from websockets.exceptions import WebSocketException
 
+        backoff = Backoff()
         try:
             while True:
                 try:
                     async with asyncio.timeout(PATIENCE_S):
                         self._connection = await self._connect()
                         await self._greet()
-                    await self._converse()
+                    backoff.connected()
+                    await until_one_ends(*self._works())
                 except (OSError, TimeoutError, wire.WireError, WebSocketException) as error:
                     # A relay that refuses this address says why in its HTTP answer.
                     page = getattr(getattr(error, "response", None), "body", None) or b""
@@ -176,7 +176,7 @@ class Session:
                     if self._connection is not None:
                         self._connection.transport.abort()
                         self._connection = None
-                await asyncio.sleep(RETRY_S)
+                await asyncio.sleep(backoff.delay_s())
         finally:
             self._unanswered.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
@@ -234,19 +234,6 @@ class Session:
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         """List the tasks that run while there is a connection."""
         return [self._send_no_drop(), self._take_all()]
-
-    async def _converse(self) -> None:
-        """Send and receive until the connection ends."""
-        tasks = [asyncio.create_task(work) for work in self._works()]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            ended = await asyncio.gather(*tasks, return_exceptions=True)
-        for error in ended:
-            if isinstance(error, Exception):
-                raise error
 
     def _left_bytes(self) -> int | None:
         connection = self._connection

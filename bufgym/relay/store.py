@@ -35,7 +35,7 @@ _COLUMNS: Final = "name, address, email, temporary, received, numbered, seen_s"
 
 
 @dataclass(eq=False)
-class Mailbox:
+class StoredSession:
     """A client's session as the relay keeps it, over all its connections."""
 
     name: str
@@ -63,7 +63,7 @@ class Mailbox:
 class Settled(NamedTuple):
     """A message that no receiver waits for any more."""
 
-    sender: Mailbox
+    sender: StoredSession
     seq: int
     receivers: int
     lost: int  # number of receivers whose sessions were forgotten before they acked it
@@ -84,14 +84,16 @@ class Store:
             self._db.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
-        self.sessions: dict[tuple[str, str], Mailbox] = {}
-        self._by_id: dict[int, Mailbox] = {}
+        self.sessions: dict[tuple[str, str], StoredSession] = {}
+        self._by_id: dict[int, StoredSession] = {}
         self._load()
 
     def _load(self) -> None:
         for row in self._db.execute(f"SELECT id, {_COLUMNS} FROM session").fetchall():
             id, name, address, email, temporary, received, numbered, seen_s = row
-            session = Mailbox(name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s)
+            session = StoredSession(
+                name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s
+            )
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
             (session.held,) = self._db.execute("SELECT count(*) FROM delivery WHERE session = ?", (id,)).fetchone()
             self.sessions[session.key] = self._by_id[id] = session
@@ -100,7 +102,7 @@ class Store:
             if session.temporary:  # left by a relay that was killed
                 self.forget(session)
 
-    def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> Mailbox:
+    def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> StoredSession:
         """Open the session of this name; a new session begins at the client's numbers.
 
         Raises RefusedError: the identity has too many sessions.
@@ -109,7 +111,7 @@ class Store:
         if session is None:
             if sum(key == identity.key for key, _ in self.sessions) >= self._most_sessions:
                 raise RefusedError("too_many", f"must be at most {self._most_sessions} sessions")
-            session = Mailbox(name, identity, temporary, acked, received)
+            session = StoredSession(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
         session.identity, session.seen_s = identity, time.time()
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
@@ -118,7 +120,7 @@ class Store:
                 self._save(session)
         return session
 
-    def left(self, session: Mailbox) -> list[Settled]:
+    def left(self, session: StoredSession) -> list[Settled]:
         """Note the end of a session's connection; forget messages that nobody will ask for."""
         session.seen_s = time.time()
         if session.temporary or session.id is None:
@@ -127,7 +129,7 @@ class Store:
             self._save(session)
         return []
 
-    def forget(self, session: Mailbox) -> list[Settled]:
+    def forget(self, session: StoredSession) -> list[Settled]:
         """Forget a session; messages held for it are lost."""
         self.sessions.pop(session.key, None)
         if session.id is None:
@@ -139,7 +141,7 @@ class Store:
         self._by_id.pop(session.id, None)
         return settled
 
-    def want(self, session: Mailbox, id: str, pattern: str | None) -> None:
+    def want(self, session: StoredSession, id: str, pattern: str | None) -> None:
         """Hold matching messages while the session is away; the pattern None ends that."""
         if pattern is None and session.durable.pop(id, None) is None:
             return
@@ -151,7 +153,9 @@ class Store:
                 session.durable[id] = pattern
                 self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
 
-    def hold(self, sender: Mailbox, seq: int, topic: str, frame: bytes, receivers: Sequence[Mailbox]) -> None:
+    def hold(
+        self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
+    ) -> None:
         """Store the sender's message number ``seq`` on disk for these receivers.
 
         Without receivers, whom other relays have, the number alone is taken.
@@ -184,7 +188,7 @@ class Store:
             receiver.numbered += 1
             receiver.held += 1
 
-    def waiting(self, session: Mailbox, after: int, most: int) -> list[tuple[int, str, bytes]]:
+    def waiting(self, session: StoredSession, after: int, most: int) -> list[tuple[int, str, bytes]]:
         """List number, topic and frame of the session's next messages."""
         if session.id is None:
             return []
@@ -194,19 +198,19 @@ class Store:
         )
         return self._db.execute(query, (session.id, after, most)).fetchall()
 
-    def acked(self, session: Mailbox, number: int) -> list[Settled]:
+    def acked(self, session: StoredSession, number: int) -> list[Settled]:
         """Note that the session has processed all messages up to this number; return the settled ones."""
         if session.id is None or session.held == 0:
             return []
         with self._transaction():
             return self._settle(session, 0, number, lost=0)
 
-    def denied(self, session: Mailbox, number: int) -> list[Settled]:
+    def denied(self, session: StoredSession, number: int) -> list[Settled]:
         """Drop a message that no rule lets the session have any more; return the settled ones."""
         with self._transaction():
             return self._settle(session, number, number, lost=1)
 
-    def expired(self, connected: Sequence[Mailbox]) -> list[Mailbox]:
+    def expired(self, connected: Sequence[StoredSession]) -> list[StoredSession]:
         """List the sessions that have been away for too long."""
         before_s = time.time() - self.limits.keep_s
         here = set(map(id, connected))
@@ -226,7 +230,7 @@ class Store:
             raise
         self._db.execute("COMMIT")
 
-    def _settle(self, session: Mailbox, first: int, last: int, lost: int) -> list[Settled]:
+    def _settle(self, session: StoredSession, first: int, last: int, lost: int) -> list[Settled]:
         settled = []
         chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
         rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
@@ -245,7 +249,7 @@ class Store:
                     settled.append(Settled(self._by_id[sender], seq, receivers, gone))
         return settled
 
-    def _remember(self, session: Mailbox) -> None:
+    def _remember(self, session: StoredSession) -> None:
         """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
             insert = f"INSERT INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
@@ -253,6 +257,6 @@ class Store:
             assert session.id is not None
             self._by_id[session.id] = session
 
-    def _save(self, session: Mailbox) -> None:
+    def _save(self, session: StoredSession) -> None:
         places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
         self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))

@@ -8,7 +8,8 @@ Robofleet.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from bufgym.relay.patterns import Pattern
@@ -47,29 +48,20 @@ class Lane:
         self.carried = False
 
 
+@dataclass(eq=False)
 class Subscription:
     """One subscriber's request under one id, with its queues."""
 
-    def __init__(
-        self,
-        id: str,
-        pattern: Pattern,
-        policy: Policy,
-        capacity: int,
-        *,
-        priority: float = 1.0,
-        durable: bool = False,
-        left_bytes: Callable[[], int] = lambda: 0,
-    ) -> None:
-        self.id = id
-        self.pattern = pattern
-        self.policy = policy
-        self.capacity = capacity
-        self.priority = priority
-        self.durable = durable
-        self._left_bytes = left_bytes
-        self.lanes: list[Lane] = []
-        self._topics: dict[str, int] = {}
+    id: str
+    pattern: Pattern
+    policy: Policy
+    capacity: int
+    _: KW_ONLY
+    priority: float = 1.0
+    durable: bool = False
+    left_bytes: Callable[[], int] = lambda: 0
+    lanes: list[Lane] = field(init=False, default_factory=list)
+    _topics: dict[str, int] = field(init=False, default_factory=dict)
 
     def offer(self, topic: str, frame: Any, size_bytes: int) -> None:
         """Put a message into its queue, where the policy decides."""
@@ -81,7 +73,7 @@ class Subscription:
                 self._topics[topic] = number
         lane, place = divmod(number, PLACES) if self.policy.for_topics else (number, 0)
         while lane >= len(self.lanes):
-            self.lanes.append(Lane(new_queue(self.policy, self.capacity), self._left_bytes))
+            self.lanes.append(Lane(new_queue(self.policy, self.capacity), self.left_bytes))
         self.lanes[lane].queue.put(frame, size_bytes, topic=place)
 
     @property
@@ -96,12 +88,7 @@ class Subscription:
 
 def next_lane(subscriptions: Sequence[Subscription], now_s: float) -> Lane | None:
     """Choose the lane that sends next; None if nothing waits."""
-    ready = list(_ready(subscriptions, now_s))
+    ready = [
+        (one.priority * (now_s - lane.served_s), lane) for one in subscriptions for lane in one.lanes if lane.ready
+    ]
     return max(ready, key=lambda each: each[0])[1] if ready else None
-
-
-def _ready(subscriptions: Sequence[Subscription], now_s: float) -> Iterator[tuple[float, Lane]]:
-    for subscription in subscriptions:
-        for lane in subscription.lanes:
-            if lane.ready:
-                yield subscription.priority * (now_s - lane.served_s), lane

@@ -70,23 +70,9 @@ def encode(message: Message) -> bytes:
     """The binary frame; names are checked, as in ``decode`` are."""
     _check(message)
     names = [name.encode() for name in (message.topic, message.type, message.encoding, message.sender)]
-    return b"".join(
-        (
-            _HEADER.pack(
-                _MAGIC,
-                VERSION,
-                MESSAGE,
-                NO_DROP if message.no_drop else 0,
-                *map(len, names),
-                b"\0\0\0",
-                len(message.payload),
-                message.seq,
-                message.stamp_us,
-            ),
-            *names,
-            message.payload,
-        )
-    )
+    numbers = len(message.payload), message.seq, message.stamp_us
+    header = _HEADER.pack(_MAGIC, VERSION, MESSAGE, int(message.no_drop), *map(len, names), b"\0\0\0", *numbers)
+    return b"".join((header, *names, message.payload))
 
 
 def decode(data: bytes, max_bytes: int = 2**26) -> Message:
@@ -255,15 +241,7 @@ def from_json(said: Mapping[str, Any]) -> Message:
             raise WireError(f"data: must be base64: {error}") from None
     else:
         raise WireError(f"data: must be base64 text for encoding {encoding!r}")
-    message = Message(
-        said["topic"],
-        payload,
-        encoding,
-        said.get("type", ""),
-        said.get("sender", ""),
-        said.get("seq", 0),
-        said.get("stamp_us", 0),
-        no_drop=said.get("no_drop", False),
-    )
+    fields = {name: said[name] for name in Message._fields if name in said}
+    message = Message(**{**fields, "payload": payload})
     _check(message)
     return message

@@ -29,12 +29,12 @@ def _compiled() -> None:
 @pytest.fixture(scope="module")
 def server(request: pytest.FixtureRequest, runner: asyncio.Runner) -> Iterator[Any]:  # noqa: F811
     """The module's relay, with the settings in the module's ``CONFIG``."""
-    from relay_cases import Server, settings
+    from relay_cases import Server, settings, wait
 
     one = Server(getattr(request.module, "CONFIG", None) or settings())
-    runner.run(one.start())
+    runner.run(wait("the module's relay", one.start()))
     yield one
-    runner.run(one.close())
+    runner.run(wait("its end", one.close()))
 
 
 @pytest.fixture

@@ -5,10 +5,11 @@ import contextlib
 import socket
 import ssl
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
+import loop_cases
 import pytest
 
 for library in ("websockets", "re2", "jwt"):
@@ -22,12 +23,36 @@ from bufgym.relay.config import Config, Rule  # noqa: E402
 from bufgym.relay.server import Server  # noqa: E402
 from bufgym.relay.wire import Message  # noqa: E402
 
+PATIENCE_S = 120.0
+"""Ends a wait that hangs. No test waits for it."""
 ALL = Rule(address="127.0.0.0/8", send=True, receive=True)
 
 
 def settings(**changed: Any) -> Config:
     """All is allowed to this machine."""
     return Config(**{"port": 0, "rules": (ALL,), "policies": ("drop-oldest", "skip-pending", "robofleet"), **changed})
+
+
+@contextlib.asynccontextmanager
+async def within(what: str) -> AsyncIterator[None]:
+    """Fail, naming ``what`` is waited for, where the block takes too long."""
+    limit = asyncio.timeout(PATIENCE_S)
+    try:
+        async with limit:
+            yield
+    except TimeoutError:
+        assert not limit.expired(), f"waited {PATIENCE_S:g} s for {what}"
+        raise
+
+
+async def wait(what: str, done: Awaitable[Any]) -> Any:
+    async with within(what):
+        return await done
+
+
+async def until(what: str, holds: Callable[[], Any]) -> None:
+    """Return once ``holds()``."""
+    await wait(what, loop_cases.until(holds))
 
 
 class Client:
@@ -48,7 +73,7 @@ class Client:
 
     async def next(self) -> Any:
         """What comes next: a ``Message``, or the object of a text frame."""
-        data = await self.socket.recv()
+        data = await wait("the relay's next frame", self.socket.recv())
         return wire.decode(data) if isinstance(data, bytes) else wire.heard(data)
 
     async def rest(self) -> list[Any]:
@@ -72,10 +97,18 @@ class Client:
         said: dict[str, Any] = await self.next()
         return said
 
-    async def came(self, seq: int, payload: bytes) -> None:
-        """The next message is this one, no_drop."""
-        message = await self.next()
-        assert (message.seq, bytes(message.payload), message.no_drop) == (seq, payload, True)
+    async def acked(self, topic: str, *seqs: int, **fields: Any) -> None:
+        """Send commands of these numbers; the relay acks each."""
+        for seq in seqs:
+            await self.command(seq, topic, **fields)
+            assert await self.next() == {"op": "ack", "seq": seq}
+
+    async def came(self, *seqs: int, payload: bytes | None = None) -> None:
+        """The next messages have these numbers and, unless it is given, payload; they are no_drop."""
+        for seq in seqs:
+            message = await self.next()
+            expected = (seq, b"%d" % seq if payload is None else payload, True)
+            assert (message.seq, bytes(message.payload), message.no_drop) == expected
 
 
 async def nothing(*clients: Client) -> bool:
@@ -121,18 +154,18 @@ async def stranger(port: int, local: str = "127.0.0.1") -> AsyncIterator[tuple[A
     finally:
         writer.close()
         with contextlib.suppress(OSError):
-            await writer.wait_closed()
+            await wait("the end of a TCP connection", writer.wait_closed())
 
 
 @contextlib.asynccontextmanager
 async def relay(config: Config | None = None) -> AsyncIterator[Server]:
     """A relay with settings that no other test of the module wants."""
     server = Server(config or settings())
-    await server.start()
+    await wait("a relay's start", server.start())
     try:
         yield server
     finally:
-        await server.close()
+        await wait("a relay's end", server.close())
 
 
 @contextlib.asynccontextmanager
@@ -144,12 +177,12 @@ async def process(port: int, folder: Path, table: str = "") -> AsyncIterator[Any
     words = ["-um", "bufgym", "relay", "serve", "--config", str(config)]
     one = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)
     try:
-        assert one.stdout is not None and b"http" in await one.stdout.readline()
+        assert one.stdout is not None and b"http" in await wait("a relay's first line", one.stdout.readline())
         yield one
     finally:
         with contextlib.suppress(ProcessLookupError):
             one.kill()
-        await one.wait()
+        await wait("a killed relay's end", one.wait())
 
 
 class Corner:

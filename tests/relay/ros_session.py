@@ -11,8 +11,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from loop_cases import beside, until
-from relay_cases import relay, settings
+from loop_cases import beside
+from relay_cases import relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay.session import Session
@@ -82,7 +82,7 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
     async def command(*what: Any) -> None:
         while True:
             try:
-                await viewer.command(*what)
+                await wait("the relay's answer", viewer.command(*what))
                 return
             except BufgymError as error:  # the robot has not subscribed yet
                 assert "no_receiver" in str(error), error
@@ -98,18 +98,18 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
         viewer.subscribe("^/robots/r/status$", lambda one: location.append(json.loads(bytes(one.payload))["location"]))
         try:
             async with beside(viewer.run(), publish()):
-                await until(lambda: len(came) >= 10 and any(location))
+                await until("texts and poses", lambda: len(came) >= 10 and any(location))
                 # What is no message, of no type that is here, or not for this robot's ROS, stops nothing.
                 await command("/robots/r/to/speech", b"\0\1\0\0\xff\xff\xff\xff", TEXT)
                 await command("/robots/r/to/speech", b"", "no_such_msgs/msg/B")
                 await command("/robots/r/to/private", cdr("secret"), TEXT)
                 for text in COMMANDS:
                     await command("/robots/r/to/speech", cdr(text), TEXT)
-                await until(lambda: len(heard) >= len(COMMANDS))
+                await until("what was said", lambda: len(heard) >= len(COMMANDS))
                 assert robot.returncode is None
         finally:
             robot.terminate()
-            await robot.wait()
+            await wait("the robot's end", robot.wait())
     return {
         "exact": all(bytes(message.payload) in {cdr(text) for text in sent} for message in came),
         "kinds": sorted({(message.encoding, message.type) for message in came}),

@@ -21,7 +21,7 @@ async def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.Monke
     compiler, compiled = threading.Event(), policies.compiled
 
     def slowly(chosen: Policy) -> Policy:
-        compiler.wait()
+        assert compiler.wait(60), "waited 60 s for the page"
         return compiled(chosen)
 
     monkeypatch.setattr(fleet_demo, "compiled", slowly)
@@ -29,7 +29,7 @@ async def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.Monke
         try:
 
             def page() -> bytes:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as answer:
                     return bytes(answer.read())
 
             assert b"<html" in (await asyncio.to_thread(page)).lower()

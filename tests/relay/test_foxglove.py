@@ -5,9 +5,9 @@ import struct
 from typing import Any
 
 import pytest
-from loop_cases import beside, compiled, until
+from loop_cases import beside, compiled
 from made_up_robot import SCAN, MadeUp
-from relay_cases import ALL, Corner, client, relay, settings
+from relay_cases import ALL, Corner, client, relay, settings, until, within
 
 pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
 
@@ -60,7 +60,7 @@ async def test_a_client_of_foxglove_sees_the_fleet(corner: Corner, monkeypatch: 
     source = Robot(corner.url, corner.robot, MadeUp(), policy="drop-oldest", capacity=16)
     topics = {f"{robot}/{name}" for name in ("camera", "odom", "queue", "scan", "status")}
     async with beside(bridge.run(), source.run(), viewer.listen(bridge.address)):
-        await until(lambda: set(came) >= {*topics, "/tf"})  # and the relay's own
+        await until("all topics", lambda: set(came) >= {*topics, "/tf"})  # and the relay's own
     scan = channels[f"{robot}/scan"]
     assert (scan["encoding"], scan["schemaName"], scan["schemaEncoding"]) == ("cdr", SCAN, "ros2msg")
     assert "float32[] ranges" in scan["schema"]
@@ -79,7 +79,7 @@ async def test_a_relay_shows_what_its_rules_allow() -> None:
     async with relay(config) as server, client(server.port) as robot, client(server.port) as other:
         assert server.window is not None
         await other.subscribe("stop$")
-        async with beside(viewer.listen(server.window.address)):
+        async with within("what it may see"), beside(viewer.listen(server.window.address)):
             seq = 0
             while set(viewer.came) != {f"/robots/r/{name}" for name in ("odom", "camera", "text", "stop")}:
                 seq += 1
@@ -91,7 +91,7 @@ async def test_a_relay_shows_what_its_rules_allow() -> None:
                 await robot.command(seq, "/robots/r/stop")
                 while not any(said.get("op") == "ack" for said in await robot.rest()):
                     pass
-                await other.came(seq, b"%d" % seq)
+                await other.came(seq)
                 await other.say("ack", seq=seq)
         assert server.hub.status()["refused"] == 0
     assert viewer.came["/robots/r/text"] == b"hello" and viewer.channels["/robots/r/text"]["encoding"] == "raw"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import client, relay, settings
+from relay_cases import client, relay, settings, wait
 from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
@@ -69,7 +69,7 @@ async def test_a_token_names_who_it_is(issuer: Issuer) -> None:
             assert bob.welcome["why"] == "no rule allows anything to this identity"
         # A token ends, and with it the connection: this one is still let in, but only just.
         async with client(server.port, token=issuer.token(exp=time.time() - issuer.tokens.leeway_s / 2)) as anna:
-            await anna.socket.wait_closed()
+            await wait("the token's end", anna.socket.wait_closed())
             assert anna.socket.close_reason == "the token has expired"
 
 

@@ -12,11 +12,11 @@ import time
 from pathlib import Path
 
 import pytest
-from loop_cases import beside, until
-from relay_cases import Corner, client, nothing, process, relay, settings
+from loop_cases import beside
+from relay_cases import Corner, client, nothing, process, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import session
+from bufgym.relay import backoff
 from bufgym.relay.config import Rule, StoreLimits
 from bufgym.relay.session import Session
 from bufgym.robot.sockets import free_port
@@ -34,9 +34,8 @@ async def test_acks_end_to_end(corner: Corner) -> None:
         refused = await operator.next()
         assert (refused["code"], refused["seq"]) == ("no_receiver", 1)
         await robot.subscribe(f"^{corner.command}$")
-        await operator.command(1, corner.command)  # a refused number was not used
-        assert await operator.next() == {"op": "ack", "seq": 1}
-        await robot.came(1, b"1")
+        await operator.acked(corner.command, 1)  # a refused number was not used
+        await robot.came(1)
         assert held.held == 1
         await robot.say("ack", seq=1)
         assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 0}
@@ -50,16 +49,13 @@ async def test_acks_end_to_end(corner: Corner) -> None:
 async def test_no_more_than_the_window_are_on_their_way(corner: Corner) -> None:
     async with corner.client() as operator, corner.client() as robot:
         await robot.subscribe(f"^{corner.command}$")
-        for seq in range(1, 5):
-            await operator.command(seq, corner.command)
-            assert (await operator.next())["op"] == "ack"
-        await robot.came(1, b"1")
-        await robot.came(2, b"2")
+        await operator.acked(corner.command, 1, 2, 3, 4)
+        await robot.came(1, 2)
         assert await nothing(operator, robot)
         await robot.say("ack", seq=2)
-        await robot.came(3, b"3")
+        await robot.came(3)
         await robot.say("ack", seq=9)
-        await robot.came(4, b"4")
+        await robot.came(4)
         assert "must be at most 4" in (await robot.next())["why"]
 
 
@@ -68,20 +64,19 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
         async with corner.client(session="a") as robot, corner.client(session="b") as viewer:
             assert (await robot.subscribe(f"^{corner.command}$", durable=True))["op"] == "subscribed"
             await viewer.subscribe(f"^{corner.command}$")
-        await until(lambda: len(corner.hub.members) == 1)
+        await until("the others' ends", lambda: len(corner.hub.members) == 1)
         for seq, code in ((1, None), (2, None), (3, None), (4, None), (5, "store_full")):
             await operator.command(seq, corner.command)
             assert (await operator.next()).get("code") == code
         async with corner.client(session="a") as robot:
-            await robot.came(1, b"1")
-            await robot.came(2, b"2")
+            await robot.came(1, 2)
         async with corner.client(session="a", received=3) as robot:
-            await robot.came(4, b"4")
+            await robot.came(4)
             assert [(await operator.next())["op"] for _ in range(3)] == ["delivered"] * 3
             await robot.say("ack", seq=4)
             assert (await operator.next())["seq"] == 4
             await operator.command(5, corner.command)
-            await robot.came(5, b"5")
+            await robot.came(5)
         # It had not asked to be waited for.
         async with corner.client(session="b") as viewer:
             assert await nothing(viewer)
@@ -89,11 +84,11 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
 
 async def test_the_same_session_takes_over(corner: Corner) -> None:
     async with corner.client() as operator, corner.client(session="a") as old, corner.client(session="a") as new:
-        await old.socket.wait_closed()
+        await wait("the end of the old", old.socket.wait_closed())
         assert old.socket.close_reason == "taken over by another connection"
         await new.subscribe(f"^{corner.command}$")
         await operator.command(1, corner.command)
-        await new.came(1, b"1")
+        await new.came(1)
 
 
 async def test_the_name_of_a_session_belongs_to_who_uses_it(corner: Corner) -> None:
@@ -103,22 +98,20 @@ async def test_the_name_of_a_session_belongs_to_who_uses_it(corner: Corner) -> N
             await robot.subscribe(f"^{corner.command}$", durable=True)
             async with corner.client(session="a", local="127.0.0.2") as thief:
                 assert thief.welcome["op"] == "welcome" and await nothing(thief, robot)
-        await until(lambda: len(corner.hub.members) == 1)
-        await operator.command(1, corner.command)
-        assert (await operator.next())["op"] == "ack"
+        await until("the others' ends", lambda: len(corner.hub.members) == 1)
+        await operator.acked(corner.command, 1)
         async with corner.client(session="a", local="127.0.0.2") as thief:
             assert await nothing(thief)
         async with corner.client(session="a") as robot:
-            await robot.came(1, b"1")
+            await robot.came(1)
 
 
 async def test_what_a_forgotten_session_had_to_get_is_told(corner: Corner) -> None:
     async with corner.client() as operator:
         async with corner.client(session="a") as robot:
             await robot.subscribe(f"^{corner.command}$", durable=True)
-        await until(lambda: len(corner.hub.members) == 1)
-        await operator.command(1, corner.command)
-        assert (await operator.next())["op"] == "ack"
+        await until("the others' ends", lambda: len(corner.hub.members) == 1)
+        await operator.acked(corner.command, 1)
         corner.hub.store.sessions[corner.address, "a"].seen_s -= corner.hub.config.store.keep_s + 1
         corner.hub.tick()
         assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1}
@@ -131,8 +124,7 @@ async def test_a_right_that_was_withdrawn(tmp_path: Path) -> None:
     async with relay(settings(folder=tmp_path)) as server, client(server.port, session="o") as operator:
         async with client(server.port, session="a") as robot:
             await robot.subscribe("command$", durable=True)
-        await operator.command(1, COMMAND)
-        assert (await operator.next())["op"] == "ack"
+        await operator.acked(COMMAND, 1)
     rules = (Rule(address="127.0.0.1", send=True), Rule(address="127.0.0.1", receive=True, topic="/other"))
     async with (
         relay(settings(folder=tmp_path, rules=rules)) as server,
@@ -162,9 +154,7 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
     async with relay(settings(folder=tmp_path / "killed")) as server, client(server.port, session="o") as operator:
         async with client(server.port, session="a") as robot:
             await robot.subscribe("command$", durable=True)
-        for seq in (1, 2):
-            await operator.command(seq, COMMAND)
-            assert (await operator.next())["op"] == "ack"
+        await operator.acked(COMMAND, 1, 2)
         shutil.copytree(tmp_path / "killed", tmp_path / "next")
     async with (
         relay(settings(folder=tmp_path / "next")) as server,
@@ -172,14 +162,13 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
         client(server.port, session="a") as robot,
     ):
         assert operator.welcome["received"] == 2
-        await robot.came(1, b"1")
-        await robot.came(2, b"2")
+        await robot.came(1, 2)
 
 
 @pytest.mark.nightly
 async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two senders with five commands unanswered each; the relay is killed under load, ``BUFGYM_KILLS`` times."""
-    monkeypatch.setattr(session, "RETRY_S", 0.05)
+    monkeypatch.setattr(backoff, "MOST_S", 0.05)
     port, uniform, took, back_s = free_port("127.0.0.1"), random.Random(0), list[list[int]](), list[float]()
     url = f"ws://127.0.0.1:{port}"
     receiver = Session(url, "robot")
@@ -191,7 +180,7 @@ async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypat
         for number in itertools.count(first, 5):
             while (k, number) not in acked:
                 try:
-                    await senders[k].command(COMMAND, [k, number])
+                    await wait("an answer", senders[k].command(COMMAND, [k, number]))
                     acked.add((k, number))
                 except BufgymError as error:
                     assert re.search("no_receiver|store_full", str(error))
@@ -202,14 +191,14 @@ async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypat
             for kill in range(KILLS + 1):
                 began_s = time.monotonic()
                 await stack.enter_async_context(process(port, tmp_path))
-                await receiver.ready.wait()
+                await wait("the receiver", receiver.ready.wait())
                 back_s.append(time.monotonic() - began_s)
                 taken = len(took)
-                await until(lambda taken=taken: len(took) >= taken + 100)
+                await until("100 more", lambda taken=taken: len(took) >= taken + 100)
                 if kill < KILLS:
                     await asyncio.sleep(uniform.uniform(0.0, 0.3))
                     await stack.aclose()
         # What was acked to the senders arrives, and the rest of what they sent may.
-        await until(lambda: acked <= {(k, number) for k, number in took})
+        await until("what was acked", lambda: acked <= {(k, number) for k, number in took})
     assert len({(k, number) for k, number in took}) == len(took), "one came twice"
     print(f"{len(took)} commands, {KILLS} kills, the receiver is back after {[round(s, 2) for s in back_s[1:]]} s")

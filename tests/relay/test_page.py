@@ -37,13 +37,14 @@ def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     async def show(folder: Path) -> None:
         async with demo.running(2, policy="drop-oldest", fades=False, folder=folder) as number:
             found.put(number)
-            await asyncio.to_thread(over.wait)
+            await asyncio.to_thread(over.wait, 600)
 
     thread = threading.Thread(target=lambda: asyncio.run(show(tmp_path_factory.mktemp("relay"))))
     thread.start()
-    yield found.get()
+    yield found.get(timeout=120)
     over.set()
-    thread.join()
+    thread.join(120)
+    assert not thread.is_alive(), "waited 120 s for the relay's end"
 
 
 @pytest.fixture(scope="module")

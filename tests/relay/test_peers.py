@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import ALL, Client, client, nothing, relay, settings
+from relay_cases import ALL, client, nothing, relay, settings, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import Nats, Rule, Server, StoreLimits
@@ -29,17 +29,18 @@ async def nats_server(port: int, folder: Path) -> AsyncIterator[Any]:
     quiet = asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(str(NATS_SERVER), *words, stdout=quiet, stderr=quiet)
     try:
-        while True:
-            with contextlib.suppress(OSError):
-                _, writer = await asyncio.open_connection("127.0.0.1", port)
-                writer.close()
-                break
-            await asyncio.sleep(0.02)
+        async with within("NATS to listen"):
+            while True:
+                with contextlib.suppress(OSError):
+                    _, writer = await asyncio.open_connection("127.0.0.1", port)
+                    writer.close()
+                    break
+                await asyncio.sleep(0.02)
         yield process
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
-        await process.wait()
+        await wait("the end of NATS", process.wait())
 
 
 def shared(port: int, name: str, **changed: Any) -> contextlib.AbstractAsyncContextManager[Server]:
@@ -89,22 +90,17 @@ async def test_a_viewer_sees_a_robot_at_another_relay_as_far_as_rules_allow(rela
         assert await nothing(sender, viewer, guest)
 
 
-async def acked(operator: Client, seq: int, topic: str) -> None:
-    await operator.command(seq, topic)
-    assert (await operator.next())["op"] == "ack"
-
-
 async def test_a_command_arrives_once_at_a_robot_of_another_relay(relays: list[Server], robot: str) -> None:
     a, b, _ = relays
     command, name = f"{robot}/command", f"{robot[8:]}-robot"
     async with client(a.port, session=f"{robot[8:]}-operator") as operator:
         async with client(b.port, session=name) as one:
             await one.subscribe(f"^{command}$", durable=True)
-            await acked(operator, 1, command)
-            await one.came(1, b"1")
+            await operator.acked(command, 1)
+            await one.came(1)
             await one.say("ack", seq=1)
             assert await nothing(one)
-        await acked(operator, 2, command)  # the robot is away: its relay holds it
+        await operator.acked(command, 2)  # the robot is away: its relay holds it
         assert a.hub.store.bytes == 0
 
         # Sent again because an answer was lost: NATS knows it.
@@ -114,8 +110,7 @@ async def test_a_command_arrives_once_at_a_robot_of_another_relay(relays: list[S
         assert [await a.hub.peers.hold(session, message) for _ in range(2)] == [True, True]
         assert not await a.hub.peers.hold(session, message._replace(topic="/robots/private"))
         async with client(b.port, session=name, received=1) as one:
-            for seq in (2, 3):
-                await one.came(seq, b"%d" % seq)
+            await one.came(2, 3)
             await one.say("ack", seq=3)
             assert await nothing(one)
 
@@ -128,13 +123,13 @@ async def test_a_relay_without_room_is_given_the_message_again(relays: list[Serv
         for seq, payload in ((1, b'"%s"' % (b"x" * 200)), (2, b'"%s"' % (b"y" * 200)), (3, b"3")):
             await operator.put(command, payload, encoding="json", seq=seq, no_drop=True)
             assert (await operator.next())["op"] == "ack"
-        await one.came(1, b'"%s"' % (b"x" * 200))
+        await one.came(1, payload=b'"%s"' % (b"x" * 200))
         assert await nothing(one)  # no room for the second, and the third waits behind it
         assert [entry["why"] for entry in b.hub.audit.recent if entry.get("what") == "nats"]
         await one.say("ack", seq=1)
-        await one.came(2, b'"%s"' % (b"y" * 200))
+        await one.came(2, payload=b'"%s"' % (b"y" * 200))
         await one.say("ack", seq=2)
-        await one.came(3, b"3")
+        await one.came(3)
 
 
 async def test_without_nats_commands_wait_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,11 +155,11 @@ async def test_without_nats_commands_wait_and_the_rest_goes_on(tmp_path: Path, m
                 await operator.next()
         await stack.enter_async_context(nats_server(port, tmp_path))
         while True:
-            async with client(a.port, session="operator") as operator:
+            async with within("an ack over NATS"), client(a.port, session="operator") as operator:
                 assert operator.welcome["received"] == 0
                 await operator.command(1, command, stamp_us=1)
                 with contextlib.suppress(Exception):
                     assert (await operator.next())["op"] == "ack"
                     break
-        await one.came(1, b"1")
+        await one.came(1)
         assert await nothing(one)

@@ -121,12 +121,10 @@ def test_a_bucket_of_ten_a_second() -> None:
 def test_quotas_are_remembered_for_a_while() -> None:
     now_s = 0.0
     quotas = Quotas(Config().limits, lambda: now_s)
-    quota = quotas.of("a")
-    quota.connect()
-    now_s = 100.0
-    quotas.tidy()
-    assert quotas.of("a") is quota
-    quotas.left(quota)
+    with quotas.connection("a", {}) as quota:
+        now_s = 100.0
+        quotas.tidy()
+        assert quotas.of("a") is quota
     quotas.tidy()
     assert quotas.of("a") is quota
     now_s = 161.0

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from loop_cases import beside, compiled, until
-from relay_cases import Corner, relay, settings
+from loop_cases import beside, compiled
+from relay_cases import Corner, relay, settings, until, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
-from bufgym.relay import session
+from bufgym.relay import backoff
 from bufgym.relay.client import RobotClient
 from bufgym.relay.session import Session, security, token
 from bufgym.relay.unanswered import Unanswered
@@ -24,7 +24,7 @@ from bufgym.traces import Trace
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "RETRY_S", 0.01)
+    monkeypatch.setattr(backoff, "MOST_S", 0.01)
 
 
 async def test_a_refused_number_is_used_again() -> None:
@@ -82,7 +82,7 @@ async def cut(link: ShapedLink, end: Session) -> None:
     """Break its connection, and mend it when it has been noticed."""
     faults = len(end.faults)
     link.cut()
-    await until(lambda: len(end.faults) > faults)
+    await until("the break to be noticed", lambda: len(end.faults) > faults)
     link.mend()
 
 
@@ -94,12 +94,12 @@ async def test_commands_come_once_and_in_order_over_a_link_that_breaks(corner: C
         sender, receiver = Session(sends, "a"), Session(receives, "b")
         async with beside(sender.run()):
             with pytest.raises(BufgymError, match=f"topic {corner.command}: refused: no_receiver"):
-                await sender.command(corner.command, {"command": "stop"})
+                await wait("the refusal", sender.command(corner.command, {"command": "stop"}))
         sender = Session(sends, "a")
         receiver.subscribe(
             f"^{corner.command}$", lambda message: came.append(json.loads(bytes(message.payload))), durable=True
         )
-        async with beside(sender.run(), receiver.run()):
+        async with within("20 commands"), beside(sender.run(), receiver.run()):
             await receiver.ready.wait()
             for k in range(20):
                 if k % 5 == 2:
@@ -108,7 +108,7 @@ async def test_commands_come_once_and_in_order_over_a_link_that_breaks(corner: C
                         await cutting
                 else:
                     await sender.command(corner.command, k)
-            await until(lambda: len(came) >= 20)
+            await until("the last", lambda: len(came) >= 20)
             assert sender.faults and receiver.faults
     assert came == list(range(20))
 
@@ -130,7 +130,7 @@ async def test_a_queue_over_a_break_and_a_change_of_policy(corner: Corner) -> No
         )
         viewer = Session(corner.url, "v")
         viewer.subscribe(f"^{topic}$", came.append)
-        async with beside(viewer.run(), robot.run()):
+        async with within("what was queued"), beside(viewer.run(), robot.run()):
             await viewer.ready.wait()
             await robot.ready.wait()
             for policy in ("drop-oldest", None):
@@ -138,13 +138,13 @@ async def test_a_queue_over_a_break_and_a_change_of_policy(corner: Corner) -> No
                     robot.publish(topic, bytes(4_000), "jpeg")
                 if policy is not None:
                     robot.change(policy)
-            await until(lambda: len(came) == 16)
+            await until("all 16", lambda: len(came) == 16)
             assert {number for number, _ in records} == {0, 1} and (1, "dropped") not in records
             await cut(link, robot)
             while len(came) == 16:  # what the link itself held when it broke is lost
                 robot.publish(topic, bytes(4_000), "jpeg")
                 await robot.ready.wait()
-                await until(lambda: not robot.queue.in_flight)
+                await until("an empty queue", lambda: not robot.queue.in_flight)
     assert all(message.sender == "a" and message.encoding == "jpeg" for message in came)
     assert [message.seq for message in came[:16]] == list(range(1, 17)) and came[-1].seq > 16
 
@@ -154,10 +154,10 @@ async def test_who_is_not_let_in_is_told_why(corner: Corner) -> None:
     async with relay(settings(rules=())) as server:
         stranger = Session(f"ws://127.0.0.1:{server.port}", "stranger")
         async with beside(stranger.run()):
-            await until(lambda: len(stranger.faults) > 1)
+            await until("another try", lambda: len(stranger.faults) > 1)
         assert "HTTP 403" in stranger.faults[0] and "no rule" in stranger.faults[0]
     with pytest.raises(RefusedError, match=r"ws://127.0.0.1:\d+: refused: unauthorized: token"):
-        await Session(corner.url, "stranger", token="x.y.z").run()
+        await wait("the refusal", Session(corner.url, "stranger", token="x.y.z").run())
 
 
 def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,9 +10,8 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
-from loop_cases import until
 from mutations import COUNT, SEED, mutated
-from relay_cases import Server, client, connect, relay, settings, stranger
+from relay_cases import Server, client, connect, relay, settings, stranger, until, wait, within
 from test_identity import Issuer
 from websockets.exceptions import WebSocketException
 
@@ -95,7 +94,7 @@ async def bystander(server: Server, attack: Callable[[int], Awaitable[None]]) ->
         for first in range(0, count, AT_ONCE):
             await robot.put("/open/it", b"%d" % first)
             attacks = [attack(k) for k in range(first, min(first + AT_ONCE, count))]
-            await asyncio.gather(watch(b"%d" % first), *attacks)
+            await wait("the attacks", asyncio.gather(watch(b"%d" % first), *attacks))
         await robot.put("/open/it", b"last")  # the attackers may have used up all other topics
         await watch(b"last")
 
@@ -121,7 +120,7 @@ async def test_broken_frames_on_sockets() -> None:
         await bystander(server, attack)
         assert server.hub.audit.refused > 0
         assert resident_bytes() - before < 200 * 2**20
-        await until(lambda: not server.hub.members)
+        await until("the attackers' ends", lambda: not server.hub.members)
         assert len(server.hub.store.sessions) < LIMITS.sessions
 
 
@@ -134,7 +133,7 @@ async def test_broken_handshakes() -> None:
                 writer.write(mutated(uniform, REQUEST, [REQUEST, b"GET /../server.py HTTP/1.1\r\n\r\n"]))
                 writer.write_eof()
                 with contextlib.suppress(OSError):
-                    assert b"import" not in await reader.read()
+                    assert b"import" not in await wait("the end", reader.read())
 
         await bystander(server, attack)
         assert any(entry.get("what") == "connection" for entry in server.hub.audit.recent)
@@ -153,7 +152,7 @@ async def test_slow_handshakes_keep_nobody_out() -> None:
                 assert one.welcome["op"] == "welcome"
             server.hub.audit.flush()
             assert server.hub.audit.refused == 20
-        await until(lambda: not server._door.waiting)
+        await until("the ends of all", lambda: not server._door.waiting)
         server.hub.audit.flush()
         assert server.hub.audit.refused == 60  # none of them had said a whole request
         async with client(server.port, local="127.0.0.2") as one:
@@ -174,7 +173,7 @@ async def test_half_a_request_and_no_hello_end_in_time() -> None:
         url = f"ws://127.0.0.1:{server.port}{wire.PATH}"
         with contextlib.suppress(WebSocketException, OSError):  # a busy machine may be late with the handshake already
             async with connect(url, subprotocols=[wire.SUBPROTOCOL], proxy=None) as socket:
-                await socket.wait_closed()
+                await wait("its end", socket.wait_closed())
         assert server.hub.members == {}
 
 
@@ -184,7 +183,7 @@ async def test_half_a_request_and_no_hello_end_in_time() -> None:
 async def test_no_hello(first: str | bytes, server: Server) -> None:
     async with connect(f"ws://127.0.0.1:{server.port}/relay", subprotocols=[wire.SUBPROTOCOL], proxy=None) as socket:
         await socket.send(first)
-        await socket.wait_closed()
+        await wait("its end", socket.wait_closed())
     assert server.hub.members == {}
 
 
@@ -198,7 +197,7 @@ async def test_many_connections_from_a_denied_address(tmp_path: Path) -> None:
                 before = resident_bytes()
             async with stranger(server.port, "127.0.0.9") as (reader, writer):
                 writer.write(REQUEST)
-                assert b"403 Forbidden" in await reader.read()
+                assert b"403 Forbidden" in await wait("a refusal", reader.read())
         assert resident_bytes() - before < 20 * 2**20
         server.hub.audit.flush()
         assert server.hub.audit.refused == count
@@ -218,7 +217,7 @@ async def test_pages_of_others_do_not_connect() -> None:
         ):
             async with stranger(server.port) as (reader, writer):
                 writer.write(REQUEST.replace(b"Host: 127.0.0.1", f"Host: {host}\r\nOrigin: {origin}".encode()))
-                assert status in await reader.readline(), origin
+                assert status in await wait("an answer", reader.readline()), origin
 
 
 def test_the_page_is_all_that_http_gives(tmp_path: Path) -> None:
@@ -243,7 +242,8 @@ async def test_a_client_that_reads_nothing_is_closed(monkeypatch: pytest.MonkeyP
     limits = Limits(messages_per_s=10**6)
     async with relay(settings(limits=limits)) as server, client(server.port, receive_buffer_bytes=16_384) as one:
         one.socket.transport.pause_reading()
-        with contextlib.suppress(WebSocketException, OSError):
+        async with within("its end"), contextlib.AsyncExitStack() as stack:
+            stack.enter_context(contextlib.suppress(WebSocketException, OSError))
             while server.hub.members:
                 await one.say("subscribe", id="a" * 200, topic="(")
                 await asyncio.sleep(0)

@@ -7,9 +7,8 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from loop_cases import until
 from mutations import COUNT, SEED, mutated
-from relay_cases import Server, client, relay, settings
+from relay_cases import Server, client, relay, settings, until, wait
 from test_identity import ANNA, Issuer
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
@@ -78,7 +77,9 @@ async def released(port: int) -> AsyncIterator[ClientConnection]:
 
 async def wanted(server: Server, patterns: int) -> None:
     """Return once clients have so many subscriptions in all: released ones are not told."""
-    await until(lambda: sum(len(member.subscriptions) for member in server.hub.members.values()) == patterns)
+    await until(
+        "subscriptions", lambda: sum(len(member.subscriptions) for member in server.hub.members.values()) == patterns
+    )
 
 
 async def test_released_clients_meet() -> None:
@@ -95,12 +96,12 @@ async def test_released_clients_meet() -> None:
         await ours.put("/robot/status", b"of another encoding")
         await ours.rest()
         await robot.send(STATUS)
-        assert await page.recv() == STATUS
+        assert await wait("a flatbuffer", page.recv()) == STATUS
         message = await ours.next()
         assert (message.encoding, message.type) == ("robofleet", "amrl_msgs/RobofleetStatus")
         assert bytes(message.payload) == STATUS
         await ours.put("/robot/status", STATUS, encoding="robofleet")
-        assert await page.recv() == STATUS
+        assert await wait("a flatbuffer", page.recv()) == STATUS
         await page.send(wants("/status", 0))
         await wanted(server, 1)
         await robot.send(STATUS)
@@ -113,10 +114,10 @@ async def test_released_clients_meet() -> None:
         await robot.send(command)
         message = await ours.next()
         assert (message.topic, message.seq, message.no_drop) == ("/robots/a/command", 1, True)
-        assert await page.recv() == command
+        assert await wait("a flatbuffer", page.recv()) == command
         await robot.send(b"garbage")
         with pytest.raises(ConnectionClosed):  # and it has heard nothing
-            await robot.recv()
+            await wait("the end", robot.recv())
 
 
 async def test_it_is_off_unless_asked_for() -> None:
@@ -137,7 +138,7 @@ async def test_a_token_lets_a_released_page_in(tmp_path: Path) -> None:
         await page.send(wants("status"))
         await wanted(server, 1)
         await robot.put("/robot/status", STATUS, encoding="robofleet")
-        assert await page.recv() == STATUS
+        assert await wait("a flatbuffer", page.recv()) == STATUS
         async with released(server.port) as nobody:
             await nobody.send(json.dumps({"id_token": issuer.token(exp=1.0)}))
-            await nobody.wait_closed()
+            await wait("the end", nobody.wait_closed())

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import beside, compiled, until
+from loop_cases import beside, compiled
 from made_up_robot import HALF_M, ODOMETRY, PICTURE, SCAN, MadeUp, Pose, cast, jpeg, odometry, picture, pose_at, scan
-from relay_cases import Corner, settings
+from relay_cases import Corner, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
@@ -109,7 +109,7 @@ async def watched(corner: Corner, source: Any, story: Any, **settings: Any) -> C
     viewer = Session(corner.url, "viewer")
     viewer.subscribe(f"^{corner.topic('')}", lambda message: came[message.topic.rpartition("/")[2]].append(message))
     async with beside(viewer.run()):
-        await viewer.ready.wait()
+        await wait("the viewer", viewer.ready.wait())
         async with beside(Robot(corner.url, corner.robot, source, capacity=16, **settings).run()):
             await story(viewer, came)
     return came
@@ -121,11 +121,13 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
     monkeypatch.setattr(robot, "QUEUE_S", 0.1)
 
     async def story(viewer: Session, came: Came) -> None:
-        await until(lambda: all(len(came[topic]) >= 2 for topic in ("odom", "scan", "camera", "queue", "status")))
+        await until(
+            "two of each", lambda: all(len(came[topic]) >= 2 for topic in ("odom", "scan", "camera", "queue", "status"))
+        )
         for wrong in ({"command": "policy", "policy": "oracle"}, "stop", 3):
-            await viewer.command(corner.command, wrong)
-        await viewer.command(corner.command, {"command": "policy", "policy": "drop-newest"})
-        await until(lambda: json.loads(bytes(came["queue"][-1].payload))["policy"] == "drop-newest")
+            await wait("an ack", viewer.command(corner.command, wrong))
+        await wait("an ack", viewer.command(corner.command, {"command": "policy", "policy": "drop-newest"}))
+        await until("the policy", lambda: json.loads(bytes(came["queue"][-1].payload))["policy"] == "drop-newest")
 
     came = await watched(corner, MadeUp(), story, policy="drop-oldest", policies=("drop-newest",))
     status = json.loads(bytes(came["status"][-1].payload))
@@ -163,7 +165,7 @@ async def test_a_recording_is_a_robot(corner: Corner, tmp_path: Path) -> None:
     """It is played again and again. (A busy machine may drop a scan, but not change their order.)"""
 
     async def story(viewer: Session, came: Came) -> None:
-        await until(lambda: len(came["scan"]) >= 12 and came["status"] and came["notes"])
+        await until("the recording, twice", lambda: len(came["scan"]) >= 12 and came["status"] and came["notes"])
 
     source = BagSource(recording(tmp_path / "drive.mcap"))
     assert [(stream.topic.name, stream.rate_hz) for stream in source.streams] == [("notes", 5.0), ("scan", 10.0)]

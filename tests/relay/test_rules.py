@@ -17,7 +17,7 @@ from bufgym.relay.config import Rule
 from bufgym.relay.hub import Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
-from bufgym.relay.store import Mailbox
+from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import Message
 
@@ -87,7 +87,7 @@ class Ear:
 
     def __init__(self, name: str, configuration: list[Rule], identity: Identity) -> None:
         self.identity = identity
-        self.session = Mailbox(name, identity, temporary=True)
+        self.session = StoredSession(name, identity, temporary=True)
         self.permissions = Permissions(configuration, identity)
         self.subscriptions = {"a": Subscription("a", pattern(".*"), policies.policy("drop-oldest"), 1)}
         self.came: set[str] = set()

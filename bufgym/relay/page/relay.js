@@ -2,7 +2,7 @@
 
 import {decode, fromJson} from "./messages.js";
 
-const RETRY_MS = 500;
+const FIRST_MS = 250, MOST_MS = 8000, HELD_MS = 5000;  // as in backoff.py
 
 export class Relay {
   // on: {state(text, isOn), welcome(), message(message), said(object), unauthorized(why)}
@@ -15,6 +15,7 @@ export class Relay {
     this.commands = [];                             // not answered yet; the first is on its way
     this.name = "page-" + [...crypto.getRandomValues(new Uint8Array(8))].map(byte => byte.toString(16).padStart(2, "0")).join("");
     this.token = new URLSearchParams(location.hash.slice(1)).get("token") ?? sessionStorage.getItem("token");
+    this.mostMs = FIRST_MS;                         // the longest delay until the next try
     this.connect();
   }
 
@@ -31,9 +32,11 @@ export class Relay {
     };
     this.socket.onmessage = event => this.hear(event.data);
     this.socket.onclose = () => {
+      if (this.welcome && performance.now() - this.since >= HELD_MS) this.mostMs = FIRST_MS;
       this.welcome = null;
       this.on.state("not connected", false);
-      if (!this.refused) setTimeout(() => this.connect(), RETRY_MS);
+      if (!this.refused) setTimeout(() => this.connect(), this.mostMs * Math.random());
+      this.mostMs = Math.min(2 * this.mostMs, MOST_MS);
     };
   }
 
@@ -87,6 +90,7 @@ export class Relay {
     if (said.op === "message") this.take(fromJson(said));
     else if (said.op === "welcome") {
       this.welcome = said;
+      this.since = performance.now();
       this.acked = said.received;
       for (const subscription of this.subscriptions.values()) this.say("subscribe", subscription);
       this.sendCommand();

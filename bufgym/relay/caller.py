@@ -1,0 +1,67 @@
+"""The other end of a WebSocket: its identity as far as it has proved it, and the answers that it is to be sent."""
+
+import asyncio
+from collections import deque
+from typing import Any, Final
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import WebSocketException
+
+from bufgym.ground.errors import BufgymError
+from bufgym.relay import wire
+from bufgym.relay.hub import Hub
+from bufgym.relay.identity import Verifier, certificate_email
+from bufgym.relay.rules import Identity, plain_address
+from bufgym.relay.subscriber import Subscription
+from bufgym.relay.wire import RefusedError
+
+POLICY_VIOLATION: Final = 1008
+
+
+class Caller:
+    """Whoever has connected, before its hello and after."""
+
+    def __init__(self, hub: Hub, socket: ServerConnection, verifier: Verifier | None, *, listens: bool = True) -> None:
+        """With ``listens`` False it is told nothing, because it would not understand."""
+        self.hub, self.socket = hub, socket
+        self.identity = Identity(plain_address(socket.remote_address[0]))
+        self.answers: deque[str] = deque()
+        self.subscriptions: dict[str, Subscription] = {}
+        self._verifier, self._listens = verifier, listens
+
+    async def prove(self, token: str | None) -> Identity:
+        """Learn who it is: by token, certificate, or address alone."""
+        tls = self.socket.transport.get_extra_info("ssl_object")
+        email, until_s = certificate_email(tls.getpeercert()) if tls is not None else "", float("inf")
+        if token is not None:
+            if self._verifier is None:
+                raise RefusedError("unauthorized", "token: this relay takes none")
+            email, until_s = await self._verifier.email(token)
+        self.identity = Identity(self.identity.address, email, until_s=until_s)
+        return self.identity
+
+    def tell(self, op: str, **fields: Any) -> None:
+        """Have this sent before any message."""
+        if self._listens:
+            self.answers.append(wire.say(op, **fields))
+
+    def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
+        """Tell it what is refused, and why; all but messages, which may come often, are audited here."""
+        code = error.code if isinstance(error, RefusedError) else "wrong"
+        if what != "publish":
+            self.hub.audit("refused", what=what, code=code, why=str(error), **self.identity.as_json())
+        self.tell("refused", what=what, code=code, why=str(error), **fields)
+
+    async def send_answers(self) -> None:
+        """Send all answers."""
+        while self.answers:
+            await self.socket.send(self.answers.popleft())
+
+    async def close(self, why: str) -> None:
+        """Send the last answers, and close."""
+        try:
+            async with asyncio.timeout(1.0):
+                await self.send_answers()
+                await self.socket.close(POLICY_VIOLATION, why)
+        except (WebSocketException, TimeoutError):
+            self.socket.transport.abort()

@@ -1,0 +1,132 @@
+"""What both ends decide, without sockets: when to try again, and what a frame leads to."""
+
+import contextlib
+import random
+from typing import Any
+
+import pytest
+from relay_cases import settings
+
+from bufgym.ground.errors import BufgymError
+from bufgym.policies import registry
+from bufgym.relay import backoff, protocol, wire
+from bufgym.relay.backoff import Backoff
+from bufgym.relay.config import Limits, Rule
+from bufgym.relay.quota import Quota, Quotas
+from bufgym.relay.rules import Identity, Permissions
+from bufgym.relay.wire import Message, RefusedError, WireError
+
+
+def test_tries_spread_out_and_begin_anew_after_a_connection_that_held() -> None:
+    """At most 0.25 s, twice as long each time, at most 8 s; two clients of one fleet never agree."""
+    now_s, drawn = 0.0, random.Random(3)
+    one, other = (Backoff(random.Random(seed), lambda: now_s) for seed in (3, 4))
+    for most_s in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 8.0):
+        assert one.delay_s() == drawn.uniform(0.0, most_s) != other.delay_s()
+    for held_s, most_s in ((backoff.HELD_S - 0.1, 8.0), (backoff.HELD_S, 0.25), (0.0, 0.5)):
+        one.connected()
+        now_s += held_s
+        assert one.delay_s() == drawn.uniform(0.0, most_s)
+    now_s += 100.0  # no connection held, however long the tries took
+    assert one.delay_s() == drawn.uniform(0.0, 1.0)
+
+
+ANNA = Identity("10.0.0.7", "anna@x.org")
+RULES = (Rule(address="10.0.0.0/8", send=True, receive=True, topic="/open/.*"),)
+CONFIG = settings(rules=RULES)
+
+
+@pytest.mark.parametrize(
+    ("first", "error"),
+    [
+        (b"\x00", "a binary frame: must be hello first"),
+        (wire.say("ack", seq=1), "ack: must be hello first"),
+        (wire.say("hello", version=9), "hello: must be of version 1, of form binary or json"),
+        (wire.say("hello", version=1, form="xml"), "hello: must be of version 1, of form binary or json"),
+        (wire.say("hello", version=1, session="a b"), "hello: session = 'a b': must be 1 to 64 letters"),
+        (wire.say("hello", version=1, name="relay"), "hello: name = 'relay': must be a name, not the relay's"),
+        (wire.say("hello", version=1, name="\n"), "hello: name '\\\\n': must be printable"),
+    ],
+)
+def test_a_hello_that_is_refused(first: str | bytes, error: str) -> None:
+    with pytest.raises(WireError, match=error):
+        protocol.admit(protocol.hello(first), ANNA, RULES, "fresh")
+
+
+def test_who_is_let_in_and_welcomed() -> None:
+    said = protocol.hello(wire.say("hello", version=1, session="a", received=3, acked=2))
+    admitted = protocol.admit(said, ANNA, RULES, "fresh")
+    assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2)
+    assert protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")[1:] == ("n", "fresh", True, "json", 0, 0)
+    welcome = protocol.welcome(CONFIG, admitted, ANNA, 5)
+    assert wire.heard(wire.say("welcome", **welcome))["received"] == 5 and welcome["session"] == "a"
+    assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*"}]
+    with pytest.raises(RefusedError, match="no rule allows anything"):
+        protocol.admit(said, Identity("11.0.0.1"), RULES, "fresh")
+
+
+def test_what_a_frame_asks() -> None:
+    message = Message("/open/a", b'{"x":1}', seq=2, no_drop=True)
+    assert protocol.asked(wire.encode(message), 100) == message
+    assert protocol.asked(wire.say("publish", topic="/open/a", data={"x": 1}, seq=2, no_drop=True), 0) == message
+    assert protocol.asked(wire.say("ack", seq=1), 0) == {"op": "ack", "seq": 1}
+    for frame, error in (
+        (wire.encode(message), "frame of 50 bytes: must be from 32 to 40"),
+        (wire.say("hello", version=1), "hello: must be one of subscribe, unsubscribe"),
+        ("x" * 2**21, "text of 2097152 characters"),
+    ):
+        with pytest.raises(WireError, match=error):
+            protocol.asked(frame, 40)
+
+
+def test_which_messages_are_taken() -> None:
+    """Topics under /open/, of which at most two; command is no_drop, and 1 to 3 of its messages were taken."""
+    limits = Limits(topics=2, messages_per_s=9)
+    permissions, quota = Permissions(RULES, ANNA), Quota(limits, 0.0)
+
+    def code(message: Message) -> bool | str:
+        no_drop = message.topic.endswith("command")
+        try:
+            return protocol.check(message, 3, permissions, quota, no_drop, 0.0)
+        except RefusedError as refused:
+            return refused.code
+
+    command = Message("/open/command", b"1", seq=3, no_drop=True)
+    assert code(command) is False and code(command._replace(seq=4)) is True
+    assert code(command._replace(seq=5)) == code(command._replace(seq=0)) == "out_of_order"
+    assert code(command._replace(no_drop=False)) == code(Message("/open/a", b"{")) == "wrong"
+    assert code(Message("/shut", b"1")) == code(Message("/relay/status", b"1")) == "unauthorized"
+    assert code(Message("/open/b", b"1")) == "too_many" and code(Message("/open/a", b"{", "raw")) is True
+    assert code(Message("/open/a", b"1")) == "too_fast" and code(command) is False
+
+
+@pytest.mark.parametrize(
+    ("asked", "error"),
+    [
+        ({"topic": "("}, "pattern"),
+        ({"policy": "afr"}, "policy 'afr': must be one of drop-oldest"),
+        ({"capacity": 0}, "capacity"),
+        ({"priority": -1}, "priority = -1.0: must be from 0 to 1e"),
+        ({"durable": True}, "durable: needs a session of a name"),
+        ({"id": "\n"}, "id"),
+    ],
+)
+def test_a_subscription_that_is_refused(asked: dict[str, Any], error: str) -> None:
+    policy = None if "policy" in asked else registry.get("drop-oldest")
+    with pytest.raises(BufgymError, match=error):
+        protocol.subscription({"id": "a", "topic": "a", **asked}, CONFIG, policy, True, lambda: 0)
+
+
+def test_a_quota_counts_what_its_connections_have() -> None:
+    """Two connections and three subscriptions at most; a connection that fails gives back what it had."""
+    quotas = Quotas(Limits(connections=2, subscriptions=3), lambda: 0.0)
+    with contextlib.suppress(ValueError), quotas.connection("a", {"x": 1, "y": 2}) as quota:
+        quota.subscribe("z", {})
+        with quotas.connection("a", {"z": 3}) as same, pytest.raises(RefusedError, match="at most 3 subscriptions"):
+            assert same is quota
+            quota.subscribe("x", {"x": 1})  # it replaces one
+            quota.subscribe("w", {"z": 3})
+        with quotas.connection("a", {}), pytest.raises(RefusedError, match="at most 2 connections"):
+            quotas.connection("a", {}).__enter__()
+        raise ValueError
+    assert quota.connections == []
