@@ -66,3 +66,7 @@ class Objective(ABC):
     def validate(self, policy: Policy) -> tuple[float, ...]:
         """The measures of an agent on the validation episodes."""
         return (self.measure(policy, self.judges),)
+
+    def validate_learner(self, learner: Any) -> tuple[float, ...]:
+        """The same of a learner that chooses among slots, where there are such."""
+        raise NotImplementedError
