@@ -64,8 +64,9 @@ class FixedEpisodes:
         """Outcomes of every registered policy of one queue, by name."""
         return {name: self.run(name) for name in registry.names(for_topics=False)}
 
-    def play(self, agent: Any, on: SlotEnvironment) -> list[Outcome]:
+    def play(self, agent: Any, on: Environment) -> list[Outcome]:
         """Outcomes of a learner that is asked when ``on`` says."""
+        assert isinstance(on, SlotEnvironment)
         cell = Cell("", self.scenario, self.capacity)
         return play(agent, MixedEnv([cell], [len(self.episodes)], decide_at=on.decide_at), self.episodes)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -27,6 +27,7 @@ FREE |= {"cluster", "backend", "address"}
 """Settings that may differ between a run and its resumption."""
 
 Numbers = tuple[float, ...]
+Some = TypeVar("Some", bound=Settings)
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def pool_of(workers: int) -> concurrent.futures.ProcessPoolExecutor:
     return concurrent.futures.ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
 
 
-def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settings, folder: Path) -> list[Run]:
+def each_seed(train: Callable[[Some, Path, int, int], Run], settings: Some, folder: Path) -> list[Run]:
     """Call ``train`` (settings, the run's folder, seed, line of its progress bar) for every seed, a process each."""
     seeds = range(settings.seed, settings.seed + settings.seeds)
     for seed in seeds:

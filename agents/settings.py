@@ -1,4 +1,4 @@
-"""The settings of training runs, which are the options of ``train.py``: a class for each algorithm, one for what all share.
+"""The settings of training runs, which are the options of ``train.py``: a class for each algorithm.
 
 The types hold the limits of single options, which are read from text once, and each class the rules of its own.
 """
@@ -19,6 +19,7 @@ from bufgym.scenario.uplink import RGBD_BYTES
 Kind = Literal["environment", "queue", "topics", "fleet"]
 """The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
 
+_KINDS: dict[str, Kind] = {"topics": "topics", "fleet": "fleet"}
 FLAT = Parameter(name="*")
 VALIDATIONS = 300
 """Episodes of a validation in an environment and on suites of one queue."""
@@ -88,8 +89,7 @@ class Suites:
     @property
     def kind(self) -> Kind:
         """The task of its suites."""
-        kind = suites.get(self.suite[0]).kind
-        return kind if kind in ("topics", "fleet") else "queue"
+        return _KINDS.get(suites.get(self.suite[0]).kind, "queue")
 
     def capacities_of(self, suite: str) -> tuple[int, ...]:
         """L to train for and to test at: the given ones, or the suite's."""
@@ -141,7 +141,7 @@ class Settings:
         if self.suites.suite and self.environment != type(self.environment)():
             raise BufgymError("--suite: it has environments of its own, so no setting of one (--env, --capacity, ...)")
         if self.kind not in self.kinds:
-            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} cannot learn {self.kind}")
+            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind ({self.kind})")
 
     @property
     def on(self) -> Environment | Suites:

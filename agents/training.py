@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import stable_baselines3 as sb3
 import torch
 from sb3_contrib import MaskablePPO
-from stable_baselines3 import PPO as PlainPPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -27,7 +28,6 @@ from agents import cma_es, guided_ppo
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.cluster import running
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
-from agents.evaluation import ValidationSets
 from agents.held_out import split_scenario
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives import OBJECTIVES
@@ -44,10 +44,10 @@ from bufgym.sb3.networks import policy_of
 
 def train_all(settings: Settings, folder: Path) -> list[Run]:
     """Train every seed, in processes of their own if there are several; with a cluster they share it."""
-    if settings.kind == "queue":
-        ValidationSets(settings, folder, progress=True)  # compute the clairvoyant's bounds once for all seeds
-    if not isinstance(settings, Evolve):
+    OBJECTIVES[settings.kind](settings, folder, settings.seed).prepare()
+    if isinstance(settings, Learner):
         return each_seed(train_seed, settings, folder)
+    assert isinstance(settings, Evolve)
     if settings.cluster is None:
         return each_seed(cma_es.train, settings, folder)
     with running(settings.cluster) as cluster:
@@ -74,7 +74,7 @@ def train_seed(settings: Learner, folder: Path, seed: int, line: int = 0, second
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
     env = ENVS[settings.kind](settings)
-    algorithm, new = class_of(settings), new_dqn if isinstance(settings, DQN) else new_ppo
+    algorithm, new = class_of(settings), LEARNERS[settings.algo]
     saved = checkpoints(home)
     torch.manual_seed(seed)  # for the first weights
     model = algorithm.load(saved[-1], env=env, device="cpu") if saved else new(settings, env)
@@ -86,7 +86,7 @@ def train_seed(settings: Learner, folder: Path, seed: int, line: int = 0, second
     progress = Progress(validation, settings, seed, line)
     left = settings.steps - model.num_timesteps
     if left > 0:
-        callbacks = [Checkpoints(home, settings.checkpoint_every), curve, validation, progress]
+        callbacks: list[BaseCallback] = [Checkpoints(home, settings.checkpoint_every), curve, validation, progress]
         if isinstance(settings, GuidedPPO):
             callbacks.append(guided_ppo.Budget(seconds, curve, settings.steps))
         # The library counts ``total_timesteps`` from here on when the count is not reset.
@@ -128,7 +128,7 @@ def validation_of(settings: Learner, folder: Path, home: Path, curve: Curve, ste
 
     def measure(model: Any) -> Numbers:
         if is_compiled(settings):
-            return objective.validate(weights.policy_of(weights_of(model), objective.name))
+            return objective.validate(weights.policy_of(objective.name, weights_of(model)))
         return objective.validate_learner(model)
 
     validations = Validations(home, objective.columns, objective.best, settings, steps)
@@ -175,16 +175,15 @@ ENVS: dict[str, Callable[[Any], VecEnv]] = {"environment": one_env, "queue": sui
 """Kind of task -> the batch of environments to train on."""
 
 
-def new_ppo(settings: PPO | GuidedPPO, env: VecEnv) -> MaskablePPO | PlainPPO:
+def new_ppo(settings: PPO | GuidedPPO, env: VecEnv) -> MaskablePPO | sb3.PPO:
     """Make an untrained actor and critic; a guided one is still the rule."""
     n_steps = settings.n_steps
     if isinstance(settings, GuidedPPO):
-        policy, policy_settings, masked = guided_ppo.GuidedPolicy, {"width": settings.width}, False
+        policy, policy_settings = guided_ppo.GuidedPolicy, {"width": settings.width}
         n_steps = min(n_steps, max(1, settings.steps // env.num_envs))
     else:
-        masked = not settings.unmasked
-        policy, policy_settings = policy_of(settings.network, settings.width, masked)
-    return (MaskablePPO if masked else PlainPPO)(
+        policy, policy_settings = policy_of(settings.network, settings.width, not settings.unmasked)
+    model: MaskablePPO | sb3.PPO = class_of(settings)(
         policy,
         env,
         learning_rate=LinearSchedule(settings.learning_rate, 0.0, 1.0),
@@ -198,6 +197,7 @@ def new_ppo(settings: PPO | GuidedPPO, env: VecEnv) -> MaskablePPO | PlainPPO:
         policy_kwargs=policy_settings,
         device="cpu",
     )
+    return model
 
 
 def even_batch(decisions: int, most: int) -> int:
@@ -242,14 +242,18 @@ def new_dqn(settings: DQN, env: VecEnv) -> MaskedDQN:
     )
 
 
-def class_of(settings: Learner) -> Any:
+def class_of(settings: Settings) -> Any:
     """The learner's class, by which its file is read."""
     if isinstance(settings, DQN):
         return MaskedDQN
-    return MaskablePPO if isinstance(settings, PPO) and not settings.unmasked else PlainPPO
+    return MaskablePPO if isinstance(settings, PPO) and not settings.unmasked else sb3.PPO
 
 
-def load(settings: Learner, run: Run) -> Any:
+LEARNERS: dict[str, Callable[[Any, VecEnv], Any]] = {"guided-ppo": new_ppo, "ppo": new_ppo, "dqn": new_dqn}
+"""Algorithm -> function that makes an untrained learner."""
+
+
+def load(settings: Settings, run: Run) -> Any:
     """The learner that the run kept."""
     torch.set_num_threads(1)  # on batches this small, more threads only wait for one another
     return class_of(settings).load(run.folder / "model.zip", device="cpu")

@@ -15,7 +15,7 @@ from train_cases import DropOldest
 from agents import mixed_env, runs, training
 from agents.dqn import INVALID, valid_actions
 from agents.evaluation import EvaluationSet, sweep_for
-from agents.settings import Settings
+from agents.settings import Evolve, Suites
 from bufgym import policies
 from bufgym.benchmark.run import draw
 from bufgym.model.qoi import exponential
@@ -27,7 +27,7 @@ from bufgym.sim import run
 SHORT = Interruption(law="uniform", t_min=6, t_max=30)
 STEEP = dataclasses.replace(SHORT, value=exponential(0.2))
 MIXED = [mixed_env.Cell("short", SHORT, 3), mixed_env.Cell("steep", STEEP, 5)]
-SUITE = Settings(suite="interruption-v1", capacities="4,8", validation_episodes=60)
+SUITE = Evolve(suites=Suites(("interruption-v1",), capacities=(4, 8)), validation_episodes=60)
 
 
 def mixed_rows(rows: int = 4, slots: int = 7) -> mixed_env.MixedEnv:
@@ -216,7 +216,7 @@ def test_a_record_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:
 
 
 def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
-    validations = runs.Validations(tmp_path, ("regret",), min, Settings(steps=40, validate_every=20), 0)
+    validations = runs.Validations(tmp_path, ("regret",), min, Evolve(steps=40, validate_every=20), 0)
     assert validations.due(0)
     best = [validations.add(steps, 0.0, (regret,)) for steps, regret in ((0, 0.5), (20, 0.4), (30, 0.4))]
     assert best == [True, True, False] and validations.best[0] == 20

@@ -71,8 +71,8 @@ def training_parts(chosen: Suites, seed: int) -> list[list[FleetEpisodes]]:
     for _ in range(PARTS):
         while len(waiting) < EPISODES:
             waiting += rng.permutation(len(links)).tolist()
-        chosen, waiting = [links[k] for k in waiting[:EPISODES]], waiting[EPISODES:]
-        short = [replace(link, uplink=replace(link.uplink, duration_s=EPISODE_S)) for link in chosen]
+        taken, waiting = [links[k] for k in waiting[:EPISODES]], waiting[EPISODES:]
+        short = [replace(link, uplink=replace(link.uplink, duration_s=EPISODE_S)) for link in taken]
         episodes = [draw(link, int(rng.integers(10**6))) for link in short]
         parts.append([FleetEpisodes(short[0], episodes, L) for L in chosen.capacities_of(chosen.suite[0])])
     return parts

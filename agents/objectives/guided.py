@@ -15,7 +15,6 @@ import numpy as np
 from agents.evaluation import qoi_of
 from agents.held_out import FixedEpisodes, fixed_episodes, split_scenario
 from agents.objectives.objective import Objective
-from agents.settings import SlotEnvironment
 from bufgym.benchmark.run import draw
 from bufgym.policies import Policy
 from bufgym.scenario import Episode
@@ -72,9 +71,7 @@ class GuidedObjective(Objective):
 
     def validate_learner(self, learner: Any) -> tuple[float, ...]:
         """The same of a learner."""
-        on = self.settings.environment
-        assert isinstance(on, SlotEnvironment)
-        return self._measures(self.judges.play(learner, on))
+        return self._measures(self.judges.play(learner, self.settings.environment))
 
     def _measures(self, outcomes: Sequence[Outcome]) -> tuple[float, ...]:
         # By QoI, which orders agents like the score, and is known even if nothing can be gained.

@@ -42,6 +42,10 @@ class SuitesObjective(Objective):
         """The suites' validation splits, made at first use: a worker that evaluates candidates needs none."""
         return ValidationSets(self.settings, self.folder)
 
+    def prepare(self) -> None:
+        """Compute the clairvoyant's bounds."""
+        ValidationSets(self.settings, self.folder, progress=True)
+
     def measure(self, policy: Policy, episodes: list[Family]) -> float:
         """Share of AFR's regret, mean over the suites."""
         return float(np.mean([family.share(policy) for family in episodes]))

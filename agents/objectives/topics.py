@@ -121,7 +121,7 @@ def mean_fitness(policy: Policy, parts: Sequence[ClientEpisodes]) -> float:
 def client_episodes(
     chosen: Suites, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
 ) -> list[ClientEpisodes]:
-    """Episodes of each setting of the one suite, its links ``scale`` times as fast; scale 0 varies each client by chance."""
+    """Episodes of each setting of the suite, its links ``scale`` times as fast; scale 0 varies clients by chance."""
     (suite,), rng = chosen.suite, np.random.default_rng(seed)
     drawn = []
     for setting in suites.get(suite).settings(split, chosen.data).values():
