@@ -86,7 +86,7 @@ class Validation(BetweenUpdates):
         home: the seed's folder.
         validations: the seed's validations so far.
         measure: model -> the measures in ``validations``' columns.
-        describe: the measures in words.
+        message: format of the last measure in words.
         curve: has the seconds of training.
     """
 
@@ -95,22 +95,16 @@ class Validation(BetweenUpdates):
         home: Path,
         validations: Validations,
         measure: Callable[[Any], Numbers],
-        describe: Callable[[Numbers], str],
+        message: str,
         curve: Curve,
     ) -> None:
         super().__init__()
-        self.home, self.validations, self.measure, self.describe, self.curve = (
-            home,
-            validations,
-            measure,
-            describe,
-            curve,
-        )
+        self.home, self.validations, self.measure, self.message, self.curve = home, validations, measure, message, curve
 
     def latest(self) -> str:
         """The latest validation in words."""
         rows = self.validations.rows
-        return self.describe(rows[-1][2:]) if rows else ""
+        return self.message.format(rows[-1][-1]) if rows else ""
 
     def _on_rollout_start(self) -> None:
         self.validate(self.model)

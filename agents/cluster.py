@@ -7,8 +7,10 @@ may wait for one another for ever. So training calls a cluster directly.
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
+from agents.settings import Cluster
 from bufgym.benchmark.cluster import WorkerDiedError, connected_ray, dask_client
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
@@ -19,25 +21,26 @@ CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]
 
 
 @contextmanager
-def running(backend: str, address: str | None) -> Iterator[str]:
-    """Yield the address of a ``ray`` or ``dask`` cluster; without one, run a cluster on this machine meanwhile.
+def running(cluster: Cluster) -> Iterator[Cluster]:
+    """Yield the cluster with its address; without one, run a cluster on this machine meanwhile.
 
     Raises BufgymError: the library is missing, or nothing answers at the address.
     """
-    with _client(backend, address) as client:
-        yield client.scheduler.address if backend == "dask" else client.get_runtime_context().gcs_address
+    with _client(cluster) as client:
+        found = client.scheduler.address if cluster.backend == "dask" else client.get_runtime_context().gcs_address
+        yield replace(cluster, address=found)
 
 
 @contextmanager
-def connected(backend: str, address: str | None) -> Iterator[CallEach]:
-    """Yield a caller that runs functions on a ``ray`` or ``dask`` cluster, where they must be importable.
+def connected(cluster: Cluster) -> Iterator[CallEach]:
+    """Yield a caller that runs functions on a cluster, where they must be importable.
 
     A Ray task, or a Dask worker with one thread, has a process to itself, which keeps the function's caches.
 
     Raises BufgymError as ``running`` does. The calls raise WorkerDiedError.
     """
-    with _client(backend, address) as client:
-        if backend == "dask":
+    with _client(cluster) as client:
+        if cluster.backend == "dask":
             died: tuple[type[Exception], ...] = (library("distributed", "dask").KilledWorker,)
 
             def call_each(function: Call, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
@@ -57,20 +60,25 @@ def connected(backend: str, address: str | None) -> Iterator[CallEach]:
             try:
                 return call_each(function, arguments)
             except died:
-                raise WorkerDiedError(f"{backend}: workers ended before their work did (out of memory?)") from None
+                raise WorkerDiedError(
+                    f"{cluster.backend}: workers ended before their work did (out of memory?)"
+                ) from None
 
         yield each
 
 
 @contextmanager
-def _client(backend: str, address: str | None) -> Iterator[Any]:
+def _client(cluster: Cluster) -> Iterator[Any]:
     """Yield Dask's client, or the connected module ``ray``."""
+    dask = cluster.backend == "dask"
     try:
-        client, own = (dask_client(address), True) if backend == "dask" else connected_ray(address)
+        client, own = (dask_client(cluster.address), True) if dask else connected_ray(cluster.address)
     except OSError as error:  # includes Ray's ConnectionError
-        raise BufgymError(f"{backend}: no cluster at {address}: {' '.join(str(error).split())}") from None
+        raise BufgymError(
+            f"{cluster.backend}: no cluster at {cluster.address}: {' '.join(str(error).split())}"
+        ) from None
     try:
         yield client
     finally:
         if own:
-            (client.close if backend == "dask" else client.shutdown)()
+            (client.close if dask else client.shutdown)()

@@ -27,7 +27,7 @@ from agents.cluster import connected
 from agents.objectives import OBJECTIVES
 from agents.objectives.objective import Objective, Vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
-from agents.settings import Settings
+from agents.settings import Evolve
 from bufgym.ground.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.guided import GuidedWeights
@@ -52,12 +52,12 @@ def evaluation_here(objective: Objective) -> Evaluate:
 
 
 @contextmanager
-def evaluation(settings: Settings, folder: Path, seed: int, objective: Objective) -> Iterator[Evaluate]:
-    """Evaluate as the settings say: here, or on the cluster at ``settings.address``, with that seed's ``objective``."""
-    if settings.backend == "local":
+def evaluation(settings: Evolve, folder: Path, seed: int, objective: Objective) -> Iterator[Evaluate]:
+    """Evaluate as the settings say: here, or on their cluster, with that seed's ``objective``."""
+    if settings.cluster is None:
         yield evaluation_here(objective)
         return
-    with connected(settings.backend, settings.address or None) as call_each:
+    with connected(settings.cluster) as call_each:
 
         def evaluate(candidates: Sequence[GuidedWeights], part: int) -> list[tuple[float, int]]:
             calls = [(settings, folder, seed, candidate, part) for candidate in candidates]
@@ -71,7 +71,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def evaluated_on_a_worker(
-    settings: Settings, folder: Path, seed: int, candidate: GuidedWeights, part: int
+    settings: Evolve, folder: Path, seed: int, candidate: GuidedWeights, part: int
 ) -> tuple[float, int]:
     """The fitness and the decisions of one candidate. Each process draws and bounds the episodes once."""
     with _ONE_AT_A_TIME:
@@ -79,7 +79,7 @@ def evaluated_on_a_worker(
 
 
 @functools.lru_cache(maxsize=32)  # several seeds, and runs one after the other, meet on one worker
-def _objective(settings: Settings, folder: Path, seed: int) -> Objective:
+def _objective(settings: Evolve, folder: Path, seed: int) -> Objective:
     return OBJECTIVES[settings.kind](settings, folder, seed)
 
 
@@ -133,7 +133,7 @@ class Evolution:
         return float(np.min(fitness))
 
 
-def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
+def train(settings: Evolve, folder: Path, seed: int, line: int = 0) -> Run:
     """Evolve one seed until ``settings.steps`` decisions were rolled out, from its last checkpoint if there is one.
 
     The agent with the best validation, the same measure on other episodes, is kept as ``model.safetensors``.
@@ -155,7 +155,12 @@ def train(settings: Settings, folder: Path, seed: int, line: int = 0) -> Run:
             if validations.due(state.steps):
                 measures = objective.validate(state.agent.policy(objective.name))
                 if validations.add(state.steps, state.seconds, measures):
-                    notes = {"name": objective.name, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
+                    notes = {
+                        "name": objective.name,
+                        "suite": ",".join(settings.suites.suite),
+                        "seeds": [seed],
+                        "algo": settings.algo,
+                    }
                     weights.save(home / MODEL, state.agent, notes)
                 report = objective.message.format(measures[-1])
                 bar.set_postfix_str(report, refresh=False)

@@ -149,9 +149,10 @@ def sweep_for(
     settings: Settings, suite: str, split: str, specs: tuple[str, ...] = ("afr",), seeds: int | None = None
 ) -> Sweep:
     """The fixed policies, episodes and capacities of a split of one of the run's suites."""
-    capacities, data = settings.capacities_of(suite), settings.data or None
+    chosen = settings.suites
+    capacities, data = chosen.capacities_of(suite), chosen.data
     if split == "validation":
-        share = math.ceil(settings.validation_episodes / len(settings.suites))
+        share = math.ceil(settings.validations() / len(chosen.suite))
         seeds = seeds_for(suite, split, capacities, share, data)
     return Sweep(suite, specs, split, capacities, seeds, data)
 
@@ -165,7 +166,7 @@ class ValidationSets:
         with FileLock(home / ".lock"):  # all seeds come here at once, and a sweep's folder refuses a second process
             self._sets = [
                 EvaluationSet(sweep_for(settings, suite, "validation"), home / suite, progress=progress)
-                for suite in settings.suites
+                for suite in settings.suites.suite
             ]
 
     def play(self, agent: Any, padded_slots: int) -> Verdict:
@@ -183,7 +184,9 @@ def _mean(verdicts: Sequence[Verdict]) -> Verdict:
 
 def test_rows(settings: Settings, policies: Sequence[Policy]) -> list[Row]:
     """The rows of these policies on the test split of the run's one suite, of any kind."""
-    sweep = Sweep(settings.suite, (), "test", settings.capacities_of(settings.suite), settings.test_seeds or None)
+    chosen = settings.suites
+    (suite,) = chosen.suite
+    sweep = Sweep(suite, (), "test", chosen.capacities_of(suite), chosen.test_seeds or None)
     rows = []
     for shard in sweep.checked().shards():
         scenario = sweep.setting(shard.label, shard.trace).scenario

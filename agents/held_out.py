@@ -13,7 +13,7 @@ import numpy as np
 
 from agents.evaluation import play
 from agents.mixed_env import Cell, MixedEnv
-from agents.settings import Settings
+from agents.settings import Environment, Settings, SlotEnvironment
 from bufgym import scenario as scenarios
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, percentile_interval, times_drawn
 from bufgym.benchmark.rows import Row
@@ -31,12 +31,12 @@ FIRST_SEED = {"validation": 2_000_000_000, "test": 1_000_000_000}
 """First seed of a split's episodes."""
 
 
-def split_scenario(settings: Settings) -> tuple[Scenario, Scenario]:
+def split_scenario(on: Environment) -> tuple[Scenario, Scenario]:
     """Training and held-out scenario, the same but for the traces; the last two traces are held out."""
-    base = scenarios.get(gym.spec(settings.env).kwargs["scenario"])
+    base = scenarios.get(gym.spec(on.env).kwargs["scenario"])
     if not isinstance(base, Uplink):
         return base, base
-    base = replace(base, size_bytes=settings.size_bytes, duration_s=settings.duration_s)
+    base = replace(base, size_bytes=on.size_bytes, duration_s=on.duration_s)
     traces, held_out = base.traces[:-HELD_OUT_TRACES], base.traces[-HELD_OUT_TRACES:]
     return replace(base, traces=traces), replace(base, traces=held_out)
 
@@ -47,10 +47,8 @@ class FixedEpisodes:
     ``validation`` has new episodes on the training traces, ``test`` has episodes on the held-out traces.
     """
 
-    def __init__(self, settings: Settings, split: str) -> None:
-        count = settings.validation_episodes if split == "validation" else settings.episodes
-        self.scenario = split_scenario(settings)[split == "test"]
-        self.capacity, self.decide_at = settings.capacity, settings.decide_at
+    def __init__(self, on: Environment, split: str, count: int) -> None:
+        self.scenario, self.capacity = split_scenario(on)[split == "test"], on.capacity
         # With uniform draws for policies that randomise.
         self.episodes = [draw(self.scenario, FIRST_SEED[split] + i) for i in range(count)]
         self._plans = [best(episode, self.capacity, self.scenario) for episode in self.episodes]
@@ -66,10 +64,11 @@ class FixedEpisodes:
         """Outcomes of every registered policy of one queue, by name."""
         return {name: self.run(name) for name in registry.names(for_topics=False)}
 
-    def play(self, agent: Any) -> list[Outcome]:
-        """Outcomes of a learner."""
+    def play(self, agent: Any, on: Environment) -> list[Outcome]:
+        """Outcomes of a learner that is asked when ``on`` says."""
+        assert isinstance(on, SlotEnvironment)
         cell = Cell("", self.scenario, self.capacity)
-        return play(agent, MixedEnv([cell], [len(self.episodes)], decide_at=self.decide_at), self.episodes)
+        return play(agent, MixedEnv([cell], [len(self.episodes)], decide_at=on.decide_at), self.episodes)
 
     def score(self, outcomes: Sequence[Outcome]) -> float:
         """0 for Drop Oldest, 1 for the clairvoyant; NaN where the two are equal."""
@@ -90,11 +89,10 @@ class FixedEpisodes:
 
 def fixed_episodes(settings: Settings, split: str) -> FixedEpisodes:
     """The episodes of these settings, whose bounds take seconds: a process makes them once for all algorithms."""
-    return _made(Settings(**{name: getattr(settings, name) for name in _MATTER}), split)
+    on = settings.environment
+    return _made(on, split, settings.validations() if split == "validation" else on.episodes)
 
 
-_MATTER = ("env", "size_bytes", "duration_s", "capacity", "decide_at", "validation_episodes", "episodes")
-"""Settings that the episodes depend on."""
 _made = functools.lru_cache(maxsize=4)(FixedEpisodes)
 
 

@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from agents.figure import draw
 from agents.held_out import fixed_episodes, summarise
 from agents.objectives import fleet, topics
 from agents.page import written
-from agents.runs import Run, write_notes
+from agents.runs import MODEL, Run, write_notes
 from agents.settings import Settings
 from bufgym.benchmark import summary
 from bufgym.benchmark.bootstrap import Interval
@@ -61,36 +62,49 @@ def by_hand() -> list[str]:
     return [name for name in registry.names(for_topics=False) if name not in learned and registry.get(name).ranked]
 
 
-def report(
-    settings: Settings, folder: Path, runs: Sequence[Run], beside: Sequence[Run], lines: Mapping[str, float]
-) -> None:
-    """Evaluate the agents of all seeds; print and save the results, and keep the best agent with its notes.
+@dataclass(frozen=True)
+class Trained:
+    """A run whose training has ended."""
 
-    ``beside`` are PPO's agents on the same actions, and ``lines`` the validation scores to beat.
-    """
-    # Chosen by validation or training episodes: choosing by the reported ones would flatter it.
-    best = max(runs, key=lambda run: run.merit)
+    settings: Settings
+    folder: Path
+    runs: Sequence[Run]
+    beside: Sequence[Run]
+    """PPO's agents on the same actions."""
+    lines: Mapping[str, float]
+    """The validation scores to beat."""
+
+    @property
+    def best(self) -> Run:
+        """Chosen by validation: choosing by the reported episodes would flatter it."""
+        return max(self.runs, key=lambda run: run.merit)
+
+    @property
+    def seeds(self) -> list[int]:
+        """Of all agents."""
+        return [run.seed for run in self.runs]
+
+    def save(self, home: Path, **results: Any) -> dict[str, Any]:
+        """Write results.json; return the best agent's QoI, for its notes."""
+        content = {
+            "settings": {"algo": self.settings.algo, **self.settings.values},
+            "seeds": self.seeds,
+            "agent": agent_name(self.best),
+            "training_s": {str(run.seed): run.seconds for run in self.runs},
+            **results,
+        }
+        (home / "results.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        qoi = {row["policy"]: row["qoi"] for row in results["scores"]}
+        return {"qoi": qoi[agent_name(self.best)], "drop-oldest": qoi["drop-oldest"], "held_out": results["held_out"]}
+
+
+def report(trained: Trained) -> None:
+    """Evaluate the agents of all seeds; print and save the results, and keep the best agent with its notes."""
+    best, folder = trained.best, trained.folder
     shutil.copyfile(best.model, folder / best.model.name)
-    seeds, notes = [best.seed], {}
-    contents = "model, rows, figure and numbers"
-    if settings.kind in ("topics", "fleet"):
-        seeds = [run.seed for run in runs]
-        report_rows(settings, folder, runs)
-        contents = f"best on validation: seed {best.seed}; model and rows"
-    elif settings.kind == "environment":
-        notes = report_environment(settings, folder, runs, best, beside, lines)
-        contents = "model, figure and numbers"
-    elif len(settings.suites) == 1:
-        notes = report_suite(settings, settings.suite, folder, folder, runs, best)[0]
-    else:
-        seeds = [run.seed for run in runs]
-        for suite in settings.suites:
-            print(f"\n{suite}")
-            score = report_suite(settings, suite, folder, folder / suite, runs, best)[1]
-            if math.isfinite(score.value):
-                notes[suite] = {"score": score.value, "interval": [score.low, score.high]}
-    write_notes(folder, settings, seeds, notes)
-    seconds = ", ".join(f"{run.seconds:.0f}" for run in (*runs, *beside))
+    seeds, notes, contents = REPORTS[trained.settings.kind](trained)
+    write_notes(folder, trained.settings, seeds, notes)
+    seconds = ", ".join(f"{run.seconds:.0f}" for run in (*trained.runs, *trained.beside))
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
 
 
@@ -99,70 +113,59 @@ def agent_name(run: Run) -> str:
     return f"agent (seed {run.seed})"
 
 
-def _save(home: Path, settings: Settings, runs: Sequence[Run], best: Run, **results: Any) -> dict[str, Any]:
-    """Write results.json; return the best agent's QoI, for its notes."""
-    content = {
-        "settings": dataclasses.asdict(settings),
-        "seeds": [run.seed for run in runs],
-        "agent": agent_name(best),
-        "training_s": {str(run.seed): run.seconds for run in runs},
-        **results,
-    }
-    (home / "results.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    qoi = {row["policy"]: row["qoi"] for row in results["scores"]}
-    return {"qoi": qoi[agent_name(best)], "drop-oldest": qoi["drop-oldest"], "held_out": results["held_out"]}
-
-
 RIVALS: dict[str, Callable[[], list[Policy]]] = {"topics": topics.rivals, "fleet": fleet.rivals}
 """Kind -> the fixed policies for comparison."""
 
 
-def report_rows(settings: Settings, folder: Path, runs: Sequence[Run]) -> None:
+Report = tuple[list[int], dict[str, Any], str]
+"""The seeds and scores for the notes of the kept agent, and what the folder holds."""
+
+
+def report_rows(trained: Trained) -> Report:
     """Write every seed's agent beside the fixed policies on the test split: rows.csv, and the table in results.txt."""
-    agents = [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in runs]
+    settings, folder = trained.settings, trained.folder
+    agents = [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in trained.runs]
     rows = test_rows(settings, [*agents, *RIVALS[settings.kind]()])
     task = TASKS[settings.kind]
     write_rows(rows, folder / "rows.csv", task.layout)
     text = summary.table_of(task.summary(rows)).plain()
     (folder / "results.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
+    return trained.seeds, {}, f"best on validation: seed {trained.best.seed}; model and rows"
 
 
-def report_environment(
-    settings: Settings,
-    folder: Path,
-    runs: Sequence[Run],
-    best: Run,
-    beside: Sequence[Run],
-    lines: Mapping[str, float],
-) -> dict[str, Any]:
-    """Evaluate all agents and fixed policies on the held-out episodes; return the best agent's notes."""
+def report_environment(trained: Trained) -> Report:
+    """Evaluate all agents and fixed policies on the held-out episodes."""
+    settings, best = trained.settings, agent_name(trained.best)
     test = fixed_episodes(settings, "test")
     outcomes = test.run_fixed()
-    names = {agent_name(run): run for run in runs} | {f"agent by PPO (seed {run.seed})": run for run in beside}
+    names = {agent_name(run): run for run in trained.runs}
+    names |= {f"agent by PPO (seed {run.seed})": run for run in trained.beside}
     for name, run in names.items():
-        compiled = run.model.suffix == ".safetensors"
-        outcomes[name] = test.run(load(run.model)) if compiled else test.play(training.load(settings, run))
+        if run.file == MODEL:
+            outcomes[name] = test.run(load(run.model))
+        else:
+            outcomes[name] = test.play(training.load(settings, run), settings.environment)
     rows = test.rows(outcomes)
-    entries, alike = summarise(outcomes, rows, agent_name(best)), same(rows)
-    print(table(entries, agent_name(best), alike))
-    print(verdict(entries, agent_name(best)))
+    entries, alike = summarise(outcomes, rows, best), same(rows)
+    print(table(entries, best, alike))
+    print(verdict(entries, best))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     held_out = {"episodes": len(test.episodes), "traces": traces}
-    notes = _save(folder, settings, runs, best, held_out=held_out, scores=entries)
+    notes = trained.save(trained.folder, held_out=held_out, scores=entries)
     unranked = apart(map(registry.get, registry.names()))
     bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in unranked}
     bars, twins = _drawn(bars, alike)
     draw(
-        folder / "figure.png",
+        trained.folder / "figure.png",
         {name: np.array(run.validation)[:, [1, 2]] for name, run in names.items()},
-        ("training, s", f"score on {settings.validation_episodes} validation episodes"),
+        ("training, s", f"score on {settings.validations()} validation episodes"),
         bars,
         f"{len(test.episodes)} episodes on held-out links" if traces else f"{len(test.episodes)} held-out episodes",
-        lines=lines,
+        lines=trained.lines,
         notes=twins,
     )
-    return notes
+    return [trained.best.seed], notes, "model, figure and numbers"
 
 
 def verdict(entries: Sequence[dict[str, Any]], agent: str) -> str:
@@ -206,9 +209,30 @@ def table(entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Seq
     return "\n".join([*aligned(lines), "score: 0 is Drop Oldest, 1 the clairvoyant", *told_once(alike)])
 
 
-def report_suite(
-    settings: Settings, suite: str, folder: Path, home: Path, runs: Sequence[Run], best: Run
-) -> tuple[dict[str, Any], Interval]:
+def report_suites(trained: Trained) -> Report:
+    """Score all agents on each suite, in a folder for each if there are several."""
+    names, contents = trained.settings.suites.suite, "model, rows, figure and numbers"
+    if len(names) == 1:
+        return [trained.best.seed], report_suite(trained, names[0], trained.folder)[0], contents
+    notes: dict[str, Any] = {}
+    for suite in names:
+        print(f"\n{suite}")
+        score = report_suite(trained, suite, trained.folder / suite)[1]
+        if math.isfinite(score.value):
+            notes[suite] = {"score": score.value, "interval": [score.low, score.high]}
+    return trained.seeds, notes, contents
+
+
+def agent_rows(settings: Settings, run: Run, evaluation: EvaluationSet) -> list[Row]:
+    """The kept agent's rows on a suite's test split."""
+    if run.file == MODEL:
+        outcomes = evaluation.run(load(run.model))
+    else:
+        outcomes = evaluation.play(training.load(settings, run), settings.suites.slots)
+    return evaluation.benchmark_rows(outcomes, f"agent ({settings.algo})", run.seed)
+
+
+def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, Any], Interval]:
     """Score all agents and fixed policies on the suite's test split, as ``bufgym bench`` does.
 
     The training seeds together are one entry, with intervals over seeds and over episodes. No choice is made here: each
@@ -218,10 +242,11 @@ def report_suite(
         (the best agent's notes, the score of the agents together).
     """
     specs = tuple(registry.names(for_topics=False))
-    sweep = sweep_for(settings, suite, "test", specs, settings.test_seeds or None)
-    evaluation = EvaluationSet(sweep, folder / "test" / suite, progress=True)
+    settings, runs = trained.settings, trained.runs
+    sweep = sweep_for(settings, suite, "test", specs, settings.suites.test_seeds or None)
+    evaluation = EvaluationSet(sweep, trained.folder / "test" / suite, progress=True)
     home.mkdir(exist_ok=True)
-    agents = {agent_name(run): training.test_rows(settings, run, evaluation) for run in runs}
+    agents = {agent_name(run): agent_rows(settings, run, evaluation) for run in runs}
     rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
     rows += [row for own in agents.values() for row in own]
     write_rows(rows, home / "rows.csv")
@@ -232,11 +257,8 @@ def report_suite(
         qoi.setdefault(row["policy"], []).append(row["qoi"])
     qoi |= {name: [row["qoi"] for row in own] for name, own in agents.items()}
     means = {name: float(np.mean(numbers)) for name, numbers in qoi.items()}
-    notes = _save(
+    notes = trained.save(
         home,
-        settings,
-        runs,
-        best,
         validation={str(run.seed): run.reached for run in runs},
         held_out={"suite": suite, "split": "test", "episodes": len(evaluation.rows) // len(evaluation.sweep.specs)},
         scores=[{"policy": name, "qoi": mean} for name, mean in means.items()],
@@ -264,3 +286,12 @@ def standings(result: Scores) -> str:
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
     note = f"{result.counted} of {total} cells (scenario, L) count; score: 0 is {BASELINE}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])
+
+
+REPORTS: dict[str, Callable[[Trained], Report]] = {
+    "environment": report_environment,
+    "queue": report_suites,
+    "topics": report_rows,
+    "fleet": report_rows,
+}
+"""Kind of task -> its report."""

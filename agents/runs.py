@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import csv
-import dataclasses
 import json
 import multiprocessing
 import os
@@ -11,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -23,10 +22,12 @@ from bufgym.ground.processes import end_with
 RUNS = Path("runs")
 MODEL = "model.safetensors"
 """The file of an agent whose weights bufgym runs without torch."""
-FREE = {"name", "resume", "steps", "checkpoint_every", "validate_every", "episodes", "seeds", "backend", "address"}
+FREE = {"command", "name", "resume", "steps", "checkpoint_every", "validate_every", "episodes", "seeds"}
+FREE |= {"cluster", "backend", "address"}
 """Settings that may differ between a run and its resumption."""
 
 Numbers = tuple[float, ...]
+Some = TypeVar("Some", bound=Settings)
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,6 @@ class Run:
 
 def prepare(settings: Settings) -> Path:
     """The run's folder: made for a new run, checked against these settings for a resumed one."""
-    settings.checked()
     folder = RUNS / (settings.name or _default_name(settings.resume))
     if settings.resume:
         if not (folder / "settings.json").exists():
@@ -75,7 +75,8 @@ def prepare(settings: Settings) -> Path:
         raise BufgymError(f"{folder} exists: choose another --name, or --resume it")
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
-        values = dataclasses.asdict(settings)
+        text = json.dumps({"command": settings.command, "algo": settings.algo, **settings.values}, indent=2) + "\n"
+        values = json.loads(text)
         if settings.resume:
             before = read_settings(folder)
             changed = [name for name in values if name not in FREE and before.get(name) != values[name]]
@@ -83,7 +84,7 @@ def prepare(settings: Settings) -> Path:
                 changes = ", ".join(f"{name} was {before.get(name)!r}, now {values[name]!r}" for name in changed)
                 raise BufgymError(f"--resume: give the settings that the run in {folder} began with: {changes}")
         with replaced(folder / "settings.json") as file:
-            file.write_text(json.dumps({"command": settings.command, **values}, indent=2) + "\n", encoding="utf-8")
+            file.write_text(text, encoding="utf-8")
     return folder
 
 
@@ -119,7 +120,7 @@ def pool_of(workers: int) -> concurrent.futures.ProcessPoolExecutor:
     return concurrent.futures.ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
 
 
-def each_seed(train: Callable[[Settings, Path, int, int], Run], settings: Settings, folder: Path) -> list[Run]:
+def each_seed(train: Callable[[Some, Path, int, int], Run], settings: Some, folder: Path) -> list[Run]:
     """Call ``train`` (settings, the run's folder, seed, line of its progress bar) for every seed, a process each."""
     seeds = range(settings.seed, settings.seed + settings.seeds)
     for seed in seeds:
@@ -198,7 +199,7 @@ class Validations:
         if not self.rows:
             return True
         since = steps - self.rows[-1][0]
-        return since >= self.settings.validate_every or ((last or steps >= self.settings.steps) and since > 0)
+        return since >= self.settings.every or ((last or steps >= self.settings.steps) and since > 0)
 
     def add(self, steps: int, seconds: float, measures: Numbers) -> bool:
         """Add a validation; return whether it is the best so far."""

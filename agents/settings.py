@@ -1,16 +1,16 @@
-"""The settings of a training run, which are the options of ``train.py``, and the rules they must keep."""
+"""The settings of training runs, which are the options of ``train.py``: a class for each algorithm.
+
+The types hold the limits of single options, which are read from text once, and each class the rules of its own.
+"""
 
 from __future__ import annotations
 
-import math
-import shlex
-from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Literal, NoReturn, get_args, get_origin, get_type_hints
+from dataclasses import dataclass, is_dataclass
+from typing import Annotated, Any, ClassVar, Literal
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
-from bufgym import ENVIRONMENTS
+from bufgym.cli.options import Capacities, Count, Least0, Natural, Positive, checked, command_line
 from bufgym.ground.errors import BufgymError
 from bufgym.policies.weights import MAX_WIDTH
 from bufgym.scenario import Uplink, suites
@@ -19,184 +19,246 @@ from bufgym.scenario.uplink import RGBD_BYTES
 Kind = Literal["environment", "queue", "topics", "fleet"]
 """The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
 
-PPO_VALIDATES = 65_536
-"""Steps between validations of guided-ppo, two of its updates: it is best within half a million decisions."""
-_ALONE = {"topics": ("a scheduler", ("guided",)), "fleet": ("a fleet's agent", ("guided", "maskable-ppo"))}
-"""Kinds for one suite alone, with the trained agent and its algorithms."""
+_KINDS: dict[str, Kind] = {"topics": "topics", "fleet": "fleet"}
+FLAT = Parameter(name="*")
+VALIDATIONS = 300
+"""Episodes of a validation in an environment and on suites of one queue."""
 
-
-def _number(**limits: float) -> Parameter:
-    return Parameter(validator=Number(**limits))
-
-
-Count = Annotated[int, _number(gte=1)]
-Natural = Annotated[int, _number(gte=0)]
-Share = Annotated[float, _number(gte=0, lte=1)]
-Positive = Annotated[float, _number(gt=0, lt=math.inf)]
+Seed = Annotated[int, checked(int, lambda number: 0 <= number < 2**31, "a whole number >= 0 and < 2^31")]
+TestSeeds = Annotated[int, checked(int, lambda number: 0 <= number <= 1000, "a whole number from 0 to 1000")]
+Batch = Annotated[int, checked(int, lambda number: number >= 2, "a whole number >= 2")]
+Share = Annotated[float, checked(float, lambda number: 0 <= number <= 1, "a number from 0 to 1")]
+Names = Annotated[tuple[str, ...], checked(lambda text: tuple(text.split(",")), all, "names such as lte-v1,outage-v1")]
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Train an agent on a bufgym environment, or on a whole suite, and evaluate it on held-out episodes."""
+class Environment:
+    """One environment to train in."""
 
-    env: str = "bufgym/Uplink-v0"
+    kind: ClassVar[Kind] = "environment"
+    env: Literal["bufgym/Uplink-v0", "bufgym/Interruption-v0"] = "bufgym/Uplink-v0"
     """Gymnasium id."""
-    suite: str = ""
+    capacity: Count = 8
+    """L, messages."""
+    size_bytes: Count = RGBD_BYTES
+    """Mean message size (uplink only)."""
+    duration_s: Positive = Uplink.duration_s
+    """Length of an episode (uplink only)."""
+    episodes: Count = 200
+    """Held-out episodes in the evaluation."""
+
+    def __post_init__(self) -> None:
+        if "Uplink" not in self.env and (self.size_bytes, self.duration_s) != (RGBD_BYTES, Uplink.duration_s):
+            raise BufgymError(f"{self.env}: its messages have no size and its episodes no length to set")
+
+
+@dataclass(frozen=True)
+class SlotEnvironment(Environment):
+    """One environment, for an agent that chooses among slots."""
+
+    decide_at: Literal["overflow", "arrival"] = "overflow"
+    """When the agent is asked: only when the buffer is full, or at every arrival."""
+
+
+@dataclass(frozen=True)
+class Suites:
+    """Suites to train on instead of an environment."""
+
+    suite: Names = ()
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
     validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
     them at once. A suite of many topics (topics-v1) makes a scheduler, one of a fleet (fleet-v1) an agent
     that all its robots share."""
-    data: str = ""
+    data: str | None = None
     """Folder of recordings, for suites that need one."""
-    capacities: str = ""
+    capacities: Capacities = ()
     """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
-    algo: Literal["guided", "guided-ppo", "maskable-ppo", "ppo", "dqn"] = "guided"
-    """guided: CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue). guided-ppo: PPO on the
-    same numbers, in an environment. On slots: PPO with action masks, PPO without, and double DQN with masks."""
-    beside: bool = True
-    """With guided, in an environment: then train guided-ppo for no longer, to compare."""
+    test_seeds: TestSeeds = 0
+    """Test episodes on each trace of a suite; 0: as many as the suite says."""
+
+    def __post_init__(self) -> None:
+        if not self.suite and any(vars(self).values()):
+            raise BufgymError("--data, --capacities and --test-seeds are of a suite, which --suite names")
+        if len(self.suite) > 1 and {"topics", "fleet"} & {suites.get(name).kind for name in self.suite}:
+            raise BufgymError(
+                f"suite {','.join(self.suite)}: an agent for topics or a fleet learns from one suite alone"
+            )
+        for name in self.suite:
+            suites.get(name).settings("validation", self.data)  # raises here if recordings are missing
+
+    @property
+    def kind(self) -> Kind:
+        """The task of its suites."""
+        return _KINDS.get(suites.get(self.suite[0]).kind, "queue")
+
+    def capacities_of(self, suite: str) -> tuple[int, ...]:
+        """L to train for and to test at: the given ones, or the suite's."""
+        return self.capacities or suites.get(suite).capacities
+
+    @property
+    def slots(self) -> int:
+        """Slots that one agent of all suites observes."""
+        return max(L for suite in self.suite for L in self.capacities_of(suite))
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where candidates are evaluated instead of the seed's process."""
+
+    backend: Literal["ray", "dask"]
+    """Evaluate the candidates on a Ray or Dask cluster, with the same result. Its workers must be able to import bufgym
+    and agents."""
+    address: str | None = None
+    """Of the cluster's head, such as tcp://host:8786; by default a cluster on this machine is begun and ended."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all algorithms share."""
+
+    algo: ClassVar[str]
+    """The command of ``train.py``, which names the agents in tables too."""
+    kinds: ClassVar[tuple[Kind, ...]] = ("environment",)
+    """The tasks it can learn."""
+    steps: Natural
+    validate_every: Natural = 0
+    """Steps; 0: a sixth of them."""
+    validation_episodes: Natural = 0
+    """About so many in each validation, over all scenarios and capacities; 0: 300, or 6 for each link of topics and 4
+    for each of a fleet."""
+    environment: Annotated[Environment, FLAT] = Environment()
+    suites: Annotated[Suites, FLAT] = Suites()
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
     """Go on from the run's last checkpoint."""
     seeds: Count = 1
     """Train this many agents, each in a process of its own."""
-    backend: Literal["local", "ray", "dask"] = "local"
-    """Where the candidates of --algo guided are evaluated: in the seed's process, or on a Ray or Dask cluster, with
-    the same result. Its workers must be able to import bufgym and agents."""
-    address: str = ""
-    """Of the cluster's head, such as tcp://host:8786; by default a cluster on this machine is begun and ended."""
-    seed: Annotated[int, _number(gte=0, lt=2**31)] = 0
+    seed: Seed = 0
     """The first seed."""
-    steps: Natural = 0
-    """Decisions to learn from, for each seed; 0: 40 million for guided, otherwise 1.5 million."""
-    capacity: Count = 8
-    """L, messages (without a suite)."""
-    size_bytes: Count = RGBD_BYTES
-    """Mean message size (uplink only)."""
-    duration_s: Positive = Uplink.duration_s
-    """Length of an episode (uplink only)."""
-    decide_at: Literal["overflow", "arrival"] = "overflow"
-    """When the agent is asked: only when the buffer is full, or at every arrival."""
+
+    def __post_init__(self) -> None:
+        if self.suites.suite and self.environment != type(self.environment)():
+            raise BufgymError("--suite: it has environments of its own, so no setting of one (--env, --capacity, ...)")
+        if self.kind not in self.kinds:
+            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind ({self.kind})")
+
+    @property
+    def on(self) -> Environment | Suites:
+        """What it trains on."""
+        return self.suites if self.suites.suite else self.environment
+
+    @property
+    def kind(self) -> Kind:
+        """The task of the run."""
+        return self.on.kind
+
+    @property
+    def every(self) -> int:
+        """Steps between validations."""
+        return self.validate_every or -(-self.steps // 6)
+
+    def validations(self, usual: int = VALIDATIONS, cells: int = 1) -> int:
+        """Episodes of a validation in each of so many cells."""
+        return max(1, round(self.validation_episodes / cells)) if self.validation_episodes else usual
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Every option with its value."""
+        found: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            found |= vars(value) if is_dataclass(value) else {name: value}
+        return found
+
+    @property
+    def command(self) -> str:
+        """The command that trains it again, with all settings that differ from the defaults."""
+        usual = {"backend": None, "address": None, **type(self)().values}  # type: ignore[call-arg]
+        here = ("name", "resume", "backend", "address")
+        changed = {name: value for name, value in self.values.items() if name not in here and value != usual[name]}
+        return command_line(f"python train.py {self.algo}", **changed)
+
+
+@dataclass(frozen=True)
+class Evolve(Settings):
+    """Evolve an agent by CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue)."""
+
+    algo = "evolve"
+    kinds = ("environment", "queue", "topics", "fleet")
+    steps: Natural = 40_000_000
+    """Decisions to learn from, for each seed."""
+    cluster: Annotated[Cluster | None, FLAT] = None
+
+
+@dataclass(frozen=True)
+class Learner(Settings):
+    """What all algorithms share that learn from single decisions."""
+
+    steps: Natural = 1_500_000
+    """Decisions to learn from, for each seed."""
     reward: Literal["retained", "delivered"] = "retained"
-    network: Literal["slots", "plain"] = "slots"
-    """One small network for every slot, or one over all numbers at once."""
     width: Count = 32
     """Hidden units a layer."""
     num_envs: Count = 256
     n_steps: Count = 128
     """Steps in each environment between updates."""
-    batch_size: Annotated[int, _number(gte=2)] = 4096
+    batch_size: Batch = 4096
     epochs: Count = 4
     """Passes over each batch of experience."""
     learning_rate: Positive = 2e-3
     """At the start; falls linearly to 0."""
     gamma: Share = 0.9
     """``retained`` pays at once what a decision costs, so a short sight suffices and keeps the noise of motion out."""
-    gae_lambda: Share = 0.9
-    entropy: Annotated[float, _number(gte=0, lt=math.inf)] = 0.0
-    """Weight of the entropy bonus."""
     checkpoint_every: Count = 250_000
     """Steps."""
-    validate_every: Natural = 0
-    """Steps; 0: a sixth of them, and 65,536 for guided-ppo."""
-    validation_episodes: Count = 300
-    """About so many in each validation, with a suite over all scenarios and capacities."""
-    test_seeds: Annotated[int, _number(gte=0, lte=1000)] = 0
-    """Test episodes on each trace of a suite; 0: as many as the suite says."""
-    episodes: Count = 200
-    """Held-out episodes in the evaluation (without a suite)."""
 
-    @property
-    def suites(self) -> tuple[str, ...]:
-        """Names in ``suite``."""
-        return tuple(filter(None, self.suite.split(",")))
 
-    @property
-    def kind(self) -> Kind:
-        """The task of the run."""
-        kinds = {suites.get(suite).kind for suite in self.suites}
-        if not kinds:
-            return "environment"
-        return "topics" if "topics" in kinds else "fleet" if "fleet" in kinds else "queue"
+@dataclass(frozen=True)
+class ActorCritic(Learner):
+    """What both kinds of PPO share."""
 
-    @property
-    def evolves(self) -> bool:
-        """Whether CMA-ES trains the agent."""
-        return self.algo == "guided"
+    gae_lambda: Share = 0.9
+    entropy: Least0 = 0.0
+    """Weight of the entropy bonus."""
 
-    def capacities_of(self, suite: str) -> tuple[int, ...]:
-        """L to train for and to test at: the given ones, or the suite's."""
-        if not self.capacities:
-            return suites.get(suite).capacities
-        try:
-            capacities = tuple(int(part) for part in self.capacities.split(","))
-        except ValueError:
-            self._refuse("capacities", "must be whole numbers such as 5,10,25")
-        if min(capacities) < 1 or len(set(capacities)) < len(capacities):
-            self._refuse("capacities", "must be whole numbers >= 1, no two alike")
-        return capacities
 
-    @property
-    def command(self) -> str:
-        """The command that trains it again, with all settings that differ from the defaults."""
-        defaults = asdict(Settings())
-        words = [
-            f"--{name.replace('_', '-')} {shlex.quote(str(value))}"
-            for name, value in asdict(self).items()
-            if name not in ("name", "resume", "backend", "address") and value != defaults[name]
-        ]
-        return " ".join(["python train.py", *words])
+@dataclass(frozen=True)
+class GuidedPPO(ActorCritic):
+    """Train by PPO on the numbers that evolve sets, in an environment."""
 
-    def resolved(self) -> Settings:
-        """These settings with the steps that suit the algorithm, where they are left open."""
-        steps = self.steps or (40_000_000 if self.evolves else 1_500_000)
-        every = PPO_VALIDATES if self.algo == "guided-ppo" else -(-steps // 6)
-        return replace(self, steps=steps, validate_every=self.validate_every or every)
+    algo = "guided-ppo"
+    validate_every: Natural = 65_536
+    """Steps; two updates, as it is best within half a million decisions. 0: a sixth of all."""
+    suites: Annotated[Suites, Parameter(parse=False)] = Suites()
+    learning_rate: Positive = 1e-3
+    """At the start; falls linearly to 0."""
 
-    def checked(self) -> Settings:
-        """Check these settings and return them; a BufgymError names the first that breaks a rule, and the rule."""
-        for name, hint in get_type_hints(Settings, include_extras=True).items():
-            value = getattr(self, name)
-            for part in getattr(hint, "__metadata__", ()):
-                for check in part.validator:
-                    try:
-                        check(type(value), value)
-                    except ValueError as broken:
-                        self._refuse(name, str(broken).replace("Must", "must").rstrip("."))
-            if get_origin(hint) is Literal and value not in get_args(hint):
-                self._refuse(name, f"must be one of {', '.join(get_args(hint))}")
-        if self.kind == "environment" and self.env not in ENVIRONMENTS:
-            self._refuse("env", f"must be one of {', '.join(ENVIRONMENTS)}")
-        if self.kind == "environment" and self.env == "bufgym/Topics-v0":
-            self._refuse("env", "a scheduler learns from a suite of topics (--suite topics-v1 --algo guided)")
-        if self.algo == "guided-ppo" and self.kind != "environment":
-            self._refuse("algo", "PPO on the numbers of a rule learns in an environment, without --suite")
-        if self.backend != "local" and not self.evolves:
-            self._refuse("backend", "a cluster evaluates the candidates of --algo guided alone")
-        if self.address and self.backend == "local":
-            self._refuse("address", "is that of a cluster: name its kind (--backend ray or dask)")
-        if self.kind in _ALONE:
-            agent, algorithms = _ALONE[self.kind]
-            if len(self.suites) > 1 or self.algo not in algorithms:
-                rule = f"{agent} learns from one suite alone, by --algo {' or '.join(algorithms)}"
-                raise BufgymError(f"suite {self.suite}: {rule}")
-        if self.kind == "fleet" and self.algo == "maskable-ppo":
-            if self.network != "slots":
-                self._refuse("network", "a fleet's agent scores slots")
-            if self.width > MAX_WIDTH:
-                self._refuse("width", f"a fleet's agent has at most {MAX_WIDTH} hidden units a layer")
-        if self.kind == "queue":
-            self._check_suites()
-        if self.capacities:
-            self.capacities_of("")
-        return self
 
-    def _check_suites(self) -> None:
-        """Check the rules of suites of one queue."""
-        for name in self.suites:
-            suite = suites.get(name)
-            suite.settings("validation", self.data or None)  # raises here if recordings are missing
+@dataclass(frozen=True)
+class PPO(ActorCritic):
+    """Train by PPO with action masks, on the slots of the buffer."""
 
-    def _refuse(self, name: str, rule: str) -> NoReturn:
-        raise BufgymError(f"{name} = {getattr(self, name)!r}: {rule}")
+    algo = "ppo"
+    kinds = ("environment", "queue", "fleet")
+    environment: Annotated[SlotEnvironment, FLAT] = SlotEnvironment()
+    network: Literal["slots", "plain"] = "slots"
+    """One small network for every slot, or one over all numbers at once."""
+    unmasked: bool = False
+    """Without masks: an invalid action does what a queue does."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind == "fleet" and (self.network != "slots" or self.unmasked or self.width > MAX_WIDTH):
+            rule = f"scores slots with masks, by at most {MAX_WIDTH} hidden units a layer"
+            raise BufgymError(f"suite {self.suites.suite[0]}: a fleet's agent {rule}")
+
+
+@dataclass(frozen=True)
+class DQN(Learner):
+    """Train by double DQN with action masks, on the slots of the buffer."""
+
+    algo = "dqn"
+    kinds = ("environment", "queue")
+    environment: Annotated[SlotEnvironment, FLAT] = SlotEnvironment()
+    network: Literal["slots", "plain"] = "slots"
+    """One small network for every slot, or one over all numbers at once."""

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import stable_baselines3 as sb3
 import torch
 from sb3_contrib import MaskablePPO
-from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -27,44 +28,44 @@ from agents import cma_es, guided_ppo
 from agents.callbacks import Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.cluster import running
 from agents.dqn import MaskedDQN, MaskedDQNPolicy, dqn_policy_of
-from agents.evaluation import EvaluationSet, ValidationSets, Verdict
-from agents.held_out import fixed_episodes, split_scenario
+from agents.held_out import split_scenario
 from agents.mixed_env import MixedEnv, cells
-from agents.objectives.fleet import FleetObjective, fleet_of
+from agents.objectives import OBJECTIVES
+from agents.objectives.fleet import fleet_of
 from agents.runs import MODEL, Numbers, Run, Validations, each_seed
-from agents.settings import Settings
-from bufgym.benchmark.rows import Row
+from agents.settings import DQN, PPO, Evolve, GuidedPPO, Learner, Settings, SlotEnvironment
 from bufgym.envs import FleetVecEnv
 from bufgym.ground.errors import BufgymError
-from bufgym.policies import learned, weights
-from bufgym.policies import load as load_policy
-from bufgym.sb3 import GymVecEnv, make_vec_env, weights_of
+from bufgym.policies import weights
+from bufgym.sb3 import GymVecEnv, make_vec_env
+from bufgym.sb3 import weights_of as slot_weights
 from bufgym.sb3.networks import policy_of
 
 
 def train_all(settings: Settings, folder: Path) -> list[Run]:
     """Train every seed, in processes of their own if there are several; with a cluster they share it."""
-    if settings.kind == "queue":
-        ValidationSets(settings, folder, progress=True)  # compute the clairvoyant's bounds once for all seeds
-    if settings.backend == "local":
-        return each_seed(cma_es.train if settings.evolves else train_seed, settings, folder)
-    with running(settings.backend, settings.address or None) as address:
-        return each_seed(cma_es.train, replace(settings, address=address), folder)
+    OBJECTIVES[settings.kind](settings, folder, settings.seed).prepare()
+    if isinstance(settings, Learner):
+        return each_seed(train_seed, settings, folder)
+    assert isinstance(settings, Evolve)
+    if settings.cluster is None:
+        return each_seed(cma_es.train, settings, folder)
+    with running(settings.cluster) as cluster:
+        return each_seed(cma_es.train, replace(settings, cluster=cluster), folder)
 
 
 def train_beside(settings: Settings, folder: Path, runs: Sequence[Run]) -> list[Run]:
-    """With ``settings.beside``: PPO on the same actions, for no longer than the longest of the runs."""
-    if not (settings.beside and settings.algo == "guided" and settings.kind == "environment"):
-        return []
+    """PPO on the actions of evolved agents, for no longer than the longest of their runs."""
     home, seconds = folder / "ppo", max(run.seconds for run in runs)
     home.mkdir(exist_ok=True)
     print(f"PPO on the same actions, for at most {seconds:.0f} s")
-    usual = replace(settings, algo="guided-ppo", steps=0, validate_every=0).resolved()
-    other = replace(usual, steps=min(settings.steps, usual.steps))
+    shared = ("environment", "validation_episodes", "name", "resume", "seeds", "seed")
+    steps = min(settings.steps, GuidedPPO.steps)
+    other = GuidedPPO(steps=steps, **{name: getattr(settings, name) for name in shared})
     return each_seed(functools.partial(train_seed, seconds=seconds), other, home)
 
 
-def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, seconds: float = math.inf) -> Run:
+def train_seed(settings: Learner, folder: Path, seed: int, line: int = 0, seconds: float = math.inf) -> Run:
     """Train one seed for its steps or so many seconds, from its latest checkpoint if any.
 
     ``line`` is the line of its progress bar.
@@ -72,8 +73,8 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, secon
     torch.set_num_threads(1)
     home = folder / f"seed-{seed}"
     home.mkdir(exist_ok=True)
-    env = training_env(settings)
-    algorithm, new = LEARNERS[settings.algo]
+    env = ENVS[settings.kind](settings)
+    algorithm, new = class_of(settings), LEARNERS[settings.algo]
     saved = checkpoints(home)
     torch.manual_seed(seed)  # for the first weights
     model = algorithm.load(saved[-1], env=env, device="cpu") if saved else new(settings, env)
@@ -85,8 +86,8 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, secon
     progress = Progress(validation, settings, seed, line)
     left = settings.steps - model.num_timesteps
     if left > 0:
-        callbacks = [Checkpoints(home, settings.checkpoint_every), curve, validation, progress]
-        if settings.algo == "guided-ppo":
+        callbacks: list[BaseCallback] = [Checkpoints(home, settings.checkpoint_every), curve, validation, progress]
+        if isinstance(settings, GuidedPPO):
             callbacks.append(guided_ppo.Budget(seconds, curve, settings.steps))
         # The library counts ``total_timesteps`` from here on when the count is not reset.
         model.learn(left, callbacks, reset_num_timesteps=False)
@@ -99,97 +100,95 @@ def train_seed(settings: Settings, folder: Path, seed: int, line: int = 0, secon
     shutil.copyfile(kept, home / "model.zip")
     spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
     file = "model.zip"
-    if settings.kind == "fleet" or settings.algo == "guided-ppo":
-        file, kept_model = MODEL, algorithm.load(kept, device="cpu")
-        found = weights_of(kept_model) if settings.kind == "fleet" else guided_ppo.weights_of(kept_model)
-        notes = {"name": settings.algo, "suite": settings.suite, "seeds": [seed], "algo": settings.algo}
+    if is_compiled(settings):
+        file, found = MODEL, weights_of(algorithm.load(kept, device="cpu"))
+        notes = {
+            "name": settings.algo,
+            "suite": ",".join(settings.suites.suite),
+            "seeds": [seed],
+            "algo": settings.algo,
+        }
         weights.save(home / MODEL, found, notes)
     return Run(seed, home, spent, curve.record.rows, rows, file, best)
 
 
-def validation_of(settings: Settings, folder: Path, home: Path, curve: Curve, steps: int) -> Validation:
-    """The validation of a learner on this kind of task."""
-    if settings.kind == "environment":
-        episodes = fixed_episodes(settings, "validation")
+def is_compiled(settings: Settings) -> bool:
+    """Whether the learner's weights are a policy that runs without torch on this kind of task."""
+    return settings.kind == "fleet" or isinstance(settings, GuidedPPO)
 
-        def score(model: Any) -> Numbers:
-            if settings.algo == "guided-ppo":
-                outcomes = episodes.run(guided_ppo.weights_of(model).policy("ppo"))
-            else:
-                outcomes = episodes.play(model)
-            return episodes.score(outcomes), float(np.mean([result.qoi for result in outcomes]))
 
-        # By QoI, which orders agents like the score, and is known even if nothing can be gained.
-        validations = Validations(home, ("score", "qoi"), max, settings, steps)
-        return Validation(home, validations, score, lambda measures: f"validation score {measures[0]:.3f}", curve)
-    if settings.kind == "fleet":
-        objective = FleetObjective(settings, folder, settings.seed)
+def weights_of(model: Any) -> Any:
+    """The weights of a learner that guides a rule or scores slots."""
+    return guided_ppo.weights_of(model) if isinstance(model.policy, guided_ppo.GuidedPolicy) else slot_weights(model)
 
-        def gain(model: Any) -> Numbers:
-            return objective.validate(learned.policy(objective.name, weights_of(model)))
 
-        validations = Validations(home, objective.columns, objective.best, settings, steps)
-        return Validation(home, validations, gain, lambda measures: objective.message.format(measures[-1]), curve)
-    sets, padded_slots = ValidationSets(settings, folder), padded_slots_of(settings)
-    return Validation(
-        home,
-        Validations(home, Verdict._fields, min, settings, steps),
-        lambda model: sets.play(model, padded_slots),
-        lambda verdict: f"validation score {verdict[0]:.4f}, regret {verdict[2]:.3f} x AFR's",
-        curve,
+def validation_of(settings: Learner, folder: Path, home: Path, curve: Curve, steps: int) -> Validation:
+    """The validation of a learner, by the measures of evolved agents."""
+    objective = OBJECTIVES[settings.kind](settings, folder, settings.seed)
+
+    def measure(model: Any) -> Numbers:
+        if is_compiled(settings):
+            return objective.validate(weights.policy_of(objective.name, weights_of(model)))
+        return objective.validate_learner(model)
+
+    validations = Validations(home, objective.columns, objective.best, settings, steps)
+    return Validation(home, validations, measure, objective.message, curve)
+
+
+def fleet_env(settings: PPO) -> VecEnv:
+    """Robots as rows, each rewarded for its own information, at the middle L; a slot network serves the others too."""
+    fleet, capacities = fleet_of(settings.suites, "train"), settings.suites.capacities_of(settings.suites.suite[0])
+    batch = FleetVecEnv(
+        max(1, settings.num_envs // fleet.robots),
+        fleet.robots,
+        fleet.uplink,
+        capacities[len(capacities) // 2],
+        reward="own",
+        term=settings.reward,
+        autoreset_mode="SameStep",
     )
+    return GymVecEnv(batch)
 
 
-def padded_slots_of(settings: Settings) -> int:
-    """Slots that the agent of a suite observes."""
-    return max(L for suite in settings.suites for L in settings.capacities_of(suite))
+def suites_env(settings: PPO | DQN) -> VecEnv:
+    """Whole train splits, about as many rows of each scenario at each L."""
+    chosen = settings.suites
+    mixed = [cell for suite in chosen.suite for cell in cells(suite, "train", chosen.capacities_of(suite), chosen.data)]
+    size = math.ceil(settings.num_envs / len(mixed))
+    return GymVecEnv(MixedEnv(mixed, [size] * len(mixed), reward=settings.reward))
 
 
-def training_env(settings: Settings) -> VecEnv:
-    """The batch of environments to train on: of one scenario, of whole train splits, or of robots as rows."""
-    if settings.kind == "fleet":
-        # Each robot is rewarded for its own information, at the middle capacity; a slot network serves the others too.
-        fleet, capacities = fleet_of(settings.suite, "train"), settings.capacities_of(settings.suite)
-        batch = FleetVecEnv(
-            max(1, settings.num_envs // fleet.robots),
-            fleet.robots,
-            fleet.uplink,
-            capacities[len(capacities) // 2],
-            reward="own",
-            term=settings.reward,
-            autoreset_mode="SameStep",
-        )
-        return GymVecEnv(batch)
-    if settings.kind == "queue":
-        mixed = [
-            cell
-            for suite in settings.suites
-            for cell in cells(suite, "train", settings.capacities_of(suite), settings.data or None)
-        ]
-        size = math.ceil(settings.num_envs / len(mixed))
-        return GymVecEnv(MixedEnv(mixed, [size] * len(mixed), reward=settings.reward))
-    if settings.algo == "guided-ppo":
-        return guided_ppo.training_env(settings)
+def one_env(settings: PPO | DQN | GuidedPPO) -> VecEnv:
+    """Rows of one scenario."""
+    on = settings.environment
     return make_vec_env(
-        settings.env,
+        on.env,
         settings.num_envs,
-        scenario=split_scenario(settings)[0],
-        capacity=settings.capacity,
-        decide_at=settings.decide_at,
+        scenario=split_scenario(on)[0],
+        capacity=on.capacity,
         reward=settings.reward,
+        **({"decide_at": on.decide_at} if isinstance(on, SlotEnvironment) else guided_ppo.OPTIONS),
     )
 
 
-def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
-    """Make an untrained actor and critic; without masks an invalid action does what a queue does."""
-    masked = settings.algo == "maskable-ppo"
-    policy, policy_settings = policy_of(settings.network, settings.width, masked)
-    return (MaskablePPO if masked else PPO)(
+ENVS: dict[str, Callable[[Any], VecEnv]] = {"environment": one_env, "queue": suites_env, "fleet": fleet_env}
+"""Kind of task -> the batch of environments to train on."""
+
+
+def new_ppo(settings: PPO | GuidedPPO, env: VecEnv) -> MaskablePPO | sb3.PPO:
+    """Make an untrained actor and critic; a guided one is still the rule."""
+    n_steps = settings.n_steps
+    if isinstance(settings, GuidedPPO):
+        policy, policy_settings = guided_ppo.GuidedPolicy, {"width": settings.width}
+        n_steps = min(n_steps, max(1, settings.steps // env.num_envs))
+    else:
+        policy, policy_settings = policy_of(settings.network, settings.width, not settings.unmasked)
+    model: MaskablePPO | sb3.PPO = class_of(settings)(
         policy,
         env,
         learning_rate=LinearSchedule(settings.learning_rate, 0.0, 1.0),
-        n_steps=settings.n_steps,
-        batch_size=even_batch(settings.n_steps * env.num_envs, settings.batch_size),
+        n_steps=n_steps,
+        batch_size=even_batch(n_steps * env.num_envs, settings.batch_size),
         n_epochs=settings.epochs,
         gamma=settings.gamma,
         gae_lambda=settings.gae_lambda,
@@ -198,6 +197,7 @@ def new_ppo(settings: Settings, env: VecEnv) -> MaskablePPO | PPO:
         policy_kwargs=policy_settings,
         device="cpu",
     )
+    return model
 
 
 def even_batch(decisions: int, most: int) -> int:
@@ -215,7 +215,7 @@ REPLAY = 100_000
 """Decisions in DQN's replay; at 32 slots they take about 250 MB."""
 
 
-def new_dqn(settings: Settings, env: VecEnv) -> MaskedDQN:
+def new_dqn(settings: DQN, env: VecEnv) -> MaskedDQN:
     """Make an untrained Q network. It sees each decision as often as PPO (``epochs`` times), in smaller batches.
 
     It explores little: a message dropped at random is missing for the rest of the episode.
@@ -242,28 +242,18 @@ def new_dqn(settings: Settings, env: VecEnv) -> MaskedDQN:
     )
 
 
-LEARNERS: dict[str, tuple[Any, Callable[[Settings, VecEnv], Any]]] = {
-    "guided-ppo": (PPO, guided_ppo.new),
-    "maskable-ppo": (MaskablePPO, new_ppo),
-    "ppo": (PPO, new_ppo),
-    "dqn": (MaskedDQN, new_dqn),
-}
-"""Algorithm -> (its class, function that makes an untrained one)."""
+def class_of(settings: Settings) -> Any:
+    """The learner's class, by which its file is read."""
+    if isinstance(settings, DQN):
+        return MaskedDQN
+    return MaskablePPO if isinstance(settings, PPO) and not settings.unmasked else sb3.PPO
 
-ALGORITHMS = (*LEARNERS, "guided")
-"""Values of ``--algo``."""
+
+LEARNERS: dict[str, Callable[[Any, VecEnv], Any]] = {"guided-ppo": new_ppo, "ppo": new_ppo, "dqn": new_dqn}
+"""Algorithm -> function that makes an untrained learner."""
 
 
 def load(settings: Settings, run: Run) -> Any:
     """The learner that the run kept."""
     torch.set_num_threads(1)  # on batches this small, more threads only wait for one another
-    return LEARNERS[settings.algo][0].load(run.folder / "model.zip", device="cpu")
-
-
-def test_rows(settings: Settings, run: Run, evaluation: EvaluationSet) -> list[Row]:
-    """The kept agent's rows on a suite's test split."""
-    if settings.evolves:
-        outcomes = evaluation.run(load_policy(run.model))
-    else:
-        outcomes = evaluation.play(load(settings, run), padded_slots_of(settings))
-    return evaluation.benchmark_rows(outcomes, f"agent ({settings.algo})", run.seed)
+    return class_of(settings).load(run.folder / "model.zip", device="cpu")

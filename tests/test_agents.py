@@ -15,7 +15,7 @@ from train_cases import DropOldest
 from agents import mixed_env, runs, training
 from agents.dqn import INVALID, valid_actions
 from agents.evaluation import EvaluationSet, sweep_for
-from agents.settings import Settings
+from agents.settings import DQN, Evolve, Suites
 from bufgym import policies
 from bufgym.benchmark.run import draw
 from bufgym.model.qoi import exponential
@@ -27,7 +27,7 @@ from bufgym.sim import run
 SHORT = Interruption(law="uniform", t_min=6, t_max=30)
 STEEP = dataclasses.replace(SHORT, value=exponential(0.2))
 MIXED = [mixed_env.Cell("short", SHORT, 3), mixed_env.Cell("steep", STEEP, 5)]
-SUITE = Settings(suite="interruption-v1", capacities="4,8", validation_episodes=60)
+SUITE = Evolve(suites=Suites(("interruption-v1",), capacities=(4, 8)), validation_episodes=60)
 
 
 def mixed_rows(rows: int = 4, slots: int = 7) -> mixed_env.MixedEnv:
@@ -138,7 +138,7 @@ def test_leaving_empty_slots_out_changes_no_score_that_counts() -> None:
 
 @pytest.fixture
 def dqn() -> Iterator[Any]:
-    arguments = dataclasses.replace(SUITE, algo="dqn", width=8, num_envs=8, n_steps=16, batch_size=64, gamma=0.5)
+    arguments = DQN(width=8, num_envs=8, n_steps=16, batch_size=64, gamma=0.5)
     env = GymVecEnv(mixed_env.MixedEnv(MIXED, [4, 4]))
     model = training.new_dqn(arguments, env)
     model.set_random_seed(0)
@@ -190,7 +190,7 @@ def test_targets_choose_by_one_network_and_value_by_the_other(dqn: Any, monkeypa
 
 def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: Path) -> None:
     few = dataclasses.replace(SUITE, validation_episodes=12)
-    plan, file = sweep_for(few, SUITE.suite, "validation"), tmp_path / "set" / "manifest.json"
+    plan, file = sweep_for(few, "interruption-v1", "validation"), tmp_path / "set" / "manifest.json"
     evaluation = EvaluationSet(plan, tmp_path / "set")
     assert len(evaluation.fixed("afr")) == 12
     assert evaluation.verdict(evaluation.play(DropOldest(), 8)).score == 0
@@ -216,7 +216,7 @@ def test_a_record_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:
 
 
 def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
-    validations = runs.Validations(tmp_path, ("regret",), min, Settings(steps=40, validate_every=20), 0)
+    validations = runs.Validations(tmp_path, ("regret",), min, Evolve(steps=40, validate_every=20), 0)
     assert validations.due(0)
     best = [validations.add(steps, 0.0, (regret,)) for steps, regret in ((0, 0.5), (20, 0.4), (30, 0.4))]
     assert best == [True, True, False] and validations.best[0] == 20

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from agents.families import Run, run_of
 from agents.mixed_env import Cell
 from agents.objectives import suites
 from agents.runs import MODEL, prepare
-from agents.settings import Settings
+from agents.settings import Cluster, Evolve, Suites
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength, integer, law
@@ -28,10 +29,8 @@ from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
 
-TINY = Settings(
-    **{"suite": "interruption-v1", "capacities": "4", "algo": "guided", "name": "tiny", "steps": 60_000},
-    **{"validate_every": 20_000, "validation_episodes": 30, "test_seeds": 25},
-)
+ON = Suites(("interruption-v1",), capacities=(4,), test_seeds=25)
+TINY = Evolve(suites=ON, name="tiny", steps=60_000, validate_every=20_000, validation_episodes=30)
 SHORT = Cell("short", Interruption(t_max=40), 5)
 
 
@@ -54,7 +53,7 @@ def test_a_candidate_is_measured_by_what_is_left_of_afrs_regret(tmp_path: Path, 
     few = {"lte-v1": 8, "sustained-v1": 12}
     found = {name: runs_of(2e6 * (k + 1)) for k, name in enumerate(few)}
     monkeypatch.setattr(suites, "of_suite", lambda name, *rest, **options: {"all": found[name][: few[name]]})
-    task = suites.SuitesObjective(replace(TINY, suite=",".join(few)), tmp_path, 3)
+    task = suites.SuitesObjective(replace(TINY, suites=Suites(tuple(few), capacities=(4,))), tmp_path, 3)
     afr, rule = policies.get("afr"), policies.get("min-gap")
     assert task.fitness(afr, 0) == task.fitness(afr, 1) == 1
     one, other = task.training
@@ -77,11 +76,11 @@ def runs_of(bytes_per_s: float) -> list[Run]:
 @pytest.mark.nightly
 def test_a_run_goes_on_after_a_kill_and_repeats() -> None:
     """What it leaves behind, test_train.py shows for every algorithm."""
-    few = replace(TINY, steps=38_000, validate_every=19_000, validation_episodes=6, test_seeds=2)
+    few = replace(TINY, steps=38_000, validate_every=19_000, validation_episodes=6, suites=replace(ON, test_seeds=2))
     folder = prepare(few)
     training.train_all(few, folder)
     whole, notes = weights.read_any(folder / "seed-0" / MODEL)
-    assert (notes["algo"], notes["suite"]) == ("guided", "interruption-v1")
+    assert (notes["algo"], notes["suite"]) == ("evolve", "interruption-v1")
     rows = columns(folder / "seed-0" / "validation.csv", "steps", "regret")
     assert rows[0][0] == 0 and rows[-1][0] >= few.steps and all(0 <= regret < 1 for _, regret in rows)
     # Half of the steps, then the rest: the same agent to the last bit.
@@ -96,7 +95,7 @@ def test_a_run_goes_on_after_a_kill_and_repeats() -> None:
 
 REPO = Path(__file__).resolve().parent.parent
 LIBRARY = {"dask": "distributed", "ray": "ray"}
-FEW = {"suite": "interruption-v1", "capacities": "4", "algo": "guided", "validate_every": 19_000}
+FEW = {"suite": "interruption-v1", "capacities": "4", "validate_every": 19_000}
 FEW |= {"validation_episodes": 6, "test_seeds": 2, "seeds": 2}
 
 
@@ -141,7 +140,7 @@ def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pyte
 
 
 @pytest.mark.parametrize("backend", ["dask", "ray"])
-def test_a_missing_library_is_one_clear_error(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_one_clear_error(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, LIBRARY[backend], None)
-    with pytest.raises(BufgymError, match=f"needs {LIBRARY[backend]}: "), cluster.running(backend, None):
+    with pytest.raises(BufgymError, match=f"needs {LIBRARY[backend]}: "), cluster.running(Cluster(backend)):
         pass

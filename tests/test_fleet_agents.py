@@ -10,7 +10,7 @@ import train_cases  # noqa: F401  (it skips without the extra)
 import train
 from agents import training
 from agents.objectives import fleet
-from agents.settings import Settings
+from agents.settings import PPO, Evolve, Suites
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import by_trace, draw, run
@@ -32,9 +32,10 @@ SUITE = dataclasses.replace(FLEET_V1, build=two_robots, capacities=(3, 4))
 
 TASK = TASKS["fleet"]
 
-TINY = Settings(suite="fleet-v1", algo="guided", name="tiny", steps=12_000, validate_every=6_000, test_seeds=1)
+ON = Suites(("fleet-v1",), test_seeds=1)
+TINY = Evolve(suites=ON, name="tiny", steps=12_000, validate_every=6_000)
 SMALL = {"num_envs": 4, "n_steps": 32, "batch_size": 64, "width": 8, "epochs": 1, "steps": 256, "validate_every": 128}
-PPO = dataclasses.replace(TINY, algo="maskable-ppo", **SMALL)  # type: ignore[arg-type]
+BY_PPO = PPO(suites=ON, name="tiny", **SMALL)  # type: ignore[arg-type]
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +48,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
-    robots = by_trace(fleet.fleet_of("fleet-v1", "validation"))[0][1]
+    robots = by_trace(fleet.fleet_of(ON, "validation"))[0][1]
     robots = dataclasses.replace(robots, uplink=dataclasses.replace(robots.uplink, duration_s=2.0))
     cell = fleet.FleetEpisodes(robots, [draw(robots, seed) for seed in (0, 1)], 4)
     rows = run([policies.get(name) for name in ("afr", "min-gap")], robots, [4], 2)
@@ -61,7 +62,7 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
 
 
 def test_evolution_begins_at_the_rule() -> None:
-    cells = fleet.training_parts("fleet-v1", SUITE.capacities, seed=0)[0]
+    cells = fleet.training_parts(ON, seed=0)[0]
     mine, rule = fleet.FleetObjective(TINY, Path(), 0).start().policy("mine"), policies.get("gap-price")
     assert [cell.team_qoi(mine) for cell in cells] == [cell.team_qoi(rule) for cell in cells]
 
@@ -79,26 +80,26 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
     assert validations[0, 0] == 0 and validations[-1, 0] >= TINY.steps and len(validations) >= 3
     # The file is what the best of these was: it does the same again.
     agent = weights.load(folder / "model.safetensors")
-    validation = fleet.validation_episodes("fleet-v1", SUITE.capacities)
+    validation = fleet.validation_episodes(TINY)
     assert fleet.mean_gain(agent, validation) == pytest.approx(validations[:, 2].max(), abs=1e-12)
     mine = [row["qoi"] for row in rows if row["policy"] == "agent (seed 0)"]
-    links = enumerate(by_trace(fleet.fleet_of("fleet-v1", "test")))
+    links = enumerate(by_trace(fleet.fleet_of(ON, "test")))
     again = [row for k, (_, link) in links for row in run([agent], link, SUITE.capacities, [1000 * k])]
     assert [row["qoi"] for row in again] == mine
 
 
 @pytest.mark.nightly
 def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
-    env = training.training_env(PPO)
+    env = training.fleet_env(BY_PPO)
     assert env.num_envs == 4 and env.envs.rows.capacity == 4  # two cells of two robots, at the middle L
-    train.main(PPO)
+    train.main(BY_PPO)
     folder = Path("runs/tiny")
     rows = read_rows(folder / "rows.csv", TASK.layout)
     assert {row["capacity"] for row in rows if row["policy"] == "agent (seed 0)"} == {3, 4}
     agent, noted = weights.read(folder / "model.safetensors")
-    assert agent.widths == (8, 8) and noted["algo"] == "maskable-ppo"
+    assert agent.widths == (8, 8) and noted["algo"] == "ppo"
     table = folder / "seed-0" / "validation.csv"
     before = table.read_text().splitlines()
-    train.main(dataclasses.replace(PPO, resume=True, steps=512))
+    train.main(dataclasses.replace(BY_PPO, resume=True, steps=512))
     after = table.read_text().splitlines()
     assert after[: len(before)] == before and after[-1].split(",")[0] == "512"

@@ -17,7 +17,7 @@ from agents import cma_es
 from agents.cma_es import Evolution
 from agents.objectives import topics
 from agents.runs import MODEL, prepare
-from agents.settings import Settings
+from agents.settings import Evolve, Suites
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
@@ -29,7 +29,8 @@ from bufgym.sim import run
 from bufgym.sim.metrics import topic_outcomes
 from bufgym.traces import Trace
 
-TINY = Settings(suite="topics-v1", algo="guided", name="tiny", steps=4_000, validate_every=1_500, test_seeds=1)
+ON = Suites(("topics-v1",), test_seeds=1)
+TINY = Evolve(suites=ON, name="tiny", steps=4_000, validate_every=1_500)
 
 
 def client(**more: Any) -> Client:
@@ -103,7 +104,7 @@ def test_fitness_by_hand(reached: tuple[float, float, float, int], expected: flo
 @pytest.fixture
 def short_episodes(monkeypatch: Patch) -> None:
     def client_episodes(
-        suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
+        chosen: Suites, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
     ) -> Any:
         rng = np.random.default_rng([seed, split == "train"])
         return [topics.ClientEpisodes(client(duration_s=2.0), 6, 1, rng)]
@@ -157,7 +158,7 @@ def test_a_run_leaves_an_agent_and_a_table(short_episodes: None, monkeypatch: Pa
     assert (home / "model.safetensors").read_bytes() == (home / "seed-0" / "model.safetensors").read_bytes()
     made, noted = weights.read_any(home / "model.safetensors")
     assert isinstance(made, SchedulerWeights)
-    assert (noted["suite"], noted["algo"], noted["seeds"]) == (suite.name, "guided", [0])
+    assert (noted["suite"], noted["algo"], noted["seeds"]) == (suite.name, "evolve", [0])
     with (home / "rows.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert {row["policy"] for row in rows} >= {"agent (seed 0)", "robofleet", "fifo"}

@@ -11,34 +11,46 @@ from cli_cases import Capsys, Patch
 from train_cases import DropOldest, KilledError, columns, in_a_folder_of_its_own  # noqa: F401
 
 import train
-from agents import guided_ppo, held_out, runs, training
+from agents import held_out, runs, training
 from agents.callbacks import Curve, checkpoints
 from agents.held_out import FixedEpisodes
 from agents.objectives import guided
-from agents.settings import Settings
+from agents.settings import (
+    DQN,
+    PPO,
+    Cluster,
+    Environment,
+    Evolve,
+    GuidedPPO,
+    Learner,
+    Settings,
+    SlotEnvironment,
+    Suites,
+)
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 from bufgym.scenario import suites
 
-TINY = Settings(
-    **{
-        "name": "tiny",
-        "algo": "maskable-ppo",
-        "steps": 512,
-        "validate_every": 250_000,
-        "capacity": 3,
-        "duration_s": 1.0,
-        "width": 8,
-        "num_envs": 4,
-        "n_steps": 32,
-    },
-    **{"batch_size": 64, "epochs": 1, "checkpoint_every": 128, "validation_episodes": 2, "episodes": 3},
-)
-ON_SUITE = {"suite": "interruption-v1", "capacities": "4,6", "num_envs": 12, "n_steps": 32, "batch_size": 96}
-ON_SUITE |= {"steps": 1_152, "validate_every": 384, "validation_episodes": 60, "test_seeds": 10}
-SUITE = dataclasses.replace(TINY, **ON_SUITE)
+SHARED: dict[str, Any] = {"name": "tiny", "steps": 512, "validate_every": 250_000, "validation_episodes": 2}
+SMALL: dict[str, Any] = {**SHARED, "width": 8, "num_envs": 4, "n_steps": 32, "batch_size": 64, "epochs": 1}
+SMALL |= {"checkpoint_every": 128}
+ON = SlotEnvironment(capacity=3, duration_s=1.0, episodes=3)
+TINY = PPO(environment=ON, **SMALL)
+GUIDED = Environment(capacity=3, duration_s=1.0, episodes=3)
+LEARNERS = {
+    "ppo": TINY,
+    "unmasked": dataclasses.replace(TINY, unmasked=True),
+    "dqn": DQN(environment=ON, **SMALL),
+    "guided-ppo": GuidedPPO(environment=GUIDED, **SMALL),
+}
+ON_SUITE: dict[str, Any] = {"suites": Suites(("interruption-v1",), capacities=(4, 6), test_seeds=10), "name": "tiny"}
+ON_SUITE |= {"steps": 1_152, "validate_every": 384, "validation_episodes": 60}
+ROWS = {"num_envs": 12, "n_steps": 32, "batch_size": 96, "environment": SlotEnvironment()}
+SUITE: dict[str, Settings] = {
+    name: dataclasses.replace(learner, **ON_SUITE, **ROWS) for name, learner in LEARNERS.items() if name != "guided-ppo"
+} | {"evolve": Evolve(**ON_SUITE)}
 """Three updates of 384 decisions: two rows of each of 3 scenarios x 2 capacities, 32 steps each."""
 
 
@@ -48,8 +60,9 @@ def curve_of(folder: Path) -> list[float]:
 
 @pytest.mark.parametrize("env", ["bufgym/Uplink-v0", pytest.param("bufgym/Interruption-v0", marks=pytest.mark.nightly)])
 def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
-    settings = dataclasses.replace(TINY, env=env, steps=128, duration_s=3.0)
-    train.main(dataclasses.replace(settings, network="plain" if "Inter" in env else "slots"))
+    plain = "Inter" in env
+    on = SlotEnvironment("bufgym/Interruption-v0", 3, episodes=3) if plain else dataclasses.replace(ON, duration_s=3.0)
+    train.main(dataclasses.replace(TINY, environment=on, steps=128, network="plain" if plain else "slots"))
     folder = Path("runs/tiny")
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     rows = {row["policy"]: row for row in results["scores"]}
@@ -59,7 +72,7 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
     assert len({row["arrived"] for row in rows.values()}) == 1  # all met the same episodes
     assert rows["agent (seed 0)"]["invalid"] == 0 and results["settings"]["env"] == env
     notes = json.loads((folder / "notes.json").read_text(encoding="utf-8"))
-    assert notes["training"].startswith("python train.py --") and notes["seeds"] == [0]
+    assert notes["training"].startswith("python train.py ppo --") and notes["seeds"] == [0]
     assert notes["scores"]["qoi"] == rows["agent (seed 0)"]["qoi"]
     assert json.loads((folder / "seed-0" / "notes.json").read_text(encoding="utf-8"))["seeds"] == [0]
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
@@ -71,21 +84,21 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
 def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.setattr(guided, "PARTS", 2)
     monkeypatch.setattr(guided, "EPISODES", 2)
-    monkeypatch.setattr(guided_ppo, "ENVS", 4)
-    settings = dataclasses.replace(TINY, algo="guided", capacity=8, duration_s=3.0, steps=3_000, validate_every=3_000)
-    train.main(settings)
+    on = Environment(capacity=8, duration_s=3.0, episodes=3)
+    settings = Evolve(environment=on, **{**SHARED, "steps": 3_000, "validate_every": 3_000})
+    train.main(settings, beside=True)
     folder = Path("runs/tiny")
     # PPO begins there as well, and is given as much time.
     (_, ppo), *_ = columns(folder / "ppo" / "seed-0" / "validation.csv", "steps", "qoi")
     found = policies.load(folder / "ppo" / "seed-0" / runs.MODEL)
     (_, first), *_ = columns(folder / "seed-0" / "validation.csv", "steps", "qoi")
-    judges = FixedEpisodes(settings, "validation")
+    judges, test = FixedEpisodes(on, "validation", 2), FixedEpisodes(on, "test", 3)
     assert first == ppo == np.mean([outcome.qoi for outcome in judges.run("gap-price")])
     agent = policies.load(folder / "model.safetensors")
     rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["scores"]
     told = {row["policy"]: row["qoi"] for row in rows}
-    assert told["agent (seed 0)"] == np.mean([o.qoi for o in FixedEpisodes(settings, "test").run(agent)])
-    assert told["agent by PPO (seed 0)"] == np.mean([o.qoi for o in FixedEpisodes(settings, "test").run(found)])
+    assert told["agent (seed 0)"] == np.mean([o.qoi for o in test.run(agent)])
+    assert told["agent by PPO (seed 0)"] == np.mean([o.qoi for o in test.run(found)])
     assert "the best rule, " in capsys.readouterr().out
 
 
@@ -128,29 +141,33 @@ def test_a_run_is_not_overwritten_or_mixed_with_another() -> None:
     with pytest.raises(BufgymError, match="exists"):
         runs.prepare(TINY)
     with pytest.raises(BufgymError, match="capacity was 3, now 4"):
-        runs.prepare(dataclasses.replace(TINY, resume=True, capacity=4))
+        runs.prepare(dataclasses.replace(TINY, resume=True, environment=dataclasses.replace(ON, capacity=4)))
     with pytest.raises(BufgymError, match="no run"):
         runs.prepare(dataclasses.replace(TINY, resume=True, name="other"))
 
 
 def test_held_out_traces_are_never_trained_on() -> None:
-    trained, tested = ({trace.name for trace in part.traces} for part in held_out.split_scenario(TINY))  # type: ignore
+    trained, tested = ({trace.name for trace in part.traces} for part in held_out.split_scenario(ON))  # type: ignore
     assert trained and len(tested) == 2 and not trained & tested
 
 
 @pytest.mark.parametrize("decide_at", ["arrival", "overflow"])
-def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: str) -> None:
+def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: Any) -> None:
     """The agent's road (observations, actions, rows) and the policies' own are the same simulation."""
-    test = held_out.FixedEpisodes(dataclasses.replace(TINY, decide_at=decide_at), "test")
-    outcomes = test.play(DropOldest())
+    on = dataclasses.replace(ON, decide_at=decide_at)
+    test = held_out.FixedEpisodes(on, "test", 3)
+    outcomes = test.play(DropOldest(), on)
     assert outcomes == test.run_fixed()["drop-oldest"]
     assert any(outcome.dropped for outcome in outcomes)
 
 
+SPLITS = ("test", "validation")
+
+
 def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
-    settings = dataclasses.replace(TINY, duration_s=5.0, episodes=4, validation_episodes=3)
-    test, validation = (held_out.FixedEpisodes(settings, split) for split in ("test", "validation"))
-    assert (len(test.episodes), len(validation.episodes)) == (4, 3)
+    on = dataclasses.replace(ON, duration_s=5.0, episodes=4)
+    test, validation = (held_out.fixed_episodes(dataclasses.replace(TINY, environment=on), s) for s in SPLITS)
+    assert (len(test.episodes), len(validation.episodes)) == (4, 2)
     outcomes = {name: test.run(name) for name in ("drop-oldest", "afr", "rosbridge", "clairvoyant")}
     assert test.score(outcomes["drop-oldest"]) == 0 and test.score(outcomes["clairvoyant"]) == pytest.approx(1)
     entries = {entry["policy"]: entry for entry in held_out.summarise(outcomes, test.rows(outcomes), "afr")}
@@ -161,28 +178,28 @@ def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("algo", training.ALGORITHMS)
+@pytest.mark.parametrize("algo", SUITE)
 def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -> None:
-    train.main(dataclasses.replace(SUITE, algo=algo))
+    train.main(SUITE[algo])
     folder = Path("runs/tiny")
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    agent = f"agent ({algo})"
+    agent = f"agent ({SUITE[algo].algo})"
     standings = {standing["policy"]: standing for standing in results["standings"]}
-    assert set(standings) == {*registry.names(for_topics=False), agent} and standings[agent]["ranked"]
+    assert set(standings) == {*registry.names(for_topics=False), agent} and not standings[agent]["apart"]
     assert {cell["exact"] for cell in results["cells"]} == {True}
     assert results["held_out"] == {"suite": "interruption-v1", "split": "test", "episodes": 60}
     # The columns of the benchmark, and the training seed: none for a fixed policy.
     rows = read_rows(folder / "rows.csv")
     assert {(row["policy"] == agent, row["training_seed"]) for row in rows} == {(True, 0), (False, None)}
     assert {row["scenario"] for row in rows} == set(suites.get("interruption-v1").settings("test"))
-    assert algo == "ppo" or not any(row["invalid"] for row in rows if row["policy"] == agent)
+    assert algo == "unmasked" or not any(row["invalid"] for row in rows if row["policy"] == agent)
     # Validated before the first update, every 384 steps (CMA-ES: a generation), and at the end; the best is kept.
     home = folder / "seed-0"
     merit = (home / "validation.csv").read_text(encoding="utf-8").splitlines()[0].split(",")[-1]
     validation = {int(steps): value for steps, value in columns(home / "validation.csv", "steps", merit)}
-    model = runs.MODEL if algo == "guided" else "model.zip"
+    model = runs.MODEL if algo == "evolve" else "model.zip"
     assert (folder / model).read_bytes() == (home / model).read_bytes()
-    if algo in training.LEARNERS:
+    if algo in LEARNERS:
         assert list(validation) == [0, 384, 768, 1152]
         best = min(validation, key=lambda steps: validation[steps])
         assert (home / model).read_bytes() == (home / "checkpoints" / f"{best:012d}.zip").read_bytes()
@@ -192,15 +209,15 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     assert agent in printed and "cells (scenario, L) count" in printed
 
 
-def weights(arguments: Settings, name: str) -> dict[str, np.ndarray]:
+def weights(arguments: Learner, name: str) -> dict[str, np.ndarray]:
     folder = runs.prepare(dataclasses.replace(arguments, name=name))
     run = training.train_seed(arguments, folder, arguments.seed)
     return {key: tensor.numpy() for key, tensor in training.load(arguments, run).policy.state_dict().items()}
 
 
-@pytest.mark.parametrize("algo", list(training.LEARNERS))
+@pytest.mark.parametrize("algo", LEARNERS)
 def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
-    arguments = dataclasses.replace(TINY, algo=algo, steps=128)
+    arguments = dataclasses.replace(LEARNERS[algo], steps=128)
     first, again = weights(arguments, "first"), weights(arguments, "again")
     assert all((first[key] == again[key]).all() for key in first)
     other = weights(dataclasses.replace(arguments, seed=1), "other")
@@ -208,7 +225,7 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
 
 
 def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
-    arguments = dataclasses.replace(TINY, algo="dqn")
+    arguments = LEARNERS["dqn"]
     folder = runs.prepare(arguments)
     models = []
     for steps in (256, 512):
@@ -228,40 +245,64 @@ def test_batches_divide_the_experience() -> None:
         training.even_batch(7, 4)
 
 
-NOT_POSITIVE = (
-    *("seeds", "capacity", "size_bytes", "duration_s", "width", "num_envs", "n_steps", "batch_size", "epochs"),
-    *("learning_rate", "checkpoint_every", "validation_episodes", "episodes"),
+POSITIVE = (
+    *("seeds", "capacity", "size-bytes", "duration-s", "episodes", "width", "num-envs", "n-steps", "batch-size"),
+    *("epochs", "learning-rate", "checkpoint-every"),
 )
-NEGATIVE = ("seed", "steps", "validate_every", "gamma", "gae_lambda", "entropy", "test_seeds")
-GUIDED = {"algo": "guided", "suite": "interruption-v1"}
+NOT_NEGATIVE = (
+    "seed",
+    "steps",
+    "validate-every",
+    "validation-episodes",
+    "gamma",
+    "gae-lambda",
+    "entropy",
+    "test-seeds",
+)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("words", "message"),
     [
-        *(({name: 0}, f"{name} = 0: must be") for name in NOT_POSITIVE),
-        *(({name: -1}, f"{name} = -1: must") for name in (*NOT_POSITIVE, *NEGATIVE)),
-        *(({name: float("nan")}, f"{name} = nan: must be") for name in ("gamma", "duration_s")),
-        *(({name: "no-such"}, f"{name} = 'no-such': must be one of") for name in ("env", "algo", "network", "reward")),
-        ({"env": "bufgym/Topics-v0"}, "env = 'bufgym/Topics-v0': a scheduler learns from a suite of topics"),
-        ({"gamma": 1.5}, "gamma = 1.5: must be <= 1"),
-        ({"batch_size": 1}, "batch_size = 1: must be >= 2"),
-        ({"suite": "lte-v1", "capacities": "0"}, "capacities = '0': must be whole numbers >= 1"),
-        ({"suite": "lte-v1", "capacities": "5,x"}, "capacities = '5,x': must be whole numbers such as"),
-        ({"suite": "lte-belgium-v1"}, "needs a folder of recordings"),
-        ({"suite": "lte-v1,topics-v1"}, "suite lte-v1,topics-v1: a scheduler learns from one suite alone"),
-        ({"suite": "fleet-v1,lte-v1"}, "suite fleet-v1,lte-v1: a fleet's agent learns from one suite alone"),
-        ({"suite": "fleet-v1", "algo": "dqn"}, "one suite alone, by --algo guided or maskable-ppo"),
-        ({"suite": "fleet-v1", "network": "plain"}, "network = 'plain': a fleet's agent scores slots"),
-        ({"backend": "no-such"}, "backend = 'no-such': must be one of local, ray, dask"),
-        ({"backend": "dask"}, "backend = 'dask': a cluster evaluates the candidates of --algo guided alone"),
-        ({**GUIDED, "address": "host:1"}, "address = 'host:1': is that of a cluster: name its kind"),
-        ({"resume": True}, "there is no run in"),
+        *((f"ppo --{name}=0", f"--{name}: 0: must be") for name in POSITIVE),
+        *((f"ppo --{name}=-1", f"--{name}: -1: must be") for name in (*POSITIVE, *NOT_NEGATIVE)),
+        *((f"ppo --{name}=nan", f"--{name}: nan: must be") for name in ("gamma", "duration-s")),
+        *((f"ppo --{name}=no", f'"no" for --{name}. Choose from') for name in ("env", "network", "reward")),
+        ("ppo --gamma 1.5", "1.5: must be a number from 0 to 1"),
+        ("ppo --batch-size 1", "1: must be a whole number >= 2"),
+        ("--suite lte-v1 --capacities 0", "0: must be whole numbers >= 1"),
+        ("--suite lte-v1 --capacities 5,x", "5,x: must be whole numbers"),
+        ("--suite lte-belgium-v1", "needs a folder of recordings"),
+        ("--suite no-such", "unknown suite 'no-such'"),
+        ("--suite lte-v1,topics-v1", "suite lte-v1,topics-v1: an agent for topics or a fleet learns from one suite"),
+        ("--suite lte-v1 --capacity 5", "--suite: it has environments of its own"),
+        ("--capacities 5", "are of a suite, which --suite names"),
+        ("--env bufgym/Interruption-v0 --size-bytes 5", "its messages have no size"),
+        ("dqn --suite fleet-v1", "suite fleet-v1: dqn learns none of this kind"),
+        ("guided-ppo --suite lte-v1", "Unknown option: --suite"),
+        ("ppo --suite fleet-v1 --network plain", "suite fleet-v1: a fleet's agent scores slots"),
+        ("ppo --backend dask", "Unknown option: --backend"),
+        ("--backend no", '"no" for --backend. Choose from'),
+        ("--address host:1", "--backend requires"),
+        ("--resume --name none", "there is no run in"),
+        ("--algo guided --num-envs 8", "type python train.py evolve, then"),
+        ("--suite lte-v1 --algo=maskable-ppo", "type python train.py ppo, then"),
     ],
 )
-def test_mistakes_end_in_one_line_before_a_folder_is_made(wrong: dict[str, Any], message: str) -> None:
-    with pytest.raises(SystemExit) as error:
-        train.main(dataclasses.replace(TINY, **wrong))
-    assert str(error.value).startswith("error: ")
-    assert message in str(error.value) and "\n" not in str(error.value)
+def test_mistakes_end_in_one_line_before_a_folder_is_made(words: str, message: str, capsys: Capsys) -> None:
+    with pytest.raises(SystemExit) as ended:
+        train.typed(words.split())
+    said = str(ended.value.code) if isinstance(ended.value.code, str) else " ".join(capsys.readouterr().err.split())
+    assert said.startswith("error: ") and said.count("error") == 1 and message in said
     assert not Path("runs").exists()
+
+
+def test_the_command_of_a_run_gives_its_settings_again() -> None:
+    for settings in (TINY, *SUITE.values(), Evolve(seeds=2, cluster=Cluster("dask"))):
+        made: list[Settings] = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(train, "main", made.append)
+            with pytest.raises(SystemExit):
+                train.typed(settings.command.split()[2:])
+        expected = dataclasses.replace(settings, name="")
+        assert made == [dataclasses.replace(expected, cluster=None) if isinstance(expected, Evolve) else expected]

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from agents.objectives.objective import Objective
+from agents.settings import Settings, Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.run import by_trace, draw
@@ -29,9 +30,9 @@ VALIDATION_EPISODES = 4
 """Validation episodes per link, of the suite's own length."""
 
 
-def fleet_of(suite: str, split: str) -> FleetScenario:
-    """The robots of a suite on all links of one split."""
-    (setting,) = suites.get(suite).settings(split).values()
+def fleet_of(chosen: Suites, split: str) -> FleetScenario:
+    """The robots of the one suite on all links of one split."""
+    (setting,) = suites.get(chosen.suite[0]).settings(split, chosen.data).values()
     fleet: FleetScenario = setting.scenario
     return fleet
 
@@ -61,25 +62,28 @@ def mean_gain(policy: Policy, parts: Sequence[FleetEpisodes]) -> float:
     return float(np.mean([part.team_qoi(policy) - part.rival for part in parts]))
 
 
-def training_parts(suite: str, capacities: Sequence[int], seed: int) -> list[list[FleetEpisodes]]:
+def training_parts(chosen: Suites, seed: int) -> list[list[FleetEpisodes]]:
     """``PARTS`` samples of the training episodes, each at every L; links in turn, ``EPISODES`` a sample."""
     rng = np.random.default_rng(seed)
-    links = [link for _, link in by_trace(fleet_of(suite, "train"))]
+    links = [link for _, link in by_trace(fleet_of(chosen, "train"))]
     waiting: list[int] = []
     parts = []
     for _ in range(PARTS):
         while len(waiting) < EPISODES:
             waiting += rng.permutation(len(links)).tolist()
-        chosen, waiting = [links[k] for k in waiting[:EPISODES]], waiting[EPISODES:]
-        short = [replace(link, uplink=replace(link.uplink, duration_s=EPISODE_S)) for link in chosen]
+        taken, waiting = [links[k] for k in waiting[:EPISODES]], waiting[EPISODES:]
+        short = [replace(link, uplink=replace(link.uplink, duration_s=EPISODE_S)) for link in taken]
         episodes = [draw(link, int(rng.integers(10**6))) for link in short]
-        parts.append([FleetEpisodes(short[0], episodes, L) for L in capacities])
+        parts.append([FleetEpisodes(short[0], episodes, L) for L in chosen.capacities_of(chosen.suite[0])])
     return parts
 
 
-def validation_episodes(suite: str, capacities: Sequence[int]) -> list[FleetEpisodes]:
+def validation_episodes(settings: Settings) -> list[FleetEpisodes]:
     """The validation episodes at every L, the same for every seed."""
-    sweep = Sweep(suite, (), "validation", seeds=VALIDATION_EPISODES).checked()
+    (suite,), capacities = settings.suites.suite, settings.suites.capacities_of(settings.suites.suite[0])
+    cells = len(capacities) * len(fleet_of(settings.suites, "validation").uplink.traces)
+    seeds = settings.validations(VALIDATION_EPISODES, cells)
+    sweep = Sweep(suite, (), "validation", seeds=seeds, data=settings.suites.data).checked()
     drawn = [(sweep.setting(shard.label, shard.trace).scenario, shard.seeds) for shard in sweep.shards()]
     episodes = [draw(robots, seed) for robots, seeds in drawn for seed in seeds]
     return [FleetEpisodes(drawn[0][0], episodes, L) for L in capacities]
@@ -94,19 +98,15 @@ class FleetObjective(Objective):
     message = "team QoI {:+.4f} over AFR's on validation"
     sigma = 0.05
 
-    @property
-    def _capacities(self) -> tuple[int, ...]:
-        return self.settings.capacities_of(self.settings.suite)
-
     @functools.cached_property
     def training(self) -> list[list[FleetEpisodes]]:
         """Episodes of ``training_parts``."""
-        return training_parts(self.settings.suite, self._capacities, self.seed)
+        return training_parts(self.settings.suites, self.seed)
 
     @functools.cached_property
     def judges(self) -> list[FleetEpisodes]:
         """Episodes of ``validation_episodes``."""
-        return validation_episodes(self.settings.suite, self._capacities)
+        return validation_episodes(self.settings)
 
     def measure(self, policy: Policy, episodes: Sequence[FleetEpisodes]) -> float:
         """Compute ``mean_gain``."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from bufgym.benchmark.run import draw
 from bufgym.policies import Policy
 from bufgym.scenario import Episode
 from bufgym.sim import Senders
+from bufgym.sim.metrics import Outcome
 
 PARTS, EPISODES = 18, 100
 """Parts of the training episodes, and episodes in each."""
@@ -48,7 +50,8 @@ class GuidedObjective(Objective):
     @functools.cached_property
     def training(self) -> list[list[Played]]:
         """New episodes on the training links, in parts."""
-        scenario, L = split_scenario(self.settings)[0], self.settings.capacity
+        on = self.settings.environment
+        scenario, L = split_scenario(on)[0], on.capacity
         senders = Senders(EPISODES, L, scenario.value, max_messages=scenario.max_messages)
         seeds = FIRST_SEED * (1 + self.seed) + np.arange(PARTS * EPISODES).reshape(PARTS, EPISODES)
         return [[Played([draw(scenario, int(seed)) for seed in part], L, senders)] for part in seeds]
@@ -64,5 +67,12 @@ class GuidedObjective(Objective):
 
     def validate(self, policy: Policy) -> tuple[float, ...]:
         """Score and mean H on the validation episodes."""
-        outcomes = self.judges.run(policy)
+        return self._measures(self.judges.run(policy))
+
+    def validate_learner(self, learner: Any) -> tuple[float, ...]:
+        """The same of a learner."""
+        return self._measures(self.judges.play(learner, self.settings.environment))
+
+    def _measures(self, outcomes: Sequence[Outcome]) -> tuple[float, ...]:
+        # By QoI, which orders agents like the score, and is known even if nothing can be gained.
         return self.judges.score(outcomes), float(np.mean([outcome.qoi for outcome in outcomes]))

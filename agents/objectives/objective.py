@@ -46,6 +46,10 @@ class Objective(ABC):
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         self.settings, self.folder, self.seed = settings, folder, seed
 
+    def prepare(self) -> None:
+        """Do once for all seeds what each would do for itself."""
+        return
+
     def start(self) -> GuidedWeights:
         """The weights at which the search begins: zeros, the plain rule."""
         return GuidedWeights(np.zeros((N_OUTPUTS, N_INPUTS), np.float32))
@@ -66,3 +70,7 @@ class Objective(ABC):
     def validate(self, policy: Policy) -> tuple[float, ...]:
         """The measures of an agent on the validation episodes."""
         return (self.measure(policy, self.judges),)
+
+    def validate_learner(self, learner: Any) -> tuple[float, ...]:
+        """The same of a learner that chooses among slots, where there are such."""
+        raise NotImplementedError

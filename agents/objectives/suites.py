@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import numpy as np
 
@@ -27,11 +28,10 @@ class SuitesObjective(Objective):
     @functools.cached_property
     def training(self) -> list[list[Family]]:
         """A family of runs of each suite, in parts."""
-        settings, rng = self.settings, np.random.default_rng(self.seed)
+        chosen, rng = self.settings.suites, np.random.default_rng(self.seed)
         by_suite = []
-        for suite in settings.suites:
-            capacities = settings.capacities_of(suite) if settings.capacities else ()
-            runs = merged(of_suite(suite, "train", capacities, data=settings.data or None))
+        for suite in chosen.suite:
+            runs = merged(of_suite(suite, "train", chosen.capacities, data=chosen.data))
             by_suite.append(divided(suite, runs, min(RUNS, len(runs)), PARTS, rng))
             if not all((family.best > family.afr).any() for family in by_suite[-1]):
                 raise BufgymError(f"suite {suite}: AFR loses nothing there, so nothing can be learned")
@@ -42,6 +42,10 @@ class SuitesObjective(Objective):
         """The suites' validation splits, made at first use: a worker that evaluates candidates needs none."""
         return ValidationSets(self.settings, self.folder)
 
+    def prepare(self) -> None:
+        """Compute the clairvoyant's bounds."""
+        ValidationSets(self.settings, self.folder, progress=True)
+
     def measure(self, policy: Policy, episodes: list[Family]) -> float:
         """Share of AFR's regret, mean over the suites."""
         return float(np.mean([family.share(policy) for family in episodes]))
@@ -49,3 +53,7 @@ class SuitesObjective(Objective):
     def validate(self, policy: Policy) -> tuple[float, ...]:
         """The verdict on the validation splits."""
         return self.judges.run(policy)
+
+    def validate_learner(self, learner: Any) -> tuple[float, ...]:
+        """The same of a learner."""
+        return self.judges.play(learner, self.settings.suites.slots)

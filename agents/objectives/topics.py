@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.objectives.objective import Objective
+from agents.settings import Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.run import draw
@@ -118,18 +119,18 @@ def mean_fitness(policy: Policy, parts: Sequence[ClientEpisodes]) -> float:
 
 
 def client_episodes(
-    suite: str, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
+    chosen: Suites, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
 ) -> list[ClientEpisodes]:
-    """Episodes of each setting of a suite, its links ``scale`` times as fast; scale 0 varies each client by chance."""
-    rng, capacities = np.random.default_rng(seed), suites.get(suite).capacities
+    """Episodes of each setting of the suite, its links ``scale`` times as fast; scale 0 varies clients by chance."""
+    (suite,), rng = chosen.suite, np.random.default_rng(seed)
     drawn = []
-    for setting in suites.get(suite).settings(split).values():
+    for setting in suites.get(suite).settings(split, chosen.data).values():
         client = setting.scenario
         if not isinstance(client, Client):
             raise BufgymError(f"suite {suite}: has no topics")
         client = client if episode_s is None else replace(client, duration_s=episode_s)
         client = replace(client, scale=scale) if scale else varied(client, rng)
-        drawn += [ClientEpisodes(client, L, episodes, rng) for L in capacities]
+        drawn += [ClientEpisodes(client, L, episodes, rng) for L in chosen.capacities_of(suite)]
     return drawn
 
 
@@ -153,13 +154,16 @@ class TopicsObjective(Objective):
     @functools.cached_property
     def training(self) -> list[list[ClientEpisodes]]:
         """``PARTS`` sets of episodes of varied clients."""
-        suite, seeds = self.settings.suite, [1000 * self.seed + part for part in range(PARTS)]
-        return [client_episodes(suite, "train", seed, EPISODES, EPISODE_S, scale=0) for seed in seeds]
+        chosen, seeds = self.settings.suites, [1000 * self.seed + part for part in range(PARTS)]
+        return [client_episodes(chosen, "train", seed, EPISODES, EPISODE_S, scale=0) for seed in seeds]
 
     @functools.cached_property
     def judges(self) -> list[ClientEpisodes]:
         """The suite's clients as they are, and on ample links."""
-        rest = self.settings.suite, "validation", VALIDATION_SEED, VALIDATION_EPISODES
+        chosen = self.settings.suites
+        (suite,) = chosen.suite
+        cells = 2 * len(chosen.capacities_of(suite)) * len(suites.get(suite).settings("validation", chosen.data))
+        rest = chosen, "validation", VALIDATION_SEED, self.settings.validations(VALIDATION_EPISODES, cells)
         return [episodes for scale in (1.0, AMPLE) for episodes in client_episodes(*rest, scale=scale)]
 
     def start(self) -> SchedulerWeights:
