@@ -1,4 +1,4 @@
-"""Fig. 1 of the AFR paper: the models that tracking and mapping make of the frames received, coloured by their error."""
+"""Fig. 1 of the AFR paper: the models that tracking and mapping make of what was received, coloured by their error."""
 
 from __future__ import annotations
 

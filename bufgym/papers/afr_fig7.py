@@ -1,8 +1,9 @@
 """Fig. 7 of the AFR paper: error of the map made of the frames received, against the queue size.
 
-``perception.mapping`` fuses the frames with their true poses, as the paper does (Sec. V-B), and compares the map with the
-map of all frames: one way, from each point of the map to the reference, as the paper measures, and both ways. A second map uses the poses that tracking finds along the frames received, up to where tracking
-breaks. It shows whether tracked poses would explain a difference from the paper.
+``perception.mapping`` fuses the frames with their true poses, as the paper does (Sec. V-B), and compares the map with
+the map of all frames: one way, from each point of the map to the reference, as the paper measures, and both ways. A
+second map uses the poses that tracking finds along the frames received, up to where tracking breaks. It shows whether
+tracked poses would explain a difference from the paper.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def lemma_violations() -> int:
 
 def kept_by_oracle(capacity: int, T: int) -> list[int]:
     """The messages that Oracle keeps: T of the interruption is told beforehand."""
-    return np.cumsum(gaps_of("oracle", capacity, [T])[0])[:-1].tolist()
+    return [int(seq) for seq in np.cumsum(gaps_of("oracle", capacity, [T])[0])[:-1]]
 
 
 def even_enough(gaps: NDArray[np.int64]) -> bool:

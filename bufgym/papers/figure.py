@@ -134,7 +134,7 @@ def facts_of(figure: Figure, rows: FigureRows) -> dict[str, Any]:
 
 
 def within(found: Interval, low: float, high: float) -> bool | str:
-    """Whether a number lies from ``low`` to ``high``: only where its interval does. UNDECIDED where a part of it does."""
+    """Whether a number lies from ``low`` to ``high``, which its interval must do; UNDECIDED where a part of it does."""
     if low <= found.low and found.high <= high:
         return True
     return False if found.high < low or found.low > high else UNDECIDED

@@ -25,9 +25,9 @@ HEAD = """\
 This page lists every sentence of the two papers that we know of and that can be checked. Each row has the command that
 tests the sentence, our number, and the verdict. Keys in brackets are from [references.bib](references.bib).
 
-The sentences are in our words, read at the place that is named: a section, an equation or a figure. "Our addition" marks
-sentences that the papers do not have. Where a paper leaves a parameter open, ours is a stated default of the command's
-figure.
+The sentences are in our words, read at the place that is named: a section, an equation or a figure. "Our addition"
+marks sentences that the papers do not have. Where a paper leaves a parameter open, ours is a stated default of the
+command's figure.
 
 A claim about a number *holds* where our interval lies within it, *differs* where the interval lies outside, and is
 *undecided* where the interval is too wide to say. "About 20 %" is from 15 to 25 %.
