@@ -51,7 +51,8 @@ class Reproduction(FrameFigure):
         return 13.0, 4.2 * len(self.recordings)
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
-        panels = figure.subplots(len(self.recordings), 1 + len(self.policies), squeeze=False)
+        columns = 1 + len(self.policies)
+        panels = figure.subplots(len(self.recordings), columns, squeeze=False, sharex="row", sharey="row")
         for line, recording in zip(panels, self.recordings, strict=True):
             on, L = self.stage(recording), self.capacities[0]
             reference = on.tracked_reference.points()

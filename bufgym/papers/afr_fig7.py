@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
-from bufgym.papers.figure import heat_table, tens, within
+from bufgym.papers.figure import heat_table, of_all, tens, within
 from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, FrameFigure, FrameRun, spearman
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
 
 RESAMPLES = 2000
+MUCH = 0.1
+"""A change of the error by more than this share counts as much."""
 ONE_WAY, BOTH_WAYS = "to_reference_mm", "rmse_mm"
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
 """Policy -> AFR's error relative to the policy's error, less 1, as the paper roughly gives it."""
@@ -84,9 +86,25 @@ class Reproduction(FrameFigure):
                     f"{name} {change(rows.where(recording=name, k=0), ONE_WAY, 'afr', other).value:+.1%}"
                     for name in self.recordings
                 )
+        if {"afr", "drop-oldest", "random"} <= set(self.policies) and len(self.capacities) > 1:
+            grown = {name: self.by_size(rows.where(recording=main, policy=name)) for name in SHOWN}
+            facts["larger"] = of_all(
+                within(found, -1.0, 0.0) if name == "afr" else within(found, -MUCH, MUCH)
+                for name, found in grown.items()
+            )
+            facts["sizes"] = "; ".join(f"{POLICIES[name][0]} {spelled(found)}" for name, found in grown.items())
+        else:
+            facts |= {"larger": None, "sizes": "not run"}
         if "drop-oldest" in self.policies and "afr" in self.policies:
             facts["moves"] = self.where_it_moves(rows.where(recording=main))
         return facts
+
+    def by_size(self, rows: FigureRows) -> Interval:
+        """The mean error at the largest L relative to that at the smallest, less 1, over the places of the fade."""
+        sizes = (max(self.capacities), min(self.capacities))
+        large, small = (np.array([rows.mean(ONE_WAY, k=k, L=L) for k in rows.distinct("k")]) for L in sizes)
+        weights = times_drawn(len(large), RESAMPLES, stream(0, "sizes"))
+        return percentile_interval((weights @ large) / (weights @ small) - 1, CONFIDENCE)
 
     def where_it_moves(self, rows: FigureRows) -> str:
         """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""

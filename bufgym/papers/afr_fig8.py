@@ -17,10 +17,13 @@ from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, ti
 from bufgym.benchmark.table import aligned
 from bufgym.papers.figure import finish, heat_table, of_all, within
 from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, RESAMPLES, FrameFigure
+from bufgym.papers.perception.stage import IMAGES
 from bufgym.papers.rows import FigureRows
 
 THIRD = 1 / 3
 """Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
+HALF = 1 / 2
+"""ORBBuf's failures are greatly reduced if they are at most this share of Drop Oldest's."""
 COLUMNS = 4
 """Columns of small pictures of the camera's path."""
 
@@ -54,7 +57,7 @@ class Reproduction(FrameFigure):
         }
         runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
         facts: dict[str, Any] = {"runs": runs}
-        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count"), "not run")
+        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count", "orbbuf_count"), "not run")
         facts["counts"] = "; ".join(
             f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
             for name, counts in broken.items()
@@ -76,6 +79,10 @@ class Reproduction(FrameFigure):
                 for policy in ("drop-oldest", "afr")
             }
             facts["oldest"] = of_all(within(found, 0.35, 0.65) for found in rates["drop-oldest"].values())
+            if IMAGES in self.policies:
+                pairs = [(counts[IMAGES], counts["drop-oldest"]) for counts in broken.values()]
+                facts["orbbuf"] = all(ours <= HALF * theirs for ours, theirs in pairs)
+            facts["orbbuf_count"] = each(".0f", (IMAGES, "drop-oldest")) if IMAGES in self.policies else "not run"
             for key, policy in (("oldest_rate", "drop-oldest"), ("afr_rate", "afr")):
                 told = (f"{name} {r.value:.0%} [{r.low:.0%}, {r.high:.0%}]" for name, r in rates[policy].items())
                 facts[key] = "; ".join(told)
