@@ -136,7 +136,7 @@ class Reproduction(FrameFigure):
                 heat_table(axes, errors, ".2f", labels, columns, vmin=least, vmax=most + 0.25 * (most - least))
                 axes.axvline(len(self.capacities) - 0.5, color="white", linewidth=4)
                 axes.set_title(f"{recording}: {title}", loc="left", fontsize=10)
-                axes.set_xlabel("RMSE of the map in mm, one way, by queue size L", fontsize=9)
+                axes.set_xlabel("RMSE in mm, one way, by queue size L", fontsize=9)
         for part, recording in zip(below, self.recordings, strict=True):
             self._maps(part, recording)
 
