@@ -17,7 +17,8 @@ def page() -> str:
 
 
 def _entry(key: str, body: str) -> str:
-    found = {name: _plain(text) for name, text in re.findall(r"(\w+)\s*=\s*\{(.*)\}", body)}
+    fields = re.findall(r"^  (\w+)\s*=\s*\{(.*?)\}(?:,?$)(?=\n  \w+\s*=|\Z)", body, re.DOTALL | re.MULTILINE)
+    found = {name: _plain(" ".join(text.split())) for name, text in fields}  # a field may take several lines
     who = found.get("author", found.get("organization", "")).replace(" and ", ", ")
     where = found.get("booktitle") or found.get("journal") or found.get("howpublished") or found.get("publisher") or ""
     links = []

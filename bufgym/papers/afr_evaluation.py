@@ -1,8 +1,4 @@
-"""Camera stream and link of the AFR paper's evaluation.
-
-The paper streams 794 RGB-D frames at 30 Hz over the Belgium 4G log car_0002 [vanderhooft2016http2], ten times for each
-policy and queue size. It does not state the size of a frame. About 160 kB reproduces its numbers, see `afr_frame_size`.
-"""
+"""Base of the figures about the link of the AFR paper's evaluation, the 4G log car_0002 [vanderhooft2016http2]."""
 
 from __future__ import annotations
 
@@ -16,13 +12,8 @@ from numpy.typing import NDArray
 from bufgym import traces
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.figure import Figure, whole
-from bufgym.scenario.suites import RATE_HZ
+from bufgym.scenario.afr_evaluation import FRAME_BYTES, LINK, PAPER_FRAMES, RATE_HZ
 from bufgym.traces import Trace
-
-PAPER_FRAMES = 794
-FRAME_BYTES = 160_000
-"""Size of a frame that roughly reproduces the paper's recalculations and frame rates."""
-LINK = "belgium_4g/csv/report_car_0002.csv"
 
 
 @dataclass(frozen=True)

@@ -1,83 +1,71 @@
-"""Messages that Drop Oldest, Random and AFR still hold when the link returns after one interruption.
-
-The picture shows the problem, as the AFR paper's first figures do. Drop Oldest loses the whole beginning, Random leaves
-random gaps, and AFR thins evenly. Message 0, sent before the interruption, and message T + 1, sent after it, are always
-received.
-"""
+"""Fig. 1 of the AFR paper: the models that tracking and mapping make of what was received, coloured by their error."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bufgym import policies, sim
-from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
+from bufgym.papers.afr_fig7 import plan_of, some_of
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun
+from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
-from bufgym.scenario import Interruption
 
-POLICIES = {"drop-oldest": "Drop Oldest", "random": "Random", "afr": "AFR"}
+PAPER_S = {"drop-oldest": 23.0, "random": 7.0}
+"""Policy -> second at which tracking fails in the paper."""
+NEAR_S = 2.0
+"""As near to it counts as about it."""
+LIMIT_MM = 50.0
+"""Distance from the reference that is drawn darkest."""
 
 
 @dataclass(frozen=True)
-class Reproduction(Figure):
-    """Figure of one interruption of T = ``last_T`` messages with L = ``capacity``."""
+class Reproduction(FrameFigure):
+    """Tracked models at one queue size, the fade where the paper has it."""
 
-    capacity: int = 8
-    last_T: int = 26
-    seed: int = 0
-    """Seed of Random's draws."""
-
-    RULES = {"last_T": whole(2)}
-    SIZE_INCHES = (10.0, 4.2)
+    capacities: Sequence[int] = (15,)
+    policies: Sequence[str] = ("drop-oldest", "random", "afr")
+    offsets: int = 1
 
     def simulate(self) -> FigureRows:
-        """Return a row for each policy and message: the arrival at which the message was dropped, or None."""
-        interruption = Interruption(law="fixed", t_max=self.last_T)
-        rng = np.random.Generator(np.random.PCG64(self.seed))
-        episode = interruption.episode(self.last_T).with_uniforms(rng)
-        rows = FigureRows()
-        for policy in POLICIES:
-            senders = sim.run(policies.get(policy), [episode], self.capacity, interruption.value)
-            dropped_us = np.asarray(senders.batch.log[0])["dropped_us"]
-            for message, at_us in enumerate(dropped_us[: self.last_T + 2].tolist()):
-                dropped_at = None if at_us == sim.NEVER else round(at_us / interruption.period_us)
-                rows.append({"policy": policy, "message": message, "dropped_at": dropped_at})
-        return rows
+        return self.play("track")
 
-    def received(self, rows: FigureRows, policy: str) -> list[int]:
-        """List the numbers of the messages received, including 0 and T + 1."""
-        return [row["message"] for row in rows.where(policy=policy, dropped_at=None)]
-
-    def tables(self, rows: FigureRows) -> list[str]:
-        return [f"{label:12} {' '.join(map(str, self.received(rows, p)))}" for p, label in POLICIES.items()]
+    def ended_s(self, row: Any) -> float:
+        """The second at which tracking breaks; infinite where it goes on to the end."""
+        return float(self.stage(row["recording"]).whole.time_us[row["failed_at"]]) / 1e6 if row["failed"] else np.inf
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
-        longest = {policy: int(np.diff(self.received(rows, policy)).max()) for policy in POLICIES}
-        return {
-            "order": longest["afr"] <= longest["random"] <= longest["drop-oldest"],
-            "afr_gap": longest["afr"],
-            "random_gap": longest["random"],
-            "oldest_gap": longest["drop-oldest"],
-            "ideal_gap": (self.last_T + 1) / (min(self.capacity, self.last_T) + 1),
-        }
+        ends = {(row["recording"], row["policy"]): self.ended_s(row) for row in rows.where(k=0)}
+        main, facts = self.recordings[-1], dict[str, Any]()
+        for policy in self.policies:
+            told = [(name, ends[name, policy]) for name in self.recordings]
+            facts[f"{policy.removeprefix('drop-')}_end"] = "; ".join(
+                f"{name} to the end" if s == np.inf else f"{name} breaks at second {s:.1f}" for name, s in told
+            )
+        near = {policy: abs(ends[main, policy] - at_s) <= NEAR_S for policy, at_s in PAPER_S.items()}
+        return facts | {"afr": ends[main, "afr"] == np.inf, "oldest": near["drop-oldest"], "random": near["random"]}
+
+    def size_inches(self, rows: FigureRows) -> tuple[float, float]:
+        return 13.0, 4.2 * len(self.recordings)
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
-        panels = figure.subplots(1, len(POLICIES), sharey=True)
-        end = self.last_T + 1
-        for axes, (policy, label) in zip(panels, POLICIES.items(), strict=True):
-            colour, grey = COLOURS[policy], COLOURS["other"]
-            for row in rows.where(policy=policy):
-                message, dropped_at = row["message"], row["dropped_at"]
-                style = {"linewidth": 1.4, "color": grey if dropped_at is not None else colour}
-                axes.plot([message, end if dropped_at is None else dropped_at], [message, message], **style)
-                if dropped_at is not None:
-                    axes.plot(dropped_at, message, "x", color=grey, markersize=5)
-            received = self.received(rows, policy)
-            axes.plot([end + 0.8] * len(received), received, "<", color=colour, markersize=5)
-            finish(axes, label, xlabel="arrivals since the link stopped", xlim=(-0.5, end + 2))
-        panels[0].set_ylabel("message")
-        panels[0].plot([], [], color=COLOURS["other"], marker="x", label="queued, then dropped")
-        panels[0].plot([], [], color=COLOURS["oracle"], marker="<", label="queued until the link returns: received")
-        legend_below(figure, 2, panels[0])
+        columns = 1 + len(self.policies)
+        panels = figure.subplots(len(self.recordings), columns, squeeze=False, sharex="row", sharey="row")
+        for line, recording in zip(panels, self.recordings, strict=True):
+            on, L = self.stage(recording), self.capacities[0]
+            reference = on.tracked_reference.points()
+            models = {"reference": reference}
+            for policy in self.policies:
+                models[POLICIES[policy][0]] = on.track_of(self.kept(FrameRun(recording, 0, L, policy))).model.points()
+            for axes, (label, points) in zip(line, models.items(), strict=True):
+                few = points[some_of(len(points))]
+                far_mm = np.minimum(1e3 * mapping.distances(few, reference), LIMIT_MM)
+                painted = axes.scatter(
+                    *(few @ plan_of(reference)).T, s=0.4, c=far_mm, cmap="turbo", vmin=0, vmax=LIMIT_MM
+                )
+                axes.set_aspect("equal")
+                axes.set_axis_off()
+                axes.set_title(f"{recording}, {label}", fontsize=9, loc="left")
+        figure.colorbar(painted, ax=panels, label="distance to the reference, mm", shrink=0.6)

@@ -1,11 +1,11 @@
-"""V of the three motions of `afr_fig2`, computed from the overlap of views, beside the AFR paper's formulas."""
+"""V of the three motions of `afr_views`, computed from the overlap of views, beside the AFR paper's formulas."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from bufgym.papers.afr_fig2 import MESSAGES, GeometryFigure
+from bufgym.papers.afr_views import MESSAGES, GeometryFigure
 from bufgym.papers.figure import COLOURS, finish
 from bufgym.papers.rows import FigureRows
 

@@ -1,8 +1,9 @@
 """Fig. 7 of the AFR paper: error of the map made of the frames received, against the queue size.
 
-``perception.mapping`` fuses the frames with their true poses, as the paper does, and compares the map with the
-map of all frames. A second map uses the poses that tracking finds along the frames received, up to where tracking
-breaks. It shows whether tracked poses would explain a difference from the paper.
+``perception.mapping`` fuses the frames with their true poses, as the paper does (Sec. V-B), and compares the map with
+the map of all frames: one way, from each point of the map to the reference, as the paper measures, and both ways. A
+second map uses the poses that tracking finds along the frames received, up to where tracking breaks. It shows whether
+tracked poses would explain a difference from the paper.
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
-from bufgym.papers.figure import heat_table
+from bufgym.papers.figure import heat_table, of_all, tens, within
 from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, FrameFigure, FrameRun, spearman
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
 
 RESAMPLES = 2000
+MUCH = 0.1
+"""A change of the error by more than this share counts as much."""
+ONE_WAY, BOTH_WAYS = "to_reference_mm", "rmse_mm"
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
 """Policy -> AFR's error relative to the policy's error, less 1, as the paper roughly gives it."""
 SHOWN = ("drop-oldest", "random", "afr")
@@ -58,8 +62,9 @@ class Reproduction(FrameFigure):
         for recording in rows.distinct("recording"):
             for title, some in (("the paper's alignment", rows.where(k=0)), ("the sweep", rows)):
                 shown = some.where(recording=recording)
-                lines += [f"{recording}, RMSE of the map in mm by L, {title}:"]
-                lines += [*shown.pivot("policy", "L", "rmse_mm", ".2f", labels), ""]
+                for way, column in (("one way", ONE_WAY), ("both ways", BOTH_WAYS)):
+                    lines += [f"{recording}, RMSE of the map in mm by L, {way}, {title}:"]
+                    lines += [*shown.pivot("policy", "L", column, ".2f", labels), ""]
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
@@ -68,22 +73,37 @@ class Reproduction(FrameFigure):
         for other, paper in PAPER.items():
             key = other.removeprefix("drop-").removesuffix("-images")
             facts[key] = None
-            facts |= {f"{key}_{what}": "not run" for what in ("change", "paper", "slam", "lack")}
+            columns = {"change": ONE_WAY, "both": BOTH_WAYS, "slam": "slam_rmse_mm", "lack": "slam_uncovered"}
+            facts |= {f"{key}_{what}": "not run" for what in (*columns, "paper")}
             if {"afr", other} <= set(self.policies):
-                found = change(rows.where(recording=main), "rmse_mm", "afr", other)
-                facts[key] = found.high < 0 and found.low <= paper
-                for what, column in {"change": "rmse_mm", "slam": "slam_rmse_mm", "lack": "slam_uncovered"}.items():
+                facts[key] = within(change(rows.where(recording=main), ONE_WAY, "afr", other), *tens(paper))
+                for what, column in columns.items():
                     facts[f"{key}_{what}"] = "; ".join(
                         f"{name} {spelled(change(rows.where(recording=name), column, 'afr', other))}"
                         for name in self.recordings
                     )
                 facts[f"{key}_paper"] = "; ".join(
-                    f"{name} {change(rows.where(recording=name, k=0), 'rmse_mm', 'afr', other).value:+.1%}"
+                    f"{name} {change(rows.where(recording=name, k=0), ONE_WAY, 'afr', other).value:+.1%}"
                     for name in self.recordings
                 )
+        if {"afr", "drop-oldest", "random"} <= set(self.policies) and len(self.capacities) > 1:
+            grown = {name: self.by_size(rows.where(recording=main, policy=name)) for name in SHOWN}
+            facts["larger"] = of_all(
+                within(found, *((-1.0, 0.0) if name == "afr" else (-MUCH, MUCH))) for name, found in grown.items()
+            )
+            facts["sizes"] = "; ".join(f"{POLICIES[name][0]} {spelled(found)}" for name, found in grown.items())
+        else:
+            facts |= {"larger": None, "sizes": "not run"}
         if "drop-oldest" in self.policies and "afr" in self.policies:
             facts["moves"] = self.where_it_moves(rows.where(recording=main))
         return facts
+
+    def by_size(self, rows: FigureRows) -> Interval:
+        """The mean error at the largest L relative to that at the smallest, less 1, over the places of the fade."""
+        sizes = (max(self.capacities), min(self.capacities))
+        large, small = (np.array([rows.mean(ONE_WAY, k=k, L=L) for k in rows.distinct("k")]) for L in sizes)
+        weights = times_drawn(len(large), RESAMPLES, stream(0, "sizes"))
+        return percentile_interval((weights @ large) / (weights @ small) - 1, CONFIDENCE)
 
     def where_it_moves(self, rows: FigureRows) -> str:
         """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""
@@ -92,7 +112,7 @@ class Reproduction(FrameFigure):
         for k in rows.distinct("k"):
             kept = [self.kept(FrameRun(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
             moved.append(float(np.mean([np.diff(x[list(frames)]).max() for frames in kept])))
-            won.append(rows.mean("rmse_mm", k=k, policy="afr") / rows.mean("rmse_mm", k=k, policy="drop-oldest") - 1)
+            won.append(rows.mean(ONE_WAY, k=k, policy="afr") / rows.mean(ONE_WAY, k=k, policy="drop-oldest") - 1)
         return f"{spearman(np.array(moved), np.array(won)):+.2f}"
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:
@@ -116,13 +136,13 @@ class Reproduction(FrameFigure):
                 heat_table(axes, errors, ".2f", labels, columns, vmin=least, vmax=most + 0.25 * (most - least))
                 axes.axvline(len(self.capacities) - 0.5, color="white", linewidth=4)
                 axes.set_title(f"{recording}: {title}", loc="left", fontsize=10)
-                axes.set_xlabel("RMSE of the map in mm, by queue size L", fontsize=9)
+                axes.set_xlabel("RMSE in mm, one way, by queue size L", fontsize=9)
         for part, recording in zip(below, self.recordings, strict=True):
             self._maps(part, recording)
 
     def _errors(self, rows: FigureRows) -> NDArray[np.float64]:
         """Errors in mm, [policies, L and their mean]."""
-        by_L = [[rows.mean("rmse_mm", policy=policy, L=L) for L in self.capacities] for policy in self.policies]
+        by_L = [[rows.mean(ONE_WAY, policy=policy, L=L) for L in self.capacities] for policy in self.policies]
         return np.column_stack([by_L, np.mean(by_L, axis=1)])
 
     def _maps(self, part: Any, recording: str) -> None:
@@ -130,10 +150,10 @@ class Reproduction(FrameFigure):
         on, L = self.stage(recording), min(self.capacities)
         limit_mm = 20.0
         panels = part.subplots(2, len(self.shown), squeeze=False, sharex=True, sharey=True)
-        plan = _plan(on.reference.points())
+        plan = plan_of(on.reference.points())
         for line, poses in zip(panels, ("true poses", "tracked"), strict=True):
             every = (on.reference if poses == "true poses" else on.tracked_reference).points()
-            few = _some(len(every))
+            few = some_of(len(every))
             for axes, policy in zip(line, self.shown, strict=True):
                 kept = self.kept(FrameRun(recording, 0, L, policy))
                 made = on.map_of(kept) if poses == "true poses" else on.track_of(kept).model
@@ -147,13 +167,13 @@ class Reproduction(FrameFigure):
         part.colorbar(painted, ax=panels, label=label, shrink=0.7, ticks=[0, 10, 20], format="%d")
 
 
-def _some(points: int) -> NDArray[np.int64]:
+def some_of(points: int) -> NDArray[np.int64]:
     """Choose the points to draw, the same for every map."""
     return np.random.Generator(np.random.PCG64(0)).permutation(points)[:SLICE]
 
 
-def _plan(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def plan_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Find the two directions in which the points spread most, float64[3, 2]; they span the plan."""
-    some = points[_some(len(points))[:2000]]
+    some = points[some_of(len(points))[:2000]]
     _, _, axes = np.linalg.svd(some - some.mean(axis=0), full_matrices=False)
     return np.asarray(axes[:2].T, np.float64)

@@ -13,13 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.benchmark.table import aligned
-from bufgym.papers.figure import finish, heat_table
-from bufgym.papers.frame_runs import POLICIES, FrameFigure
+from bufgym.papers.figure import finish, heat_table, of_all, within
+from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, RESAMPLES, FrameFigure
+from bufgym.papers.perception.stage import IMAGES
 from bufgym.papers.rows import FigureRows
 
 THIRD = 1 / 3
 """Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
+HALF = 1 / 2
+"""ORBBuf's failures are greatly reduced if they are at most this share of Drop Oldest's."""
 COLUMNS = 4
 """Columns of small pictures of the camera's path."""
 
@@ -53,7 +57,7 @@ class Reproduction(FrameFigure):
         }
         runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
         facts: dict[str, Any] = {"runs": runs}
-        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count"), "not run")
+        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count", "orbbuf_count"), "not run")
         facts["counts"] = "; ".join(
             f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
             for name, counts in broken.items()
@@ -70,14 +74,24 @@ class Reproduction(FrameFigure):
             return all(rule(counts) for counts in broken.values())
 
         if {"afr", "drop-oldest"} <= set(self.policies):
-            facts["oldest"] = everywhere(lambda counts: 0.4 <= counts["drop-oldest"] / runs <= 0.6)
-            facts["oldest_rate"], facts["afr_rate"] = each(".0%", ("drop-oldest",), runs), each(".0%", ("afr",), runs)
+            rates = {
+                policy: {name: rate(rows.where(recording=name, policy=policy)) for name in self.recordings}
+                for policy in ("drop-oldest", "afr")
+            }
+            facts["oldest"] = of_all(within(found, 0.35, 0.65) for found in rates["drop-oldest"].values())
+            if IMAGES in self.policies:
+                pairs = [(counts[IMAGES], counts["drop-oldest"]) for counts in broken.values()]
+                facts["orbbuf"] = all(ours <= HALF * theirs for ours, theirs in pairs)
+            facts["orbbuf_count"] = each(".0f", (IMAGES, "drop-oldest")) if IMAGES in self.policies else "not run"
+            for key, policy in (("oldest_rate", "drop-oldest"), ("afr_rate", "afr")):
+                told = (f"{name} {r.value:.0%} [{r.low:.0%}, {r.high:.0%}]" for name, r in rates[policy].items())
+                facts[key] = "; ".join(told)
             facts["third_count"] = each(".0f", ("afr", "drop-oldest"))
             large = FigureRows(row for row in rows if row["L"] > 10)
             facts["large_count"] = failures(large, policy="afr")
             facts |= dict.fromkeys(("afr", "third", "large"))
             if everywhere(lambda counts: counts["drop-oldest"] > 0):  # else AFR has nothing to improve
-                facts["afr"] = everywhere(lambda counts: counts["afr"] / runs < 0.1)
+                facts["afr"] = of_all(within(found, 0.0, 0.1) for found in rates["afr"].values())
                 facts["third"] = everywhere(lambda counts: counts["afr"] <= THIRD * counts["drop-oldest"])
                 facts["large"] = failures(large, policy="afr") == 0 if large else None
         return facts
@@ -121,6 +135,13 @@ class Reproduction(FrameFigure):
         for axes in panels[::COLUMNS]:
             axes.set_ylabel("m", fontsize=8)
         part.suptitle(f"{recording}: where, all L (the way begins at the triangle)", x=0.02, ha="left", fontsize=10)
+
+
+def rate(rows: FigureRows) -> Interval:
+    """Share of the runs that fail; the interval draws offsets of the fade, each with all its runs."""
+    shares = np.array([failures(rows, k=k) / len(rows.where(k=k)) for k in rows.distinct("k")])
+    drawn = times_drawn(len(shares), RESAMPLES, stream(0, "failures"))
+    return percentile_interval(drawn @ shares / len(shares), CONFIDENCE)
 
 
 def failures(rows: FigureRows, **where: object) -> int:

@@ -19,10 +19,11 @@ from bufgym import policies, sim
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.table import aligned
-from bufgym.papers.afr_evaluation import FRAME_BYTES, LinkFigure
+from bufgym.papers.afr_evaluation import LinkFigure
 from bufgym.papers.figure import COLOURS, finish
 from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario import Uplink
+from bufgym.scenario.afr_evaluation import FRAME_BYTES
 from bufgym.scenario.suites import CAPACITIES, RATE_HZ, time_value
 
 SECONDS = (21, 23)

@@ -14,11 +14,12 @@ import textwrap
 import tomllib
 from abc import ABC, abstractmethod
 from collections import ChainMap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
 from bufgym.model import checks
@@ -38,7 +39,8 @@ COLOURS = {
 }
 """Colour of each policy in every figure, from Okabe and Ito's palette for colour-blind readers."""
 
-VERDICTS = {True: "holds", False: "DIFFERS", None: "not tested here"}
+UNDECIDED = "undecided"
+VERDICTS = {True: "holds", False: "DIFFERS", None: "not tested here", UNDECIDED: UNDECIDED}
 WIDTH = 120
 """Width of the printed text in letters."""
 
@@ -131,6 +133,24 @@ def facts_of(figure: Figure, rows: FigureRows) -> dict[str, Any]:
     return {**constants, "figure": figure, **options, **figure.claims(rows)}
 
 
+def within(found: Interval, low: float, high: float) -> bool | str:
+    """Whether a number lies from ``low`` to ``high``, which its interval must do; UNDECIDED where a part of it does."""
+    if low <= found.low and found.high <= high:
+        return True
+    return False if found.high < low or found.low > high else UNDECIDED
+
+
+def of_all(verdicts: Iterable[bool | str | None]) -> bool | str | None:
+    """The verdict of a claim about several cases: one that differs makes it differ, one undecided leaves it open."""
+    found = list(verdicts)
+    return next((verdict for verdict in (False, UNDECIDED, None) if verdict in found), True)
+
+
+def tens(share: float) -> tuple[float, float]:
+    """What rounds to this number of whole tens of per cent, as in "about 20 %"."""
+    return share - 0.05, share + 0.05
+
+
 def report(name: str, figure: Figure, rows: FigureRows) -> list[str]:
     """Lines of text: our numbers beside the paper's, and which of its claims hold."""
     facts, texts = facts_of(figure, rows), statements()[name]
@@ -145,9 +165,7 @@ def report(name: str, figure: Figure, rows: FigureRows) -> list[str]:
 
 def source(text: Mapping[str, Any]) -> str:
     """Name the claim's place in the paper, or say that the claim is ours."""
-    if text.get("own"):
-        return "Our addition"
-    return str(text["place"]) if text.get("abstract") else f"{text['place']} (wording not checked)"
+    return "Our addition" if text.get("own") else str(text["place"])
 
 
 def _filled(text: str, facts: Mapping[str, Any]) -> list[str]:

@@ -28,17 +28,17 @@ from bufgym import traces
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
 from bufgym.benchmark.rows import Row
 from bufgym.ground.libraries import library
-from bufgym.papers.afr_evaluation import LINK, PAPER_FRAMES
 from bufgym.papers.figure import COLOURS, Figure, whole
-from bufgym.papers.frame_tasks import SEVEN_SCENES, FrameTask, Kind, carry_out, stage
+from bufgym.papers.frame_tasks import FOLDERS, FrameTask, Kind, carry_out, stage
 from bufgym.papers.perception import streams, views
 from bufgym.papers.perception.stage import IMAGES, OFFSETS, Stage
 from bufgym.papers.rows import FigureRows
+from bufgym.scenario.afr_evaluation import LINK, PAPER_FRAMES, fade
 from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
 from bufgym.traces import Trace
 
-RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect"}
-"""Name -> description of the recording; 7-scenes needs a folder of recordings."""
+RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect", "tum": "TUM RGB-D freiburg1_desk, Kinect"}
+"""Name -> description of the recording; all but the room need a folder of recordings."""
 
 POLICIES = {
     "drop-oldest": ("Drop Oldest", COLOURS["drop-oldest"]),
@@ -52,11 +52,6 @@ POLICIES = {
 """Policy -> label, colour. The clairvoyant plans for motion QoI."""
 RESAMPLES, CONFIDENCE = 1000, 0.95
 """Bootstrap of a rank correlation."""
-
-
-def fade() -> Trace:
-    """Stand-in for the paper's link: 2.2 MB/s, about its mean, and 0.4 MB/s from second 21 to second 24."""
-    return Trace.steps([(21, 2.2e6), (3, 0.4e6), (30, 2.2e6)], name="fade")
 
 
 class FrameRun(NamedTuple):
@@ -92,8 +87,8 @@ class FrameFigure(Figure):
 
     @property
     def recordings(self) -> list[str]:
-        real = self.data is not None and (self.data / SEVEN_SCENES).is_dir()
-        return ["room", *(["7-scenes"] if real else [])]
+        data = self.data
+        return ["room", *(name for name, folder in FOLDERS.items() if data is not None and (data / folder).is_dir())]
 
     @cached_property
     def link(self) -> Trace:

@@ -23,7 +23,8 @@ from bufgym.papers.perception.room import made_up_room
 from bufgym.papers.perception.stage import WIDTH, Stage
 from bufgym.traces import Trace
 
-SEVEN_SCENES = "rgbd_7scenes"
+FOLDERS = {"7-scenes": "rgbd_7scenes", "tum": "rgbd_dataset_freiburg1_desk"}
+"""Recording -> its folder in that of all recordings; the paper's own are of TUM RGB-D."""
 Kind = Literal["kept", "map", "track"]
 
 
@@ -33,8 +34,8 @@ def stage(name: str, data: str | None, frames: int) -> Stage:
     if name == "room":
         return Stage(made_up_room(0, frames=frames))
     if data is None:
-        raise BufgymError(f"recording {name}: needs a folder of recordings (--data DIR) with {SEVEN_SCENES}")
-    return Stage(open_sequence(Path(data) / SEVEN_SCENES).first(frames))
+        raise BufgymError(f"recording {name}: needs a folder of recordings (--data DIR) with {FOLDERS[name]}")
+    return Stage(open_sequence(Path(data) / FOLDERS[name]).first(frames))
 
 
 class FrameTask(NamedTuple):

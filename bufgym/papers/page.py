@@ -12,12 +12,12 @@ from typing import Any
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers import FIGURES, TAKES_DATA, figure
-from bufgym.papers.figure import facts_of, source, statements
+from bufgym.papers.figure import UNDECIDED, facts_of, source, statements
 
 PAPERS = {"afr": "AFR [wang2022afr]", "robofleet": "Robofleet [sikand2021robofleet]"}
 """Prefix of a section's name -> the paper with its key in references.bib."""
 
-VERDICTS = {True: "holds", False: "**differs**", None: "not checked"}
+VERDICTS = {True: "holds", False: "**differs**", None: "not checked", UNDECIDED: UNDECIDED}
 
 HEAD = """\
 # The papers' claims
@@ -25,9 +25,12 @@ HEAD = """\
 This page lists every sentence of the two papers that we know of and that can be checked. Each row has the command that
 tests the sentence, our number, and the verdict. Keys in brackets are from [references.bib](references.bib).
 
-The sentences are in our words. Where the place names the abstract, we checked the sentence against the abstract. The
-wording of all others was not checked against the papers' text. "Our addition" marks sentences that the papers do not
-have. Where a paper leaves a parameter open, ours is a stated default of the command's figure.
+The sentences are in our words, read at the place that is named: a section, an equation or a figure. "Our addition"
+marks sentences that the papers do not have. Where a paper leaves a parameter open, ours is a stated default of the
+command's figure.
+
+A claim about a number *holds* where our interval lies within it, *differs* where the interval lies outside, and is
+*undecided* where the interval is too wide to say. "About 20 %" is from 15 to 25 %.
 
 This page is made by
 

@@ -88,9 +88,19 @@ class Reproduction(CloudFigure):
         trio = list(zip(rates, ms["robofleet"], ms["rosbridge"], ms["ros-native"], strict=True))
         ahead = [rate for rate, own, _, native in trio if own < native * (1 - EQUAL)]
         behind = [rate for rate, own, _, native in trio if own > native * (1 + EQUAL)]
+        received = {
+            name: [rows.mean("received_hz", sender=name, publish_hz=rate) for rate in rates] for name in SENDERS
+        }
+        fewer = [
+            r
+            for r, own, native in zip(rates, received["robofleet"], received["ros-native"], strict=True)
+            if own < native * (1 - EQUAL)
+        ]
         return {
             "rosbridge": all(own < bridge for _, own, bridge, _ in trio),
-            "native": not behind,
+            # Ideal: the link carries all that is published.
+            "native": not any(rate <= self.link_hz for rate in ahead) and bool(behind),
+            "fewer": listed([f"{rate:g}" for rate in fewer]),
             "ahead_of_native": listed([f"{rate:g}" for rate in ahead]),
             "behind_native": listed([f"{rate:g}" for rate in behind]),
             "some": "; ".join(

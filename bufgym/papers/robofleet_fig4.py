@@ -38,6 +38,10 @@ WATCHED = 12.0
 LEAST_WATCHED_S = 30.0
 
 
+SIMILAR = 0.9
+"""Share of the cells that must lie nearer to native ROS's recovery than to rosbridge's."""
+
+
 @dataclass(frozen=True)
 class Reproduction(CloudFigure):
     """Fig. 4 for these lengths of the dropout and these links; the picture shows the fastest link."""
@@ -87,7 +91,17 @@ class Reproduction(CloudFigure):
             group: ", ".join(f"{d:g} s" for *g, d in about if (*g,) == group)
             for group in dict.fromkeys((kind, mbit) for kind, mbit, _ in about)
         }
+        trios = [dict(zip(SENDERS, cell, strict=True)) for cell in cells.values()]
+        known = [trio for trio in trios if 0 < trio["robofleet"] < math.inf and 0 < trio["ros-native"] < math.inf]
+        # Nearer to native ROS's than to rosbridge's, by factors.
+        near = [
+            factor(trio["robofleet"], trio["ros-native"]) < factor(trio["robofleet"], trio["rosbridge"])
+            for trio in known
+        ]
         return {
+            "native": sum(near) >= SIMILAR * len(near) if near else None,
+            "near_cells": sum(near),
+            "known_cells": len(near),
             "cells": len(cells),
             "sooner_cells": sum(r > 1 for r in ratios.values()),
             "about_cells": len(about),
@@ -153,6 +167,11 @@ def recovery_s(sent: Sent, away_s: float, back_s: float, factor: float) -> float
 
 Cells = dict[tuple[str, float, float], tuple[float, ...]]
 """(kind, Mbit/s, dropout in s) -> recovery of each of ``SENDERS``, s."""
+
+
+def factor(a: float, b: float) -> float:
+    """How many times as large the larger of the two is."""
+    return max(a, b) / min(a, b)
 
 
 def ratio(cell: Sequence[float]) -> float:

@@ -22,6 +22,8 @@ from bufgym.traces.generate import steady
 
 CONSTANT = 1.05
 """Largest ratio of Robofleet's latency with the most consumers to its latency with one that counts as constant."""
+COMPARABLE = 2.0
+"""Latencies within this factor of each other count as comparable."""
 STRAIGHT = 0.98
 """Least correlation of native ROS's mean latency with the number of consumers that counts as linear."""
 
@@ -94,7 +96,8 @@ class Reproduction(ClientFigure):
         return [shown.mean("mean_latency_s", consumers=n) for n in range(1, self.max_consumers + 1)]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
-        growth, linear, slopes = {}, [], []
+        growth, slopes = dict[int, float](), list[str]()
+        linear: dict[bool, list[bool]] = {True: [], False: []}
         for points in self.points:
             first, *_, last = self.latencies_s(rows, points, "Robofleet")
             growth[points] = last / first
@@ -102,9 +105,10 @@ class Reproduction(ClientFigure):
                 latency_s, consumers = self.latencies_s(rows, points, line), range(1, self.max_consumers + 1)
                 straight = float(np.corrcoef(consumers, latency_s)[0, 1])
                 slope = float(np.polyfit(consumers, latency_s, 1)[0])
-                linear.append(straight >= STRAIGHT and slope > 0)
+                is_linear = straight >= STRAIGHT and slope > 0
+                linear[self.fits(points) >= self.max_consumers].append(is_linear)
                 slopes.append(
-                    f"{points:,} points, {line} {'yes' if linear[-1] else 'NO'} ({slope:.3f} s a consumer, "
+                    f"{points:,} points, {line} {'yes' if is_linear else 'NO'} ({slope:.3f} s a consumer, "
                     f"r = {straight:.3f})"
                 )
         one = rows.where(consumers=1)
@@ -118,8 +122,33 @@ class Reproduction(ClientFigure):
             ),
             "constant": max(growth.values()) <= CONSTANT,
             "growth": listed([f"{ratio:.2f} times at {points:,} points" for points, ratio in growth.items()]),
-            "linear": all(linear),
+            "linear": all(linear[True]) if linear[True] else None,
+            "beyond": all(linear[False]) if linear[False] else None,
+            **self.many(rows),
             "slopes": "; ".join(slopes),
+        }
+
+    def many(self, rows: FigureRows) -> dict[str, Any]:
+        """Latency and share received of each program with the most consumers."""
+        names = ("rosbridge", "ros-native", "robofleet")
+        last = rows.where(consumers=self.max_consumers)
+        by = {
+            column: {p: [last.mean(column, points=p, sender=n) for n in names] for p in self.points}
+            for column in ("mean_latency_s", "received_share")
+        }
+        slower = {p: (bridge / native, own / native) for p, (bridge, native, own) in by["mean_latency_s"].items()}
+        told = {
+            column: "; ".join(
+                f"{p:,} points " + " / ".join(format(x, spec) for x in trio) for p, trio in by[column].items()
+            )
+            for column, spec in (("mean_latency_s", ".3f"), ("received_share", ".0%"))
+        }
+        return {
+            "comparable": all(1 / COMPARABLE <= bridge <= COMPARABLE for bridge, _ in slower.values()),
+            "outperforms": all(own < 1 / COMPARABLE for _, own in slower.values()),
+            "throughput": all(own >= native / COMPARABLE for _, native, own in by["received_share"].values()),
+            "many_s": told["mean_latency_s"],
+            "many_share": told["received_share"],
         }
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:

@@ -10,6 +10,7 @@ import numpy as np
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.qoi import Value
+from bufgym.scenario.afr_evaluation import afr_evaluation
 from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
@@ -27,6 +28,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
     "interruption": (Interruption, "one interruption of unknown length (AFR paper, Sec. III-B)"),
     "lte": (uplink_over_lte, "30 Hz RGB-D camera on a driving robot over the shipped synthetic LTE traces"),
     "topics": (client_over_lte, "the topics of Robofleet's example client over the shipped synthetic LTE traces"),
+    "afr-evaluation": (
+        afr_evaluation,
+        "AFR's evaluation: 794 frames at 30 Hz over car_0002 or a stand-in",
+    ),
     "suite": (_suite, "the scenarios of a suite's split, one of them drawn for each episode"),
 }
 """Name -> (function or class that makes it, one line about it)."""

@@ -101,7 +101,7 @@ def test_same_seed_same_episode(name):
     assert (a.arrivals == b.arrivals).all()
     assert a.link == b.link
     assert len(a.arrivals) <= made.max_messages
-    assert a.link != c.link
+    assert a.link != c.link or name == "afr-evaluation"  # which begins at its link's start
 
 
 def test_streams_are_separate():

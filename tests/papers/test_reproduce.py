@@ -127,7 +127,7 @@ def test_unknown_names_and_unusable_options_are_refused() -> None:
     for name, options, says in (
         ("afr-fig5", {"rums": 3}, "afr-fig5: unknown option 'rums'; did you mean 'runs'"),
         ("afr-fig5", {"runs": 0}, "must be|need"),
-        ("afr-fig2", {"turn_degrees": 0}, "must be|need"),
+        ("afr-views", {"turn_degrees": 0}, "must be|need"),
         ("afr-vs-random", {"last_T": 3}, "must be|need"),
         ("afr-fig6", LTE | {"size_bytes": 0}, "size_bytes = 0"),
         *((f"robofleet-fig{k}", {"runs": 0}, "runs = 0: must be a whole number >= 1") for k in range(3, 8)),

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from bufgym.ground.errors import BufgymError
+from bufgym.scenario.afr_evaluation import LINK, evaluation
 from bufgym.scenario.suites.suite import Build, Setting, Suite
 from bufgym.scenario.suites.synthetic import SIZE_BYTES, TRACES, both_sizes, both_values
-from bufgym.traces import Motion, read_motion, read_trace
+from bufgym.traces import Motion, markov_link, read_motion, read_trace
 from bufgym.traces.formats.speed_tests import runs_of
 
 _TUM = {
@@ -138,4 +139,17 @@ SUITES = tuple(
             "mahimahi/*.gz",
         ),
     )
+)
+
+
+def _afr(split: str, data: Path | None) -> dict[str, Setting]:
+    """To learn from there are made-up links of cars; the paper's own is the test."""
+    assert data is not None
+    seeds = {"train": range(6), "validation": range(6, 9)}
+    links = [read_trace(_there(data / LINK))] if split == "test" else [markov_link("car", seed=k) for k in seeds[split]]
+    return {"evaluation": Setting(evaluation(*links), "794 frames of 160 kB at 30 Hz, from the link's start")}
+
+
+SUITES += (
+    Suite("afr-evaluation-v1", "AFR's evaluation over car_0002", _afr, capacities=(5, 10, 15), seeds=10, needs=LINK),
 )

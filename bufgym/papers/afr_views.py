@@ -1,0 +1,130 @@
+"""Camera views under the three motions from which the AFR paper derives V.
+
+| motion | the view | V(d), the fraction of a view that is new d messages later |
+|---|---|---|
+| moving back from a wall | a square of the wall that grows by the same factor with each message | 1 - b^d |
+| turning in place | an angle that turns by the same angle with each message | min(1, d / D) |
+| along a corridor | a stretch of the side wall that moves on by the same length with each message | min(1, d / D) |
+
+The overlap of two views is computed from their edges and compared with the formula. V is also checked against Eq. 3-6:
+it starts at 0, does not fall, stays at most 1 and is concave.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
+from bufgym.papers.figure import COLOURS, Figure, legend_below
+from bufgym.papers.rows import FigureRows
+
+VIEW_ANGLE = math.radians(60)
+"""The camera's field of view."""
+MESSAGES = 20
+"""V is computed for distances 0..``MESSAGES``."""
+
+
+@dataclass(frozen=True)
+class CameraMotion:
+    label: str  # label in the picture
+    view: Callable[[float], tuple[float, float]]  # left and right edge of a message's view, given the message's number
+    dimensions: int  # 1 if the view has edges in one direction, 2 if it has the same edges in both
+    formula: Value  # V as the paper gives it
+
+    def new(self, d: float) -> float:
+        """Fraction of a view that was not in the view ``d`` messages earlier."""
+        (left, right), (from_, until) = self.view(d), self.view(0)
+        overlap = max(0.0, min(right, until) - max(left, from_)) / (right - left)
+        return 1 - float(overlap**self.dimensions)
+
+    def table(self) -> NDArray[np.float64]:
+        """V(0), ..., V(MESSAGES) from the views, float64[MESSAGES + 1]."""
+        return np.array([self.new(d) for d in range(MESSAGES + 1)])
+
+
+@dataclass(frozen=True)
+class GeometryFigure(Figure):
+    """A figure of the three motions."""
+
+    base: float = 0.618
+    """Fraction of a wall's view that was in the previous message's view (Fig. 5 of the paper)."""
+    turn_degrees: float = 7.5
+    """Angle turned between two messages."""
+    step_m: float = 0.15
+    """Distance driven along the corridor between two messages."""
+    wall_m: float = 1.5
+    """Distance to the corridor's side wall, and to the other wall at the start."""
+
+    SIZE_INCHES = (10.0, 3.9)
+
+    def motions(self) -> dict[str, CameraMotion]:
+        """Map a column name to its motion."""
+        half, width = math.tan(VIEW_ANGLE / 2), 2 * self.wall_m * math.tan(VIEW_ANGLE / 2)
+        turn = math.radians(self.turn_degrees)
+
+        def wall(k: float) -> tuple[float, float]:
+            edge = half * self.wall_m * self.base ** (-k / 2)
+            return -edge, edge
+
+        return {
+            "wall": CameraMotion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
+            "turn": CameraMotion(
+                "turning in place",
+                lambda k: (k * turn - VIEW_ANGLE / 2, k * turn + VIEW_ANGLE / 2),
+                1,
+                qoi.saturating(VIEW_ANGLE / turn),
+            ),
+            "corridor": CameraMotion(
+                "along a corridor, looking at its side",
+                lambda k: (k * self.step_m - width / 2, k * self.step_m + width / 2),
+                1,
+                qoi.saturating(width / self.step_m),
+            ),
+        }
+
+    def simulate(self) -> FigureRows:
+        """Return a row for each motion and distance d with V from the views and V from the formula."""
+        return FigureRows(
+            {"motion": name, "d": d, "V": float(v), "formula": motion.formula(d)}
+            for name, motion in self.motions().items()
+            for d, v in enumerate(motion.table())
+        )
+
+    def claims(self, rows: FigureRows) -> dict[str, Any]:
+        # ``tabulated`` refuses a V that breaks one of Eq. 3-6.
+        values = [qoi.tabulated(range(MESSAGES + 1), rows.column("V", motion=name).tolist()) for name in self.motions()]
+        difference = float(abs(rows.column("V") - rows.column("formula")).max())
+        names = ", ".join(motion.formula.name for motion in self.motions().values())
+        return {"concave": len(values) == len(self.motions()), "formulas": difference < 1e-12, "names": names}
+
+
+@dataclass(frozen=True)
+class Reproduction(GeometryFigure):
+    """Picture of the camera's first views in each motion, seen from above."""
+
+    shown: int = 4
+    """Number of messages drawn."""
+
+    def draw(self, rows: FigureRows, figure: Any) -> None:
+        panels = figure.subplots(1, 3)
+        for axes, (name, motion) in zip(panels, self.motions().items(), strict=True):
+            for k in range(self.shown):
+                left, right = motion.view(k)
+                if name == "turn":
+                    x, y = [0, math.sin(left), math.sin(right), 0], [0, math.cos(left), math.cos(right), 0]
+                else:
+                    away = self.wall_m if name == "corridor" else right / math.tan(VIEW_ANGLE / 2)
+                    x, y = [left, (left + right) / 2, right], [0, -away, 0]
+                    axes.axhline(0, color=COLOURS["oracle"], linewidth=3)
+                axes.plot(x, y, color=list(COLOURS.values())[k % 6], linewidth=1.4, label=f"message {k}")
+            axes.set_title(motion.label, loc="left", fontsize=10)
+            axes.set(aspect="equal", xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+        legend_below(figure, self.shown, panels[0])
