@@ -229,7 +229,7 @@ def write_json(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> None
 def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
     """Add a line of JSON to the file ``path``: date, version, sizes, ratios. Return what fell, in a line.
 
-    Ratios are compared with those of the last runs of the same sizes.
+    Ratios are compared with the last runs of the same sizes.
     """
     told = json.loads(json.dumps(asdict(sizes)))  # as the file has it
     try:

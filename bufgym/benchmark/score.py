@@ -121,7 +121,7 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     """Scores of every policy in every cell, and the standings over the discriminative cells.
 
     Rows of a trained agent may have a "training_seed"; the H of an episode is then the mean over training seeds. Every
-    policy is compared with ``against`` by its share of ``REFERENCE``'s regret. Errors are those of ``episodes.read``.
+    policy is compared with ``against`` by its share of ``REFERENCE``'s regret. See ``episodes.read`` for errors.
     """
     table = episodes.read(rows, BASELINE, against)
     drawn = links_drawn(table.episodes, RESAMPLES, SEED)

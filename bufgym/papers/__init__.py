@@ -85,7 +85,7 @@ Watch: TypeAlias = Callable[[int, float], AbstractContextManager[Callable[[], No
 def run_live(name: str, out: Path | None = None, watch: Watch | None = None, **options: Any) -> str:
     """Run one figure both simulated and on real sockets, with the fewer and shorter runs of its ``LIVE`` options.
 
-    ``watch`` shows the progress of the live runs. The rest is as for ``run``; options replace those of ``LIVE``.
+    ``watch`` shows the progress of the live runs. The rest is as for ``run``; options replace ``LIVE``'s.
     """
     from bufgym.papers.on_sockets import apart  # sockets and threads, not needed to simulate
 

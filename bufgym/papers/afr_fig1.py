@@ -1,4 +1,4 @@
-"""Fig. 1 of the AFR paper: the models that tracking and mapping make of what was received, coloured by their error."""
+"""Fig. 1 of the AFR paper: the models that tracking makes of the frames received, coloured by error."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Reproduction(Figure):
     SIZE_INCHES = (12.0, 2.8)
 
     def simulate(self) -> FigureRows:
-        """Return a row for each policy: messages dequeued in interruptions of every length, and those that arrived."""
+        """Return a row for each policy: messages dequeued in interruptions of all lengths, and arrivals."""
         interruption = Interruption(law="fixed", t_max=self.last_T)
         rng = np.random.Generator(np.random.PCG64(0))
         episodes = [interruption.episode(T).with_uniforms(rng) for T in range(1, self.last_T + 1)]

@@ -4,7 +4,7 @@ A sender's nominal latency is the median over messages received before the dropo
 further message received has at most ``factor`` times the nominal latency. Its recovery time runs from the link's return
 to the first of these messages, and is infinite if even the last message is later.
 
-The paper leaves open how long the dropout was, what was sent and how fast the link was. So we sweep the length and the
+The paper leaves open the dropout's length, the messages and the link's rate. So we sweep the length and the
 link, for one topic of each kind, at the rates of the paper's Fig. 6 and 7.
 """
 

@@ -1,4 +1,4 @@
-"""Middleware that cuts a message into fragments, all of which must arrive: Zenoh, and DDS over UDP.
+"""Middleware that cuts a message into fragments, and all must arrive: Zenoh, and DDS over UDP.
 
 A message that fits only in part is sent in part. Losing one fragment loses the message, yet its other fragments use up
 the link. On a link somewhat too slow for the stream, next to nothing may arrive. The sender here carries whole messages

@@ -23,7 +23,7 @@ class Outbox:
     """The only task that writes to a connection."""
 
     def __init__(self, caller: Caller, member: Member, form: str, received: int) -> None:
-        """``form`` is that of its messages; the client has no_drop messages up to ``received``."""
+        """``form`` says how its messages are written; the client has no_drop messages up to ``received``."""
         self._hub, self._caller, self._socket = caller.hub, caller, caller.socket
         self._awake = asyncio.Event()
         self._member, self._form = member, form

@@ -118,7 +118,7 @@ async def receive(
     out: str | None = None,
     messages: Count | None = None,
 ) -> None:
-    """Receive, ack and count what is sent here; Ctrl-C ends it.
+    """Receive, ack and count the messages sent here; Ctrl-C ends it.
 
     Args:
         out: Write received messages to this file (.mcap).

@@ -1,6 +1,6 @@
 """x on board: the scene's motion, summed from a robot's odometry as it arrives.
 
-For the same poses the sum equals that of ``bufgym.traces.motion_from_poses`` over a recording.
+For the same poses the sum equals the one by ``bufgym.traces.motion_from_poses`` over a recording.
 """
 
 import math

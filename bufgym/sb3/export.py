@@ -71,7 +71,7 @@ def weights_of(model: Any) -> Weights:
     policy = getattr(model, "policy", model)
     features, scorer = (getattr(policy, part, None) for part in ("features_extractor", "mlp_extractor"))
     if not isinstance(features, SlotExtractor) or not isinstance(scorer, SlotScorer):
-        raise BufgymError("only an agent that scores slots can be exported (train.py --network slots)")
+        raise BufgymError("only an agent that scores slots can be exported (train.py ppo --network slots)")
     fields = (*features.slot_fields, *features.context_fields)
     return Weights(fields, _network(scorer.score), _network(scorer.accept))
 

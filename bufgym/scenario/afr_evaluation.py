@@ -26,7 +26,7 @@ def fade() -> Trace:
 
 
 def evaluation(*links: Trace) -> Uplink:
-    """The stream over these links from their start; V is that of the paper's Fig. 5."""
+    """The stream over these links from their start; V is the one in the paper's Fig. 5."""
     return Uplink(
         traces=links,
         rate_hz=RATE_HZ,

@@ -1,8 +1,8 @@
 """A link's capacity over time: how many bytes it could have carried since the trace began.
 
 Model: cumulative bytes, piecewise linear between knots (the view of mahimahi's `link_queue`, with straight lines in
-place of packets). Time is int64 microseconds and capacity int64 bytes, so that what is computed from a trace is the
-same on every machine. For example, 1 MB/s for one second is the two knots (0, 0), (1_000_000, 1_000_000).
+place of packets). Time is int64 microseconds and capacity int64 bytes, so that computations from a trace give the same
+on every machine. For example, 1 MB/s for one second is the two knots (0, 0), (1_000_000, 1_000_000).
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class Trace:
         return self.time_us, np.diff(self.cumulative_bytes) * float(US_PER_S) / np.diff(self.time_us)
 
     def rate_bytes_per_s(self, time_us: npt.ArrayLike) -> Float64Array:
-        """Rate in bytes/s at each time (microseconds, any shape); at a knot, that of the segment that begins there.
+        """Rate in bytes/s at each time (microseconds, any shape); at a knot, the rate of the segment that begins there.
 
         Beyond the last knot `after` decides: loop, hold, or 0.
         """

@@ -103,7 +103,7 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
         self.state.library.enable_object_caching()
 
     def define_pipelines(self) -> list[Any]:
-        """Numba's own passes, and those of this package."""
+        """Numba's own passes and this package's."""
         (passes,) = super().define_pipelines()
         return [with_none_fields(passes)]
 

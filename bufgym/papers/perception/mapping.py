@@ -108,7 +108,7 @@ class Map:
 def fuse(sequence: Sequence, frames: Iterable[int], grid: VoxelGrid | None = None) -> Map:
     """Fuse these frames into a map, in the given order with their true poses.
 
-    ``grid`` is by default that of the whole recording, so that maps of different frames are comparable.
+    ``grid`` is by default the whole recording's, so that maps of different frames are comparable.
     """
     result = Map.empty(grid or grid_of(sequence))
     for k in frames:

@@ -3,7 +3,7 @@
 Similarity is that of ORB features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011): the
 share of one image's features that match one of the other's, each being the other's nearest. The released code has a
 random number in this place, and the wording of the paper's formula was not at hand: the formula is ours. The rule
-around it is that of the policy `orbbuf`, which compares recorded motion.
+around it is the same as in the policy `orbbuf`, which compares recorded motion.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ def export(
     A model.zip holds pickles, so reading it can run any code: export models of your own alone.
 
     Args:
-        model: Of a run of train.py: model.safetensors, or model.zip (--network slots). For C: a policy's name, as afr,
-            or a .safetensors of weights.
+        model: Of a run of train.py: model.safetensors, or model.zip (ppo --network slots). For C: a policy's name, such
+            as afr, or a .safetensors of weights.
         out: File to write.
         to: Kind of file.
     """

@@ -126,7 +126,7 @@ def read_runs(path: StrPath, column: str = RUNS[0]) -> Knots:
 
 
 def runs_of(path: StrPath) -> dict[str, list[Line]]:
-    """The runs of a file with their lines, in its order, which need not be that of their numbers."""
+    """The runs of a file with their lines, in its order; their numbers may have another."""
     with open_text(path) as file:
         text = file.text()
     runs: dict[str, list[Line]] = {}

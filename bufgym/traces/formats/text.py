@@ -63,7 +63,7 @@ class Line(NamedTuple):
         return fault(self.path, rule, line=self.number or None, value=value, field=field)
 
     def columns(self, count: int, separator: str | None = None) -> list[str]:
-        """The line's cells, of which there must be `count`; separated by white space unless a separator is given."""
+        """The line's cells; there must be `count`; separated by white space unless a separator is given."""
         cells = [cell.strip() for cell in self.text.split(separator)]
         if len(cells) != count:
             raise self.error(self.text, f"must have {count} columns, has {len(cells)}")

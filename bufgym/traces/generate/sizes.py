@@ -3,7 +3,7 @@
 - `equal`: all the same.
 - `jpeg`: each picture by itself. A slow log-normal part, AR(1) in the logarithm, times one drawn anew for each.
 - `gop`: H.264. Every so many frames a whole picture (I) is sent, `ratio` times as large as the changes (P) between. The
-  slow part is that of P.
+  slow part belongs to P.
 - `depth-colour`: two messages of one camera in turn, depth `ratio` times as large as colour, with one slow part.
 - `motion`: (`FLOOR` + speed)^exponent times a part drawn anew, where speed is that of the last `WINDOW_US`, relative to
   the recording's mean.
@@ -11,7 +11,7 @@
 
 `jpeg:cv=0.3,rho=0.9` changes parameters: `rho` from one frame to the next and `cv` of the slow part, `noise`, the
 coefficient of variation of the part drawn anew, and those named above. Each law has the asked mean in expectation: it
-is divided by its own mean, not by that of the sequence drawn.
+is divided by its own mean, not by the drawn sequence's.
 """
 
 import functools
