@@ -116,7 +116,7 @@ class Reproduction(Figure):
         peaks = equal_lengths(rows)
         beyond = [row for row in rows if row["T"] > PAPER_L]
         ordered = [
-            row["afr"] >= row["random"] * (1 - EQUAL) and row["random"] >= row["drop-oldest"] * (1 - EQUAL)
+            row["drop-oldest"] * (1 - EQUAL) <= row["random"] <= min(row["afr"], row["oracle-ideal"]) * (1 + EQUAL)
             for row in beyond
         ]
         return {

@@ -87,9 +87,13 @@ class Reproduction(FrameFigure):
                     for name in self.recordings
                 )
         if {"afr", "drop-oldest", "random"} <= set(self.policies) and len(self.capacities) > 1:
-            grown = {name: self.by_size(rows.where(recording=main, policy=name)) for name in SHOWN}
+            grown = {
+                name: self.by_size(rows.where(recording=main, policy=name))
+                for name in (*SHOWN, "orbbuf-images")
+                if name in self.policies
+            }
             facts["larger"] = of_all(
-                within(found, *((-1.0, 0.0) if name == "afr" else (-MUCH, MUCH))) for name, found in grown.items()
+                within(found, *((-1.0, 0.0) if name == "afr" else (-MUCH, np.inf))) for name, found in grown.items()
             )
             facts["sizes"] = "; ".join(f"{POLICIES[name][0]} {spelled(found)}" for name, found in grown.items())
         else:

@@ -57,7 +57,8 @@ class Reproduction(FrameFigure):
         }
         runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
         facts: dict[str, Any] = {"runs": runs}
-        facts |= dict.fromkeys(("oldest_rate", "afr_rate", "large_count", "third_count", "orbbuf_count"), "not run")
+        not_run = ("oldest_rate", "afr_rate", "random_rate", "large_count", "third_count", "orbbuf_count")
+        facts |= dict.fromkeys(not_run, "not run")
         facts["counts"] = "; ".join(
             f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
             for name, counts in broken.items()
@@ -76,14 +77,16 @@ class Reproduction(FrameFigure):
         if {"afr", "drop-oldest"} <= set(self.policies):
             rates = {
                 policy: {name: rate(rows.where(recording=name, policy=policy)) for name in self.recordings}
-                for policy in ("drop-oldest", "afr")
+                for policy in ("drop-oldest", "afr", "random")
+                if policy in self.policies
             }
             facts["oldest"] = of_all(within(found, 0.35, 0.65) for found in rates["drop-oldest"].values())
             if IMAGES in self.policies:
                 pairs = [(counts[IMAGES], counts["drop-oldest"]) for counts in broken.values()]
                 facts["orbbuf"] = all(ours <= HALF * theirs for ours, theirs in pairs)
             facts["orbbuf_count"] = each(".0f", (IMAGES, "drop-oldest")) if IMAGES in self.policies else "not run"
-            for key, policy in (("oldest_rate", "drop-oldest"), ("afr_rate", "afr")):
+            for policy in rates:
+                key = f"{policy.removeprefix('drop-')}_rate"
                 told = (f"{name} {r.value:.0%} [{r.low:.0%}, {r.high:.0%}]" for name, r in rates[policy].items())
                 facts[key] = "; ".join(told)
             facts["third_count"] = each(".0f", ("afr", "drop-oldest"))
@@ -91,7 +94,7 @@ class Reproduction(FrameFigure):
             facts["large_count"] = failures(large, policy="afr")
             facts |= dict.fromkeys(("afr", "third", "large"))
             if everywhere(lambda counts: counts["drop-oldest"] > 0):  # else AFR has nothing to improve
-                facts["afr"] = of_all(within(found, 0.0, 0.1) for found in rates["afr"].values())
+                facts["afr"] = of_all(within(found, 0.0, np.nextafter(0.1, 0)) for found in rates["afr"].values())
                 facts["third"] = everywhere(lambda counts: counts["afr"] <= THIRD * counts["drop-oldest"])
                 facts["large"] = failures(large, policy="afr") == 0 if large else None
         return facts

@@ -105,8 +105,6 @@ class Reproduction(LinkFigure):
         fast = {kb: abs(np.array(hz) - PAPER_HZ).max() <= WITHIN_HZ for kb, hz in rates.items()}
         main = self.size_bytes / 1000
         return {
-            "recalculations": bool(many[main]),
-            "rate": bool(fast[main]),
             "kb": main,
             "fewest": counts[main][0],
             "most": counts[main][1],

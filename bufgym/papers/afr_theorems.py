@@ -8,8 +8,8 @@ The ratio of Theorem 2 is not linear in V. But for gaps g that add up to T + 1 =
 1) V(m)) is smallest for V(d) = min(1, d / m). With t = V(m), concavity gives V(g) >= t g / m for g <= m, and V(g) >= t
 for g >= m as V does not fall. The worst ratio over all V is therefore sum min(1, g / m) / (L + 1).
 
-We add two statements to the paper's theorems. The first is a sharper bound, 2(sqrt((2L + 1) / (L + 1)) - 1), the
-minimum of the same ratio. The second is about AFR's gaps. One pass of p merges gaps of r to gaps of 2r, so the largest
+We add to the paper's theorems a sharper bound, 2(sqrt((2L + 1) / (L + 1)) - 1), the
+minimum of the same ratio. About AFR's gaps (Appendix I): one pass of p merges gaps of r to gaps of 2r, so the largest
 gap between kept messages is at most twice the smallest. The gap at the edge, from the newest kept message to message T
 + 1, is at most the smallest of these gaps.
 """

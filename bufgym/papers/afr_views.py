@@ -1,4 +1,4 @@
-"""Camera views under the three motions from which the AFR paper derives V.
+"""Camera views under three motions: two of the AFR paper, and a look aside along a corridor, which is ours.
 
 | motion | the view | V(d), the fraction of a view that is new d messages later |
 |---|---|---|
@@ -36,7 +36,7 @@ class CameraMotion:
     label: str  # label in the picture
     view: Callable[[float], tuple[float, float]]  # left and right edge of a message's view, given the message's number
     dimensions: int  # 1 if the view has edges in one direction, 2 if it has the same edges in both
-    formula: Value  # V as the paper gives it
+    formula: Value  # V in closed form; the paper gives that of the wall
 
     def new(self, d: float) -> float:
         """Fraction of a view that was not in the view ``d`` messages earlier."""

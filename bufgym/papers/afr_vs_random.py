@@ -131,7 +131,7 @@ class Reproduction(Figure):
         random = float(expected_extremes(L, T)[T, D - 1])
         afr = int(extremes(gaps)[D - 1])
         return {
-            "grid": violations == 0,
+            "grid": violations == 0 and not random > afr,
             "one": bool(random > afr),
             "violations": violations,
             "cases": int(beyond_1.column("cases").sum()),

@@ -146,6 +146,11 @@ def of_all(verdicts: Iterable[bool | str | None]) -> bool | str | None:
     return next((verdict for verdict in (False, UNDECIDED, None) if verdict in found), True)
 
 
+def either(cases: Sequence[bool]) -> bool | str:
+    """The verdict of a claim about a parameter that the paper leaves open: UNDECIDED if it depends on it."""
+    return all(cases) if len(set(cases)) == 1 else UNDECIDED
+
+
 def tens(share: float) -> tuple[float, float]:
     """What rounds to this number of whole tens of per cent, as in "about 20 %"."""
     return share - 0.05, share + 0.05

@@ -53,7 +53,7 @@ def claim_rows(name: str, out: Path | None = None, **options: Any) -> list[str]:
     for claim, text in texts.get("claims", {}).items():
         ours = " ".join(text["ours"].format(**facts).split())
         cells = [source(text), text["says"].format(**facts), command, ours, VERDICTS[facts.get(claim)]]
-        lines.append("| " + " | ".join([*cells, text.get("why", "")]) + " |")
+        lines.append("| " + " | ".join([*cells, " ".join(text.get("why", "").format(**facts).split())]) + " |")
     return lines
 
 

@@ -92,9 +92,7 @@ class Reproduction(Figure):
         }
         equal = {
             claim: all(sizes[kind][encoding] == PAPER[kind][k] for kind in PAPER)
-            for k, (claim, encoding) in enumerate(
-                (("ros", "ros1"), ("flatbuffer", "robofleet"), ("json", "json-numbers"))
-            )
+            for k, (claim, encoding) in enumerate((("flatbuffer", "robofleet"), ("json", "json-numbers")), 1)
         }
         scan, fix, image = (self.messages[kind] for kind in PAPER)
         contents = {
