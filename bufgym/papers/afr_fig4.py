@@ -7,6 +7,7 @@ doubles. The counter c now rejects every second arrival, and the next pass begin
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from bufgym import policies, sim
 from bufgym.benchmark.table import aligned
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
-from bufgym.papers.rows import FigureRows
+from bufgym.papers.rows import FigureRows, listed
 from bufgym.policies.afr import C, P, R
 from bufgym.scenario import Interruption
 
@@ -87,7 +88,10 @@ class Reproduction(Figure):
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         same = [row["dropped"] == PAPER_DROPS[row["T"]] for row in rows if row["T"] in PAPER_DROPS]
-        return {"drops": all(same), "same": sum(same), "compared": len(same)}
+        path = itertools.pairwise(steps(last_T=40))
+        doubled = [step.T for before, step in path if step.r > before.r and step.p == 0]
+        drops = {"drops": all(same), "same": sum(same), "compared": len(same)}
+        return drops | {"doubles": doubled == [16, 32], "doubled": listed([str(T) for T in doubled])}
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
         axes = figure.add_subplot()
