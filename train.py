@@ -69,9 +69,9 @@ def main(settings: Settings, beside: bool = False) -> None:
 def typed(words: Sequence[str]) -> None:
     """Do what was typed; a mistake ends in one line."""
     try:
-        for word, value in zip(words, [*words[1:], ""], strict=True):
+        for k, word in enumerate(words):
             if word.startswith("--algo"):
-                now = BEFORE.get(word.partition("=")[2] or value, "evolve")
+                now = BEFORE.get(word.partition("=")[2] or "".join(words[k + 1 : k + 2]), "evolve")
                 raise BufgymError(f"--algo is a command now: type python train.py {now}, then the other settings")
         app(words)
     except BufgymError as error:

@@ -306,3 +306,12 @@ def test_the_command_of_a_run_gives_its_settings_again() -> None:
                 train.typed(settings.command.split()[2:])
         expected = dataclasses.replace(settings, name="")
         assert made == [dataclasses.replace(expected, cluster=None) if isinstance(expected, Evolve) else expected]
+
+
+def test_without_words_evolve_runs_and_ppo_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``python train.py``, the command of ``make train``."""
+    asked: list[Any] = []
+    monkeypatch.setattr(train, "main", lambda settings, beside=False: asked.append((settings, beside)))
+    with pytest.raises(SystemExit):
+        train.typed([])
+    assert asked == [(Evolve(), True)]
