@@ -81,7 +81,7 @@ def main(folder: str) -> None:
     try:
         there = start(BASE, "receive", "--port", "0").rpartition(" ")[2]
         back = start(ROBOT, "receive", "--port", "0").rpartition(" ")[2]
-        log = ["--log", str(Path(folder, "log.mcap"))]
+        log = ["--policies", "fifo", "--log", str(Path(folder, "log.mcap"))]
         told = start(ROBOT, "send", "--config", f"{folder}/client.toml", "--to", there, "--odom", "odom", *log)
         told_back = start(BASE, "send", "--config", f"{folder}/commands.toml", "--to", back)
         own = Publisher(robot.node, String, "own/echo", to=("127.0.0.1", int(there.rpartition(":")[2])))

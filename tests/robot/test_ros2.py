@@ -52,7 +52,7 @@ def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None
     assert seen["told"][1] == "/commands: std_msgs/msg/String, reliable"
     assert seen["best_effort"] and seen["by"] == "bufgym_receive" and seen["faults"] == []
     log = read_log(tmp_path / "log.mcap")
-    assert log[0]["policy"] == "learned-scheduler" and replay(log).differences == ()
+    assert log[0]["policy"] == "fifo" and replay(log).differences == ()
     # 2 m of motion at a scene scale of 2 m, compared 30 times a second at most.
     moved = [record["x"] for record in of(log, "put") if record["topic"] == 0]
     assert moved[0] < 0.1 and 0.85 < moved[-1] <= 1.0
