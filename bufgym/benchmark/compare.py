@@ -154,7 +154,7 @@ def compare(
     for name in settings:
         if name not in known:
             raise unknown("keyword", name, [*KEYWORDS, *QUEUE, *known], place="compare")
-    stream = scenario.get(on, **settings) if isinstance(on, str) else on
+    stream = scenario.get(stream, **settings) if settings else stream
     label, seeds, capacities = on if isinstance(on, str) else "", 10 if seeds is None else seeds, capacities or [8]
     return beside(chosen, stream, capacities, seeds, label=label, about=about, rival=rival, progress=progress, **queue)
 

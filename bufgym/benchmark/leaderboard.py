@@ -63,11 +63,8 @@ def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> lis
     summary = task.summary(rows, unranked)
     cells = len(summary.cells) if summary.scores is None else summary.scores.counted
     return [
-        Entry(
-            *(suite, place.policy, place.rank or 0, cells),
-            *({key: standing[key] for key in task.listed}, __version__),
-        )
-        for place, standing in zip(places(summary), summary.overall, strict=True)
+        Entry(suite, s.policy, place.rank or 0, cells, {key: s[key] for key in task.listed}, __version__)
+        for place, s in zip(places(summary), summary.overall, strict=True)
     ]
 
 

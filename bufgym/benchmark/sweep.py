@@ -28,11 +28,11 @@ from bufgym.benchmark.run import bar, by_trace, check_distinct, run
 from bufgym.benchmark.table import apart
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__, modules
-from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
 from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE
-from bufgym.scenario.registry import parameters
+from bufgym.scenario.registry import with_parameters
 from bufgym.scenario.suites import Setting
 
 _SEEDS_PER_SHARD = 25
@@ -71,12 +71,8 @@ class Sweep:
         settings = suites.get(self.suite).settings(self.split, self.data)
         if not self.changes:
             return settings
-        known = parameters(next(iter(settings.values())).scenario)
-        for name in self.changes:
-            if name not in known:
-                raise unknown("parameter", name, known, place=self.suite)
         return {
-            label: replace(setting, scenario=replace(setting.scenario, **self.changes))
+            label: replace(setting, scenario=with_parameters(setting.scenario, self.changes, place=self.suite))
             for label, setting in settings.items()
         }
 

@@ -178,9 +178,9 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
                 admitted = await kind.greet(caller)
         except TimeoutError:
             raise RefusedError("wrong", f"no hello within {hello_s:g} s") from None
-        _, _, name, temporary, _, received, acked = admitted
+        numbers = admitted.received, admitted.acked
         with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
-            session = hub.store.open(name, caller.identity, temporary, received, acked)
+            session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"
             await kind(caller, admitted, session, quota).run(greeted)
     except BufgymError as error:

@@ -1,7 +1,7 @@
 """The one registry of scenarios, by name."""
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -105,12 +105,7 @@ def get(spec: str | Scenario, options: Iterable[str] = (), /, **overrides: Any) 
         spec = checked(spec, type(spec).__name__)
     if not overrides:
         return spec
-    known = parameters(spec)
-    for name in overrides:
-        if name not in known:
-            also = "" if known else " (it is no dataclass)"
-            raise unknown("parameter", name, [*known, *options], also, type(spec).__name__)
-    return replace(spec, **overrides)  # type: ignore[type-var]
+    return with_parameters(spec, overrides, options)
 
 
 def about(scenario: Any) -> str:
@@ -121,3 +116,15 @@ def about(scenario: Any) -> str:
 def parameters(spec: Any) -> list[str]:
     """Names of a scenario's parameters, sorted; none where it is no dataclass."""
     return sorted(f.name for f in fields(spec)) if is_dataclass(spec) else []
+
+
+def with_parameters(
+    spec: Scenario, changes: Mapping[str, Any], options: Iterable[str] = (), place: str = ""
+) -> Scenario:
+    """The scenario with changed parameters, if it has all of them; see ``get``. Errors name ``place`` or its class."""
+    known = parameters(spec)
+    for name in changes:
+        if name not in known:
+            also = "" if known else " (it is no dataclass)"
+            raise unknown("parameter", name, [*known, *options], also, place or type(spec).__name__)
+    return replace(spec, **changes)  # type: ignore[type-var]
