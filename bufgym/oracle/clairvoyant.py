@@ -25,7 +25,7 @@ from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_l
 from bufgym.model.qoi import Value
 from bufgym.oracle import labels, unequal
 from bufgym.oracle.interruption import evenly_kept
-from bufgym.oracle.programme import NEVER
+from bufgym.oracle.programme import NEVER, Messages
 from bufgym.policies.registry import built_in
 from bufgym.scenario import Episode
 
@@ -68,7 +68,7 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
     if (size == size[0]).all():
         room = min(capacity, most_bytes // int(size[0]))
         limit = np.full(n, room * size[0] if room else NEVER)
-        sent, gain = labels.best(c, size, limit, x, v.array, ends)
+        sent, gain = labels.best(Messages(c, size, limit, x, v.array, ends))
     elif _fits(c, size, capacity, most_bytes, ends, np.empty(n, np.int64)):
         sent, gain = np.arange(n), v.information(x) - 1.0  # V is concave, so no plan beats sending all messages
     else:
@@ -76,7 +76,7 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
         _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
         # While no more bytes wait than in the L smallest messages, fewer than L messages wait.
         certain = np.minimum(np.minimum(limit, np.sort(size)[:capacity].sum()), most_bytes - size)
-        sent, gain = unequal.best(c, size, limit, certain, x, v.array, ends, capacity, most_bytes)
+        sent, gain = unequal.best(Messages(c, size, limit, x, v.array, ends), certain, capacity, most_bytes)
     kept = np.zeros(n, np.bool_)
     kept[sent] = True
     qoi = 1.0 + gain if len(sent) else 0.0

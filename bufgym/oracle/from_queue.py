@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bufgym.ground.kernel import Floats, Ints, at, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.ahead import TIE, Ahead, sends, step_of
-from bufgym.sim.state import ARRIVAL_WAITS, CARRIES, Batch
+from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
 
 class Work(NamedTuple):
@@ -85,9 +85,7 @@ def so_far(batch: Batch, i: int, ends: int) -> tuple[float, int]:
     """H of all messages that the socket took and the link will carry, and the byte at which the last of them ends."""
     sender = batch.senders[i]
     gain, counted = sender.delivered_gain, sender.dequeued
-    e = sender.position
-    if sender.busy > 0 and sender.link != CARRIES:
-        e = ends + 1
+    e = sender.position  # of one queue with a link of its own: what is in the socket, the link carries
     if e > ends:
         counted -= sender.busy
     for k in range(sender.credited, counted):
@@ -158,15 +156,20 @@ def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int
             # Of equal plans those that send more: they are less often impossible.
             if gain + work.jump[t, k] >= most - TIE:
                 most, sent, target = gain + work.jump[t, k], t, work.target[t, k]
-    if possible(ahead, work, i, batch.senders[i].next, e, count, until, sent, target):
+    if possible(batch, ahead, work, i, e, (count, until, sent, target)):
         return float(most)
     return forced(batch, ahead, work, i, e, count, until)
 
 
 @kernel
-def possible(ahead: Ahead, work: Work, i: int, n: int, e: int, count: int, until: int, sent: int, target: int) -> bool:
-    """Whether a plan with ``sent`` of the queue's messages and then ``target`` keeps the socket busy enough."""
-    b, m = ahead.link[i, 0], target
+def possible(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, plan: tuple[int, int, int, int]) -> bool:
+    """Whether a plan keeps the socket busy enough.
+
+    ``plan`` is (messages queued, transmissions delivered, queued messages that it sends, the arrival that it sends
+    next); ``best_from`` makes it.
+    """
+    b, n = ahead.link[i, 0], batch.senders[i].next
+    count, until, sent, m = plan
     for t in range(sent + 1, until + 1):
         if m < 0 or m - n > work.arrived[t] - (count - t):
             return False

@@ -25,7 +25,7 @@ import numpy as np
 
 from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.qoi import value
-from bufgym.oracle.programme import Problem, find_future, new_problem
+from bufgym.oracle.programme import Messages, Problem, find_future, new_problem
 
 GRID = 16
 """Grid steps to a message."""
@@ -49,10 +49,10 @@ class Labels(NamedTuple):
     parent: Ints  # int64[room], the label before it; -1 at the first message of a plan
 
 
-def best(c: Ints, size: Ints, limit: Ints, x: Floats, v: Floats, ends: int) -> tuple[Ints, float]:
+def best(messages: Messages) -> tuple[Ints, float]:
     """Find the best plan; return its messages in order and its gain, H - 1."""
-    n = len(c)
-    problem, guide = new_problem(c, size, limit, limit, x, v, ends, GRID), np.empty(n, np.int64)
+    n = len(messages.c)
+    problem, guide = new_problem(messages, messages.limit, GRID), np.empty(n, np.int64)
     find_future(problem)
     _, low = guided(problem, guide)
     high = most(problem)

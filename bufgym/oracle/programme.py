@@ -20,8 +20,8 @@ BLOCK = 32
 """Grid positions that share the range of successors to look at."""
 
 
-class Problem(NamedTuple):
-    """One episode as the kernels read it; arrays over messages."""
+class Messages(NamedTuple):
+    """One episode's messages as the link sees them; arrays over messages."""
 
     c: Ints  # int64, bytes that the link can have carried when the message arrives
     size: Ints  # int64, bytes of the message
@@ -29,6 +29,17 @@ class Problem(NamedTuple):
     x: Floats  # float64, coordinate of the message
     v: Floats  # ``Value.array``
     ends: int  # the link's last byte
+
+
+class Problem(NamedTuple):
+    """``Messages`` and what the kernels look up about them."""
+
+    c: Ints
+    size: Ints
+    limit: Ints
+    x: Floats
+    v: Floats
+    ends: int
     between: Ints
     """int64, the last message before it that could have been sent before it arrives; -1: none."""
     idle: Ints
@@ -51,18 +62,17 @@ class Room(NamedTuple):
     """float64[messages, steps], like ``future``, if the message begins there after waiting; less its price."""
 
 
-def new_problem(
-    c: Ints, size: Ints, limit: Ints, certain: Ints, x: Floats, v: Floats, ends: int, steps: int
-) -> Problem:
+def new_problem(messages: Messages, certain: Ints, steps: int) -> Problem:
     """Set up one episode on a grid of ``steps`` to a mean message, or fewer (``MAX_CELLS``); ``future`` is 0.
 
     A message that waits for at most ``certain`` bytes finds room, whichever messages wait.
     """
+    c, size, limit = messages[:3]
     n, furthest = len(c), max(0, int((limit + size).max()))
     grid = max(1, int(size.mean()) // steps, furthest * n // MAX_CELLS)
     between, idle = np.empty((2, n), np.int64)
     find_idle(c, size, limit, certain, between, idle)
-    return Problem(c, size, limit, x, v, ends, between, idle, grid, np.zeros((n, furthest // grid + 2)))
+    return Problem(*messages, between, idle, grid, np.zeros((n, furthest // grid + 2)))
 
 
 @kernel

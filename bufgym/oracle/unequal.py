@@ -24,7 +24,7 @@ from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
 from bufgym.oracle import beam
-from bufgym.oracle.programme import Problem, Room, find_priced_future, new_problem
+from bufgym.oracle.programme import Messages, Problem, Room, find_priced_future, new_problem
 
 ROUNDS = 40
 """Most price updates."""
@@ -38,20 +38,21 @@ WIDTH, LAST_WIDTH = 8, 64
 """States per message in the beam, likewise."""
 
 
-def best(
-    c: Ints, size: Ints, limit: Ints, certain: Ints, x: Floats, v: Floats, ends: int, capacity: int, max_bytes: int
-) -> tuple[Ints, float]:
-    """Find messages of a plan that keeps to L and B, in order, and an upper bound of any such plan's gain, H - 1."""
-    n = len(c)
+def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tuple[Ints, float]:
+    """Find messages of a plan that keeps to L and B, in order, and an upper bound of any such plan's gain, H - 1.
+
+    ``certain``, int64[messages], is explained at ``new_problem``.
+    """
+    n = len(messages.c)
     byte_limit = max_bytes < UNLIMITED_BYTES
     rooms = np.array([[capacity], [max_bytes if byte_limit else 0]], np.float64)
     # A step in the price of a byte is to that of a message as a byte to a mean message.
-    scale = np.array([[1.0], [1 / size.mean() if byte_limit else 0.0]])
+    scale = np.array([[1.0], [1 / messages.size.mean() if byte_limit else 0.0]])
     prices, kept_prices, queued = np.zeros((2, n)), np.zeros((2, n)), np.empty((2, n))
     message, begin, work = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     plan, plan_gain, bound = np.zeros(0, np.int64), 0.0, np.inf
     step, waited = 1.0, 0
-    p = new_problem(c, size, limit, certain, x, v, ends, GRID)
+    p = new_problem(messages, certain, GRID)
     states = beam.new_states(n, WIDTH)
     for _ in range(ROUNDS):
         room = _priced(p, prices, capacity, max_bytes)
@@ -74,7 +75,7 @@ def best(
         if squares == 0:
             break
         prices = np.maximum(0.0, prices + step * (total - plan_gain) / squares * slope * scale)
-    p = new_problem(c, size, limit, certain, x, v, ends, FINE_GRID)
+    p = new_problem(messages, certain, FINE_GRID)
     room = _priced(p, kept_prices, capacity, max_bytes)
     length, gain = beam.search(p, room, beam.new_states(n, LAST_WIDTH), work)
     if gain > plan_gain:

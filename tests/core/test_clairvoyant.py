@@ -224,7 +224,7 @@ def test_it_is_exact_to_the_byte(seed, equal, v):
     ends = int(rng.choice([2**62, c[-1] + rng.integers(-3, 4 * unit)]))
     problem = [part.tolist() for part in (c, size, limit, x)]
     # Where sizes differ, the bound on a grid of one byte is the answer itself.
-    assert labels.best(c, size, limit, x, v.array, ends)[1] == pytest.approx(
+    assert labels.best(programme.Messages(c, size, limit, x, v.array, ends))[1] == pytest.approx(
         naive_oracle.best_by_bytes(*problem, v, ends), abs=EXACT
     )
 
@@ -238,7 +238,7 @@ def middling(seed: int, n: int):
     x = np.cumsum(rng.random(n) * rng.integers(0, 2, n))
     v = [qoi.exponential(0.4), qoi.saturating(1.7), qoi.tabulated([0, 1, 3], [0, 0.6, 1])][seed % 3]
     ends = int(c[-1]) - size if seed % 4 == 0 else 2**62
-    return c, np.full(n, size), np.full(n, L * size), x, v.array, ends
+    return programme.Messages(c, np.full(n, size), np.full(n, L * size), x, v.array, ends)
 
 
 def without_bounds(c, size, limit, x, v, ends) -> float:
@@ -258,7 +258,7 @@ def test_bounds_coarse_grids_and_little_room_lose_nothing(module, setting, numbe
     problems = [middling(seed, 60 + 6 * seed if JIT else 25) for seed in range(12 if JIT else 2)]
     best = [without_bounds(*problem) for problem in problems]
     monkeypatch.setattr(module, setting, number)
-    assert [labels.best(*problem)[1] for problem in problems] == pytest.approx(best, abs=EXACT)
+    assert [labels.best(problem)[1] for problem in problems] == pytest.approx(best, abs=EXACT)
 
 
 @kernels
@@ -275,7 +275,9 @@ def test_bounds_coarse_grids_and_little_room_lose_nothing(module, setting, numbe
 def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
     """Three messages of 10 bytes arrive at bytes 0, 1 and 2 of the link."""
     c, size, far = np.arange(3), np.full(3, 10), np.full(3, 100)
-    p = programme.new_problem(c, size, far, np.zeros(3, np.int64), np.arange(3.0), V.array, 2**62, 1)
+    p = programme.new_problem(
+        programme.Messages(c, size, far, np.arange(3.0), V.array, 2**62), np.zeros(3, np.int64), 1
+    )
     room = programme.Room(capacity, max_bytes, np.zeros((2, 200)), np.zeros((2, 4)), p.future)
     work = np.empty(3, np.int64)
     length, gain = beam.search(p, room, beam.new_states(3, width), work)

@@ -13,7 +13,7 @@ from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import clairvoyant, unequal
-from bufgym.oracle.programme import Room, new_problem, waiting_cost
+from bufgym.oracle.programme import Messages, Room, new_problem, waiting_cost
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
@@ -28,7 +28,7 @@ def test_the_best_plan_under_prices_is_that_of_a_search(messages, ends, v):
     price of every arrival that it waits through, its own too: so much, and so much more a byte."""
     c, size, limit, price, per_byte = np.array(sorted(messages)).T
     prices, x = np.array([price / 8, per_byte / 64]), np.arange(len(c)) * 1.5
-    p = new_problem(c, size, limit, np.full(len(c), -(10**6)), x, v.array, ends, 10**6)
+    p = new_problem(Messages(c, size, limit, x, v.array, ends), np.full(len(c), -(10**6)), 10**6)
     assert p.grid == 1
 
     def cost(j, begin):
@@ -110,7 +110,8 @@ def test_nothing_is_lost_by_looking_only_at_successors_that_can_still_be_best(se
     n, grid = 24, int(rng.integers(2, 6))
     size, limit = rng.integers(1, 60, n), rng.choice([-1, 0, 30, 90, 150], n)
     c, x = np.cumsum(rng.integers(0, 25, n)), np.cumsum(rng.choice([0.0, 0.125, 0.5, 2.0], n))
-    p = new_problem(c, size, limit, np.full(n, -(10**6)), x, v.array, int(c[-1]) + 80, int(size.mean()) // grid + 1)
+    sent = Messages(c, size, limit, x, v.array, int(c[-1]) + 80)
+    p = new_problem(sent, np.full(n, -(10**6)), int(size.mean()) // grid + 1)
     room = unequal._priced(p, rng.choice([0.0, 0.0, 0.02, 0.2], (2, n)) * [[1.0], [0.02]], n, 10**6)
     for i in np.flatnonzero((limit >= 0) & (c + size <= p.ends)):
         for step in range((c[i] + size[i]) // p.grid, min(c[i] + limit[i] + size[i], p.ends) // p.grid + 1):
@@ -126,7 +127,7 @@ def test_leaving_messages_out_while_the_link_is_idle_is_never_worth_it(seed, v):
     c, size, limit = np.cumsum(rng.integers(0, 70, n)), rng.integers(1, 40, n), rng.choice([-1, 0, 20, 60], n)
     totals = []
     for certain in (limit, np.full(n, -(10**6))):
-        p = new_problem(c, size, limit, certain, x, v.array, int(c[-1]) + 30, 10**6)
+        p = new_problem(Messages(c, size, limit, x, v.array, int(c[-1]) + 30), certain, 10**6)
         room = unequal._priced(p, np.zeros((2, n)), n, 10**6)
         totals.append(unequal.follow(p, room, np.empty(n, np.int64), np.empty(n, np.int64))[1])
     assert totals[0] == pytest.approx(totals[1], abs=1e-12)

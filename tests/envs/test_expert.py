@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from env_cases import valid_action
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from bufgym import oracle, policies
@@ -74,7 +74,12 @@ def episodes(draw: Any) -> tuple[Episode, int]:
     return Episode(messages(times, 4, x), link), draw(st.integers(1, 3))
 
 
+DEAD = Episode(messages([0, 1, 2], 4, [0.0, 1.0, 2.0]), Link(trace([(0, 0), (5, 2)], "stop"), 0))
+"""The link ends in the midst of the first message, which never leaves the socket."""
+
+
 @pytest.mark.kernels
+@example((DEAD, 1), V, [0])
 @given(episodes(), st.sampled_from([V, qoi.saturating(3.0)]), st.lists(st.integers(0, 2**32 - 1), max_size=4))
 def test_values_are_those_of_all_action_sequences(case: tuple[Episode, int], v: Any, seeds: list[int]) -> None:
     """At the start, and after actions at random."""
