@@ -6,9 +6,9 @@
     client.publish("/robots/robot-3/camera", jpeg, encoding="jpeg")  # never blocks; the policy decides what goes
     await client.command("/robots/robot-4/command", {"command": "stop"})  # returns once the relay holds it
 
-Little waits outside the queue: the system's buffers are small, and a message counts as on its way until the relay's
-system has acked its last byte. After a reconnect, messages still on their way are sent again under their original
-numbers.
+Little waits outside the queue: the system's buffers are small, and a message counts as on its way until the relay has
+answered the PING behind it with its PONG, as at Robofleet's client (Sec. III-B). After a reconnect, messages still on
+their way are sent again under their original numbers.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
@@ -28,8 +28,6 @@ from bufgym.relay.session import Session
 from bufgym.robot.log import Record
 from bufgym.robot.queue import Item, PolicyQueue
 
-_POLL_S: Final = (0.001, 0.016)  # time between two checks for departures: at first, and when nothing moves
-
 
 @dataclass(eq=False)
 class _Away:
@@ -37,8 +35,8 @@ class _Away:
 
     queue: PolicyQueue
     item: Item
-    answered: asyncio.Future[None] | None = None  # on a no_drop topic: done when the relay holds it
-    written: bool = False
+    held: asyncio.Future[None] | None = None  # on a no_drop topic: done when the relay holds it
+    pong: Any = None  # on others: done when the relay has it
 
 
 class RobotClient(Session):
@@ -64,7 +62,7 @@ class RobotClient(Session):
             topics: topics to publish on and their rules; without any, ordinary messages can't be published.
             policy: a drop rule for one topic, a scheduler for several.
             capacity: L, messages of all topics together.
-            window: n_T, messages handed to the system and not yet acked by the relay's, at most.
+            window: n_T, messages sent and not yet answered by the relay, at most.
             value: V of topics that have none of their own.
             log: called with the number of the queue, which ``change`` counts, and each record of its events.
             url, name, token, tls, say: as for ``Session``.
@@ -140,7 +138,7 @@ class RobotClient(Session):
     async def _send_all(self) -> None:
         """Send what the queues hand out, in order, after the messages that the last connection left."""
         for away in self._away:
-            away.written = False
+            away.pong = None
         for away in list(self._away):
             await self._send(away)
         while self._queues:
@@ -153,38 +151,24 @@ class RobotClient(Session):
             await self._send(away)
 
     async def _send(self, away: _Away) -> None:
-        if away.answered is None:
-            message = away.item.message
-            if any(pattern.fullmatch(message.topic) for pattern in self._no_drop):
-                away.answered = self._unanswered.put(message._replace(no_drop=True))
-                self._wanted.set()
-            else:
-                await self._connection.send(wire.encode(message))
-        away.written = True
+        message = away.item.message
+        if away.held is None and not any(pattern.fullmatch(message.topic) for pattern in self._no_drop):
+            await self._connection.send(wire.encode(message))
+            away.pong = await self._connection.ping()
+        elif away.held is None:
+            away.held = self._unanswered.put(message._replace(no_drop=True))
+            self._wanted.set()
         self._moved.set()
 
     async def _leave_all(self) -> None:
-        """Tell the queues in order which messages have left; bytes still left belong to the messages behind them."""
+        """Tell the queues in order which messages have left."""
         while True:
             await self._moved.wait()
             self._moved.clear()
-            while self._away and self._away[0].written:
-                away = self._away[0]
-                if away.answered is not None:
-                    await asyncio.wait([away.answered])
-                    if (error := away.answered.exception()) is not None:
-                        self.note(str(error))
-                else:
-                    await self._left()
-                self._away.popleft()
-                away.queue.gone()
-
-    async def _left(self) -> None:
-        """Wait until the oldest message away has left."""
-        poll_s, most_s = _POLL_S
-        while (left_bytes := self._left_bytes()) is not None:
-            behind = sum(away.item.size_bytes for away in list(self._away)[1:] if away.written)
-            if left_bytes <= behind:
-                return
-            await asyncio.sleep(poll_s)
-            poll_s = min(2 * poll_s, most_s)
+            while self._away and (answer := self._away[0].held or self._away[0].pong) is not None:
+                await asyncio.wait([answer])
+                if (error := answer.exception()) is not None:
+                    if answer is not self._away[0].held:
+                        raise error  # the connection has ended
+                    self.note(str(error))
+                self._away.popleft().queue.gone()

@@ -1,5 +1,6 @@
 """The client: what the relay has not answered, by hand; a queue over a link that breaks; tokens and addresses."""
 
+import asyncio
 import contextlib
 import json
 from collections.abc import AsyncIterator
@@ -147,6 +148,34 @@ async def test_a_queue_over_a_break_and_a_change_of_policy(corner: Corner) -> No
                 await until("an empty queue", lambda: not robot.queue.in_flight)
     assert all(message.sender == "a" and message.encoding == "jpeg" for message in came)
     assert [message.seq for message in came[:16]] == list(range(1, 17)) and came[-1].seq > 16
+
+
+@compiled
+async def test_a_message_is_on_its_way_until_the_relay_answers_the_ping_behind_it(corner: Corner) -> None:
+    """The relay's system acks at once, which does not count; the PONGs are late here."""
+    came: list[int] = []
+    pongs: list[asyncio.Future[float]] = []
+    topic = corner.topic("camera")
+    robot = RobotClient(corner.url, "a", topics=(Topic(topic),), policy="drop-newest", capacity=8, window=2)
+    viewer = Session(corner.url, "v")
+    viewer.subscribe(f"^{topic}$", lambda message: came.append(message.seq))
+
+    async def ping() -> asyncio.Future[float]:
+        pongs.append(asyncio.get_running_loop().create_future())
+        return pongs[-1]
+
+    async with within("messages"), beside(viewer.run(), robot.run()):
+        await viewer.ready.wait()
+        await robot.ready.wait()
+        robot._connection.ping = ping
+        for _ in range(4):
+            robot.publish(topic, b"1")
+        await until("two to arrive", lambda: len(came) == 2)
+        await asyncio.sleep(0.1)  # time in which a third could
+        assert (came, robot.queue.in_flight, len(robot.queue)) == ([1, 2], 2, 2)
+        pongs[0].set_result(0.1)
+        await until("the third", lambda: len(came) == 3)
+        assert (robot.queue.in_flight, len(pongs)) == (2, 3)
 
 
 async def test_who_is_not_let_in_is_told_why(corner: Corner) -> None:
