@@ -1,4 +1,4 @@
-"""V of the three motions of `afr_views`, computed from the overlap of views, beside the AFR paper's formulas."""
+"""V of the four motions of `afr_views`, computed from the overlap of views, beside the AFR paper's formulas."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bufgym.papers.rows import FigureRows
 
 @dataclass(frozen=True)
 class Reproduction(GeometryFigure):
-    """Plot of V(d) for the three motions."""
+    """Plot of V(d) for the four motions."""
 
     SIZE_INCHES = (7.0, 4.2)
 
@@ -21,7 +21,9 @@ class Reproduction(GeometryFigure):
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
         axes = figure.add_subplot()
-        for (name, motion), colour in zip(self.motions().items(), ("afr", "random", "drop-oldest"), strict=True):
+        for (name, motion), colour in zip(
+            self.motions().items(), ("pink", "afr", "random", "drop-oldest"), strict=True
+        ):
             d = rows.column("d", motion=name)
             axes.plot(d, rows.column("formula", motion=name), color=COLOURS[colour], linewidth=1.2)
             label = f"{motion.label}: {motion.formula.name}"

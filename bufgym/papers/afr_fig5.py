@@ -101,6 +101,9 @@ class Reproduction(Figure):
                 "drop-oldest": float(drop_oldest[T - 1]),
                 "random": float(samples[T - 1].mean()),
                 "random_sd": float(samples[T - 1].std(ddof=1)),
+                "random_within": float(
+                    (abs(samples[T - 1] - samples[T - 1].mean()) <= samples[T - 1].std(ddof=1)).mean()
+                ),
             }
             for T in lengths
         )
@@ -119,7 +122,15 @@ class Reproduction(Figure):
             row["drop-oldest"] * (1 - EQUAL) <= row["random"] <= min(row["afr"], row["oracle-ideal"]) * (1 + EQUAL)
             for row in beyond
         ]
+        best = rows.column("oracle")
+        near = np.array([row["random_within"] for row in beyond if row["random_sd"] > EQUAL])
         return {
+            "never": bool((np.diff(best) >= -EQUAL).all() and best.max() < PAPER_L + 1),
+            "best": best.max(),
+            "within": bool(0.63 <= near.mean() <= 0.73) if len(near) else None,
+            "near": f"{near.mean():.1%} on average, from {near.min():.0%} to {near.max():.0%} at single T"
+            if len(near)
+            else "not run",
             "equal": peaks == list(PAPER_PEAKS),
             "order": all(ordered) if ordered else None,
             "ordered": sum(ordered),

@@ -22,6 +22,8 @@ from bufgym.papers.rows import FigureRows
 
 THIRD = 1 / 3
 """Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
+HELP = 0.1
+"""A larger queue helps if it lowers the share of runs that fail by this much."""
 HALF = 1 / 2
 """ORBBuf's failures are greatly reduced if they are at most this share of Drop Oldest's."""
 COLUMNS = 4
@@ -57,7 +59,7 @@ class Reproduction(FrameFigure):
         }
         runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
         facts: dict[str, Any] = {"runs": runs}
-        not_run = ("oldest_rate", "afr_rate", "random_rate", "large_count", "third_count", "orbbuf_count")
+        not_run = ("by_size", "oldest_rate", "afr_rate", "random_rate", "large_count", "third_count", "orbbuf_count")
         facts |= dict.fromkeys(not_run, "not run")
         facts["counts"] = "; ".join(
             f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
@@ -74,6 +76,13 @@ class Reproduction(FrameFigure):
         def everywhere(rule: Callable[[dict[str, int]], bool]) -> bool:
             return all(rule(counts) for counts in broken.values())
 
+        small, large_L = min(self.capacities), max(self.capacities)
+        shown = [name for name in ("drop-oldest", "random") if name in self.policies and small < large_L]
+        if shown:
+            grown = {name: self.by_size(rows.where(policy=name), small, large_L) for name in shown}
+            facts["sizes"] = of_all(within(found, np.nextafter(-HELP, 0), 1.0) for found in grown.values())
+            told = (f"{POLICIES[name][0]} {r.value:+.0%} [{r.low:+.0%}, {r.high:+.0%}]" for name, r in grown.items())
+            facts["by_size"] = "; ".join(told)
         if {"afr", "drop-oldest"} <= set(self.policies):
             rates = {
                 policy: {name: rate(rows.where(recording=name, policy=policy)) for name in self.recordings}
@@ -98,6 +107,15 @@ class Reproduction(FrameFigure):
                 facts["third"] = everywhere(lambda counts: counts["afr"] <= THIRD * counts["drop-oldest"])
                 facts["large"] = failures(large, policy="afr") == 0 if large else None
         return facts
+
+    def by_size(self, rows: FigureRows, small: int, large: int) -> Interval:
+        """Share of runs that fail at the largest L less that at the smallest, over the places of the fade."""
+        runs = len(self.recordings)
+        changes = np.array(
+            [(failures(rows, k=k, L=large) - failures(rows, k=k, L=small)) / runs for k in rows.distinct("k")]
+        )
+        drawn = times_drawn(len(changes), RESAMPLES, stream(0, "sizes"))
+        return percentile_interval(drawn @ changes / len(changes), CONFIDENCE)
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return 13.0, (0.4 + 1.7 * math.ceil(len(self.policies) / COLUMNS)) * len(self.recordings)

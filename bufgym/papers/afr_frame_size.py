@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bufgym import policies, sim
 from bufgym.benchmark.rows import Row
@@ -62,13 +63,14 @@ class Reproduction(LinkFigure):
                 value=time_value(),
             )
             episodes = [draw(uplink, seed) for seed in range(self.runs)]
-            names = ("afr", "afr-paper", "orbbuf")
+            names = ("afr", "afr-paper", "orbbuf", "drop-oldest")
             for (seed, episode), policy, L in product(enumerate(episodes), names, self.capacities):
                 senders = sim.run(policies.get(policy), [episode], L, uplink.value)
                 count = senders.batch.senders[0]["arrivals"]
                 kept = np.asarray(senders.batch.log[0])[:count]["dropped_us"] == sim.NEVER
                 arrival_s = episode.arrivals["arrival_us"][:count] / 1e6
                 row: Row = {"size_kb": size_kb, "policy": policy, "L": L, "run": seed, "dropped": int((~kept).sum())}
+                row["full"] = full(np.asarray(senders.batch.log[0])[:count], arrival_s, L)
                 for s in SECONDS:
                     row[f"kept_in_second_{s}"] = int((kept & (s <= arrival_s) & (arrival_s < s + 1)).sum())
                 rows.append(row)
@@ -104,6 +106,7 @@ class Reproduction(LinkFigure):
         many = {kb: abs(np.array(c) / PAPER_RECALCULATIONS - 1).max() <= NEAR for kb, c in counts.items()}
         fast = {kb: abs(np.array(hz) - PAPER_HZ).max() <= WITHIN_HZ for kb, hz in rates.items()}
         main = self.size_bytes / 1000
+        shares = [rows.mean("full", size_kb=main, policy="drop-oldest", L=L) for L in self.capacities]
         return {
             "kb": main,
             "fewest": counts[main][0],
@@ -114,6 +117,9 @@ class Reproduction(LinkFigure):
             "both_kb": listed([f"{kb:g}" for kb in sizes if many[kb] and fast[kb]]),
             "rates": ", ".join(f"{hz:.1f}" for hz in rates[main]),
             "least_L": min(self.capacities),
+            "sizes": listed(self.capacities),
+            "full": min(shares) > 0.5,
+            "full_shares": listed([f"{share:.0%}" for share in shares]),
         }
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
@@ -133,3 +139,14 @@ class Reproduction(LinkFigure):
             axes.axvline(FRAME_BYTES / 1000, color=COLOURS["other"], linewidth=1)
             axes.set_xlabel("size of a frame, kB")
             axes.legend(frameon=False, fontsize=8)
+
+
+def full(log: NDArray[np.void], arrival_s: NDArray[np.float64], capacity: int) -> float:
+    """Share of the time until the last arrival in which ``capacity`` messages are queued."""
+    left_us = np.where(log["dropped_us"] == sim.NEVER, log["dequeued_us"], log["dropped_us"])
+    left_s = np.where(left_us == sim.NEVER, np.inf, left_us / 1e6)
+    at_s = np.concatenate([left_s, arrival_s])  # at one time those that leave come first
+    change = np.repeat([-1, 1], len(arrival_s))
+    order = np.argsort(at_s, kind="stable")
+    lasts_s = np.diff(np.minimum(at_s[order], arrival_s[-1]))
+    return float(lasts_s[np.cumsum(change[order])[:-1] >= capacity].sum() / (arrival_s[-1] - arrival_s[0]))

@@ -1,7 +1,8 @@
-"""Camera views under three motions: two of the AFR paper, and a look aside along a corridor, which is ours.
+"""Camera views under four motions: three of the AFR paper, and a look aside along a corridor, which is ours.
 
 | motion | the view | V(d), the fraction of a view that is new d messages later |
 |---|---|---|
+| forward along a corridor | the area between the walls that the camera sees up to its range | d / D, then it bends |
 | moving back from a wall | a square of the wall that grows by the same factor with each message | 1 - b^d |
 | turning in place | an angle that turns by the same angle with each message | min(1, d / D) |
 | along a corridor | a stretch of the side wall that moves on by the same length with each message | min(1, d / D) |
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,8 +51,27 @@ class CameraMotion:
 
 
 @dataclass(frozen=True)
+class Forward(CameraMotion):
+    """Forward along a corridor; ``view`` is the stretch ahead, from the camera to its range (Fig. 3 (a))."""
+
+    half_m: float  # half the corridor's width
+
+    def area(self, camera_m: float, until_m: float) -> float:
+        """Area between the walls that a camera there sees, up to this line across the corridor."""
+        walls_m = camera_m + self.half_m / math.tan(VIEW_ANGLE / 2)  # where its view meets them
+        edges = np.array([camera_m, min(walls_m, until_m), max(until_m, camera_m)])
+        widths = 2 * np.minimum(self.half_m, np.maximum(0.0, edges - camera_m) * math.tan(VIEW_ANGLE / 2))
+        return float(np.trapezoid(widths, edges))
+
+    def new(self, d: float) -> float:
+        (_, until_m), (camera_m, range_m) = self.view(0), self.view(d)
+        # What a camera sees, the one behind it sees as well, up to that one's range.
+        return 1 - self.area(camera_m, max(camera_m, until_m)) / self.area(camera_m, range_m)
+
+
+@dataclass(frozen=True)
 class GeometryFigure(Figure):
-    """A figure of the three motions."""
+    """A figure of the four motions."""
 
     base: float = 0.618
     """Fraction of a wall's view that was in the previous message's view (Fig. 5 of the paper)."""
@@ -59,21 +79,37 @@ class GeometryFigure(Figure):
     """Angle turned between two messages."""
     step_m: float = 0.15
     """Distance driven along the corridor between two messages."""
+    range_m: float = 4.0
+    """How far the camera sees along the corridor, about what a Kinect does."""
     wall_m: float = 1.5
     """Distance to the corridor's side wall, and to the other wall at the start."""
 
-    SIZE_INCHES = (10.0, 3.9)
+    SIZE_INCHES = (12.0, 3.9)
 
     def motions(self) -> dict[str, CameraMotion]:
         """Map a column name to its motion."""
         half, width = math.tan(VIEW_ANGLE / 2), 2 * self.wall_m * math.tan(VIEW_ANGLE / 2)
         turn = math.radians(self.turn_degrees)
+        walls_m = self.wall_m / half  # from the camera to where its view meets the walls
+
+        def area(depth_m: float) -> float:
+            """What lies before the camera and between the walls, up to this depth."""
+            return self.wall_m * (2 * depth_m - walls_m) if depth_m > walls_m else max(0.0, depth_m) ** 2 * half
+
+        new = [1 - area(self.range_m - d * self.step_m) / area(self.range_m) for d in range(MESSAGES + 1)]
 
         def wall(k: float) -> tuple[float, float]:
             edge = half * self.wall_m * self.base ** (-k / 2)
             return -edge, edge
 
         return {
+            "forward": Forward(
+                "forward along a corridor",
+                lambda k: (k * self.step_m, k * self.step_m + self.range_m),
+                2,
+                replace(qoi.tabulated(range(MESSAGES + 1), new), name="straight, then bending"),
+                self.wall_m,
+            ),
             "wall": CameraMotion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
             "turn": CameraMotion(
                 "turning in place",
@@ -113,12 +149,18 @@ class Reproduction(GeometryFigure):
     """Number of messages drawn."""
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
-        panels = figure.subplots(1, 3)
+        panels = figure.subplots(1, 4)
         for axes, (name, motion) in zip(panels, self.motions().items(), strict=True):
             for k in range(self.shown):
                 left, right = motion.view(k)
                 if name == "turn":
                     x, y = [0, math.sin(left), math.sin(right), 0], [0, math.cos(left), math.cos(right), 0]
+                elif name == "forward":
+                    bend = left + self.wall_m / math.tan(VIEW_ANGLE / 2)
+                    x = [0, -self.wall_m, -self.wall_m, self.wall_m, self.wall_m, 0]
+                    y = [left, bend, right, right, bend, left]
+                    for wall_m in (-self.wall_m, self.wall_m):
+                        axes.axvline(wall_m, color=COLOURS["oracle"], linewidth=3)
                 else:
                     away = self.wall_m if name == "corridor" else right / math.tan(VIEW_ANGLE / 2)
                     x, y = [left, (left + right) / 2, right], [0, -away, 0]

@@ -100,7 +100,12 @@ class Reproduction(Figure):
             "fix_letters": len(fix["header"]["frame_id"]),
             "jpeg_bytes": len(image["data"]),
         }
-        return equal | listed | contents | {"others": ", ".join(kind for kind in sizes if kind not in PAPER)}
+        shorter: dict[str, Any] = {"kinds": ", ".join(sizes)}
+        for name, encoding in (("json_ratio", "json-numbers"), ("base64_ratio", "json")):
+            ratios = sorted(by[encoding] / by["robofleet"] for by in sizes.values())
+            shorter[name] = f"{ratios[0]:.2f} to {ratios[-1]:.2f}"
+        shorter["compact"] = all(by["robofleet"] < by["json-numbers"] for by in sizes.values())
+        return equal | listed | contents | shorter | {"others": ", ".join(kind for kind in sizes if kind not in PAPER)}
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
         sizes = sizes_of(rows)

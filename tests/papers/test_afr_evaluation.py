@@ -3,11 +3,14 @@
 import csv
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bufgym.cli import main
 from bufgym.ground.errors import BufgymError
 from bufgym.papers import NEEDS_DATA, figure, run
+from bufgym.papers.afr_frame_size import full
+from bufgym.sim import NEVER
 from bufgym.traces import Trace, write_csv
 
 
@@ -57,3 +60,10 @@ def test_all_leaves_them_out_without_data_which_is_passed_on(
         assert says in "".join(capsys.readouterr())
     with (tmp_path / "out" / "afr-fig6.csv").open(newline="") as file:
         assert [row["under_500KBps"] for row in csv.DictReader(file)][:2] == ["False", "True"]
+
+
+def test_the_share_of_the_time_in_which_a_queue_is_full() -> None:
+    """L = 2: messages come at 0, 1 and 3 s, the second leaves at 1.5 s, the first is dropped at 2 s: two for .5 s."""
+    kinds = [("dropped_us", np.int64), ("dequeued_us", np.int64)]
+    log = np.array([(2_000_000, NEVER), (NEVER, 1_500_000), (NEVER, NEVER)], kinds)
+    assert full(log, np.array([0.0, 1.0, 3.0]), 2) == pytest.approx(0.5 / 3)

@@ -34,6 +34,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "afr-overlap": {**FRAMES, "capacity": 2, "distances": (1, 4, 8), "motions": (0.05, 0.1)},
     "afr-qoi-task": {**FRAMES, "offsets": 3},
     "robofleet-table1": {"points": 50},
+    "robofleet-table2": {"points": 50, "runs": 2, "seconds": 0.5},
     "robofleet-fig3": {"rates_hz": (5, 100), "duration_s": 0.5, "runs": 1},
     "robofleet-fig4": {"dropouts_s": (1,), "links_mbit_per_s": (100,), "kinds": ("CompressedImage",), "runs": 2},
     "robofleet-fig5": {"fall_s": 3, "stay_s": 1, "runs": 1},
@@ -43,10 +44,14 @@ SMALL: dict[str, dict[str, Any]] = {
 """Options that keep each figure short; a new figure must add its own."""
 
 OF_FRAMES = [name for name, options in SMALL.items() if "offsets" in options]
-NEEDS_LIBRARIES = {"robofleet-table1": ("rosbags", "flatbuffers"), **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy"))}
+NEEDS_LIBRARIES = {
+    "robofleet-table1": ("rosbags", "flatbuffers"),
+    "robofleet-table2": ("rosbags", "flatbuffers", "roslibpy", "websockets"),
+    **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy")),
+}
 
 CLAIMS = Path(__file__).parent.parent.parent / "docs" / "claims.md"
-SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9"}
+SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9", "robofleet-table2"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in SLOW)) for n in FIGURES])
