@@ -14,7 +14,6 @@ need the extra ``live``.
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -71,26 +70,13 @@ def value_of(v: Record) -> Value:
     return Value(v["name"], np.array(v["numbers"], np.float64))
 
 
-class LogFile(AbstractContextManager["LogFile"]):
+class LogFile(McapFile):
     """A log in an MCAP file; call it with each record, then close it. A log that was not closed can also be read."""
-
-    def __init__(self, path: str | Path) -> None:
-        self._file = McapFile(path)
-        self.path = self._file.path
 
     def __call__(self, record: Record) -> None:
         """Write one record."""
         now_ns = record["us"] * 1000
-        self._file.write(
-            f"/{record['event']}", json.dumps(record).encode(), now_ns, now_ns, schema="bufgym.live.Record"
-        )
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._file.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        self.write(f"/{record['event']}", json.dumps(record).encode(), now_ns, now_ns, schema="bufgym.live.Record")
 
 
 def read_log(path: str | Path) -> list[Record]:

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from bufgym.robot.extra import needs
 
@@ -59,3 +59,9 @@ class McapFile:
         if not self.file.closed:
             self._writer.finish()
             self.file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -162,18 +162,8 @@ class PolicyQueue:
                 seq = self._row.put(now_us, size_bytes, x, topic, uniform)
             self._latest_x[scene] = x
             self._held[seq] = Item(message, seq, -1, now_us, size_bytes, x, topic)
-            self._tell(
-                {
-                    "event": "put",
-                    "us": now_us,
-                    "seq": seq,
-                    "size_bytes": size_bytes,
-                    "x": x,
-                    "topic": topic,
-                    "uniform": uniform,
-                    "carried": carried,
-                }
-            )
+            about = {"seq": seq, "size_bytes": size_bytes, "x": x, "topic": topic}
+            self._tell({"event": "put", "us": now_us, **about, "uniform": uniform, "carried": carried})
             self._settle(now_us, seq)
         return seq
 
@@ -214,7 +204,7 @@ class PolicyQueue:
 
     def __iter__(self) -> Iterator[Item]:
         """Iterate over ``get``; asking for the next message calls ``gone`` for the last."""
-        while (item := self.get()) is not None:
+        for item in iter(self.get, None):
             yield item
             self.gone()
 
@@ -289,21 +279,18 @@ class PolicyQueue:
 
     def _settle(self, now_us: int, newcomer: int | None) -> None:
         """Hand on dequeued messages and release dropped ones."""
-        dequeued = self._row.dequeued
-        number = self._number
-        while number < dequeued:
+        before, self._number = self._number, self._row.dequeued
+        for number in range(before, self._number):
             item = self._held.pop(self._row.dequeued_seq(number))
             self._ready.append(replace(item, number=number))
             self._tell({"event": "dequeued", "us": now_us, "seq": item.seq})
-            number += 1
-        changed, self._number = number > self._number, number
         if len(self._held) > self._row.occupancy:
             queued = set(self._row.queued)
             for seq in [seq for seq in self._held if seq not in queued]:
                 del self._held[seq]
                 self.dropped += 1
                 self._tell({"event": "dropped", "us": now_us, "seq": seq, "why": self._why(seq, newcomer)})
-        if changed or self._drained:
+        if self._number > before or self._drained:
             self._wake()
 
     def _why(self, seq: int, newcomer: int | None) -> str:

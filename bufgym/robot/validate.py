@@ -124,13 +124,7 @@ class Play(Protocol):
 
 def over(transport: str) -> Play:
     """Make a ``Play`` over one of ``TRANSPORTS``."""
-
-    def played(
-        policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
-    ) -> list[Received]:
-        return asyncio.run(play(policy, episode, capacity, value, transport=transport, speed=speed, seed=seed))
-
-    return played
+    return lambda *episode, **settings: asyncio.run(play(*episode, transport=transport, **settings))
 
 
 def validate(
@@ -156,21 +150,12 @@ def validate(
                 messages = received(simulated, 0)
                 transmitted_us = simulated.batch.log["transmitted_us"][0, messages["seq"]]
                 delivery_us = transmitted_us + episode.link.propagation_us - messages["arrival_us"]
+                theirs = outcome(simulated, 0).qoi, best
                 for transport, played in plays.items():
                     came = played(policy, episode, capacity, scenario.value, speed=speed, seed=seed)
-                    runs.append(
-                        LiveRun(
-                            policy.name,
-                            trace.name,
-                            seed,
-                            len(came),
-                            len(messages),
-                            scenario.value.information([message.x for message in came]),
-                            outcome(simulated, 0).qoi,
-                            best,
-                            transport,
-                            tuple(message.received_ns / 1e9 * speed - message.at_us / 1e6 for message in came),
-                            tuple((delivery_us / 1e6).tolist()),
-                        )
-                    )
+                    live_s = tuple(message.received_ns / 1e9 * speed - message.at_us / 1e6 for message in came)
+                    qoi = scenario.value.information([message.x for message in came]), *theirs
+                    times_s = live_s, tuple((delivery_us / 1e6).tolist())
+                    of = policy.name, trace.name, seed
+                    runs.append(LiveRun(*of, len(came), len(messages), *qoi, transport, *times_s))
     return runs

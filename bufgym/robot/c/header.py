@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from bufgym import policies
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, printable
-from bufgym.ground.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import TINY
@@ -21,6 +20,7 @@ from bufgym.policies import Policy, chains, guided, learned, price_dp, target_ga
 from bufgym.policies.scoring import unpack
 from bufgym.policies.target_gap import straight
 from bufgym.robot.c.calls import random_episode, recorded
+from bufgym.traces.formats.text import write_text
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
 SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
@@ -56,13 +56,8 @@ def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_byte
     Raises:
         BufgymError: as ``header``, or the file cannot be written.
     """
-    target, text = Path(out), header(policy, capacity, value, max_bytes)
-    try:
-        with replaced(target) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise BufgymError(f"{target}: cannot be written: {error.strerror}") from None
-    return target
+    write_text(out, [header(policy, capacity, value, max_bytes)])
+    return Path(out)
 
 
 def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None) -> str:
