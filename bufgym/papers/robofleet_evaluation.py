@@ -203,9 +203,8 @@ class ClientFigure(Figure):
     def send(
         self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
     ) -> Sent:
-        if "queue_size" not in client:
-            client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
-        sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
+        client = {"queue_size": getattr(self, "queue_size", QUEUE_SIZE), "live": self.live, **client}
+        sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, **client)
         last_s = float(np.nanmax(sent.received_s, initial=duration_s))
         for told in self.watchers:
             told(min(last_s, max(duration_s, client.get("watched_s", math.inf))))
@@ -220,11 +219,10 @@ def played_once(run: Run) -> Run:
 
     @functools.wraps(run)
     def once(figure: ClientFigure, *arguments: Any) -> Any:
-        if not figure.live:
-            return run(figure, *arguments)
-        if arguments not in figure.played:
-            figure.played[arguments] = run(figure, *arguments)
-        return figure.played[arguments]
+        kept = figure.played if figure.live else {}
+        if arguments not in kept:
+            kept[arguments] = run(figure, *arguments)
+        return kept[arguments]
 
     return cast(Run, once)
 
