@@ -60,6 +60,7 @@ def test_validate_keeps_its_runs(tmp_path: Path) -> None:
     assert main(["live", "validate", *arguments]) == 0
     kept = json.loads((tmp_path / "runs.json").read_text(encoding="utf-8"))
     assert len(kept["runs"]) == 2 and "--transport tcp websocket" in kept["command"]
+    assert all(len(one["live_s"]) == one["live_delivered"] > 0 for one in kept["runs"])
 
 
 @pytest.mark.parametrize(

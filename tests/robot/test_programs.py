@@ -43,13 +43,10 @@ def ends(_: Connection) -> None:
     pass
 
 
-@pytest.mark.parametrize(("work", "words"), [(fails, "other: no such thing"), (ends, "other: has ended")])
-def test_who_waits_for_one_program_hears_that_another_has_failed(work: Any, words: str) -> None:
-    with running(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
-        asyncio.run(echo.told())
-
-
-def test_a_program_is_spoken_to_and_may_be_silent() -> None:
+def test_a_program_is_spoken_to_and_may_be_silent_and_who_waits_hears_that_another_has_failed() -> None:
+    for work, words in ((fails, "other: no such thing"), (ends, "other: has ended")):
+        with running(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
+            asyncio.run(echo.told())
     with running(echo=echoes) as (echo,):
         echo.tell({"port": 3})
         assert asyncio.run(echo.told()) == {"port": 3}
