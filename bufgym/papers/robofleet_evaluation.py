@@ -152,15 +152,9 @@ def send(
     if program.queued:
         rules = {"limit": queue_size, "no_drop": False}
     round_trip_us = round(round_trip_ms * 1000)
-    client = Client(
-        tuple(replace(s, topic=replace(s.topic, **rules)) for s in streams),
-        (link,),
-        duration_s=duration_s,
-        random_offset=False,
-        propagation_us=round_trip_us // 2,
-        round_trip_us=round_trip_us,
-        consumers=consumers,
-    )
+    ruled = tuple(replace(s, topic=replace(s.topic, **rules)) for s in streams)
+    times: dict[str, Any] = {"propagation_us": round_trip_us // 2, "round_trip_us": round_trip_us}
+    client = Client(ruled, (link,), duration_s=duration_s, random_offset=False, consumers=consumers, **times)
     # Room for all messages, because a no_drop queue has no limit.
     room = client.max_messages * consumers
     policy = policies.get(program.policy)

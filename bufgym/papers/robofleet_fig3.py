@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+from bufgym.benchmark.rows import Row
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.robofleet_evaluation import MBIT, SHORT, CloudFigure, cloud_bytes, curves, p95, stream
 from bufgym.papers.rows import FigureRows, listed
@@ -52,19 +53,11 @@ class Reproduction(CloudFigure):
             sent = self.send(name, (stream("PointCloud2", rate, points=self.points),), link, self.duration_s, seed)
             latency_s = sent.received.latency_s
             received_hz = float((sent.received_s <= self.duration_s).sum() / self.duration_s)
-            rows.append(
-                {
-                    "sender": name,
-                    "publish_hz": rate,
-                    "run": seed,
-                    "latency_ms": 1e3 * float(latency_s.mean()),
-                    "p95_latency_ms": 1e3 * p95(latency_s),
-                    "last_latency_ms": 1e3 * float(latency_s[-1]),
-                    "received_hz": received_hz,
-                    "received_mbit_per_s": received_hz * size / MBIT,
-                    "dropped": len(sent) - len(latency_s),
-                }
-            )
+            row: Row = {"sender": name, "publish_hz": rate, "run": seed}
+            for column, seconds in (("", latency_s.mean()), ("p95_", p95(latency_s)), ("last_", latency_s[-1])):
+                row[f"{column}latency_ms"] = 1e3 * float(seconds)
+            row |= {"received_hz": received_hz, "received_mbit_per_s": received_hz * size / MBIT}
+            rows.append(row | {"dropped": len(sent) - len(latency_s)})
         return rows
 
     def tables(self, rows: FigureRows) -> list[str]:

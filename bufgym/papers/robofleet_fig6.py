@@ -48,9 +48,8 @@ class Reproduction(ClientFigure):
         link = steady(self.mbit_per_s * MBIT)
         senders = [("robofleet", 1), ("rosbridge", 1), *(("ros-native", queue) for queue in self.queue_sizes)]
         rows = FigureRows()
-        for points, n, (name, queue), seed in product(
-            self.points, range(1, self.max_consumers + 1), senders, range(self.runs)
-        ):
+        every_n = range(1, self.max_consumers + 1)
+        for points, n, (name, queue), seed in product(self.points, every_n, senders, range(self.runs)):
             topic = stream("PointCloud2", self.rate_hz, points=points)
             settings = {"queue_size": queue, "consumers": n, "watched_s": self.duration_s}
             sent = self.send(name, (topic,), link, self.duration_s, seed, **settings)
@@ -59,15 +58,9 @@ class Reproduction(ClientFigure):
             reached = np.bincount(sent.consumer, in_time) / np.bincount(sent.consumer)  # share of each consumer
             label = f"native ROS, queue of {queue}" if name == "ros-native" else PROGRAMS[name].label.split(",")[0]
             key = {"points": points, "consumers": n, "sender": name, "queue_size": queue, "run": seed, "line": label}
-            rows.append(
-                {
-                    **key,
-                    "mean_latency_s": average(latency_s),
-                    "p95_latency_s": p95(latency_s),
-                    "received_share": float(in_time.mean()),
-                    "least_received_share": float(reached.min()),
-                }
-            )
+            latency = {"mean_latency_s": average(latency_s), "p95_latency_s": p95(latency_s)}
+            shares = {"received_share": float(in_time.mean()), "least_received_share": float(reached.min())}
+            rows.append({**key, **latency, **shares})
         return rows
 
     def fits(self, points: int) -> float:
@@ -104,12 +97,9 @@ class Reproduction(ClientFigure):
                 latency_s, consumers = self.latencies_s(rows, points, line), range(1, self.max_consumers + 1)
                 straight = float(np.corrcoef(consumers, latency_s)[0, 1])
                 slope = float(np.polyfit(consumers, latency_s, 1)[0])
-                is_linear = straight >= STRAIGHT and slope > 0
-                linear.append(is_linear)
-                slopes.append(
-                    f"{points:,} points, {line} {'yes' if is_linear else 'NO'} ({slope:.3f} s a consumer, "
-                    f"r = {straight:.3f})"
-                )
+                linear.append(straight >= STRAIGHT and slope > 0)
+                told = f"{slope:.3f} s a consumer, r = {straight:.3f}"
+                slopes.append(f"{points:,} points, {line} {'yes' if linear[-1] else 'NO'} ({told})")
         one = rows.where(consumers=1)
         trios = {p: [one.mean("mean_latency_s", points=p, sender=n) for n in NAMES] for p in self.points}
         return {

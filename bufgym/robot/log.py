@@ -33,32 +33,15 @@ EVENTS: Final = ("settings", "put", "dequeued", "gone", "dropped")
 MAX_RECORD_BYTES: Final = 2**20
 
 
-def settings(
-    policy: Policy,
-    capacity: int,
-    value: Value,
-    max_bytes: int | None,
-    decide_at: str,
-    topics: Sequence[Topic],
-    window: int,
-    ends_us: int | None,
-) -> Record:
-    """Make the first record of a log, with all settings of the queue; V is stored as its exact numbers."""
-    return {
-        "event": "settings",
-        "us": 0,
-        "policy": policy.name,
-        "parameters": dict(policy.parameters),
-        "capacity": int(capacity),
-        "max_bytes": max_bytes,
-        "v": _numbers(value),
-        "decide_at": decide_at,
-        "topics": [
-            {**asdict(topic), "value": None if topic.value is None else _numbers(topic.value)} for topic in topics
-        ],
-        "window": int(window),
-        "ends_us": ends_us,
-    }
+def settings(policy: Policy, capacity: int, value: Value, *, topics: Sequence[Topic], **rules: Any) -> Record:
+    """Make the first record of a log, with all settings of the queue; V is stored as its exact numbers.
+
+    ``rules`` are ``max_bytes``, ``decide_at``, ``window`` and ``ends_us``.
+    """
+    values = [None if topic.value is None else _numbers(topic.value) for topic in topics]
+    told = [{**asdict(topic), "value": v} for topic, v in zip(topics, values, strict=True)]
+    ruling = {"policy": policy.name, "parameters": dict(policy.parameters), "capacity": int(capacity)}
+    return {"event": "settings", "us": 0, **ruling, "v": _numbers(value), "topics": told, **rules}
 
 
 def _numbers(value: Value) -> Record:

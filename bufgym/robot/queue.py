@@ -102,17 +102,9 @@ class PolicyQueue:
         if duration_s is not None:
             between("duration_s", duration_s, 0, MAX_TIME_US / 1e6, "s")
         ends_us = None if duration_s is None else round(1e6 * duration_s)
-        self._row = LiveRow(
-            self.policy,
-            capacity,
-            value,
-            max_bytes=max_bytes,
-            decide_at=decide_at,
-            topics=topics,
-            window=check_window(window),
-            ends_us=ends_us,
-            room=whole("room", room, 8, 2**30),
-        )
+        rules: dict[str, Any] = {"max_bytes": max_bytes, "decide_at": decide_at, "topics": topics, "ends_us": ends_us}
+        rules["window"] = check_window(window)
+        self._row = LiveRow(self.policy, capacity, value, room=whole("room", room, 8, 2**30), **rules)
         self.left_bytes: Callable[[], int | None] = lambda: None
         """Called at each ``put``: returns the bytes handed out that have not left, None if unknown. A transport sets
         it."""
@@ -134,7 +126,7 @@ class PolicyQueue:
         self._closed = False
         self.dropped = 0
         """Messages dropped so far."""
-        self._tell(settings(self.policy, capacity, value, max_bytes, decide_at, topics, window, ends_us))
+        self._tell(settings(self.policy, capacity, value, **rules))
 
     def put(
         self, message: Any, size_bytes: int, x: float | None = None, topic: int = 0, at_us: int | None = None
@@ -249,11 +241,8 @@ class PolicyQueue:
 
     def _stamp(self, at_us: int | None) -> int:
         """Time stamp an event, later than all before, whatever the clock does."""
-        if at_us is None:
-            now_us = int((self._clock() - self._began_s) * 1e6)
-        else:
-            now_us = whole("at_us", at_us, 0, MAX_TIME_US)
-        self._now_us = max(now_us, self._now_us + 1)
+        ours_us = int((self._clock() - self._began_s) * 1e6) if at_us is None else whole("at_us", at_us, 0, MAX_TIME_US)
+        self._now_us = max(ours_us, self._now_us + 1)
         return self._now_us
 
     def _next_x(self, scene: int, x: float | None) -> float:

@@ -85,15 +85,10 @@ class Receiver:
             raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
         with needs("websockets"):
             from websockets.asyncio.server import serve
-        self._server = await serve(
-            lambda connection: self._serve(WebSocketChannel(connection, self._max_body_bytes)),
-            host,
-            port,
-            compression=None,
-            ping_interval=None,
-            max_size=self._max_body_bytes + HEADER_BYTES,
-            max_queue=1,
-        )
+        most = self._max_body_bytes
+        limits: dict[str, Any] = {"max_size": most + HEADER_BYTES, "max_queue": 1}
+        limits |= {"compression": None, "ping_interval": None}
+        self._server = await serve(lambda one: self._serve(WebSocketChannel(one, most)), host, port, **limits)
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     async def close(self) -> None:

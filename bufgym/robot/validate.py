@@ -3,9 +3,9 @@
 import asyncio
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +59,8 @@ async def play(
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
-    warm(PolicyQueue(policy, capacity, value=value, topics=topics, window=episode.window))
+    rules: dict[str, Any] = {"value": value, "topics": topics, "window": episode.window}
+    warm(PolicyQueue(policy, capacity, **rules))
     came: list[Received] = []
 
     def take(message: Received) -> None:
@@ -71,17 +72,9 @@ async def play(
     messages = episode.arrivals
     bodies = memoryview(bytes(int(messages["size_bytes"].max())))
     began_s = time.monotonic()
-    queue = PolicyQueue(
-        policy,
-        capacity,
-        value=value,
-        topics=topics,
-        window=episode.window,
-        duration_s=None if episode.ends_us is None else episode.ends_us / 1e6,
-        seed=seed,
-        log=None if log is None else log.append,
-        clock=lambda: (time.monotonic() - began_s) * speed,
-    )
+    rules |= {"duration_s": None if episode.ends_us is None else episode.ends_us / 1e6, "seed": seed}
+    rules |= {"log": None if log is None else log.append, "clock": lambda: (time.monotonic() - began_s) * speed}
+    queue = PolicyQueue(policy, capacity, **rules)
     sender = Sender(queue, lambda: TRANSPORTS[transport]("127.0.0.1", port, small=small), leaves)
     sending = asyncio.create_task(sender.run())
     try:
@@ -114,12 +107,8 @@ def warm(queue: PolicyQueue) -> None:
     queue.close()
 
 
-class Play(Protocol):
-    """A function that plays an episode live and returns the messages received, as ``play`` does."""
-
-    def __call__(
-        self, policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
-    ) -> list[Received]: ...
+Play = Callable[..., list[Received]]
+"""Plays live: (policy, episode, capacity, value, speed=1.0, seed=0) -> the messages received, as ``play`` has them."""
 
 
 def over(transport: str) -> Play:

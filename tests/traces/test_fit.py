@@ -92,7 +92,7 @@ def test_statistics_by_hand() -> None:
     assert ks_distance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 0.0
 
 
-def test_what_the_fit_refuses() -> None:
+def test_what_the_fit_refuses(tmp_path: Path, capsys: Capsys) -> None:
     for wrong, says in (
         ({}, "no recordings"),
         ({"slow": rows_of([1e5] * 100)}, "mode slow: 0 of 100 s have 500000 bytes/s or more: must be at least 60"),
@@ -105,6 +105,13 @@ def test_what_the_fit_refuses() -> None:
     assert [mode_of(name) for name in names] == ["car", "wifi-office", "tram", "bus"]
     with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
         mode_of("0001.csv")
+    for words, says in (
+        ("", "needs recordings, FILE ... or --suite NAME"),
+        ("a.csv --suite lte-v1", "--suite: cannot go with FILE or --mode"),
+        ("a.csv --data .", "--data: needs --suite"),
+    ):
+        fails(["trace", "fit", *words.split(), "-o", tmp_path / "b.json"], says, capsys)
+    assert not (tmp_path / "b.json").exists()
 
 
 def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory() -> None:
@@ -151,16 +158,6 @@ def test_the_command_fits_what_a_suite_trains_on(
     ((mode, link),) = read_links(tmp_path / "two.json").items()
     assert (mode, link.recordings, link.seconds) == ("two", 2, 200)
     assert '"made_by": "bufgym trace fit --suite two-v7 -o two.json"' in (tmp_path / "two.json").read_text()
-
-
-def test_what_the_command_refuses(tmp_path: Path, capsys: Capsys) -> None:
-    for words, says in (
-        ("", "needs recordings, FILE ... or --suite NAME"),
-        ("a.csv --suite lte-v1", "--suite: cannot go with FILE or --mode"),
-        ("a.csv --data .", "--data: needs --suite"),
-    ):
-        fails(["trace", "fit", *words.split(), "-o", tmp_path / "b.json"], says, capsys)
-    assert not (tmp_path / "b.json").exists()
 
 
 @pytest.mark.nightly

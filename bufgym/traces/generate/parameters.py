@@ -140,13 +140,9 @@ def write_links(links: Mapping[str, LinkParameters], path: StrPath, threshold_by
         "probabilities_of_quantiles": PROBABILITIES,
         "modes": {mode: asdict(link) for mode, link in links.items()},
     }
-    write_text(path, [_dumped(content)])
-
-
-def _dumped(content: Mapping[str, Any]) -> str:
-    """JSON with one line for each number, and one for each row of numbers."""
-    rows = re.compile(r"\[\s*([^]]*?)\s*\]")
-    return rows.sub(lambda row: f"[{' '.join(row[1].split())}]", json.dumps(content, indent=2)) + "\n"
+    # One line for each number, and one for each row of numbers.
+    rows, text = re.compile(r"\[\s*([^]]*?)\s*\]"), json.dumps(content, indent=2)
+    write_text(path, [rows.sub(lambda row: f"[{' '.join(row[1].split())}]", text), "\n"])
 
 
 def _link(entry: object) -> LinkParameters:
