@@ -66,8 +66,8 @@ class Reproduction(FrameFigure):
             for title, some in (("the paper's alignment", rows.where(k=0)), ("the sweep", rows)):
                 shown = some.where(recording=recording)
                 for way, column in (("one way", ONE_WAY), ("both ways", BOTH_WAYS)):
-                    lines += [f"{recording}, RMSE of the map in mm by L, {way}, {title}:"]
-                    lines += [*shown.pivot("policy", "L", column, ".2f", labels), ""]
+                    head = f"{recording}, RMSE of the map in mm by L, {way}, {title}:"
+                    lines += [head, *shown.pivot("policy", "L", column, ".2f", labels), ""]
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
