@@ -40,10 +40,9 @@ class Reproduction(FrameFigure):
         ends = {(row["recording"], row["policy"]): self.ended_s(row) for row in rows.where(k=0)}
         main, facts = self.recordings[-1], dict[str, Any]()
         for policy in self.policies:
-            told = [(name, ends[name, policy]) for name in self.recordings]
-            facts[f"{policy.removeprefix('drop-')}_end"] = "; ".join(
-                f"{name} to the end" if s == np.inf else f"{name} breaks at second {s:.1f}" for name, s in told
-            )
+            ends_s = (ends[name, policy] for name in self.recordings)
+            told = ("to the end" if s == np.inf else f"breaks at second {s:.1f}" for s in ends_s)
+            facts[f"{policy.removeprefix('drop-')}_end"] = self.of_each(told)
         near = {policy: abs(ends[main, policy] - at_s) <= NEAR_S for policy, at_s in PAPER_S.items()}
         return facts | {"afr": ends[main, "afr"] == np.inf, "oldest": near["drop-oldest"], "random": near["random"]}
 

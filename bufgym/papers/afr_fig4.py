@@ -105,14 +105,8 @@ class Reproduction(Figure):
             axes.annotate(state, place, va="center", fontsize=8, backgroundcolor="white")
         axes.plot([], [], "o", color=COLOURS["afr"], label="kept")
         axes.plot([], [], "x", color=COLOURS["drop-oldest"], markeredgewidth=2, label="dropped at this T")
-        finish(
-            axes,
-            f"AFR, L = {PAPER_L}: messages kept as the interruption grows",
-            xlim=(0.3, PAPER_T[1] + 3.6),
-            xlabel="message",
-            ylabel="T, messages since the link stopped",
-            xticks=range(1, PAPER_T[1] + 1),
-            yticks=[row["T"] for row in rows],
-        )
+        finish(axes, f"AFR, L = {PAPER_L}: messages kept as the interruption grows", xlim=(0.3, PAPER_T[1] + 3.6))
+        axes.set(xlabel="message", ylabel="T, messages since the link stopped")
+        axes.set(xticks=range(1, PAPER_T[1] + 1), yticks=rows.distinct("T"))
         axes.invert_yaxis()
         legend_below(figure, 2)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
+from bufgym.benchmark.rows import Row
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
@@ -57,12 +58,9 @@ def gained_at_random(
     interruption: Interruption, T: int, capacity: int, runs: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Return H - 1 of ``runs`` independent runs of Random over an interruption of T messages, float64[runs]."""
-    parts = []
     episode = interruption.episode(T)
-    for start in range(0, runs, BATCH):
-        episodes = [episode.with_uniforms(rng) for _ in range(min(BATCH, runs - start))]
-        parts.append(gained("random", episodes, capacity, interruption.value))
-    return np.concatenate(parts)
+    batches = ([episode.with_uniforms(rng) for _ in range(min(BATCH, runs - k))] for k in range(0, runs, BATCH))
+    return np.concatenate([gained("random", batch, capacity, interruption.value) for batch in batches])
 
 
 def mean_score(policy: str, capacity: int, first: int, last: int) -> float:
@@ -92,21 +90,15 @@ class Reproduction(Figure):
         episodes = [interruption.episode(T) for T in lengths]
         samples = [gained_at_random(interruption, T, PAPER_L, self.runs, rng) for T in lengths]
         afr, drop_oldest = (gained(policy, episodes, PAPER_L, v) for policy in ("afr", "drop-oldest"))
-        return FigureRows(
-            {
-                "T": T,
-                "oracle-ideal": oracle.ideal(PAPER_L, T, v),
-                "oracle": oracle.integer(PAPER_L, T, v),
-                "afr": float(afr[T - 1]),
-                "drop-oldest": float(drop_oldest[T - 1]),
-                "random": float(samples[T - 1].mean()),
-                "random_sd": float(samples[T - 1].std(ddof=1)),
-                "random_within": float(
-                    (abs(samples[T - 1] - samples[T - 1].mean()) <= samples[T - 1].std(ddof=1)).mean()
-                ),
-            }
-            for T in lengths
-        )
+        rows = FigureRows()
+        for T, ours, oldest, sample in zip(lengths, afr, drop_oldest, samples, strict=True):
+            row: Row = {"T": T, "oracle-ideal": oracle.ideal(PAPER_L, T, v), "oracle": oracle.integer(PAPER_L, T, v)}
+            row |= {"afr": float(ours), "drop-oldest": float(oldest)}
+            mean, sd = float(sample.mean()), float(sample.std(ddof=1))
+            rows.append(
+                row | {"random": mean, "random_sd": sd, "random_within": float((abs(sample - mean) <= sd).mean())}
+            )
+        return rows
 
     def tables(self, rows: FigureRows) -> list[str]:
         shown = sorted({1, 8, 9, 17, 18, 25, 35, 36, 50, 71, 72, self.last_T} & set(rows.distinct("T")))
@@ -151,14 +143,9 @@ class Reproduction(Figure):
         peaks = equal_lengths(rows)
         heights = [rows[T - 1]["afr"] for T in peaks]
         axes.plot(peaks, heights, "o", color=COLOURS["afr"], markersize=6, label="AFR = oracle-ideal")
-        finish(
-            axes,
-            "Information gained in one interruption, L = 8, V(d) = 1 − 0.618$^d$",
-            xlim=(0, self.last_T + 1),
-            ylim=(0, PAPER_L + 2),
-            xlabel="T, messages during the interruption",
-            ylabel="information gained, H − 1",
-        )
+        finish(axes, "Information gained in one interruption, L = 8, V(d) = 1 − 0.618$^d$")
+        axes.set(xlabel="T, messages during the interruption", ylabel="information gained, H − 1")
+        axes.set(xlim=(0, self.last_T + 1), ylim=(0, PAPER_L + 2))
         axes.legend(loc="lower right", frameon=False, ncols=2)
 
 

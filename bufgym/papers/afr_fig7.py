@@ -33,15 +33,18 @@ SLICE = 30_000
 
 
 def change(rows: FigureRows, column: str, policy: str, other: str) -> Interval:
-    """Divide the column's mean under ``policy`` by its mean under ``other`` and subtract 1.
+    """Divide the column's mean under ``policy`` by its mean under ``other`` and subtract 1."""
+    ours, theirs = ([rows.mean(column, k=k, policy=name) for k in rows.distinct("k")] for name in (policy, other))
+    return _quotient(ours, theirs, f"{column} {policy} {other}")
 
-    The interval comes from a paired bootstrap over offsets: a drawn offset brings all its runs of both policies.
+
+def _quotient(above: list[float], below: list[float], label: str) -> Interval:
+    """Divide the means of numbers by offset and subtract 1.
+
+    The interval comes from a paired bootstrap over offsets: a drawn offset brings all its runs of both.
     """
-    ours, theirs = (
-        np.array([rows.mean(column, k=k, policy=name) for k in rows.distinct("k")]) for name in (policy, other)
-    )
-    weights = times_drawn(len(ours), RESAMPLES, stream(0, f"{column} {policy} {other}"))
-    return percentile_interval((weights @ ours) / (weights @ theirs) - 1, CONFIDENCE)
+    weights = times_drawn(len(above), RESAMPLES, stream(0, label))
+    return percentile_interval((weights @ above) / (weights @ below) - 1, CONFIDENCE)
 
 
 def spelled(interval: Interval) -> str:
@@ -63,8 +66,8 @@ class Reproduction(FrameFigure):
             for title, some in (("the paper's alignment", rows.where(k=0)), ("the sweep", rows)):
                 shown = some.where(recording=recording)
                 for way, column in (("one way", ONE_WAY), ("both ways", BOTH_WAYS)):
-                    lines += [f"{recording}, RMSE of the map in mm by L, {way}, {title}:"]
-                    lines += [*shown.pivot("policy", "L", column, ".2f", labels), ""]
+                    head = f"{recording}, RMSE of the map in mm by L, {way}, {title}:"
+                    lines += [head, *shown.pivot("policy", "L", column, ".2f", labels), ""]
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
@@ -78,23 +81,15 @@ class Reproduction(FrameFigure):
             if {"afr", other} <= set(self.policies):
                 facts[key] = within(change(rows.where(recording=main), ONE_WAY, "afr", other), *tens(paper))
                 for what, column in columns.items():
-                    facts[f"{key}_{what}"] = "; ".join(
-                        f"{name} {spelled(change(rows.where(recording=name), column, 'afr', other))}"
-                        for name in self.recordings
-                    )
-                facts[f"{key}_paper"] = "; ".join(
-                    f"{name} {change(rows.where(recording=name, k=0), ONE_WAY, 'afr', other).value:+.1%}"
-                    for name in self.recordings
-                )
+                    told = (spelled(change(rows.where(recording=r), column, "afr", other)) for r in self.recordings)
+                    facts[f"{key}_{what}"] = self.of_each(told)
+                changes = (change(rows.where(recording=r, k=0), ONE_WAY, "afr", other) for r in self.recordings)
+                facts[f"{key}_paper"] = self.of_each(f"{found.value:+.1%}" for found in changes)
         if {"afr", "drop-oldest", "random"} <= set(self.policies) and len(self.capacities) > 1:
-            grown = {
-                name: self.by_size(rows.where(recording=main, policy=name))
-                for name in (*SHOWN, "orbbuf-images")
-                if name in self.policies
-            }
-            facts["larger"] = of_all(
-                within(found, *((-1.0, 0.0) if name == "afr" else (-MUCH, np.inf))) for name, found in grown.items()
-            )
+            compared = [name for name in (*SHOWN, "orbbuf-images") if name in self.policies]
+            grown = {name: self.by_size(rows.where(recording=main, policy=name)) for name in compared}
+            limits = {"afr": (-1.0, 0.0)}
+            facts["larger"] = of_all(within(grown[name], *limits.get(name, (-MUCH, np.inf))) for name in compared)
             facts["sizes"] = "; ".join(f"{POLICIES[name][0]} {spelled(found)}" for name, found in grown.items())
         else:
             facts |= {"larger": None, "sizes": "not run"}
@@ -105,16 +100,15 @@ class Reproduction(FrameFigure):
     def by_size(self, rows: FigureRows) -> Interval:
         """The mean error at the largest L relative to that at the smallest, less 1, over the places of the fade."""
         sizes = (max(self.capacities), min(self.capacities))
-        large, small = (np.array([rows.mean(ONE_WAY, k=k, L=L) for k in rows.distinct("k")]) for L in sizes)
-        weights = times_drawn(len(large), RESAMPLES, stream(0, "sizes"))
-        return percentile_interval((weights @ large) / (weights @ small) - 1, CONFIDENCE)
+        large, small = ([rows.mean(ONE_WAY, k=k, L=L) for k in rows.distinct("k")] for L in sizes)
+        return _quotient(large, small, "sizes")
 
     def where_it_moves(self, rows: FigureRows) -> str:
         """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""
-        moved, won = [], []
-        x = self.stage(rows[0]["recording"]).whole.motion().at(self.stage(rows[0]["recording"]).whole.time_us)
+        moved, won, recording = [], [], rows[0]["recording"]
+        x = self.x_of(recording)
         for k in rows.distinct("k"):
-            kept = [self.kept(FrameRun(rows[0]["recording"], k, L, "drop-oldest")) for L in self.capacities]
+            kept = [self.kept(FrameRun(recording, k, L, "drop-oldest")) for L in self.capacities]
             moved.append(float(np.mean([np.diff(x[list(frames)]).max() for frames in kept])))
             won.append(rows.mean(ONE_WAY, k=k, policy="afr") / rows.mean(ONE_WAY, k=k, policy="drop-oldest") - 1)
         return f"{spearman(np.array(moved), np.array(won)):+.2f}"

@@ -58,20 +58,16 @@ class Reproduction(FrameFigure):
             for name in self.recordings
         }
         runs = len(rows.where(recording=self.recordings[0], policy=self.policies[0]))
-        facts: dict[str, Any] = {"runs": runs}
         not_run = ("by_size", "oldest_rate", "afr_rate", "random_rate", "large_count", "third_count", "orbbuf_count")
-        facts |= dict.fromkeys(not_run, "not run")
+        facts: dict[str, Any] = {"runs": runs, **dict.fromkeys(not_run, "not run")}
         facts["counts"] = "; ".join(
             f"{name}: " + ", ".join(f"{POLICIES[policy][0]} {count}" for policy, count in counts.items())
             for name, counts in broken.items()
         )
 
-        def each(spec: str, policies: tuple[str, ...], of: int = 1) -> str:
-            """Format the failures of these policies for every recording."""
-            return "; ".join(
-                f"{name} {' against '.join(format(counts[policy] / of, spec) for policy in policies)}"
-                for name, counts in broken.items()
-            )
+        def against_oldest(policy: str) -> str:
+            """Failures of this policy and of Drop Oldest on every recording."""
+            return self.of_each(f"{counts[policy]} against {counts['drop-oldest']}" for counts in broken.values())
 
         def everywhere(rule: Callable[[dict[str, int]], bool]) -> bool:
             return all(rule(counts) for counts in broken.values())
@@ -93,12 +89,11 @@ class Reproduction(FrameFigure):
             if IMAGES in self.policies:
                 pairs = [(counts[IMAGES], counts["drop-oldest"]) for counts in broken.values()]
                 facts["orbbuf"] = all(ours <= HALF * theirs for ours, theirs in pairs)
-            facts["orbbuf_count"] = each(".0f", (IMAGES, "drop-oldest")) if IMAGES in self.policies else "not run"
+                facts["orbbuf_count"] = against_oldest(IMAGES)
             for policy in rates:
-                key = f"{policy.removeprefix('drop-')}_rate"
-                told = (f"{name} {r.value:.0%} [{r.low:.0%}, {r.high:.0%}]" for name, r in rates[policy].items())
-                facts[key] = "; ".join(told)
-            facts["third_count"] = each(".0f", ("afr", "drop-oldest"))
+                told = (f"{r.value:.0%} [{r.low:.0%}, {r.high:.0%}]" for r in rates[policy].values())
+                facts[f"{policy.removeprefix('drop-')}_rate"] = self.of_each(told)
+            facts["third_count"] = against_oldest("afr")
             large = FigureRows(row for row in rows if row["L"] > 10)
             facts["large_count"] = failures(large, policy="afr")
             facts |= dict.fromkeys(("afr", "third", "large"))

@@ -161,7 +161,7 @@ class Reproduction(Figure):
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         fast = [row for row in rows if row["paper"].startswith("<")]
-        called = [f"{row['policy']} {_yes(row['called_median_us'] < LIMIT_PYTHON_US)}" for row in fast]
+        called = [f"{row['policy']} {'yes' if row['called_median_us'] < LIMIT_PYTHON_US else 'NO'}" for row in fast]
         images_ms = [row["called_median_us"] / 1e3 for row in rows if row["policy"] == IMAGES]
         return {
             "orbbuf": NEAR_MS[0] <= images_ms[0] <= NEAR_MS[1] if images_ms else None,
@@ -183,13 +183,8 @@ class Reproduction(Figure):
         for sign, us, label in (("<", 10.0, "paper: under 10 us"), ("~", 10e3, "paper: ORBBuf, features recomputed")):
             lines = [i for i, row in enumerate(rows) if row["paper"].startswith(sign)]
             axes.plot([us] * len(lines), lines, "<D"[sign == "~"], color=COLOURS["drop-oldest"], label=label)
-        finish(
-            axes, f"One decision on a full queue, L = {self.capacity}", xscale="log", xlabel="time of one decision, us"
-        )
+        title = f"One decision on a full queue, L = {self.capacity}"
+        finish(axes, title, xscale="log", xlabel="time of one decision, us")
         axes.set_yticks(at, rows.distinct("policy"))
         axes.invert_yaxis()
         legend_below(figure, 2)
-
-
-def _yes(claim: bool) -> str:
-    return "yes" if claim else "NO"

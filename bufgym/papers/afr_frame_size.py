@@ -52,16 +52,9 @@ class Reproduction(LinkFigure):
         """Return a row for each size, policy, L and run."""
         rows = FigureRows()
         for size_kb in sorted({self.size_bytes / 1000, *self.sweep_kb}):
-            uplink = Uplink(
-                traces=(self.link,),
-                rate_hz=RATE_HZ,
-                jitter=JITTER,
-                size_bytes=round(1000 * size_kb),
-                size_cv=0.0,
-                duration_s=self.frames / RATE_HZ,
-                link_offset_s=(0.0, 0.0),
-                value=time_value(),
-            )
+            size: dict[str, Any] = {"size_bytes": round(1000 * size_kb), "size_cv": 0.0, "value": time_value()}
+            stream: dict[str, Any] = {"rate_hz": RATE_HZ, "jitter": JITTER, "duration_s": self.frames / RATE_HZ}
+            uplink = Uplink(traces=(self.link,), link_offset_s=(0.0, 0.0), **stream, **size)
             episodes = [draw(uplink, seed) for seed in range(self.runs)]
             names = ("afr", "afr-paper", "orbbuf", "drop-oldest")
             for (seed, episode), policy, L in product(enumerate(episodes), names, self.capacities):
@@ -90,14 +83,10 @@ class Reproduction(LinkFigure):
         heads = [f"{policy}, second {s}" for policy in ("afr", "afr-paper") for s in SECONDS]
         lines = [["kB", "recalculations", *heads]]
         for size_kb in rows.distinct("size_kb"):
-            fewest, most = self.recalculations(rows, size_kb)
-            lines.append(
-                [f"{size_kb:g}", f"{fewest:.0f}-{most:.0f}", *(f"{hz:.1f}" for hz in self.rates_hz(rows, size_kb))]
-            )
-        return [
-            "ORBBuf's evictions over all L; frames that AFR keeps of each second at the smallest L:",
-            *aligned(lines),
-        ]
+            counts, rates = self.recalculations(rows, size_kb), self.rates_hz(rows, size_kb)
+            lines.append([f"{size_kb:g}", "{:.0f}-{:.0f}".format(*counts), *(f"{hz:.1f}" for hz in rates)])
+        title = "ORBBuf's evictions over all L; frames that AFR keeps of each second at the smallest L:"
+        return [title, *aligned(lines)]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         sizes = rows.distinct("size_kb")

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.model.qoi import Value
 from bufgym.papers.afr_fig9 import full_queue, inside_us
 from bufgym.papers.afr_theorems import gaps_of
 from bufgym.papers.figure import COLOURS, Figure, finish
@@ -122,7 +121,8 @@ class Reproduction(Figure):
             senders = sim.run(policies.get(name), [scenario.episode(self.last_T)], self.capacity, scenario.value)
             gaps = np.diff(metrics.received(senders, 0)["seq"])
             counted = 1 + float(senders.batch.senders["delivered_gain"][0])  # as the transition adds it up
-            off = max(off, abs(1 + sum(map(_v(scenario.value), gaps)) - counted))
+            added = (scenario.value.information([0.0, float(gap)]) - 1 for gap in gaps)  # V of each gap by itself
+            off = max(off, abs(1 + sum(added) - counted))
         return off
 
     def most_kept(self, name: str) -> int:
@@ -141,8 +141,3 @@ class Reproduction(Figure):
         title = f"Random: part of runs in which message i is kept, L = {self.capacity}, T = {self.last_T}"
         finish(axes, title, xlabel="message i", ylim=(0, 1))
         axes.legend(frameon=False)
-
-
-def _v(value: Value) -> Any:
-    """V as a function of a gap."""
-    return lambda gap: value.information(np.array([0.0, float(gap)])) - 1

@@ -47,9 +47,8 @@ class Reproduction(FrameFigure):
     def simulate(self) -> FigureRows:
         rows = FigureRows()
         for recording in self.recordings:
-            seen = self.stage(recording).seen
+            seen, x = self.stage(recording).seen, self.x_of(recording)
             v = 1.0 - seen.astype(np.float64)
-            x = self.stage(recording).whole.motion().at(self.stage(recording).whole.time_us)
             number = np.arange(len(x), dtype=np.float64)
             for by, at, distances in (("frames", number, self.distances), ("motion", x, self.motions)):
                 for d in distances:
@@ -70,15 +69,12 @@ class Reproduction(FrameFigure):
         return lines[:-1]
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
-        by_frames = rows.where(by="frames")
-        played = FigureRows(row for row in by_frames if row["behind"] is not None)
+        played = FigureRows(row for row in rows.where(by="frames") if row["behind"] is not None)
         facts: dict[str, Any] = {}
         for rule in ("broken_5", "broken_6"):
-            facts[rule] = "; ".join(
-                f"{recording} {shown.mean(rule, by='frames'):.0%} of the cases by frames, "
-                f"{shown.mean(rule, by='motion'):.0%} by motion"
-                for recording in rows.distinct("recording")
-                for shown in [rows.where(recording=recording)]
+            by = ({b: rows.mean(rule, by=b, recording=r) for b in ("frames", "motion")} for r in self.recordings)
+            facts[rule] = self.of_each(
+                "{frames:.0%} of the cases by frames, {motion:.0%} by motion".format(**b) for b in by
             )
         facts["excess"] = float(rows.column("excess_6").max())
         facts["rising"] = bool((rows.column("broken_5") < NOISE).all())
@@ -107,9 +103,8 @@ class Reproduction(FrameFigure):
                 d = shown.column("d")
                 axes.fill_between(d, shown.column("V_low"), shown.column("V_high"), color=colour, alpha=0.2)
                 axes.plot(d, shown.column("V"), "o-", color=colour, markersize=4, label=recording)
-            played = FigureRows(
-                row for row in rows.where(recording=recording, by="frames") if row["behind"] is not None
-            )
+            by_frames = rows.where(recording=recording, by="frames")
+            played = FigureRows(row for row in by_frames if row["behind"] is not None)
             for name, line in (("afr", "-"), ("oldest", "--")):
                 label = f"{recording}, {'AFR' if name == 'afr' else 'Drop Oldest'}"
                 right.plot(played.column("d"), played.column(f"{name}_of_best"), line, color=colour, label=label)

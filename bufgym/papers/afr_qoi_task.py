@@ -70,11 +70,8 @@ class Reproduction(FrameFigure):
         for recording, scope in rows.distinct("recording", "scope"):
             shown = rows.where(recording=recording, scope=scope)
             cells = [[m, *map(_spelled, shown.where(measure=m))] for m in MEASURES.values()]
-            lines += [
-                f"{recording}, {scope}: Spearman's correlation [95 %]",
-                *aligned([["", *TASKS.values()], *cells]),
-                "",
-            ]
+            table = aligned([["", *TASKS.values()], *cells])
+            lines += [f"{recording}, {scope}: Spearman's correlation [95 %]", *table, ""]
         for recording in rows.distinct("recording"):
             shown = self.runs.where(recording=recording)
             cells = [

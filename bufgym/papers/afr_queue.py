@@ -57,9 +57,7 @@ class Reproduction(Figure):
         longest = {policy: int(np.diff(self.received(rows, policy)).max()) for policy in POLICIES}
         return {
             "order": longest["afr"] <= longest["random"] <= longest["drop-oldest"],
-            "afr_gap": longest["afr"],
-            "random_gap": longest["random"],
-            "oldest_gap": longest["drop-oldest"],
+            **{f"{policy.removeprefix('drop-')}_gap": gap for policy, gap in longest.items()},
             "ideal_gap": (self.last_T + 1) / (min(self.capacity, self.last_T) + 1),
         }
 

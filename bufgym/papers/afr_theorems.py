@@ -112,9 +112,8 @@ class Reproduction(Figure):
         for L in range(1, self.max_capacity + 1):
             row: Row = {"L": L, "paper_bound": bound(L), "sharper_bound": sharper_bound(L), "worst": 1.0, "at_T": 0}
             row |= dict.fromkeys(("comparisons", *VIOLATIONS), 0)
-            for T, gaps, oldest_gaps in zip(
-                lengths, gaps_of("afr", L, lengths), gaps_of("drop-oldest", L, lengths), strict=True
-            ):
+            both = (gaps_of(policy, L, lengths) for policy in ("afr", "drop-oldest"))
+            for T, gaps, oldest_gaps in zip(lengths, *both, strict=True):
                 afr, oldest, oracle = (extremes(g)[:T] for g in (gaps, oldest_gaps, best_gaps(L, T)))
                 ideal = np.minimum(T + 1, np.arange(1, T + 1) * len(gaps))  # (L + 1) min((T + 1) / (L + 1), D)
                 ratio = worst_ratio(gaps)
@@ -168,11 +167,6 @@ class Reproduction(Figure):
         }
         for name, (line, colour, label) in looks.items():
             axes.plot(rows.column("L"), rows.column(name), line, color=COLOURS[colour], markersize=4, label=label)
-        finish(
-            axes,
-            f"Theorem 2: AFR at its worst, T = 1..{self.last_T}",
-            xlim=(0, self.max_capacity + 1),
-            xlabel="L, messages",
-            ylabel="AFR / oracle-ideal, information gained",
-        )
+        finish(axes, f"Theorem 2: AFR at its worst, T = 1..{self.last_T}", xlim=(0, self.max_capacity + 1))
+        axes.set(xlabel="L, messages", ylabel="AFR / oracle-ideal, information gained")
         axes.legend(loc="lower right", frameon=False)

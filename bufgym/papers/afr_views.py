@@ -50,6 +50,11 @@ class CameraMotion:
         return np.array([self.new(d) for d in range(MESSAGES + 1)])
 
 
+def _passing(width: float, step: float) -> tuple[Callable[[float], tuple[float, float]], int, Value]:
+    """View, dimensions and V of a motion by ``step`` a message past what is seen ``width`` wide."""
+    return lambda k: (k * step - width / 2, k * step + width / 2), 1, qoi.saturating(width / step)
+
+
 @dataclass(frozen=True)
 class Forward(CameraMotion):
     """Forward along a corridor; ``view`` is the stretch ahead, from the camera to its range (Fig. 3 (a))."""
@@ -111,18 +116,8 @@ class GeometryFigure(Figure):
                 self.wall_m,
             ),
             "wall": CameraMotion("moving back from a wall", wall, 2, qoi.exponential(self.base)),
-            "turn": CameraMotion(
-                "turning in place",
-                lambda k: (k * turn - VIEW_ANGLE / 2, k * turn + VIEW_ANGLE / 2),
-                1,
-                qoi.saturating(VIEW_ANGLE / turn),
-            ),
-            "corridor": CameraMotion(
-                "along a corridor, looking at its side",
-                lambda k: (k * self.step_m - width / 2, k * self.step_m + width / 2),
-                1,
-                qoi.saturating(width / self.step_m),
-            ),
+            "turn": CameraMotion("turning in place", *_passing(VIEW_ANGLE, turn)),
+            "corridor": CameraMotion("along a corridor, looking at its side", *_passing(width, self.step_m)),
         }
 
     def simulate(self) -> FigureRows:

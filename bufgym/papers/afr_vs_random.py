@@ -130,16 +130,9 @@ class Reproduction(Figure):
         violations = int(beyond_1.column("violations").sum())
         random = float(expected_extremes(L, T)[T, D - 1])
         afr = int(extremes(gaps)[D - 1])
-        return {
-            "grid": violations == 0 and not random > afr,
-            "one": bool(random > afr),
-            "violations": violations,
-            "cases": int(beyond_1.column("cases").sum()),
-            "counter_T": T,
-            "counter_D": D,
-            "counter_afr": afr,
-            "counter_random": random,
-        }
+        counter = {"counter_T": T, "counter_D": D, "counter_afr": afr, "counter_random": random}
+        cases = {"violations": violations, "cases": int(beyond_1.column("cases").sum())}
+        return {"grid": violations == 0 and not random > afr, "one": bool(random > afr), **cases, **counter}
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
         left, right = figure.subplots(1, 2)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product, starmap
@@ -99,6 +99,15 @@ class FrameFigure(Figure):
     def stage(self, recording: str) -> Stage:
         return stage(recording, self._folder, self.frames)
 
+    def x_of(self, recording: str) -> NDArray[np.float64]:
+        """Coordinate of each frame, float64[frames]."""
+        whole = self.stage(recording).whole
+        return whole.motion().at(whole.time_us)
+
+    def of_each(self, told: Iterable[str]) -> str:
+        """Join what is told of each recording, in order."""
+        return "; ".join(map(" ".join, zip(self.recordings, told, strict=True)))
+
     def settings(self) -> list[FrameRun]:
         return list(starmap(FrameRun, product(self.recordings, range(self.offsets), self.capacities, self.policies)))
 
@@ -150,14 +159,11 @@ class FrameFigure(Figure):
         parts = []
         for recording in self.recordings:
             whole = self.stage(recording).whole
-            size_kb = float(streams.sizes(whole).mean()) / 1e3
-            seconds = float(whole.time_us[-1]) / 1e6
-            carried = self.stage(recording).episode(self.link, 0).link.carried_at(int(whole.time_us[-1]))
-            demand = float(streams.sizes(whole).sum())
-            parts.append(
-                f"{recording}: {RECORDINGS[recording]}, {len(whole)} frames of {size_kb:.0f} kB in {seconds:.1f} s, "
-                f"of which the link {self.link.name} carries {carried / demand:.0%}."
-            )
+            sizes, end_us = streams.sizes(whole), int(whole.time_us[-1])
+            carried = self.stage(recording).episode(self.link, 0).link.carried_at(end_us) / float(sizes.sum())
+            frames = f"{len(whole)} frames of {sizes.mean() / 1e3:.0f} kB in {end_us / 1e6:.1f} s"
+            link = f"of which the link {self.link.name} carries {carried:.0%}"
+            parts.append(f"{recording}: {RECORDINGS[recording]}, {frames}, {link}.")
         return "\n\n".join(parts)
 
 

@@ -152,15 +152,9 @@ def send(
     if program.queued:
         rules = {"limit": queue_size, "no_drop": False}
     round_trip_us = round(round_trip_ms * 1000)
-    client = Client(
-        tuple(replace(s, topic=replace(s.topic, **rules)) for s in streams),
-        (link,),
-        duration_s=duration_s,
-        random_offset=False,
-        propagation_us=round_trip_us // 2,
-        round_trip_us=round_trip_us,
-        consumers=consumers,
-    )
+    ruled = tuple(replace(s, topic=replace(s.topic, **rules)) for s in streams)
+    times: dict[str, Any] = {"propagation_us": round_trip_us // 2, "round_trip_us": round_trip_us}
+    client = Client(ruled, (link,), duration_s=duration_s, random_offset=False, consumers=consumers, **times)
     # Room for all messages, because a no_drop queue has no limit.
     room = client.max_messages * consumers
     policy = policies.get(program.policy)
@@ -203,9 +197,8 @@ class ClientFigure(Figure):
     def send(
         self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
     ) -> Sent:
-        if "queue_size" not in client:
-            client["queue_size"] = getattr(self, "queue_size", QUEUE_SIZE)
-        sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, live=self.live, **client)
+        client = {"queue_size": getattr(self, "queue_size", QUEUE_SIZE), "live": self.live, **client}
+        sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, **client)
         last_s = float(np.nanmax(sent.received_s, initial=duration_s))
         for told in self.watchers:
             told(min(last_s, max(duration_s, client.get("watched_s", math.inf))))
@@ -220,11 +213,10 @@ def played_once(run: Run) -> Run:
 
     @functools.wraps(run)
     def once(figure: ClientFigure, *arguments: Any) -> Any:
-        if not figure.live:
-            return run(figure, *arguments)
-        if arguments not in figure.played:
-            figure.played[arguments] = run(figure, *arguments)
-        return figure.played[arguments]
+        kept = figure.played if figure.live else {}
+        if arguments not in kept:
+            kept[arguments] = run(figure, *arguments)
+        return kept[arguments]
 
     return cast(Run, once)
 

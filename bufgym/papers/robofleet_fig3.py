@@ -12,12 +12,14 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+from bufgym.benchmark.rows import Row
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.robofleet_evaluation import MBIT, SHORT, CloudFigure, cloud_bytes, curves, p95, stream
 from bufgym.papers.rows import FigureRows, listed
 from bufgym.traces.generate import steady
 
 SENDERS = ("robofleet", "no-drop", "no-drop-released", "rosbridge", "ros-native")
+TRIO = ("robofleet", "rosbridge", "ros-native")
 LOW = 2.0
 """Ratio to the latency at the lowest rate up to which a latency is called low."""
 EQUAL = 0.02
@@ -51,19 +53,11 @@ class Reproduction(CloudFigure):
             sent = self.send(name, (stream("PointCloud2", rate, points=self.points),), link, self.duration_s, seed)
             latency_s = sent.received.latency_s
             received_hz = float((sent.received_s <= self.duration_s).sum() / self.duration_s)
-            rows.append(
-                {
-                    "sender": name,
-                    "publish_hz": rate,
-                    "run": seed,
-                    "latency_ms": 1e3 * float(latency_s.mean()),
-                    "p95_latency_ms": 1e3 * p95(latency_s),
-                    "last_latency_ms": 1e3 * float(latency_s[-1]),
-                    "received_hz": received_hz,
-                    "received_mbit_per_s": received_hz * size / MBIT,
-                    "dropped": len(sent) - len(latency_s),
-                }
-            )
+            row: Row = {"sender": name, "publish_hz": rate, "run": seed}
+            for column, seconds in (("", latency_s.mean()), ("p95_", p95(latency_s)), ("last_", latency_s[-1])):
+                row[f"{column}latency_ms"] = 1e3 * float(seconds)
+            row |= {"received_hz": received_hz, "received_mbit_per_s": received_hz * size / MBIT}
+            rows.append(row | {"dropped": len(sent) - len(latency_s)})
         return rows
 
     def tables(self, rows: FigureRows) -> list[str]:
@@ -83,21 +77,18 @@ class Reproduction(CloudFigure):
         received_hz = at_high.mean("received_hz", sender="robofleet")
         tested = high > self.link_hz
         # Rosbridge is behind already at the lowest rate, because its messages are longer.
-        rates = sorted(self.rates_hz)
-        ms = {name: [rows.mean("latency_ms", sender=name, publish_hz=rate) for rate in rates] for name in SENDERS}
-        trio = list(zip(rates, ms["robofleet"], ms["rosbridge"], ms["ros-native"], strict=True))
-        ahead = [rate for rate, own, _, native in trio if own < native * (1 - EQUAL)]
-        behind = [rate for rate, own, _, native in trio if own > native * (1 + EQUAL)]
-        received = {
-            name: [rows.mean("received_hz", sender=name, publish_hz=rate) for rate in rates] for name in SENDERS
-        }
-        fewer = [
-            r
-            for r, own, native in zip(rates, received["robofleet"], received["ros-native"], strict=True)
-            if own < native * (1 - EQUAL)
-        ]
+        ms, hz = (
+            [
+                (rate, *(rows.mean(name, sender=sender, publish_hz=rate) for sender in TRIO))
+                for rate in sorted(self.rates_hz)
+            ]
+            for name in ("latency_ms", "received_hz")
+        )
+        ahead = [rate for rate, own, _, native in ms if own < native * (1 - EQUAL)]
+        behind = [rate for rate, own, _, native in ms if own > native * (1 + EQUAL)]
+        fewer = [rate for rate, own, _, native in hz if own < native * (1 - EQUAL)]
         return {
-            "rosbridge": all(own < bridge for _, own, bridge, _ in trio),
+            "rosbridge": all(own < bridge for _, own, bridge, _ in ms),
             # Ideal: the link carries all that is published.
             "native": not any(rate <= self.link_hz for rate in ahead) and bool(behind),
             "fewer": listed([f"{rate:g}" for rate in fewer]),
@@ -105,7 +96,7 @@ class Reproduction(CloudFigure):
             "behind_native": listed([f"{rate:g}" for rate in behind]),
             "some": "; ".join(
                 f"{rate:g} Hz {own:.1f} / {bridge:.0f} / {native:.1f} ms"
-                for rate, own, bridge, native in trio
+                for rate, own, bridge, native in ms
                 if rate in (low, 40, 60, high)
             ),
             "low": growth["robofleet"] <= LOW and received_hz < high if tested else None,

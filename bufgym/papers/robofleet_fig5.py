@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark.rows import Row
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.figure import COLOURS, at_least_0, finish, legend_below
 from bufgym.papers.robofleet_evaluation import JITTER, MBIT, SHORT, CloudFigure, cloud_bytes, curves, stream
@@ -22,6 +23,7 @@ from bufgym.papers.rows import FigureRows, average
 from bufgym.traces.generate import ramp
 
 SENDERS = ("robofleet", "no-drop", "rosbridge", "ros-native")
+OTHERS = {"bridge": "rosbridge", "no_drop": "no-drop", "native": "ros-native"}
 BROKEN = 2.0
 
 
@@ -64,17 +66,10 @@ class Reproduction(CloudFigure):
             for second in range(math.ceil(self.until_s)):
                 within = (second <= received.received_s) & (received.received_s < second + 1)
                 latency_s = received.latency_s[within]
-                rows.append(
-                    {
-                        "sender": name,
-                        "run": seed,
-                        "second": second,
-                        "link_mbit_per_s": self.capacity(second + 0.5),
-                        "received": len(latency_s),
-                        "mean_latency_s": average(latency_s),
-                        "max_latency_s": float(latency_s.max()) if len(latency_s) else math.nan,
-                    }
-                )
+                row: Row = {"sender": name, "run": seed, "second": second}
+                row |= {"link_mbit_per_s": self.capacity(second + 0.5), "received": len(latency_s)}
+                highest_s = float(latency_s.max()) if len(latency_s) else math.nan
+                rows.append(row | {"mean_latency_s": average(latency_s), "max_latency_s": highest_s})
         return rows
 
     def tables(self, rows: FigureRows) -> list[str]:
@@ -92,9 +87,8 @@ class Reproduction(CloudFigure):
         """Find the second in which this program breaks; None if it never does."""
         size = dict(zip(("ros-native", "robofleet", "rosbridge"), cloud_bytes(self.points), strict=True))
         for second in rows.distinct("second"):
-            alone_s = (
-                size.get(name, size["robofleet"]) / (self.capacity(second + 0.5) * MBIT) + self.round_trip_ms / 2e3
-            )
+            link_s = size.get(name, size["robofleet"]) / (self.capacity(second + 0.5) * MBIT)
+            alone_s = link_s + self.round_trip_ms / 2e3
             if rows.mean("mean_latency_s", sender=name, second=second) > BROKEN * alone_s:
                 return int(second)
         return None
@@ -115,8 +109,6 @@ class Reproduction(CloudFigure):
                 f"{SHORT[name]} {'never' if second is None else f'in second {second}'}"
                 for name, second in broken.items()
             ),
-            "bridge_s": highest_s["rosbridge"],
-            "bridge_share": share["rosbridge"],
             "json_demand": self.rate_hz * cloud_bytes(self.points)[2] / MBIT,
             "low": bool(highest_s["robofleet"] <= bound_s and share["robofleet"] < 1),
             "cloud_bytes": size,
@@ -126,10 +118,8 @@ class Reproduction(CloudFigure):
             "bound_s": bound_s,
             "highest_s": highest_s["robofleet"],
             "share": share["robofleet"],
-            "no_drop_s": highest_s["no-drop"],
-            "no_drop_share": share["no-drop"],
-            "native_s": highest_s["ros-native"],
-            "native_share": share["ros-native"],
+            **{f"{key}_s": highest_s[name] for key, name in OTHERS.items()},
+            **{f"{key}_share": share[name] for key, name in OTHERS.items()},
         }
 
     def draw(self, rows: FigureRows, figure: Any) -> None:

@@ -22,6 +22,7 @@ from bufgym.traces.generate import steady
 
 COMPARABLE = 2.0
 """Latencies within this factor of each other count as comparable."""
+NAMES = ("rosbridge", "ros-native", "robofleet")
 STRAIGHT = 0.98
 """Least correlation of native ROS's mean latency with the number of consumers that counts as linear."""
 
@@ -47,9 +48,8 @@ class Reproduction(ClientFigure):
         link = steady(self.mbit_per_s * MBIT)
         senders = [("robofleet", 1), ("rosbridge", 1), *(("ros-native", queue) for queue in self.queue_sizes)]
         rows = FigureRows()
-        for points, n, (name, queue), seed in product(
-            self.points, range(1, self.max_consumers + 1), senders, range(self.runs)
-        ):
+        every_n = range(1, self.max_consumers + 1)
+        for points, n, (name, queue), seed in product(self.points, every_n, senders, range(self.runs)):
             topic = stream("PointCloud2", self.rate_hz, points=points)
             settings = {"queue_size": queue, "consumers": n, "watched_s": self.duration_s}
             sent = self.send(name, (topic,), link, self.duration_s, seed, **settings)
@@ -58,15 +58,9 @@ class Reproduction(ClientFigure):
             reached = np.bincount(sent.consumer, in_time) / np.bincount(sent.consumer)  # share of each consumer
             label = f"native ROS, queue of {queue}" if name == "ros-native" else PROGRAMS[name].label.split(",")[0]
             key = {"points": points, "consumers": n, "sender": name, "queue_size": queue, "run": seed, "line": label}
-            rows.append(
-                {
-                    **key,
-                    "mean_latency_s": average(latency_s),
-                    "p95_latency_s": p95(latency_s),
-                    "received_share": float(in_time.mean()),
-                    "least_received_share": float(reached.min()),
-                }
-            )
+            latency = {"mean_latency_s": average(latency_s), "p95_latency_s": p95(latency_s)}
+            shares = {"received_share": float(in_time.mean()), "least_received_share": float(reached.min())}
+            rows.append({**key, **latency, **shares})
         return rows
 
     def fits(self, points: int) -> float:
@@ -103,21 +97,14 @@ class Reproduction(ClientFigure):
                 latency_s, consumers = self.latencies_s(rows, points, line), range(1, self.max_consumers + 1)
                 straight = float(np.corrcoef(consumers, latency_s)[0, 1])
                 slope = float(np.polyfit(consumers, latency_s, 1)[0])
-                is_linear = straight >= STRAIGHT and slope > 0
-                linear.append(is_linear)
-                slopes.append(
-                    f"{points:,} points, {line} {'yes' if is_linear else 'NO'} ({slope:.3f} s a consumer, "
-                    f"r = {straight:.3f})"
-                )
+                linear.append(straight >= STRAIGHT and slope > 0)
+                told = f"{slope:.3f} s a consumer, r = {straight:.3f}"
+                slopes.append(f"{points:,} points, {line} {'yes' if linear[-1] else 'NO'} ({told})")
         one = rows.where(consumers=1)
-        names = ("rosbridge", "ros-native", "robofleet")
-        trios = {p: [one.mean("mean_latency_s", points=p, sender=n) for n in names] for p in self.points}
+        trios = {p: [one.mean("mean_latency_s", points=p, sender=n) for n in NAMES] for p in self.points}
         return {
             "rosbridge": all(bridge > native for bridge, native, _ in trios.values()),
-            "bridge": "; ".join(
-                f"{points:,} points " + " / ".join(f"{seconds:.3f}" for seconds in trio) + " s"
-                for points, trio in trios.items()
-            ),
+            "bridge": _told(trios, ".3f", " s"),
             "growth": listed([f"{ratio:.2f} times at {points:,} points" for points, ratio in growth.items()]),
             "linear": either(linear),
             **self.many(rows),
@@ -126,25 +113,18 @@ class Reproduction(ClientFigure):
 
     def many(self, rows: FigureRows) -> dict[str, Any]:
         """Latency and share received of each program with the most consumers."""
-        names = ("rosbridge", "ros-native", "robofleet")
         last = rows.where(consumers=self.max_consumers)
         by = {
-            column: {p: [last.mean(column, points=p, sender=n) for n in names] for p in self.points}
+            column: {p: [last.mean(column, points=p, sender=n) for n in NAMES] for p in self.points}
             for column in ("mean_latency_s", "received_share")
         }
         slower = {p: (bridge / native, own / native) for p, (bridge, native, own) in by["mean_latency_s"].items()}
-        told = {
-            column: "; ".join(
-                f"{p:,} points " + " / ".join(format(x, spec) for x in trio) for p, trio in by[column].items()
-            )
-            for column, spec in (("mean_latency_s", ".3f"), ("received_share", ".0%"))
-        }
         return {
             "comparable": either([1 / COMPARABLE <= bridge <= COMPARABLE for bridge, _ in slower.values()]),
             "outperforms": all(own < min(1.0, bridge) / COMPARABLE for bridge, own in slower.values()),
             "throughput": all(own >= native / COMPARABLE for _, native, own in by["received_share"].values()),
-            "many_s": told["mean_latency_s"],
-            "many_share": told["received_share"],
+            "many_s": _told(by["mean_latency_s"], ".3f"),
+            "many_share": _told(by["received_share"], ".0%"),
         }
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:
@@ -168,3 +148,8 @@ class Reproduction(ClientFigure):
             axes.set_xticks(consumers)
         panels[0].set_ylabel("mean latency, s")
         legend_below(figure, 4, panels[0])
+
+
+def _told(trios: dict[int, list[float]], spec: str, unit: str = "") -> str:
+    """Format the numbers of ``NAMES`` for each number of points."""
+    return "; ".join(f"{p:,} points {' / '.join(format(x, spec) for x in trio)}{unit}" for p, trio in trios.items())

@@ -123,28 +123,19 @@ class Reproduction(ClientFigure):
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         first = rows.where(image_priority=self.image_priorities[0], bad_mbit_per_s=self.shown)
         lost = sum(row["lost"] for row in rows.where(sender="robofleet", topic="PoseStamped"))
-        medians = (
-            f"{PROGRAMS[name].label.split(',')[0]} "
-            f"{first.mean('median_in_zone_ms', sender=name, topic='PoseStamped') / 1e3:.2f} s"
-            for name in SENDERS
-        )
+        called = {name: PROGRAMS[name].label.split(",")[0] for name in SENDERS}
+        poses = {n: first.mean("median_in_zone_ms", sender=n, topic="PoseStamped") / 1e3 for n in SENDERS}
         affected = {name: self.affected(rows, name) for name in SENDERS}
-        spikes = [
-            row["highest_in_zone_ms"] > row["highest_before_ms"]
-            for row in rows.where(image_priority=self.image_priorities[0])
-        ]
+        pairs = zip(affected["rosbridge"], affected["robofleet"], strict=True)
+        every = rows.where(image_priority=self.image_priorities[0])
+        spikes = [row["highest_in_zone_ms"] > row["highest_before_ms"] for row in every]
         return {
             "spike": all(spikes),
-            "longer": all(
-                bridge > own for bridge, own in zip(affected["rosbridge"], affected["robofleet"], strict=True)
-            ),
+            "longer": all(bridge > own for bridge, own in pairs),
             "spikes": sum(spikes),
             "played": len(spikes),
             "zones": ", ".join(f"{bad:g}" for bad in self.bad_mbit_per_s),
-            "affected": "; ".join(
-                f"{PROGRAMS[name].label.split(',')[0]} {', '.join(f'{s:.1f}' for s in seconds)} s"
-                for name, seconds in affected.items()
-            ),
+            "affected": "; ".join(f"{called[n]} {', '.join(f'{s:.1f}' for s in affected[n])} s" for n in SENDERS),
             "no-drop": lost == 0,
             "lost": lost,
             "topics": "; ".join(
@@ -152,7 +143,7 @@ class Reproduction(ClientFigure):
                 for kind, (hz, rules) in TOPICS.items()
             ),
             "demand": sum(BYTES[kind][1] * hz for kind, (hz, _) in TOPICS.items()) / MBIT,
-            "medians": ", ".join(medians),
+            "medians": ", ".join(f"{called[name]} {seconds:.2f} s" for name, seconds in poses.items()),
         }
 
     def draw(self, rows: FigureRows, figure: Any) -> None:

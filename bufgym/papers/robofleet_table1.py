@@ -82,17 +82,12 @@ class Reproduction(Figure):
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         sizes = sizes_of(rows)
-        listed = {
-            name: ", ".join(f"{sizes[kind][encoding]:,}" for kind in PAPER)
-            for name, encoding in (
-                ("flat_bytes", "robofleet"),
-                ("bare_bytes", "robofleet-bare"),
-                ("json_bytes", "json-numbers"),
-            )
-        }
+        of = {"flat_bytes": "robofleet", "bare_bytes": "robofleet-bare", "json_bytes": "json-numbers"}
+        listed = {name: ", ".join(f"{sizes[kind][encoding]:,}" for kind in PAPER) for name, encoding in of.items()}
+        compared = {"flatbuffer": "robofleet", "json": "json-numbers"}
         equal = {
-            claim: all(sizes[kind][encoding] == PAPER[kind][k] for kind in PAPER)
-            for k, (claim, encoding) in enumerate((("flatbuffer", "robofleet"), ("json", "json-numbers")), 1)
+            claim: all(sizes[kind][encoding] == of_paper(kind, encoding) for kind in PAPER)
+            for claim, encoding in compared.items()
         }
         scan, fix, image = (self.messages[kind] for kind in PAPER)
         contents = {
@@ -128,10 +123,8 @@ class Reproduction(Figure):
 
 
 def sizes_of(rows: FigureRows) -> dict[str, dict[str, int]]:
-    sizes: dict[str, dict[str, int]] = {}
-    for row in rows:
-        sizes.setdefault(row["message"], {})[row["encoding"]] = row["bytes"]
-    return sizes
+    of = rows.where
+    return {kind: {row["encoding"]: row["bytes"] for row in of(message=kind)} for kind in rows.distinct("message")}
 
 
 def of_paper(kind: str, encoding: str) -> int | None:

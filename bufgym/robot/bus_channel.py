@@ -53,17 +53,14 @@ class BusChannel:
     async def connect(cls, opening: Open, host: str, port: int, *, small: bool = True) -> BusChannel:
         """Connect a sender once the receiver is there; ``small`` has no effect on the library's buffers."""
         channel = cls(os.urandom(8).hex())
-        made = asyncio.ensure_future(
-            asyncio.to_thread(
-                opening, host, port, channel.name, lambda _, data: channel.soon(channel.take, data), channel.peer
-            )
-        )
+        there = host, port, channel.name, lambda _, data: channel.soon(channel.take, data), channel.peer
+        made = asyncio.ensure_future(asyncio.to_thread(opening, *there))
         try:
             bus = await asyncio.shield(made)
         except asyncio.CancelledError:
             made.add_done_callback(_abandoned)
             raise
-        channel.publish, channel.on_close = bus.publish, lambda: _close(bus)
+        channel.publish, channel.on_close = bus.publish, lambda: _aside(bus.close)
         try:
             await channel._there.wait()
         except BaseException:
@@ -154,11 +151,7 @@ class BusServer:
 def _abandoned(made: asyncio.Future[Bus]) -> None:
     """Close a bus whose opener has given up."""
     if not made.cancelled() and made.exception() is None:
-        _close(made.result())
-
-
-def _close(bus: Bus) -> None:
-    _aside(bus.close)
+        _aside(made.result().close)
 
 
 def _aside(do: Callable[..., None], *arguments: Any) -> None:

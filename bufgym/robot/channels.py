@@ -93,15 +93,10 @@ class WebSocketChannel:
             from websockets.asyncio.client import connect
             from websockets.exceptions import WebSocketException
         limit: dict[str, Any] = {"write_limit": (1, 0)} if small else {}
+        limit["ping_interval"] = None  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
         try:
-            connection = await connect(
-                f"ws://{host}:{port}",
-                sock=await connected(host, port, small),
-                compression=None,
-                ping_interval=None,  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
-                proxy=None,
-                **limit,
-            )
+            taken = await connected(host, port, small)
+            connection = await connect(f"ws://{host}:{port}", sock=taken, compression=None, proxy=None, **limit)
         except WebSocketException as error:
             raise ConnectionError(f"{host}:{port}: {error}") from None
         return cls(connection)

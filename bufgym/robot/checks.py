@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -87,14 +88,9 @@ def validate(
 
 def _play_over(transport: str) -> Play:
     """Find the player for a transport; raise an error if it is not installed."""
-    if transport == "ros1":
-        from bufgym.robot.ros1 import episode as ros1
-
-        return ros1.player()
-    if transport == "ros2":
-        from bufgym.robot.ros2 import episode as ros2
-
-        return ros2.player()
+    if transport in ("ros1", "ros2"):
+        player: Play = importlib.import_module(f"bufgym.robot.{transport}.episode").player()
+        return player
     from bufgym.robot.validate import over
 
     return over(transport)

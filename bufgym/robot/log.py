@@ -14,7 +14,6 @@ need the extra ``live``.
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -34,32 +33,15 @@ EVENTS: Final = ("settings", "put", "dequeued", "gone", "dropped")
 MAX_RECORD_BYTES: Final = 2**20
 
 
-def settings(
-    policy: Policy,
-    capacity: int,
-    value: Value,
-    max_bytes: int | None,
-    decide_at: str,
-    topics: Sequence[Topic],
-    window: int,
-    ends_us: int | None,
-) -> Record:
-    """Make the first record of a log, with all settings of the queue; V is stored as its exact numbers."""
-    return {
-        "event": "settings",
-        "us": 0,
-        "policy": policy.name,
-        "parameters": dict(policy.parameters),
-        "capacity": int(capacity),
-        "max_bytes": max_bytes,
-        "v": _numbers(value),
-        "decide_at": decide_at,
-        "topics": [
-            {**asdict(topic), "value": None if topic.value is None else _numbers(topic.value)} for topic in topics
-        ],
-        "window": int(window),
-        "ends_us": ends_us,
-    }
+def settings(policy: Policy, capacity: int, value: Value, *, topics: Sequence[Topic], **rules: Any) -> Record:
+    """Make the first record of a log, with all settings of the queue; V is stored as its exact numbers.
+
+    ``rules`` are ``max_bytes``, ``decide_at``, ``window`` and ``ends_us``.
+    """
+    values = [None if topic.value is None else _numbers(topic.value) for topic in topics]
+    told = [{**asdict(topic), "value": v} for topic, v in zip(topics, values, strict=True)]
+    ruling = {"policy": policy.name, "parameters": dict(policy.parameters), "capacity": int(capacity)}
+    return {"event": "settings", "us": 0, **ruling, "v": _numbers(value), "topics": told, **rules}
 
 
 def _numbers(value: Value) -> Record:
@@ -71,26 +53,13 @@ def value_of(v: Record) -> Value:
     return Value(v["name"], np.array(v["numbers"], np.float64))
 
 
-class LogFile(AbstractContextManager["LogFile"]):
+class LogFile(McapFile):
     """A log in an MCAP file; call it with each record, then close it. A log that was not closed can also be read."""
-
-    def __init__(self, path: str | Path) -> None:
-        self._file = McapFile(path)
-        self.path = self._file.path
 
     def __call__(self, record: Record) -> None:
         """Write one record."""
         now_ns = record["us"] * 1000
-        self._file.write(
-            f"/{record['event']}", json.dumps(record).encode(), now_ns, now_ns, schema="bufgym.live.Record"
-        )
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._file.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        self.write(f"/{record['event']}", json.dumps(record).encode(), now_ns, now_ns, schema="bufgym.live.Record")
 
 
 def read_log(path: str | Path) -> list[Record]:

@@ -23,14 +23,11 @@ class Margin:
     share: Interval  # live over simulated
 
     def __str__(self) -> str:
-        live, simulated, share = map(_percent, (self.live, self.simulated, self.share))
+        numbers = (self.live, self.simulated, self.share)
+        live, simulated, share = (" ".join(written(number, percent)).strip() for number in numbers)
         lower = f"{self.policy} against {self.reference}, {self.episodes} episodes: regret lower by"
         there = f": {share} of the simulator's margin is there live" if self.simulated.value > 0 else ""
         return f"{lower} {live} live, {simulated} simulated{there}."
-
-
-def _percent(interval: Interval) -> str:
-    return " ".join(written(interval, percent)).strip()
 
 
 def margins(runs: Sequence[LiveRun], reference: str = "afr") -> list[Margin]:

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from bufgym.robot.extra import needs
 
@@ -36,10 +36,12 @@ class McapFile:
         seq: int = 0,
     ) -> None:
         """Add a message; ``schema`` is the name of its type, empty for none."""
-        key = topic, encoding, schema
+        key, kind = (topic, encoding, schema), (schema, schema_encoding)
+        if schema and kind not in self._schemas:
+            text = b'{"type": "object"}' if schema_encoding == "jsonschema" else b""
+            self._schemas[kind] = self._writer.register_schema(schema, schema_encoding, text)
         if key not in self._channels:
-            id = self._schema(schema, schema_encoding) if schema else 0
-            self._channels[key] = self._writer.register_channel(topic, encoding, id)
+            self._channels[key] = self._writer.register_channel(topic, encoding, self._schemas.get(kind, 0))
         self._writer.add_message(
             self._channels[key], log_time=log_ns, publish_time=publish_ns, sequence=seq % 2**32, data=data
         )
@@ -48,14 +50,14 @@ class McapFile:
             self.file.flush()
             self._flushed_s = now_s
 
-    def _schema(self, name: str, encoding: str) -> int:
-        if (name, encoding) not in self._schemas:
-            text = b'{"type": "object"}' if encoding == "jsonschema" else b""
-            self._schemas[name, encoding] = self._writer.register_schema(name, encoding, text)
-        return self._schemas[name, encoding]
-
     def close(self) -> None:
         """Finish the file."""
         if not self.file.closed:
             self._writer.finish()
             self.file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -123,6 +123,11 @@ def check_messages(mark: str) -> None:
             raise BufgymError(f"{package}: is the other ROS's here: each ROS wants a Python of its own")
 
 
+def check_speed(speed: float) -> None:
+    if speed != 1:
+        raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
+
+
 def publish_in_time(
     episode: Episode, began_s: float, move: Callable[[int, float], None], show: Callable[[int, int], None]
 ) -> None:
@@ -173,9 +178,6 @@ class Seen:
 
 def received(frames: list[tuple[int, int]], episode: Episode, began_s: float) -> list[Received]:
     """List the episode's messages that were received."""
-    found = []
-    for number, (k, at_ns) in enumerate(frames):
-        message = episode.arrivals[k]
-        at_us, x, topic = int(message["arrival_us"]), float(message["x"]), int(message["topic"])
-        found.append(Received("", number, k, at_us, x, topic, b"", at_ns - round(began_s * 1e9)))
-    return found
+    rows: list[tuple[int, float, int]] = episode.arrivals[["arrival_us", "x", "topic"]].tolist()
+    began_ns = round(began_s * 1e9)
+    return [Received("", n, k, *rows[k], b"", at_ns - began_ns) for n, (k, at_ns) in enumerate(frames)]

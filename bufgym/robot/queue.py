@@ -102,17 +102,9 @@ class PolicyQueue:
         if duration_s is not None:
             between("duration_s", duration_s, 0, MAX_TIME_US / 1e6, "s")
         ends_us = None if duration_s is None else round(1e6 * duration_s)
-        self._row = LiveRow(
-            self.policy,
-            capacity,
-            value,
-            max_bytes=max_bytes,
-            decide_at=decide_at,
-            topics=topics,
-            window=check_window(window),
-            ends_us=ends_us,
-            room=whole("room", room, 8, 2**30),
-        )
+        rules: dict[str, Any] = {"max_bytes": max_bytes, "decide_at": decide_at, "topics": topics, "ends_us": ends_us}
+        rules["window"] = check_window(window)
+        self._row = LiveRow(self.policy, capacity, value, room=whole("room", room, 8, 2**30), **rules)
         self.left_bytes: Callable[[], int | None] = lambda: None
         """Called at each ``put``: returns the bytes handed out that have not left, None if unknown. A transport sets
         it."""
@@ -134,7 +126,7 @@ class PolicyQueue:
         self._closed = False
         self.dropped = 0
         """Messages dropped so far."""
-        self._tell(settings(self.policy, capacity, value, max_bytes, decide_at, topics, window, ends_us))
+        self._tell(settings(self.policy, capacity, value, **rules))
 
     def put(
         self, message: Any, size_bytes: int, x: float | None = None, topic: int = 0, at_us: int | None = None
@@ -162,18 +154,8 @@ class PolicyQueue:
                 seq = self._row.put(now_us, size_bytes, x, topic, uniform)
             self._latest_x[scene] = x
             self._held[seq] = Item(message, seq, -1, now_us, size_bytes, x, topic)
-            self._tell(
-                {
-                    "event": "put",
-                    "us": now_us,
-                    "seq": seq,
-                    "size_bytes": size_bytes,
-                    "x": x,
-                    "topic": topic,
-                    "uniform": uniform,
-                    "carried": carried,
-                }
-            )
+            about = {"seq": seq, "size_bytes": size_bytes, "x": x, "topic": topic}
+            self._tell({"event": "put", "us": now_us, **about, "uniform": uniform, "carried": carried})
             self._settle(now_us, seq)
         return seq
 
@@ -214,7 +196,7 @@ class PolicyQueue:
 
     def __iter__(self) -> Iterator[Item]:
         """Iterate over ``get``; asking for the next message calls ``gone`` for the last."""
-        while (item := self.get()) is not None:
+        for item in iter(self.get, None):
             yield item
             self.gone()
 
@@ -259,11 +241,8 @@ class PolicyQueue:
 
     def _stamp(self, at_us: int | None) -> int:
         """Time stamp an event, later than all before, whatever the clock does."""
-        if at_us is None:
-            now_us = int((self._clock() - self._began_s) * 1e6)
-        else:
-            now_us = whole("at_us", at_us, 0, MAX_TIME_US)
-        self._now_us = max(now_us, self._now_us + 1)
+        ours_us = int((self._clock() - self._began_s) * 1e6) if at_us is None else whole("at_us", at_us, 0, MAX_TIME_US)
+        self._now_us = max(ours_us, self._now_us + 1)
         return self._now_us
 
     def _next_x(self, scene: int, x: float | None) -> float:
@@ -289,21 +268,18 @@ class PolicyQueue:
 
     def _settle(self, now_us: int, newcomer: int | None) -> None:
         """Hand on dequeued messages and release dropped ones."""
-        dequeued = self._row.dequeued
-        number = self._number
-        while number < dequeued:
+        before, self._number = self._number, self._row.dequeued
+        for number in range(before, self._number):
             item = self._held.pop(self._row.dequeued_seq(number))
             self._ready.append(replace(item, number=number))
             self._tell({"event": "dequeued", "us": now_us, "seq": item.seq})
-            number += 1
-        changed, self._number = number > self._number, number
         if len(self._held) > self._row.occupancy:
             queued = set(self._row.queued)
             for seq in [seq for seq in self._held if seq not in queued]:
                 del self._held[seq]
                 self.dropped += 1
                 self._tell({"event": "dropped", "us": now_us, "seq": seq, "why": self._why(seq, newcomer)})
-        if changed or self._drained:
+        if self._number > before or self._drained:
             self._wake()
 
     def _why(self, seq: int, newcomer: int | None) -> str:

@@ -1,14 +1,12 @@
 """The receiving end: takes messages from any number of senders, acks each, and delivers none twice."""
 
 import asyncio
-import contextlib
 import inspect
 import json
 import socket
 import time
 from collections import OrderedDict, deque
 from collections.abc import Awaitable, Callable
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
@@ -87,15 +85,10 @@ class Receiver:
             raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
         with needs("websockets"):
             from websockets.asyncio.server import serve
-        self._server = await serve(
-            lambda connection: self._serve(WebSocketChannel(connection, self._max_body_bytes)),
-            host,
-            port,
-            compression=None,
-            ping_interval=None,
-            max_size=self._max_body_bytes + HEADER_BYTES,
-            max_queue=1,
-        )
+        most = self._max_body_bytes
+        limits: dict[str, Any] = {"max_size": most + HEADER_BYTES, "max_queue": 1}
+        limits |= {"compression": None, "ping_interval": None}
+        self._server = await serve(lambda one: self._serve(WebSocketChannel(one, most)), host, port, **limits)
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     async def close(self) -> None:
@@ -150,18 +143,7 @@ class Receiver:
                     f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}"
                 )
             if frame.number == stream.expected:
-                answer = self._on_message(
-                    Received(
-                        name.hex(),
-                        frame.number,
-                        frame.seq,
-                        frame.at_us,
-                        frame.x,
-                        frame.topic,
-                        frame.body,
-                        time.time_ns(),
-                    )
-                )
+                answer = self._on_message(Received(name.hex(), *frame[1:], time.time_ns()))
                 if inspect.isawaitable(answer):
                     await answer
                 stream.expected += 1
@@ -186,25 +168,15 @@ async def listener(host: str, port: int, receive_buffer_bytes: int | None = None
     return listening
 
 
-class Recording(contextlib.AbstractContextManager["Recording"]):
+class Recording(McapFile):
     """Recording of received messages in an MCAP file, with bodies on ``/topic_0`` and so on, the rest on
     ``/received``."""
-
-    def __init__(self, path: str | Path) -> None:
-        self._file = McapFile(path)
 
     def __call__(self, message: Received) -> None:
         """Write one message; an ``on_message`` of ``Receiver``."""
         times, seq = (message.received_ns, message.at_us * 1000), message.seq
         body, encoding = bytes(message.body), "application/octet-stream"
-        self._file.write(f"/topic_{message.topic}", body, *times, encoding=encoding, seq=seq)
+        self.write(f"/topic_{message.topic}", body, *times, encoding=encoding, seq=seq)
         about = {**message._asdict(), "size_bytes": len(body)}
         del about["body"]
-        self._file.write("/received", json.dumps(about).encode(), *times, schema="bufgym.live.Received", seq=seq)
-
-    def close(self) -> None:
-        """Finish the file."""
-        self._file.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        self.write("/received", json.dumps(about).encode(), *times, schema="bufgym.live.Received", seq=seq)

@@ -57,15 +57,8 @@ def _replayed(records: Sequence[Record], policy: Policy | None) -> Replay:
         policy = replace(get(made["policy"]), parameters=made["parameters"])
     topics = [Topic(**{**topic, "value": topic["value"] and value_of(topic["value"])}) for topic in made["topics"]]
     episode = Episode(_arrivals(records), Link(_trace(records)), window=made["window"], ends_us=made.get("ends_us"))
-    senders = run(
-        policy,
-        [episode],
-        made["capacity"],
-        value_of(made["v"]),
-        max_bytes=made["max_bytes"],
-        decide_at=made["decide_at"],
-        topics=topics,
-    )
+    limits = {"max_bytes": made["max_bytes"], "decide_at": made["decide_at"]}
+    senders = run(policy, [episode], made["capacity"], value_of(made["v"]), topics=topics, **limits)
     return Replay(senders, episode, tuple(_differences(records, senders)))
 
 
@@ -73,18 +66,16 @@ def _arrivals(records: Sequence[Record]) -> np.ndarray[Any, Any]:
     """Arrivals of the log, MESSAGE[n]."""
     puts = list(of(records, "put"))
     arrivals = zeroed(len(puts), MESSAGE)
-    for name, column in (("seq", "seq"), ("arrival_us", "us"), ("size_bytes", "size_bytes"), ("topic", "topic")):
-        arrivals[name] = [put[column] for put in puts]
-    arrivals["x"], arrivals["uniform"] = [put["x"] for put in puts], [put["uniform"] for put in puts]
+    for name in ("seq", "arrival_us", "size_bytes", "topic", "x", "uniform"):
+        arrivals[name] = [put["us" if name == "arrival_us" else name] for put in puts]
     return arrivals
 
 
 def _trace(records: Sequence[Record]) -> Trace:
     """Trace of the bytes carried, with a knot at each arrival and each departure."""
     told = [record for record in records if "carried" in record]
-    return Trace(
-        "live", np.array([0, 1, *(r["us"] for r in told)]), np.array([0, 0, *(r["carried"] for r in told)]), "stop"
-    )
+    times, counts = np.array([(0, 0), (1, 0), *((record["us"], record["carried"]) for record in told)]).T
+    return Trace("live", times, counts, "stop")
 
 
 def _differences(records: Sequence[Record], senders: Senders) -> list[str]:

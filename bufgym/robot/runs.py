@@ -42,16 +42,6 @@ class LiveRun:
         return regret(self.simulated_qoi, self.best_qoi)
 
     @property
-    def qoi_difference(self) -> float:
-        """Live H over simulated H, less 1."""
-        return self.live_qoi / self.simulated_qoi - 1 if self.simulated_qoi else 0.0
-
-    @property
-    def delivered_difference(self) -> int:
-        """Messages delivered live less those delivered in the simulator."""
-        return self.live_delivered - self.simulated_delivered
-
-    @property
     def live_median_s(self) -> float:
         """Median delivery time."""
         return statistics.median(self.live_s) if self.live_s else 0.0
@@ -93,8 +83,8 @@ def orders(runs: Sequence[LiveRun]) -> tuple[int, int]:
 
 def agreement(runs: Sequence[LiveRun]) -> str:
     """Summarize the difference of live and simulated in one line."""
-    apart = [abs(one.qoi_difference) for one in runs]
-    counts = [abs(one.delivered_difference) for one in runs]
+    apart = [abs(one.live_qoi / one.simulated_qoi - 1) if one.simulated_qoi else 0.0 for one in runs]
+    counts = [abs(one.live_delivered - one.simulated_delivered) for one in runs]
     same, pairs = orders(runs)
     return (
         f"{len(runs)} runs: QoI live and simulated {statistics.median(apart):.2%} apart (median), "

@@ -6,6 +6,7 @@ delayed. Its own buffers are small, so that it hides no queue. Normally the send
 """
 
 import asyncio
+import contextlib
 import socket
 import time
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from typing import Final
 
 from bufgym.model.link import FOREVER, Link
 from bufgym.robot.receiver import listener
-from bufgym.robot.tasks import Tasks
+from bufgym.robot.tasks import Tasks, until_one_ends
 
 RECEIVE_BUFFER_BYTES: Final = 16_384
 _PIECE_BYTES: Final = 16_384
@@ -93,29 +94,15 @@ class ShapedLink:
 
     async def _forward(self, near: socket.socket) -> None:
         """Forward one connection to its end."""
-        loop = asyncio.get_running_loop()
-        far = socket.socket()
-        tasks = []
-        try:
+        with near, socket.socket() as far, contextlib.suppress(OSError):  # without a target the sender reconnects
             far.setblocking(False)
             for one in (near, far):
                 one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._back:
                 far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-            await loop.sock_connect(far, self._target)
+            await asyncio.get_running_loop().sock_connect(far, self._target)
             sender, receiver = (far, near) if self._back else (near, far)
-            tasks = [asyncio.create_task(self._up(sender, receiver)), asyncio.create_task(self._down(receiver, sender))]
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        except OSError:
-            pass  # the target does not listen: the sender reconnects
-        finally:
-            for task in tasks:
-                task.cancel()
-            try:
-                await asyncio.gather(*tasks, return_exceptions=True)
-            finally:  # also when the link is closed meanwhile
-                near.close()
-                far.close()
+            await until_one_ends(self._up(sender, receiver), self._down(receiver, sender))
 
     async def _up(self, sender: socket.socket, receiver: socket.socket) -> None:
         """Forward to the receiver each piece once it has crossed; connections take turns."""

@@ -3,9 +3,9 @@
 import asyncio
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +59,8 @@ async def play(
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
-    warm(PolicyQueue(policy, capacity, value=value, topics=topics, window=episode.window))
+    rules: dict[str, Any] = {"value": value, "topics": topics, "window": episode.window}
+    warm(PolicyQueue(policy, capacity, **rules))
     came: list[Received] = []
 
     def take(message: Received) -> None:
@@ -71,17 +72,9 @@ async def play(
     messages = episode.arrivals
     bodies = memoryview(bytes(int(messages["size_bytes"].max())))
     began_s = time.monotonic()
-    queue = PolicyQueue(
-        policy,
-        capacity,
-        value=value,
-        topics=topics,
-        window=episode.window,
-        duration_s=None if episode.ends_us is None else episode.ends_us / 1e6,
-        seed=seed,
-        log=None if log is None else log.append,
-        clock=lambda: (time.monotonic() - began_s) * speed,
-    )
+    rules |= {"duration_s": None if episode.ends_us is None else episode.ends_us / 1e6, "seed": seed}
+    rules |= {"log": None if log is None else log.append, "clock": lambda: (time.monotonic() - began_s) * speed}
+    queue = PolicyQueue(policy, capacity, **rules)
     sender = Sender(queue, lambda: TRANSPORTS[transport]("127.0.0.1", port, small=small), leaves)
     sending = asyncio.create_task(sender.run())
     try:
@@ -114,23 +107,13 @@ def warm(queue: PolicyQueue) -> None:
     queue.close()
 
 
-class Play(Protocol):
-    """A function that plays an episode live and returns the messages received, as ``play`` does."""
-
-    def __call__(
-        self, policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
-    ) -> list[Received]: ...
+Play = Callable[..., list[Received]]
+"""Plays live: (policy, episode, capacity, value, speed=1.0, seed=0) -> the messages received, as ``play`` has them."""
 
 
 def over(transport: str) -> Play:
     """Make a ``Play`` over one of ``TRANSPORTS``."""
-
-    def played(
-        policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
-    ) -> list[Received]:
-        return asyncio.run(play(policy, episode, capacity, value, transport=transport, speed=speed, seed=seed))
-
-    return played
+    return lambda *episode, **settings: asyncio.run(play(*episode, transport=transport, **settings))
 
 
 def validate(
@@ -156,21 +139,12 @@ def validate(
                 messages = received(simulated, 0)
                 transmitted_us = simulated.batch.log["transmitted_us"][0, messages["seq"]]
                 delivery_us = transmitted_us + episode.link.propagation_us - messages["arrival_us"]
+                theirs = outcome(simulated, 0).qoi, best
                 for transport, played in plays.items():
                     came = played(policy, episode, capacity, scenario.value, speed=speed, seed=seed)
-                    runs.append(
-                        LiveRun(
-                            policy.name,
-                            trace.name,
-                            seed,
-                            len(came),
-                            len(messages),
-                            scenario.value.information([message.x for message in came]),
-                            outcome(simulated, 0).qoi,
-                            best,
-                            transport,
-                            tuple(message.received_ns / 1e9 * speed - message.at_us / 1e6 for message in came),
-                            tuple((delivery_us / 1e6).tolist()),
-                        )
-                    )
+                    live_s = tuple(message.received_ns / 1e9 * speed - message.at_us / 1e6 for message in came)
+                    qoi = scenario.value.information([message.x for message in came]), *theirs
+                    times_s = live_s, tuple((delivery_us / 1e6).tolist())
+                    of = policy.name, trace.name, seed
+                    runs.append(LiveRun(*of, len(came), len(messages), *qoi, transport, *times_s))
     return runs

@@ -88,15 +88,9 @@ class View:
             gap = max((after - before for before, after in zip(self._xs, self._xs[1:], strict=False)), default=0.0)
             qoi = value_of(made["v"]).information(self._xs)
             lines.append(f"QoI      {qoi:6.1f}   of what has left   the longest gap {gap:.3g}")
-        peak = max(self._left_bytes) * 8e-6
-        lines += [
-            "",
-            f"queue, 0 to {capacity}, a second a bar, now on the right",
-            f"|{_bars(self._longest, capacity):>{HISTORY_S}}|",
-            f"left, 0 to {peak:.1f} Mbit/s",
-            f"|{_bars(self._left_bytes, max(self._left_bytes)):>{HISTORY_S}}|",
-        ]
-        return "\n".join(lines)
+        peak = max(self._left_bytes)
+        lines += ["", f"queue, 0 to {capacity}, a second a bar, now on the right", _bars(self._longest, capacity)]
+        return "\n".join([*lines, f"left, 0 to {peak * 8e-6:.1f} Mbit/s", _bars(self._left_bytes, peak)])
 
     def _rates(self, event: str) -> str:
         sizes = [size for _, other, size in self._lately if other == event]
@@ -104,6 +98,7 @@ class View:
 
 
 def _bars(numbers: Iterable[int], most: int) -> str:
-    """Draw a character for each number; any number above 0 is visible."""
+    """Draw a character for each number, between two lines; any number above 0 is visible."""
     steps = len(_BARS) - 1
-    return "".join(_BARS[min(steps, -(-number * steps // most)) if most else 0] for number in numbers)
+    drawn = "".join(_BARS[min(steps, -(-number * steps // most)) if most else 0] for number in numbers)
+    return f"|{drawn:>{HISTORY_S}}|"

@@ -46,6 +46,7 @@ LAGS_S: Final = (1, 2, 3, 5, 10, 20, 30, 60)
 FEW_OUTAGES: Final = 10
 LEAST_SECONDS: Final = 60
 
+_LENT: Final = ("length_tail", "length_scale_s", "low_quantiles_bytes_per_s")
 _MEMORIES: Final = np.arange(0, 0.96, 0.05)
 _STAYS_S: Final = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0, 56.0, 80.0, 112.0, 160.0, 224.0)
 _PLACES: Final = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
@@ -104,16 +105,9 @@ def _fit(mode: str, rows: Rates) -> LinkParameters:
         count = f"{good.size} of {pooled.size} s have {LOW_BYTES_PER_S:g} bytes/s or more"
         raise BufgymError(f"mode {mode}: {count}: must be at least {LEAST_SECONDS}")
     far = pooled[np.concatenate([(row >= LOW_BYTES_PER_S) & ~beside_outages(row) for row in rows])]
-    return LinkParameters(
-        recordings=len(rows),
-        seconds=int(pooled.size),
-        quantiles_bytes_per_s=_rounded_quantiles(far if far.size >= LEAST_SECONDS else good, PROBABILITIES),
-        place_share=0.0,
-        level_share=0.0,
-        level_stay_s=_STAYS_S[0],
-        fast_memory=0.0,
-        outages=_fit_outages(rows),
-    )
+    quantiles = _rounded_quantiles(far if far.size >= LEAST_SECONDS else good, PROBABILITIES)
+    memory = {"place_share": 0.0, "level_share": 0.0, "level_stay_s": _STAYS_S[0], "fast_memory": 0.0}
+    return LinkParameters(len(rows), int(pooled.size), quantiles, **memory, outages=_fit_outages(rows))
 
 
 def _with_borrowed(link: LinkParameters, of_all_modes: OutageParameters | None) -> LinkParameters:
@@ -121,14 +115,8 @@ def _with_borrowed(link: LinkParameters, of_all_modes: OutageParameters | None) 
     own = link.outages
     if own is None or of_all_modes is None or own.spells >= FEW_OUTAGES or own.spells == of_all_modes.spells:
         return link
-    outages = replace(
-        own,
-        length_tail=of_all_modes.length_tail,
-        length_scale_s=of_all_modes.length_scale_s,
-        low_quantiles_bytes_per_s=of_all_modes.low_quantiles_bytes_per_s,
-        borrowed=True,
-    )
-    return replace(link, outages=outages)
+    lent = {name: getattr(of_all_modes, name) for name in _LENT}
+    return replace(link, outages=replace(own, **lent, borrowed=True))
 
 
 def _rounded_quantiles(values: Float64Array, probabilities: Sequence[float]) -> tuple[float, ...]:

@@ -96,12 +96,8 @@ class Trace:
         """Same name, same knots, same ending; `source` says only where they came from."""
         if not isinstance(other, Trace):
             return NotImplemented
-        return (
-            self.name == other.name
-            and self.after == other.after
-            and np.array_equal(self.time_us, other.time_us)
-            and np.array_equal(self.cumulative_bytes, other.cumulative_bytes)
-        )
+        arrays = ((self.time_us, other.time_us), (self.cumulative_bytes, other.cumulative_bytes))
+        return (self.name, self.after) == (other.name, other.after) and all(np.array_equal(*pair) for pair in arrays)
 
     def __hash__(self) -> int:
         return hash((self.name, self.after, self.time_us.size, self.duration_us, self.total_bytes))

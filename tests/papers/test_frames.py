@@ -93,10 +93,9 @@ def test_missing_measurements_poses_that_drifted_and_reduced_frames(tmp_path: Pa
 
 
 def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(BufgymError, match=r"depth\.txt \(TUM\)"):
-        open_sequence(tmp_path)
-    with pytest.raises(BufgymError, match="no such folder"):
-        open_sequence(tmp_path / "desk")
+    for folder, says in ((tmp_path, r"depth\.txt \(TUM\)"), (tmp_path / "desk", "no such folder")):
+        with pytest.raises(BufgymError, match=says):
+            open_sequence(folder)
     monkeypatch.setitem(sys.modules, "rvl", None)
     with pytest.raises(BufgymError, match=r"bufgym needs rvl: pip install .*(rvl|perception)"):
         library("rvl")

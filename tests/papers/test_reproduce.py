@@ -121,6 +121,8 @@ def test_the_rows_of_one_figure_are_renewed(
     assert file.read_text() == "what was known"
     command = ["reproduce", "robofleet-fig3", "--live", "--claims", str(file)]
     fails(command, "--live: not with --claims, whose numbers are simulated", capsys)
+    says = "afr-fig4: is not played on sockets; robofleet-fig3 to robofleet-fig7 are"
+    fails(["reproduce", "afr-fig4", "--live", "--out", str(tmp_path)], says, capsys)
 
 
 def test_what_is_cited_is_in_the_references() -> None:

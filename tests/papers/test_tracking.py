@@ -1,14 +1,12 @@
 """Tracking: a known movement is found again, a gap that is too long is a failure, and its kernels as worked by hand."""
 
-import functools
-
 import frame_cases
 import numpy as np
 import pytest
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import icp, tracking
-from bufgym.papers.perception.frames import Camera, Sequence
+from bufgym.papers.perception.frames import Camera
 from bufgym.papers.perception.mapping import Map, VoxelGrid, fuse
 from bufgym.papers.perception.room import MadeUpRoom, made_up_room
 from bufgym.papers.perception.tracking import Tracker, difference, smoothed, track
@@ -74,11 +72,6 @@ def test_the_model_is_seen_where_it_is() -> None:
         assert vertices[2, 3, 0] == pytest.approx(-0.5 / 4 * 1.2, abs=1e-3)
 
 
-@functools.cache
-def walk() -> Sequence:
-    return made_up_room(0, frames=80).reduced(4).loaded()
-
-
 def test_a_known_movement_is_found_again() -> None:
     """3 cm to the right, 2 cm down, 1 cm ahead, and a turn of 1.5 degrees: found within 6 mm and 0.3 degrees."""
     still, angle, moved = made_up_room(0, frames=2), np.radians(1.5), np.eye(4)
@@ -98,7 +91,7 @@ def test_a_known_movement_is_found_again() -> None:
 
 
 def test_it_follows_every_frame_and_fails_at_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
-    sequence = walk()
+    sequence = made_up_room(0, frames=80).reduced(4).loaded()
     whole = track(sequence, range(80), smooth=lambda k: smoothed(sequence.depth(k)))  # as it does itself
     assert not whole.failed and whole.where is None
     assert max(difference(*both)[0] for both in zip(whole.poses, sequence.poses, strict=True)) < 0.05
@@ -112,6 +105,9 @@ def test_it_follows_every_frame_and_fails_at_a_gap(monkeypatch: pytest.MonkeyPat
     assert track(told, range(6)).where == 4
     monkeypatch.setattr(tracking, "MOST_ERROR_M", 0.3)
     assert track(told, range(6)).where is None
+    for frames in ([], [3, 2], [2, 2], [-1, 1], [1, 80]):
+        with pytest.raises(BufgymError, match="at least one index below 80, increasing"):
+            track(sequence, frames)
 
 
 @pytest.mark.kernels
@@ -123,9 +119,3 @@ def test_a_single_wall_leaves_the_way_along_it_open(monkeypatch: pytest.MonkeyPa
     tracker.add(NOWHERE, np.eye(4))
     assert tracker.follow(np.full((6, 8), 1.0, np.float32)) is None
     assert (tracker.model.weight == Map.empty(grid).weight).all()
-
-
-def test_frames_and_settings_that_mean_nothing() -> None:
-    for frames in ([], [3, 2], [2, 2], [-1, 1], [1, 80]):
-        with pytest.raises(BufgymError, match="at least one index below 80, increasing"):
-            track(walk(), frames)

@@ -43,13 +43,10 @@ def ends(_: Connection) -> None:
     pass
 
 
-@pytest.mark.parametrize(("work", "words"), [(fails, "other: no such thing"), (ends, "other: has ended")])
-def test_who_waits_for_one_program_hears_that_another_has_failed(work: Any, words: str) -> None:
-    with running(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
-        asyncio.run(echo.told())
-
-
-def test_a_program_is_spoken_to_and_may_be_silent() -> None:
+def test_a_program_is_spoken_to_and_may_be_silent_and_who_waits_hears_that_another_has_failed() -> None:
+    for work, words in ((fails, "other: no such thing"), (ends, "other: has ended")):
+        with running(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
+            asyncio.run(echo.told())
     with running(echo=echoes) as (echo,):
         echo.tell({"port": 3})
         assert asyncio.run(echo.told()) == {"port": 3}
@@ -114,15 +111,12 @@ def test_each_frame_comes_in_time_after_a_pose_that_says_its_x(monkeypatch: pyte
     ]
 
 
-def test_what_came_is_told_as_messages_of_the_episode() -> None:
+def test_what_came_is_told_as_messages_of_the_episode_in_real_time() -> None:
     came = received([(0, 2_030_000_000), (2, 2_090_000_000)], EPISODE, 2.0)
     assert [(one.number, one.seq, one.at_us, one.x, one.received_ns) for one in came] == [
         (0, 0, 0, 0.0, 30_000_000),
         (1, 2, 60_000, 1.5, 90_000_000),
     ]
-
-
-@pytest.mark.parametrize("play", [ros1.play, ros2.play])
-def test_ros_knows_one_speed(play: Any) -> None:
-    with pytest.raises(BufgymError, match="speed = 2: must be 1 with ROS"):
-        play(policies.get("afr"), EPISODE, 4, qoi.exponential(), speed=2.0)
+    for play in (ros1.play, ros2.play):
+        with pytest.raises(BufgymError, match="speed = 2: must be 1 with ROS"):
+            play(policies.get("afr"), EPISODE, 4, qoi.exponential(), speed=2.0)

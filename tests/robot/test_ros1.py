@@ -89,20 +89,15 @@ def topics(monkeypatch: pytest.MonkeyPatch) -> Any:
     return sys.modules["rospy.topics"]
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
+def test_the_command_names_what_is_wrong(topics: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    for options, words in (
         (["none.py"], "none.py: no such file"),
         (["--policy", "/camera=nobody", __file__], "unknown policy 'nobody'"),
         (["--value", "round:1", __file__], "round"),
-    ],
-)
-def test_the_command_names_what_is_wrong(
-    options: list[str], words: str, topics: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(options) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("bufgym.robot.ros1: error: ") and words in told and told.count("\n") == 1
+    ):
+        assert command(options) == 2
+        told = capsys.readouterr().err
+        assert told.startswith("bufgym.robot.ros1: error: ") and words in told and told.count("\n") == 1
 
 
 def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> None:

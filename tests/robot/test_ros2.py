@@ -77,21 +77,14 @@ def test_what_is_no_message_of_a_relay_ends_the_connection(body: bytes) -> None:
         parse(b"\x03\x05\0\0\x01" + b"/a;" + body)
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("camera", "a/msg/B"), ("/a//b", "a/msg/B"), ("/a", "os"), ("/a", "../os/msg/B"), ("/a", "a/srv/B")],
-)
-def test_names_that_are_none(name: str, kind: str) -> None:
-    with pytest.raises(BufgymError, match="must"):
-        Published(name, kind)
-
-
-def test_a_type_that_is_not_installed() -> None:
+def test_topics_that_cannot_be_relayed() -> None:
+    """Names that are none, a type that is not installed, and what moves without odometry."""
+    wrong = [("camera", "a/msg/B"), ("/a//b", "a/msg/B"), ("/a", "os"), ("/a", "../os/msg/B"), ("/a", "a/srv/B")]
+    for name, kind in wrong:
+        with pytest.raises(BufgymError, match="must"):
+            Published(name, kind)
     with pytest.raises(BufgymError, match=r"topic /a: messages of no_such_msgs/msg/B, which is not installed here"):
         _ = Published("/a", "no_such_msgs/msg/B").message_class
-
-
-def test_what_moves_needs_odometry() -> None:
     with pytest.raises(BufgymError, match=r"topic 'pointcloud': moves, which needs a topic with odometry"):
         RosSender(read_client(REPO / "examples" / "client.toml"), "127.0.0.1", 1)
 

@@ -2,9 +2,7 @@
 
 import asyncio
 import itertools
-import json
 import socket
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from bufgym.model.link import Link
 from bufgym.robot import PolicyQueue, replay, shaped
 from bufgym.robot.channels import TRANSPORTS
 from bufgym.robot.log import Record
-from bufgym.robot.runs import LiveRun, orders, save, table
+from bufgym.robot.runs import LiveRun, orders, table
 from bufgym.robot.shaped import ShapedLink
 from bufgym.robot.validate import over, play, validate
 from bufgym.scenario import Episode, Uplink, messages
@@ -131,7 +129,7 @@ def test_live_as_in_the_simulator() -> None:
         assert 0 <= one.simulated_regret < 1
 
 
-def test_the_table_by_hand() -> None:
+def test_the_table_and_orders_by_hand() -> None:
     runs = [
         LiveRun("afr", "a", 0, 9, 10, 4.0, 5.0, 5.0, "tcp", (0.1, 0.2, 0.6), (0.1, 0.2)),
         LiveRun("afr", "b", 0, 10, 10, 5.0, 5.0, 5.0, "tcp", (0.2, 0.4), (0.15,)),
@@ -140,21 +138,12 @@ def test_the_table_by_hand() -> None:
     assert "| afr | 9.5 | 10.0 | 4.500 | 5.000 | 10.00% | 0.00% | 0.250 | 0.150 |" in text
     assert "10.00% apart (median), 20.00% at most; delivered 0.5 and 1." in text
 
-
-def test_orders_by_hand() -> None:
-    """On link a the three differ by more than 1 % but for the last two, of which live one swaps with the first."""
-
     def one(policy: str, simulated: float, live: float, link: str = "a") -> LiveRun:
         return LiveRun(policy, link, 0, 1, 1, live, simulated, 9.0)
 
+    # On link a the three differ by more than 1 % but for the last two, of which live one swaps with the first.
     runs = [one("afr", 5.0, 4.9), one("random", 4.0, 3.9), one("drop-oldest", 4.03, 4.95), one("afr", 1.0, 1.0, "b")]
     assert orders(runs) == (1, 2)
-
-
-def test_every_run_is_kept(tmp_path: Path) -> None:
-    runs = [LiveRun("afr", "lte", 0, 99, 100, 4.99, 5.0, 5.0, "tcp", (0.1, 0.2), (0.1, 0.3))]
-    kept = json.loads(save(runs, "10 s of video", "bufgym live validate --trace x", tmp_path / "out").read_text())
-    assert kept["runs"][0]["live_s"] == [0.1, 0.2] and kept["command"] == "bufgym live validate --trace x"
 
 
 # --- when a shaped link counts as idle: it carries 1 MB/s, and pieces have 10 kB -------------------------------------

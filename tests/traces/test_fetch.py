@@ -103,7 +103,9 @@ def test_the_sums_are_those_of_the_recorded_files(shared_data: Path, tmp_path: P
         assert not known
 
 
-def test_the_command_lists_and_fetches(site: Site, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
+def test_the_command_lists_and_fetches_and_says_what_is_wrong(
+    site: Site, tmp_path: Path, monkeypatch: Patch, capsys: Capsys
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert cache_folder().parts[-3:] == ("cache", "bufgym", "datasets")
     out = shown(["trace", "fetch", "--list"], capsys)
@@ -117,10 +119,6 @@ def test_the_command_lists_and_fetches(site: Site, tmp_path: Path, monkeypatch: 
     assert re.search("licence +not known", said.out) and re.search("please cite +nobody", said.out)
     assert said.err == f"downloading {site.address}/data.bin\n"
     assert (cache_folder() / "mine" / "data.bin").read_bytes() == DATA
-
-
-def test_the_command_says_what_is_wrong(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for words, says in (
         ("", "needs the NAME of a data set (--list names them)"),
         ("belgium", "belgium: no such data set: must be one of belgium-4g"),

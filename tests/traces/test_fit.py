@@ -42,10 +42,6 @@ def quick(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> No
         monkeypatch.setattr("bufgym.traces.fit._TRIAL_S", 500)
 
 
-def rows_of(values: list[float]) -> list[Float64Array]:
-    return [np.array(values)]
-
-
 @pytest.mark.nightly
 def test_the_fit_recovers_the_parameters_of_the_generator() -> None:
     fitted = fit_links({"known": recordings()})["known"]
@@ -85,19 +81,19 @@ def test_statistics_by_hand() -> None:
     starts, ends = spells(np.array([1e5, 2e6, 0.0, 4e5, 5e5]))
     assert (starts.tolist(), ends.tolist()) == ([0, 2], [1, 4])
     # 1, -1, 1, -1 about 0: products at lag 1 are all -1, at lag 2 all 1, the variance is 1; no pair at lag 9.
-    correlations, pairs = autocorrelation(rows_of([1.0, -1.0, 1.0, -1.0]), (1, 2, 9))
+    correlations, pairs = autocorrelation([np.array([1.0, -1.0, 1.0, -1.0])], (1, 2, 9))
     assert (correlations.tolist(), pairs.tolist()) == ([-1.0, 1.0, 0.0], [3, 2, 0])
     # Of 1, 2 none is above 2; of 2, 3, 4, 5 three are: distance 3/4.
     assert ks_distance(np.array([1.0, 2.0]), np.array([2.0, 3.0, 4.0, 5.0])) == 0.75
     assert ks_distance(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 0.0
 
 
-def test_what_the_fit_refuses() -> None:
+def test_what_the_fit_refuses(tmp_path: Path, capsys: Capsys) -> None:
     for wrong, says in (
         ({}, "no recordings"),
-        ({"slow": rows_of([1e5] * 100)}, "mode slow: 0 of 100 s have 500000 bytes/s or more: must be at least 60"),
-        ({"nan": rows_of([float("nan")] * 100)}, "mode nan: rates must be finite"),
-        ({"negative": rows_of([-1.0] * 100)}, "mode negative: rates must be finite and >= 0"),
+        ({"slow": [np.full(100, 1e5)]}, "mode slow: 0 of 100 s have 500000 bytes/s or more: must be at least 60"),
+        ({"nan": [np.full(100, np.nan)]}, "mode nan: rates must be finite"),
+        ({"negative": [np.full(100, -1.0)]}, "mode negative: rates must be finite and >= 0"),
     ):
         with pytest.raises(BufgymError, match=says):
             fit_links(wrong)
@@ -105,6 +101,13 @@ def test_what_the_fit_refuses() -> None:
     assert [mode_of(name) for name in names] == ["car", "wifi-office", "tram", "bus"]
     with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
         mode_of("0001.csv")
+    for words, says in (
+        ("", "needs recordings, FILE ... or --suite NAME"),
+        ("a.csv --suite lte-v1", "--suite: cannot go with FILE or --mode"),
+        ("a.csv --data .", "--data: needs --suite"),
+    ):
+        fails(["trace", "fit", *words.split(), "-o", tmp_path / "b.json"], says, capsys)
+    assert not (tmp_path / "b.json").exists()
 
 
 def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory() -> None:
@@ -151,16 +154,6 @@ def test_the_command_fits_what_a_suite_trains_on(
     ((mode, link),) = read_links(tmp_path / "two.json").items()
     assert (mode, link.recordings, link.seconds) == ("two", 2, 200)
     assert '"made_by": "bufgym trace fit --suite two-v7 -o two.json"' in (tmp_path / "two.json").read_text()
-
-
-def test_what_the_command_refuses(tmp_path: Path, capsys: Capsys) -> None:
-    for words, says in (
-        ("", "needs recordings, FILE ... or --suite NAME"),
-        ("a.csv --suite lte-v1", "--suite: cannot go with FILE or --mode"),
-        ("a.csv --data .", "--data: needs --suite"),
-    ):
-        fails(["trace", "fit", *words.split(), "-o", tmp_path / "b.json"], says, capsys)
-    assert not (tmp_path / "b.json").exists()
 
 
 @pytest.mark.nightly

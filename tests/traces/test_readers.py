@@ -154,15 +154,13 @@ def test_info_of_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert ["mean_KBps", "1.75"] in [line.split() for line in out.splitlines()]
 
 
-def test_validate_tells_sound_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_validate_tells_sound_files_and_info_goes_on_after_a_broken_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sound, broken = written(tmp_path, "1\n2\n", "sound.up"), written(tmp_path, "1\nx\n", "broken.up")
     assert main(["trace", "validate", str(sound), str(broken), str(tmp_path / "missing")]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["OK", "error", "error", "1"]
-
-
-def test_info_goes_on_after_a_broken_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sound, broken = written(tmp_path, "1\n2\n", "sound.up"), written(tmp_path, "1\nx\n", "broken.up")
     assert main(["trace", "info", str(broken), str(tmp_path / "missing"), str(sound)]) == 2
     said = capsys.readouterr()
     assert said.out.startswith("sound.up\n") and "missing: no such file" in said.err

@@ -206,12 +206,9 @@ def _pose(path: Path, text: str, line: int | None = None) -> Float64Array:
     except ValueError:
         raise BufgymError(where(path, line, text, rule)) from None
     rotation = matrix[:3, :3]
-    if (
-        not np.isfinite(matrix).all()
-        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or np.linalg.det(rotation) < 0
-        or (matrix[3] != (0, 0, 0, 1)).any()
-    ):
+    whole = np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max() if whole else np.inf
+    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise BufgymError(where(path, line, text, rule))
     left, _, right = np.linalg.svd(rotation)
     matrix[:3, :3] = left @ right

@@ -48,12 +48,7 @@ def _note(calls: NDArray[Any], n: int, kind: int, at_us: int, size_bytes: int) -
 
 
 def _record(
-    batch: Batch,
-    memory: NDArray[np.float64],
-    on_arrival: Any,
-    on_departure: Any,
-    hears_departures: bool,
-    calls: NDArray[Any],
+    batch: Batch, memory: Any, on_arrival: Any, on_departure: Any, hears_departures: bool, calls: NDArray[Any]
 ) -> int:
     """Run every sender of the batch to its end, record the calls and return their number."""
     n = 0

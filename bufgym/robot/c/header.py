@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bufgym import policies
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, printable
-from bufgym.ground.files import replaced
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import TINY
@@ -21,6 +19,7 @@ from bufgym.policies import Policy, chains, guided, learned, price_dp, target_ga
 from bufgym.policies.scoring import unpack
 from bufgym.policies.target_gap import straight
 from bufgym.robot.c.calls import random_episode, recorded
+from bufgym.traces.formats.text import write_text
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
 SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
@@ -56,13 +55,8 @@ def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_byte
     Raises:
         BufgymError: as ``header``, or the file cannot be written.
     """
-    target, text = Path(out), header(policy, capacity, value, max_bytes)
-    try:
-        with replaced(target) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise BufgymError(f"{target}: cannot be written: {error.strerror}") from None
-    return target
+    write_text(out, [header(policy, capacity, value, max_bytes)])
+    return Path(out)
 
 
 def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None) -> str:
@@ -77,7 +71,10 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False)) if guides else policy.parameters
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
-    unlimited = max_bytes is None
+    unlimited, rng = max_bytes is None, np.random.default_rng(_SEED)
+    # Messages of the calls in the header all fit into B.
+    episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
+    calls = recorded(policy, episodes, capacity, value, max_bytes)
     numbers = {
         "ABOUT": _comment(policy.summary),
         "SOURCE": _comment(policy.source),
@@ -104,7 +101,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "OUTPUTS": _lines(f"BUFGYM_OUT_{output.name.upper()}" for output in guided.OUTPUTS),
         "WEIGHTS": _array("double", "bufgym_weights", policy.weights[guided.NUMBERS :]) if guides else "",
         "STEADY_US": repr(thinning.HORIZON_US),
-        "CALLS": "".join(map(_call, _calls(policy, capacity, value, max_bytes))),
+        "CALLS": "".join(f"    {{{', '.join(map(repr, call.item()))}}},\n" for call in calls),
     }
     if learns:
         numbers |= _scorer(policy)
@@ -146,13 +143,6 @@ def _scorer(policy: Policy) -> dict[str, Any]:
     }
 
 
-def _calls(policy: Policy, capacity: int, value: Value, max_bytes: int | None) -> NDArray[Any]:
-    """Record the calls in the header, whose messages all fit into B."""
-    rng = np.random.default_rng(_SEED)
-    episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
-    return recorded(policy, episodes, capacity, value, max_bytes)
-
-
 def _part(name: str) -> str:
     return (_PARTS / name).read_text(encoding="utf-8")
 
@@ -183,7 +173,3 @@ def _lines(words: Iterable[str]) -> str:
 
 def _enum(names: Iterable[str]) -> str:
     return f"enum {{\n    {_lines(f'BUFGYM_{name.upper()}' for name in names)}\n}};"
-
-
-def _call(call: Any) -> str:
-    return "    {" + ", ".join(repr(call[name].item()) for name in call.dtype.names) + "},\n"

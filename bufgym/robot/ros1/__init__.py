@@ -94,7 +94,8 @@ def install(
         ruling = chosen.get(connection.name, policy)
         if ruling is None or queue_size < 1:
             return QueuedConnection(connection, queue_size)
-        file = None if log is None else _log_file(Path(log), connection.name, next(numbers))
+        name = f"{connection.name.strip('/').replace('/', '_')}-{next(numbers)}.mcap"
+        file = None if log is None else LogFile(Path(log, name))
         queue = PolicyQueue(ruling, min(queue_size, MAX_CAPACITY), value=value, log=file, room=_ROOM)
         if moved is None:
             return PolicyConnection(connection, queue, log=file)
@@ -111,10 +112,6 @@ def _warm_up(policy: Any, value: Value) -> None:
         queue.put(None, 1)
     queue.get()
     queue.gone()
-
-
-def _log_file(folder: Path, topic: str, number: int) -> LogFile:
-    return LogFile(folder / f"{topic.strip('/').replace('/', '_')}-{number}.mcap")
 
 
 class _Subscribed:

@@ -16,16 +16,10 @@ RULES = "also mine.safetensors or module:function, whose code is run; 'rospy': r
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node; return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m bufgym.robot.ros1", description="Run a rospy node as it is, its queues under a policy."
-    )
-    parser.add_argument(
-        "--policy",
-        action="append",
-        default=[],
-        metavar="[/TOPIC=]NAME",
-        help=f"for all topics (afr), or for one; may be given several times; {RULES}",
-    )
+    about = "Run a rospy node as it is, its queues under a policy."
+    parser = argparse.ArgumentParser(prog="python -m bufgym.robot.ros1", description=about)
+    names = f"for all topics (afr), or for one; may be given several times; {RULES}"
+    parser.add_argument("--policy", action="append", default=[], metavar="[/TOPIC=]NAME", help=names)
     parser.add_argument("--odom", metavar="TOPIC", help="poses that x is summed from (default: x counts messages)")
     parser.add_argument("--value", metavar="V", help="as in bench: exponential:0.618")
     parser.add_argument("--log", metavar="FOLDER", help="log every decision there")
@@ -36,13 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not Path(options.node).is_file():
             raise BufgymError(f"{options.node}: no such file")
         topics = dict(map(_choice, options.policy))
-        ros1.install(
-            topics.pop("", "afr"),
-            topics=topics,
-            odometry=options.odom,
-            value=None if options.value is None else qoi.parse(options.value),
-            log=options.log,
-        )
+        value = None if options.value is None else qoi.parse(options.value)
+        ros1.install(topics.pop("", "afr"), topics=topics, odometry=options.odom, value=value, log=options.log)
     except BufgymError as error:
         print(f"bufgym.robot.ros1: error: {error}", file=sys.stderr)
         return 2

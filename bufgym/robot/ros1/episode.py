@@ -18,7 +18,6 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.robot import PolicyQueue, programs, ros1
@@ -45,16 +44,12 @@ def play(
     policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
 ) -> list[Received]:
     """Play the episode; return the messages that a rospy subscriber got. Randomised policies use their own draws."""
-    if speed != 1:
-        raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
+    programs.check_speed(speed)
     warm(PolicyQueue(policy, capacity, value=value))
-    with (
-        tempfile.TemporaryDirectory() as logs,
-        programs.running(
-            viewer=partial(_view, logs), camera=partial(_publish, logs, policy, episode, capacity, value)
-        ) as workers,
-    ):
-        return asyncio.run(_play(workers, episode))
+    with tempfile.TemporaryDirectory() as logs:
+        camera = partial(_publish, logs, policy, episode, capacity, value)
+        with programs.running(viewer=partial(_view, logs), camera=camera) as workers:
+            return asyncio.run(_play(workers, episode))
 
 
 async def _play(workers: Sequence[programs.Worker], episode: Episode) -> list[Received]:

@@ -18,12 +18,11 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.robot import PolicyQueue, programs
-from bufgym.robot.log import Record
+from bufgym.robot.log import Record, of
 from bufgym.robot.receiver import Received
 from bufgym.robot.ros2.names import needs_rclpy
 from bufgym.robot.ros2.relay import RosSender, receive
@@ -55,8 +54,7 @@ def play(
     policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
 ) -> list[Received]:
     """Play the episode; return the messages that a viewer got. Randomised policies use their own draws."""
-    if speed != 1:
-        raise BufgymError(f"speed = {speed:g}: must be 1 with ROS, whose nodes live in real time")
+    programs.check_speed(speed)
     warm(PolicyQueue(policy, capacity, value=value))
     with programs.running(
         receive=_receive, send=partial(_send, policy, capacity, value), viewer=_view, camera=partial(_publish, episode)
@@ -103,23 +101,18 @@ def _receive(parent: Connection) -> None:
 
 
 def _send(policy: Policy, capacity: int, value: Value, parent: Connection) -> None:
-    puts: list[Record] = []
-
-    def count(record: Record) -> None:
-        if record["event"] == "put":
-            puts.append(record)
-
+    records: list[Record] = []
     stream = Stream(Topic(programs.CAMERA), rate_hz=30.0, size_bytes=1, moves=True)
     # Where a client is simulated, it needs a link and a motion as well.
     client = Client((stream,), (Trace.steps([(1.0, 1e6)]),), (load_motion("drive-0"),), value=value)
     _on(_DOMAIN)
     to, odometry = ("127.0.0.1", parent.recv()), programs.ODOMETRY
-    robot = RosSender(client, *to, policy=policy, capacity=capacity, odometry=odometry, log=count)
+    robot = RosSender(client, *to, policy=policy, capacity=capacity, odometry=odometry, log=records.append)
 
     def all_sent() -> None:
         parent.recv()
         time.sleep(_SETTLED_S)
-        parent.send(programs.drained(robot.queue, len(puts)))
+        parent.send(programs.drained(robot.queue, len(list(of(records, "put")))))
 
     async def relay() -> None:
         await asyncio.gather(robot.run(), asyncio.to_thread(all_sent))

@@ -62,20 +62,13 @@ def workload_from_bag(
         raise BufgymError(f"{bag.path}: no message on {', '.join(names) or 'any topic'}")
     time_ns = bag.time_ns[chosen]
     x, gaps = _motion_at(time_ns, bag, settings, bridge_gaps)
-    source = f"{bag.path} ({bag.kind})"
+    measured = ""
     if bag.poses is not None:
-        measured = f"{settings.fov_deg:g} degrees, {settings.scene_scale_m:g} m"
-        source = f"{bag.path} ({bag.kind}, motion from {bag.poses.format}: {measured})"
-    return Workload(
-        trace_name(str(bag.path).removesuffix(".mcap").removesuffix(".bag").removesuffix(".db3")),
-        (time_ns - time_ns[0]) // 1000,
-        bag.size_bytes[chosen],
-        topic,
-        names,
-        x,
-        source,
-        gaps,
-    )
+        view = f"{settings.fov_deg:g} degrees, {settings.scene_scale_m:g} m"
+        measured = f", motion from {bag.poses.format}: {view}"
+    name = trace_name(bag.path.removesuffix(".mcap").removesuffix(".bag").removesuffix(".db3"))
+    arrival_us, source = (time_ns - time_ns[0]) // 1000, f"{bag.path} ({bag.kind}{measured})"
+    return Workload(name, arrival_us, bag.size_bytes[chosen], topic, names, x, source, gaps)
 
 
 def _motion_at(

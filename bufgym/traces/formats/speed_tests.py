@@ -14,7 +14,7 @@ from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, Intervals, Knots, Rate, held_rates
 from bufgym.traces.formats.logs import json_items, json_number, read_json
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
-from bufgym.traces.formats.text import Line, open_text
+from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 
 MAX_INTERVAL_S: Final = 3600
@@ -116,8 +116,8 @@ def read_runs(path: StrPath, column: str = RUNS[0]) -> Knots:
     if len(lines) > 1 and len(lines) % 2:
         raise lines[-1].error(None, f"{column} must have one line, or pairs of them: times in s, Mbit/s")
     rates = lines[min(1, len(lines) - 1)]
-    cells = _cells(rates)
-    times = _cells(lines[0]) if len(lines) > 1 else [f"{RUN_STEP_S * k:.1f}" for k in range(len(cells))]
+    cells = split_cells(rates.text)
+    times = split_cells(lines[0].text) if len(lines) > 1 else [f"{RUN_STEP_S * k:.1f}" for k in range(len(cells))]
     if len(times) != len(cells):
         raise rates.error(len(cells), f"must be as many as times in the line above ({len(times)})", "samples")
     steps = "times as stated" if len(lines) > 1 else f"a sample each {RUN_STEP_S:g} s"
@@ -143,10 +143,6 @@ def runs_of(path: StrPath) -> dict[str, list[Line]]:
                 raise line.error(line.text, "must come under a heading, Run 1")
             runs[next(reversed(runs))].append(line)
     return runs
-
-
-def _cells(line: Line) -> list[str]:
-    return [cell.strip() for cell in line.text.split(",")]
 
 
 def _rates(timed: Line, times: list[str], line: Line, cells: list[str]) -> Iterator[Rate]:

@@ -63,17 +63,10 @@ def read_workload_csv(path: StrPath) -> Workload:
                 xs.append(x)
     if not times:
         raise fault(path, "holds no message: must hold at least one")
-    arrival_us = np.array(times, np.int64)
-    x_of_messages = np.array(xs, np.float64)
-    return Workload(
-        trace_name(path),
-        arrival_us - arrival_us[0],
-        np.array(sizes, np.int64),
-        np.array(numbers, np.int64),
-        tuple(topics),
-        x_of_messages - x_of_messages[0] if "x" in titles else None,
-        f"{path} ({','.join(titles)})",
-    )
+    arrival_us, size, number = (np.array(column, np.int64) for column in (times, sizes, numbers))
+    x_from_0 = np.array(xs, np.float64) - xs[0] if xs else None
+    source = f"{path} ({','.join(titles)})"
+    return Workload(trace_name(path), arrival_us - arrival_us[0], size, number, tuple(topics), x_from_0, source)
 
 
 def _size(line: Line, text: str) -> int:
@@ -93,13 +86,10 @@ def write_workload_csv(workload: Workload, path: StrPath) -> None:
         if workload.topics != ("",) and (not name or name != name.strip() or "," in name or not name.isprintable()):
             raise BufgymError(f"topic {name!r}: a name in a CSV file must be printable, without commas, and not empty")
     assert workload.topic is not None
-    titles = ["time_s", "bytes"]
-    columns = [[f"{t // US_PER_S}.{t % US_PER_S:06d}" for t in workload.arrival_us.tolist()]]
-    columns.append([str(size) for size in workload.size_bytes.tolist()])
+    columns = {"time_s": [f"{t // US_PER_S}.{t % US_PER_S:06d}" for t in workload.arrival_us.tolist()]}
+    columns["bytes"] = list(map(str, workload.size_bytes.tolist()))
     if workload.topics != ("",):
-        titles.append("topic")
-        columns.append([workload.topics[k] for k in workload.topic.tolist()])
+        columns["topic"] = [workload.topics[k] for k in workload.topic.tolist()]
     if workload.x is not None:
-        titles.append("x")
-        columns.append([repr(x) for x in workload.x.tolist()])
-    write_text(path, (",".join(row) + "\n" for row in [titles, *zip(*columns, strict=True)]))
+        columns["x"] = list(map(repr, workload.x.tolist()))
+    write_text(path, (",".join(row) + "\n" for row in [columns, *zip(*columns.values(), strict=True)]))

@@ -1,6 +1,6 @@
 """Motion of a robot that drives around, from a seed: uniform doubles only, rounded to millionths (see `draws`)."""
 
-from typing import Final, Literal, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -15,13 +15,13 @@ Limits: TypeAlias = tuple[float, float]
 _STEP_US: Final = 100_000
 
 
-# How a small delivery or survey robot drives.
-_CRUISE_M_PER_S: Final[Limits] = (0.5, 1.5)
-_CRUISE_TURN_DEG_PER_S: Final[Limits] = (0.0, 10.0)
-_CRUISE_S: Final[Limits] = (4.0, 15.0)
-_TURN_DEG_PER_S: Final[Limits] = (30.0, 60.0)  # in place
-_TURN_S: Final[Limits] = (1.0, 4.0)
-_STOP_S: Final[Limits] = (2.0, 8.0)
+# How a small delivery or survey robot drives: limits of its speed in m/s, its turning in degrees/s and the time in s.
+_NOTHING: Final[Limits] = (0.0, 0.0)
+_PHASES: Final[dict[str, tuple[Limits, Limits, Limits]]] = {
+    "cruise": ((0.5, 1.5), (0.0, 10.0), (4.0, 15.0)),
+    "turn": (_NOTHING, (30.0, 60.0), (1.0, 4.0)),
+    "stop": (_NOTHING, _NOTHING, (2.0, 8.0)),
+}
 # What follows a stretch of driving; otherwise the robot drives on at another speed.
 _TURN_CHANCE: Final = 0.55
 _STOP_CHANCE: Final = 0.25
@@ -45,18 +45,9 @@ def drive_motion(seed: int, duration_s: float = 300.0) -> Motion:
     count = round(duration_s * US_PER_S / _STEP_US)
     step_s = _STEP_US / US_PER_S
     steps: list[int] = []
-    phase: Literal["cruise", "turn", "stop"] = "cruise"
+    phase = "cruise"
     while len(steps) < count:
-        speed_m_per_s = turn_deg_per_s = 0.0
-        if phase == "cruise":
-            speed_m_per_s = _drawn(random, _CRUISE_M_PER_S)
-            turn_deg_per_s = _drawn(random, _CRUISE_TURN_DEG_PER_S)
-            lasts_s = _drawn(random, _CRUISE_S)
-        elif phase == "turn":
-            turn_deg_per_s = _drawn(random, _TURN_DEG_PER_S)
-            lasts_s = _drawn(random, _TURN_S)
-        else:
-            lasts_s = _drawn(random, _STOP_S)
+        speed_m_per_s, turn_deg_per_s, lasts_s = (_drawn(random, limits) for limits in _PHASES[phase])
         per_s = speed_m_per_s / scale.scene_scale_m + turn_deg_per_s / scale.fov_deg
         steps += [round(per_s * step_s * 1e6)] * max(1, round(lasts_s / step_s))
         uniform = float(random.random())
@@ -70,4 +61,6 @@ def drive_motion(seed: int, duration_s: float = 300.0) -> Motion:
 
 
 def _drawn(random: np.random.Generator, limits: Limits) -> float:
+    if limits == _NOTHING:
+        return 0.0  # takes nothing from the stream
     return limits[0] + (limits[1] - limits[0]) * float(random.random())

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, get_type_hints
+from typing import Annotated, Any, Final, get_type_hints
 
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
@@ -35,15 +35,8 @@ SHOULDER_S: Final = 5
 _MAX_RATE: Final = 1e10
 
 
-class Between(NamedTuple):
-    """The range of a parameter, stated with it: `share: Annotated[float, Between(0, 1)]`."""
-
-    least: float
-    most: float
-
-
 def _check_ranges(parameters: object) -> None:
-    """Check each field of a dataclass that is annotated with a range."""
+    """Check each field of a dataclass that is annotated with a range, as in `share: Annotated[float, (0, 1)]`."""
     for name, hint in get_type_hints(type(parameters), include_extras=True).items():
         for limits in getattr(hint, "__metadata__", ()):
             checked(name, getattr(parameters, name), *limits)
@@ -53,19 +46,19 @@ def _check_ranges(parameters: object) -> None:
 class OutageParameters:
     """Outages: runs of seconds below a threshold."""
 
-    spells: Annotated[int, Between(1, 1e9)]
+    spells: Annotated[int, (1, 1e9)]
     """Number of outages that the other numbers come from."""
-    short_gap_share: Annotated[float, Between(0, 1)]
+    short_gap_share: Annotated[float, (0, 1)]
     """Chance that the next outage follows soon: outages come in clusters."""
-    short_gap_s: Annotated[float, Between(1, 1e7)]
+    short_gap_s: Annotated[float, (1, 1e7)]
     """Mean time from one's end to the start of the next, if that follows soon; geometric, s."""
-    long_gap_s: Annotated[float, Between(1, 1e7)]
+    long_gap_s: Annotated[float, (1, 1e7)]
     """The same for the others."""
-    shoulder: Annotated[float, Between(0, 1)]
+    shoulder: Annotated[float, (0, 1)]
     """Mean rate within SHOULDER_S of an outage, relative to that of seconds farther away."""
-    length_tail: Annotated[float, Between(0.1, 100)]
+    length_tail: Annotated[float, (0.1, 100)]
     """An outage lasts longer than k s with chance (1 + k / length_scale_s)**-length_tail."""
-    length_scale_s: Annotated[float, Between(0.01, 1e4)]
+    length_scale_s: Annotated[float, (0.01, 1e4)]
     """See length_tail."""
     low_quantiles_bytes_per_s: tuple[float, ...]
     """5 rates, from least to greatest, of the seconds inside."""
@@ -81,19 +74,19 @@ class OutageParameters:
 class LinkParameters:
     """A link in steps of 1 s; `markov.py` says how a trace is drawn from it."""
 
-    recordings: Annotated[int, Between(1, 1e9)]
+    recordings: Annotated[int, (1, 1e9)]
     """Number of recordings that it was fitted to."""
-    seconds: Annotated[int, Between(1, 1e9)]
+    seconds: Annotated[int, (1, 1e9)]
     """Their total length, s."""
     quantiles_bytes_per_s: tuple[float, ...]
     """Rates at `PROBABILITIES` among the seconds that are neither in an outage nor beside one."""
-    place_share: Annotated[float, Between(0, 1)]
+    place_share: Annotated[float, (0, 1)]
     """Share of the variance (of the rates' normal scores) that stays the same for a whole trace."""
     level_share: float
     """Share that stays the same for a while, then is drawn again; at most 1 - place_share."""
-    level_stay_s: Annotated[float, Between(1, 1e7)]
+    level_stay_s: Annotated[float, (1, 1e7)]
     """How long that is on average, s."""
-    fast_memory: Annotated[float, Between(0, 0.999)]
+    fast_memory: Annotated[float, (0, 0.999)]
     """Correlation from one second to the next of the remaining part, an AR(1) process."""
     outages: OutageParameters | None
     """None if there were none."""
@@ -147,15 +140,9 @@ def write_links(links: Mapping[str, LinkParameters], path: StrPath, threshold_by
         "probabilities_of_quantiles": PROBABILITIES,
         "modes": {mode: asdict(link) for mode, link in links.items()},
     }
-    write_text(path, [_dumped(content)])
-
-
-def _dumped(content: Mapping[str, Any]) -> str:
-    """JSON with one line for each number, and one for each row of numbers."""
-    text = json.dumps(content, indent=2)
-    return (
-        re.sub(r"\[[^]]*\]", lambda row: re.sub(r"\s+", " ", row[0]).replace("[ ", "[").replace(" ]", "]"), text) + "\n"
-    )
+    # One line for each number, and one for each row of numbers.
+    rows, text = re.compile(r"\[\s*([^]]*?)\s*\]"), json.dumps(content, indent=2)
+    write_text(path, [rows.sub(lambda row: f"[{' '.join(row[1].split())}]", text), "\n"])
 
 
 def _link(entry: object) -> LinkParameters:
@@ -176,9 +163,5 @@ def _values(entry: object, kind: type[LinkParameters] | type[OutageParameters]) 
 def _check_quantiles(owner: object, name: str, count: int) -> None:
     rates = getattr(owner, name)
     is_row = isinstance(rates, tuple) and len(rates) == count
-    if (
-        not is_row
-        or not all(is_finite(rate) and 0 <= rate <= _MAX_RATE for rate in rates)
-        or list(rates) != sorted(rates)
-    ):
+    if not (is_row and all(is_finite(r) and 0 <= r <= _MAX_RATE for r in rates) and list(rates) == sorted(rates)):
         raise BufgymError(f"{name}: must be {count} rates from 0 to {_MAX_RATE:g} bytes/s that do not decrease")

@@ -16,14 +16,9 @@ from bufgym.traces.generate.lte import LteMode, synthetic_lte
 # Mode and mean in bytes/s of lte-synthetic-<seed>.csv. The means lie around the 6.9 MB/s of 30 frames of 230 kB a
 # second: from a link that barely suits a robot to one where only breakdowns are a problem.
 SHIPPED_LTE: Final[tuple[tuple[LteMode, float], ...]] = (
-    ("walk", 8e6),
-    ("walk", 10e6),
-    ("walk", 12e6),
-    ("drive", 8e6),
-    ("drive", 10e6),
-    ("drive", 12e6),
-    ("train", 9e6),
-    ("train", 11e6),
+    *(("walk", 8e6), ("walk", 10e6), ("walk", 12e6)),
+    *(("drive", 8e6), ("drive", 10e6), ("drive", 12e6)),
+    *(("train", 9e6), ("train", 11e6)),
 )
 SHIPPED_SEEDS_OF_MOTION: Final = (0, 1)
 SHIPPED_DURATION_S: Final = 300
