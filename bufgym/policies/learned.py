@@ -126,15 +126,5 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
     on_link = {field.name for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.group == "link"}
     numbers, (first, second) = tuple(weights.parameters().tolist()), weights.widths
     work = 2 * len(weights.fields) - len(weights.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
-    reads_rate = not on_link.isdisjoint(weights.fields)
-    policy = Policy(
-        name,
-        on_arrival,
-        weights=numbers,
-        work=work,
-        compile=True,
-        reads_rate=reads_rate,
-        reads_left=True,
-        built_in=True,
-    )
-    return replace(policy, about=summary, source=source)
+    policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_left=True, built_in=True)
+    return replace(policy, reads_rate=not on_link.isdisjoint(weights.fields), about=summary, source=source)
