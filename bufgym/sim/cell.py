@@ -69,14 +69,8 @@ def run_fleet(
     longest = max(len(arrivals) for episode in episodes for arrivals in episode.arrivals)
     if policy.unbounded:
         capacity, max_bytes = longest, None
-    senders = Senders(
-        robots * len(episodes),
-        capacity,
-        v,
-        max_messages=longest,
-        max_bytes=max_bytes,
-        decide_at=decide_at,
-    )
+    n = robots * len(episodes)
+    senders = Senders(n, capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at)
     fleet = Fleet(senders, robots)
     for c, episode in enumerate(episodes):
         fleet.load(c, episode)

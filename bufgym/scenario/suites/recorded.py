@@ -121,18 +121,13 @@ SUITES = tuple(
         ("uplink-5g-v1", "over 5G uplinks of a drive, split by day", _uplink_5g, "uplink_5g/*.out.gz"),
         ("uplink-wifi-v1", "over WiFi uplinks in a shipyard, split by place", _uplink_wifi, "uplink_wifi/*.json.gz"),
         ("uplink-mmwave-v1", "over 5G mmWave uplinks, split by place", _uplink_mmwave, "uplink_mmwave/*.list.gz"),
-        ("lumos5g-v1", "over Lumos5G's 4G traces", _every_fifth("lumos5g/4G/*", SIZE_BYTES), "lumos5g/4G/*"),
-        (
-            "norway-hsdpa-v1",
-            "of 8 kB frames over the Norway HSDPA logs",
-            _every_fifth("norway_hsdpa/cooked/*", 8_000),
-            "norway_hsdpa/cooked/*",
-        ),
-        (
-            "mahimahi-v1",
-            "of 30 kB frames over Mahimahi's cellular traces",
-            _every_fifth("mahimahi/*.gz", 30_000),
-            "mahimahi/*.gz",
+        *(
+            (name, over, _every_fifth(pattern, size_bytes), pattern)
+            for name, over, pattern, size_bytes in (
+                ("lumos5g-v1", "over Lumos5G's 4G traces", "lumos5g/4G/*", SIZE_BYTES),
+                ("norway-hsdpa-v1", "of 8 kB frames over the Norway HSDPA logs", "norway_hsdpa/cooked/*", 8_000),
+                ("mahimahi-v1", "of 30 kB frames over Mahimahi's cellular traces", "mahimahi/*.gz", 30_000),
+            )
         ),
     )
 )
