@@ -106,11 +106,6 @@ def copies_of(topics: Sequence[Topic], consumers: int) -> list[Topic]:
     ]
 
 
-def check_ack_delay(ack_delay_us: Any) -> int:
-    """Check the time from a message's last byte on the link to its ack, us."""
-    return whole("ack_delay_us", ack_delay_us, 0, MAX_ACK_DELAY_US)
-
-
 def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """The topics' settings as TOPIC[topics], and all their V in one array; no topics give one row without limits."""
     # A single topic with rules gets a companion without messages: one row means "no rules, whatever the topic number".

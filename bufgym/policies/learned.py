@@ -30,7 +30,7 @@ from bufgym.model.observe import (
     observe_on_board_slots,
 )
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.scoring import DROP, KEEP, Network, begin, divide, read_context, score, unpack
+from bufgym.policies.scoring import DROP, KEEP, Network, begin, divide, score, unpack
 
 __all__ = ["NAMES", "Network", "Weights", "policy"]
 
@@ -57,7 +57,8 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         if scorer.fields[i] >= TABLE_SLOTS:
             observe_on_board_slots(buffer, arrival, scratch.rows[TABLE_SLOTS:])
             break
-    read_context(scorer, scratch)
+    for i in range(scorer.context):
+        scratch.f[i] = scratch.context[int(scorer.fields[i])]
     common = begin(scorer, DROP, scratch)
     own, best, decision, freed_bytes = score(scorer, DROP, common, L, scratch), -np.inf, REJECT, 0
     for k in range(s):

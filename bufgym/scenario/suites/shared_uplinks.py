@@ -58,13 +58,7 @@ def _fleet(split: str, data: Path) -> dict[str, Setting]:
 
 
 SUITES = (
-    Suite(
-        "topics-v1",
-        "Robofleet's example client, 8 topics, over LTE with dropouts",
-        _topics,
-        capacities=(32,),
-        kind="topics",
-    ),
+    Suite("topics-v1", "Robofleet's example client, 8 topics, over LTE with dropouts", _topics, (32,), kind="topics"),
     Suite(
         "fleet-v1",
         "16 robots share a cell; 30 Hz camera over synthetic LTE links, x is each camera's motion",

@@ -128,11 +128,6 @@ def _stress(split: str, data: Path) -> dict[str, Setting]:
 
 SUITES = (
     Suite(
-        "stress-v1",
-        "conditions that nobody trained on, by the worst cell",
-        _stress,
-        capacities=CAPACITIES,
-        seeds=2,
-        kind="stress",
+        "stress-v1", "conditions that nobody trained on, by the worst cell", _stress, CAPACITIES, seeds=2, kind="stress"
     ),
 )
