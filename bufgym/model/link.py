@@ -78,9 +78,7 @@ class Link:
 
     def carried_at(self, t_us: int) -> int:
         """C at one time, bytes, rounded down."""
-        trace = self.trace
-        us, size, after = trace.time_us, trace.cumulative_bytes, _AFTER[trace.after]
-        return int(position_at(us, size, 0, len(us) - 1, after, 0, t_us + self.offset_us)[0])
+        return int(self.carried_by(np.array([t_us], np.int64))[0])
 
     def time_at(self, position: int) -> int:
         """The first time, us, at which the link has carried ``position`` > 0 bytes; FOREVER if it never will."""
@@ -137,19 +135,16 @@ class KnotStore:
             left.senders -= 1
             if not left.senders:
                 self._idle[id(left.trace)] = left
-        place = self._places.get(id(trace)) or self._stored(trace)
+        place = self._places.get(id(trace))
+        if place is None:
+            knots = len(trace.time_us)
+            place = self._places[id(trace)] = _Place(trace, *self._room(knots))
+            here = slice(place.first, place.first + knots)
+            self.us[here], self.bytes[here] = trace.time_us, trace.cumulative_bytes
         place.senders += 1
         self._idle.pop(id(trace), None)
         self._followed[sender] = place
         return place.words
-
-    def _stored(self, trace: Trace) -> _Place:
-        knots = len(trace.time_us)
-        place = _Place(trace, *self._room(knots))
-        self._places[id(trace)] = place
-        here = slice(place.first, place.first + knots)
-        self.us[here], self.bytes[here] = trace.time_us, trace.cumulative_bytes
-        return place
 
     def _room(self, knots: int) -> tuple[int, int]:
         """Find room for so many knots; return (first knot, size of the room)."""

@@ -143,12 +143,7 @@ def tabulated(distances: Sequence[float], values: Sequence[float]) -> Value:
         raise BufgymError(f"V = tabulated: distances {d.tolist()}: must begin at 0 and increase")
     # V is constant after the table: one more point lets the check see that corner too.
     check = np.append(d, 2 * d[-1])
-    return _checked(f"tabulated:{len(d)} points", _table(d.tolist(), levels.tolist()), check)
-
-
-def _table(distances: Sequence[float], levels: Sequence[float]) -> list[float]:
-    """``Value.array`` of a table."""
-    return [TABULATED, len(distances), *distances, *levels]
+    return _checked(f"tabulated:{len(d)} points", [TABULATED, len(d), *d.tolist(), *levels.tolist()], check)
 
 
 def of_function(v: Callable[[float], float], name: str = "") -> Value:
@@ -177,7 +172,7 @@ def of_function(v: Callable[[float], float], name: str = "") -> Value:
         middle = (below + until) / 2
         below, until = (below, middle) if at(middle) >= top * (1 - 1e-12) else (middle, until)
     distances = [0.0, *np.geomspace(until / 1e4, until, POINTS - 1).tolist()]
-    return _checked(name, _table(distances, [at(d) for d in distances]), np.append(distances, 2 * until))
+    return _checked(name, [TABULATED, POINTS, *distances, *map(at, distances)], np.append(distances, 2 * until))
 
 
 POINTS = 65
@@ -191,7 +186,12 @@ def parse(text: str) -> Value:
     kinds: dict[str, Callable[..., Value]] = {"exponential": exponential, "saturating": saturating}
     kind, _, number = text.partition(":")
     if kind == "tabulated":
-        return _parse_table(text, number)
+        try:
+            pairs = [tuple(map(float, point.split("="))) for point in number.split(",")]
+            distances, levels = zip(*pairs, strict=True)
+        except ValueError:
+            raise BufgymError(f"V = {text!r}: must be of the form tabulated:distance=V,distance=V,...") from None
+        return tabulated(distances, levels)
     if kind not in kinds:
         known = f"{', '.join(kinds)} (as in exponential:0.618), tabulated (as in tabulated:0=0,1=0.6,4=1)"
         raise BufgymError(f"V = {text!r}: unknown kind {kind!r}; known: {known}")
@@ -202,15 +202,6 @@ def parse(text: str) -> Value:
     except ValueError:
         raise BufgymError(f"V = {text!r}: {number!r} is not a number") from None
     return kinds[kind](parameter)
-
-
-def _parse_table(text: str, points: str) -> Value:
-    try:
-        pairs = [tuple(map(float, point.split("="))) for point in points.split(",")]
-        distances, levels = zip(*pairs, strict=True)
-    except ValueError:
-        raise BufgymError(f"V = {text!r}: must be of the form tabulated:distance=V,distance=V,...") from None
-    return tabulated(distances, levels)
 
 
 def load(v: Any) -> Value:

@@ -51,14 +51,9 @@ class Topic:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise BufgymError(f"topic {self.name!r}: a name must be a non-empty text")
-        for name, zero, optional in (
-            ("priority", True, False),
-            ("weight", True, True),
-            ("rate_limit_hz", False, True),
-            ("deadline_s", False, True),
-        ):
-            number = getattr(self, name)
-            if optional and number is None:
+        for name in ("priority", "weight", "rate_limit_hz", "deadline_s"):
+            number, zero = getattr(self, name), name in ("priority", "weight")
+            if number is None and name != "priority":
                 continue
             if not is_number(number) or not 0 <= number <= MAX_NUMBER or (number == 0 and not zero):
                 raise self._wrong(name, f"must be a number {'>= 0' if zero else '> 0'}, at most {MAX_NUMBER:g}")
@@ -109,11 +104,6 @@ def copies_of(topics: Sequence[Topic], consumers: int) -> list[Topic]:
         for c in range(consumers)
         for topic in topics
     ]
-
-
-def check_ack_delay(ack_delay_us: Any) -> int:
-    """Check the time from a message's last byte on the link to its ack, us."""
-    return whole("ack_delay_us", ack_delay_us, 0, MAX_ACK_DELAY_US)
 
 
 def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArray[Any], NDArray[np.float64]]:

@@ -29,16 +29,9 @@ class States(NamedTuple):
 
 def new_states(messages: int, width: int) -> States:
     """Make room for ``width`` states at each message."""
-    shape = (messages, width)
-    return States(
-        np.zeros(messages, np.int64),
-        np.zeros(shape, np.int64),
-        np.zeros(shape),
-        np.zeros(shape),
-        np.zeros(shape),
-        np.zeros((*shape, 2), np.int64),
-        np.zeros(messages, np.int64),
-    )
+    used, end, parent, latest = (np.zeros((messages, *rest), np.int64) for rest in ((), (width,), (width, 2), ()))
+    gain, net, promise = np.zeros((3, messages, width))
+    return States(used, end, gain, net, promise, parent, latest)
 
 
 @kernel

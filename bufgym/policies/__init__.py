@@ -25,22 +25,9 @@ from bufgym.policies.registry import ClientSettings, Policy, get, names, registe
 from bufgym.policies.schedulers import make_room
 
 __all__ = [
-    "ACCEPT",
-    "HOLD",
-    "REJECT",
-    "ClientSettings",
-    "Policy",
-    "after",
-    "before",
-    "get",
-    "has_space",
-    "is_first",
-    "load",
-    "make_room",
-    "names",
-    "register",
-    "register_later",
-]
+    "ACCEPT", "HOLD", "REJECT", "ClientSettings", "Policy", "after", "before", "get", "has_space", "is_first", "load",
+    "make_room", "names", "register", "register_later",
+]  # fmt: skip
 
 
 def load(path: str | os.PathLike[str]) -> Policy:

@@ -12,7 +12,8 @@ from bufgym.policies.classic import keep_first
 from bufgym.policies.registry import Arrival, Memory, built_in
 
 TARGET_MS, INTERVAL_MS = range(2)  # indices of CoDel's parameters
-FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(7)  # indices of its memory
+STATE = ("first_above_us", "drop_next_us", "count", "lastcount", "dropping", "again", "maxpacket_bytes")  # its memory
+FIRST_ABOVE, DROP_NEXT, DROPS, LAST_DROPS, DROPPING, AGAIN, MAX_PACKET = range(7)  # indices of it
 
 
 @kernel
@@ -73,9 +74,7 @@ def codel_dequeue(buffer: Buffer, memory: Memory) -> bool:
 @built_in(
     "codel",
     parameters={"target_ms": 5.0, "interval_ms": 100.0},
-    memory=dict.fromkeys(
-        ("first_above_us", "drop_next_us", "count", "lastcount", "dropping", "again", "maxpacket_bytes"), 0.0
-    ),
+    memory=dict.fromkeys(STATE, 0.0),
     on_dequeue=codel_dequeue,
     source="CoDel, RFC 8289 [nichols2018codel]",
 )

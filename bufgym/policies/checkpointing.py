@@ -15,18 +15,14 @@ from bufgym.policies.registry import Arrival, Memory, built_in
 
 
 @kernel
-def full_length(buffer: Buffer, arrival: Arrival) -> int:
-    """Messages in a full queue: L, or as many like those now waiting as fit into B, if fewer."""
-    like_these = float(buffer.max_bytes) * (len(buffer.slots) + 1) / (buffer.backlog_bytes + arrival.size_bytes)
-    return int(min(float(buffer.capacity), like_these))
-
-
-@kernel
-def growing_gap(r: float, p: float, L: int, alpha: float) -> float:
+def growing_gap(buffer: Buffer, arrival: Arrival, r: float, p: float, alpha: float) -> float:
     """Arrivals from kept message r (L + p) to the next one kept, r (L + p + 1); message i is kept at L (i / L)^alpha.
 
-    The form of the expression gives exactly r for alpha = 1.
+    Here L is that of a full queue, or as many like those now waiting as fit into B, if fewer. The form of the
+    expression gives exactly r for alpha = 1.
     """
+    like_these = float(buffer.max_bytes) * (len(buffer.slots) + 1) / (buffer.backlog_bytes + arrival.size_bytes)
+    L = int(min(float(buffer.capacity), like_these))
     return float(r**alpha * L ** (1 - alpha) * ((L + p + 1) ** alpha - (L + p) ** alpha))
 
 
@@ -43,12 +39,11 @@ def linear_alpha(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     lowered = r > 1 and buffer.evictions == 0 and fill(buffer) <= 2 / 3
     if lowered:
         r = r / 2
-    gap = growing_gap(r, p, full_length(buffer, arrival), alpha)
+    gap = growing_gap(buffer, arrival, r, p, alpha)
     if lowered:
         c = c % gap
-    if r == 1 and has_space(
-        buffer, arrival
-    ):  # unlike the paper's stream this queue drains; with every pass undone, an arrival that finds room is kept
+    # Unlike the paper's stream this queue drains: with every pass undone, an arrival that finds room is kept.
+    if r == 1 and has_space(buffer, arrival):
         memory[R], memory[C] = r, 0.0
         return ACCEPT
     return thin(r, c, p, gap, buffer, arrival, memory)

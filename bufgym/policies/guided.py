@@ -265,15 +265,11 @@ class GuidedWeights:
         return {"weight": self.weight}
 
 
-def whole(weights: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
-    """The weights; those for a light load alone get zeros for a heavy one."""
-    alone = weights.shape == GuidedWeights.LIGHT != shape
-    return np.concatenate([weights, np.zeros_like(weights)]) if alone else weights
-
-
 def numbers_of(name: str, base: Numbers, weights: NDArray[Any], shape: tuple[int, int]) -> tuple[float, ...]:
-    """The rule's numbers and W, which must have this shape, as a policy's weights."""
-    W = whole(np.asarray(weights, np.float64), shape)
+    """The rule's numbers and W, which must have this shape, as a policy's weights. W_light alone gets W_heavy = 0."""
+    W = np.asarray(weights, np.float64)
+    if W.shape == GuidedWeights.LIGHT != shape:
+        W = np.concatenate([W, np.zeros_like(W)])
     if W.shape != shape or not np.isfinite(W).all():
         rule = f"must be {shape[0]} x {shape[1]} finite numbers"
         raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")

@@ -30,7 +30,7 @@ from bufgym.model.observe import (
     observe_on_board_slots,
 )
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.scoring import DROP, KEEP, Network, begin, divide, read_context, score, unpack
+from bufgym.policies.scoring import DROP, KEEP, Network, begin, divide, score, unpack
 
 __all__ = ["NAMES", "Network", "Weights", "policy"]
 
@@ -57,7 +57,8 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
         if scorer.fields[i] >= TABLE_SLOTS:
             observe_on_board_slots(buffer, arrival, scratch.rows[TABLE_SLOTS:])
             break
-    read_context(scorer, scratch)
+    for i in range(scorer.context):
+        scratch.f[i] = scratch.context[int(scorer.fields[i])]
     common = begin(scorer, DROP, scratch)
     own, best, decision, freed_bytes = score(scorer, DROP, common, L, scratch), -np.inf, REJECT, 0
     for k in range(s):
@@ -126,15 +127,5 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
     on_link = {field.name for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.group == "link"}
     numbers, (first, second) = tuple(weights.parameters().tolist()), weights.widths
     work = 2 * len(weights.fields) - len(weights.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
-    reads_rate = not on_link.isdisjoint(weights.fields)
-    policy = Policy(
-        name,
-        on_arrival,
-        weights=numbers,
-        work=work,
-        compile=True,
-        reads_rate=reads_rate,
-        reads_left=True,
-        built_in=True,
-    )
-    return replace(policy, about=summary, source=source)
+    policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_left=True, built_in=True)
+    return replace(policy, reads_rate=not on_link.isdisjoint(weights.fields), about=summary, source=source)

@@ -83,13 +83,6 @@ def divide(memory: NDArray[np.float64], scorer: Scorer, contexts: int, slots: in
 
 
 @kernel
-def read_context(scorer: Scorer, scratch: Scratch) -> None:
-    """Take the context's features from the observation."""
-    for i in range(scorer.context):
-        scratch.f[i] = scratch.context[int(scorer.fields[i])]
-
-
-@kernel
 def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
     """The context's part of every score by network ``which``; its part of the first layer goes to ``scratch.h``."""
     net = scorer.networks[which * scorer.size : (which + 1) * scorer.size]

@@ -30,7 +30,8 @@ MOST_RATIO = 0.96
 FORGETS_S = 1e6
 """Time for which an old target holds until a message has shown another."""
 
-LEVEL, TARGET, AVERAGE, RATIO, COUNT, LARGE_LEFT, LARGE_PART, ABOVE = range(len(PIPE), len(PIPE) + 8)
+STATE = ("level_bytes", "target", "average_bytes", "ratio", "count", "large_left", "large_part", "above")
+LEVEL, TARGET, AVERAGE, RATIO, COUNT, LARGE_LEFT, LARGE_PART, ABOVE = range(len(PIPE), len(PIPE) + len(STATE))
 """Indices of the dropper's state, after the pipe's."""
 
 
@@ -93,12 +94,7 @@ def fill(memory: Memory, size_bytes: float, period_us: float) -> None:
 
 @built_in(
     "webrtc-frame-dropper",
-    memory={
-        **PIPE,
-        **dict.fromkeys(
-            ("level_bytes", "target", "average_bytes", "ratio", "count", "large_left", "large_part", "above"), 0.0
-        ),
-    },
+    memory=PIPE | dict.fromkeys(STATE, 0.0),
     source="WebRTC, modules/video_coding/utility/frame_dropper [webrtc]",
     reads_left=True,
 )

@@ -5,6 +5,7 @@ around the seconds 21 and 23 at L = 5 (Sec. V-B); see ``bufgym reproduce afr-fra
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from bufgym.model import qoi
@@ -27,14 +28,8 @@ def fade() -> Trace:
 
 def evaluation(*links: Trace) -> Uplink:
     """The stream over these links from their start; V is the one in the paper's Fig. 5."""
-    return Uplink(
-        traces=links,
-        rate_hz=RATE_HZ,
-        size_bytes=FRAME_BYTES,
-        duration_s=PAPER_FRAMES / RATE_HZ,
-        random_offset=False,
-        value=qoi.exponential(0.618),
-    )
+    stream = Uplink(links, rate_hz=RATE_HZ, size_bytes=FRAME_BYTES, random_offset=False)
+    return replace(stream, duration_s=PAPER_FRAMES / RATE_HZ, value=qoi.exponential(0.618))
 
 
 def afr_evaluation() -> Uplink:

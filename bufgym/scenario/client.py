@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.files import check_keys, read_toml
-from bufgym.ground.kernel import records
 from bufgym.model import qoi
-from bufgym.model.buffer import MESSAGE
 from bufgym.model.checks import above_0, check_window, whole
 from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics
-from bufgym.scenario.arrivals import read_only
+from bufgym.scenario.arrivals import messages, read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
 from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes
 from bufgym.scenario.episode import Episode, Streams
@@ -168,10 +166,8 @@ class Client:
         columns = [self._published(k, stream, moving, rng) for k, stream in enumerate(self.streams)]
         times, numbers, sizes_bytes, xs = (np.concatenate(column) for column in zip(*columns, strict=True))
         order = np.argsort(times, kind="stable")
-        arrivals = records(len(times), MESSAGE)
-        arrivals["seq"] = np.arange(len(times))
-        arrivals["arrival_us"] = times[order] - times[order[0]]
-        arrivals["topic"], arrivals["size_bytes"], arrivals["x"] = numbers[order], sizes_bytes[order], xs[order]
+        arrivals = messages(times[order] - times[order[0]], sizes_bytes[order], xs[order])
+        arrivals["topic"] = numbers[order]
         trace, offset_us = place_link(self._links, streams.link, self.random_offset)
         return Episode(
             read_only(arrivals),

@@ -14,7 +14,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import check_window, whole
 from bufgym.model.link import FOREVER, MAX_TIME_US, Link
 from bufgym.model.qoi import Value
-from bufgym.model.topics import Topic, check_ack_delay
+from bufgym.model.topics import MAX_ACK_DELAY_US, Topic
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
 from bufgym.traces.workload import MAX_MESSAGES
 
@@ -75,7 +75,7 @@ class Episode:
 
     def __post_init__(self) -> None:
         check_window(self.window)
-        check_ack_delay(self.ack_delay_us)
+        whole("ack_delay_us", self.ack_delay_us, 0, MAX_ACK_DELAY_US)
         check_link(self.link)
         arrivals = sealed(self.arrivals)
         total_bytes, rises = check_messages(arrivals)

@@ -36,7 +36,7 @@ class FleetEpisode:
     """Time at which each robot was told that its stream ends, as in ``Episode``."""
 
     def __post_init__(self) -> None:
-        check_robots(len(self.arrivals))
+        whole("robots", len(self.arrivals), 1, MAX_ROBOTS)
         check_end(self.ends_us)
         check_link(self.link)
         robots, last_us, total_bytes = [], 0, 0
@@ -91,7 +91,7 @@ class FleetScenario:
     """Empty: one queue for each robot."""
 
     def __post_init__(self) -> None:
-        check_robots(self.robots)
+        whole("robots", self.robots, 1, MAX_ROBOTS)
         if not isinstance(self.uplink, Uplink):
             raise BufgymError(f"uplink: {self.uplink!r} is not a bufgym.scenario Uplink")
         if self.uplink.workload is not None:
@@ -136,8 +136,3 @@ def _uplink(spec: str | Uplink, **parameters: Any) -> Uplink:
     if not isinstance(scenario, Uplink):
         raise BufgymError(f"scenario {spec!r}: a fleet needs an Uplink, whose link goes on; it is {scenario!r}")
     return scenario
-
-
-def check_robots(robots: Any) -> int:
-    """Check N and return it."""
-    return whole("robots", robots, 1, MAX_ROBOTS)

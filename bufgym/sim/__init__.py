@@ -23,14 +23,5 @@ from bufgym.sim.senders import Senders, run
 from bufgym.sim.state import NEVER
 
 __all__ = [
-    "NEVER",
-    "Fleet",
-    "Outcome",
-    "Senders",
-    "TopicOutcome",
-    "outcome",
-    "received",
-    "run",
-    "run_fleet",
-    "topic_outcomes",
-]
+    "NEVER", "Fleet", "Outcome", "Senders", "TopicOutcome", "outcome", "received", "run", "run_fleet", "topic_outcomes",
+]  # fmt: skip

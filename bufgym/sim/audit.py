@@ -6,10 +6,9 @@ So every benchmark run is checked at its end: a policy that changed a message or
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import item, kernel
+from bufgym.ground.kernel import at, item, kernel
 from bufgym.model.qoi import value
 from bufgym.scenario import Episode
 from bufgym.sim.state import NEVER, Batch
@@ -29,29 +28,18 @@ _ROUNDING = 1e-9
 
 def touched(batch: Batch, i: int, episode: Episode, topic_table: NDArray[Any]) -> str:
     """What does not agree with the episode or the topics' rules in sender ``i``'s finished run; empty if all does."""
-    rows = batch.slots[i], batch.arrivals[i], batch.log[i], batch.order[i], batch.topics[i]
-    return _FAULTS[_fault(batch.senders[i : i + 1], *rows, batch.v, episode.arrivals, topic_table)]
+    return _FAULTS[_fault(batch, i, episode.arrivals, topic_table)]
 
 
 @kernel
-def _fault(
-    senders: NDArray[Any],
-    slots: NDArray[Any],
-    held: NDArray[Any],
-    log: NDArray[Any],
-    order: NDArray[np.int64],
-    topics: NDArray[Any],
-    v: NDArray[np.float64],
-    arrivals: NDArray[Any],
-    rules: NDArray[Any],
-) -> int:
+def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) -> int:
     """The fault that is found first, as a place in ``_FAULTS``; 0 for none. ``arrivals`` and ``rules`` are as given."""
-    sender, n = item(senders, 0), len(arrivals)
+    sender, n = batch.senders[i], len(arrivals)
     sent, dropped = 0, 0
     for k in range(n):
-        if not _same(item(held, k), item(arrivals, k)):
+        if not _same(at(batch.arrivals, i, k), item(arrivals, k)):
             return _ARRIVAL
-        entry = item(log, k)
+        entry = at(batch.log, i, k)
         if entry.dequeued_us != NEVER:
             sent += 1
             if entry.dropped_us != NEVER or entry.dequeued_us < item(arrivals, k).arrival_us:
@@ -60,11 +48,12 @@ def _fault(
             dropped += 1
     before, queued_bytes = -1, 0
     for k in range(sender.first, sender.first + sender.occupancy):
-        message = slots[k]
+        message = batch.slots[i, k]
         if not before < message.seq < n or not _same(message, item(arrivals, message.seq)):
             return _QUEUED
         before = message.seq
-        if item(log, before).dequeued_us != NEVER or item(log, before).dropped_us != NEVER:
+        entry = at(batch.log, i, before)
+        if entry.dequeued_us != NEVER or entry.dropped_us != NEVER:
             return _QUEUED
         queued_bytes += message.size_bytes
     if queued_bytes != sender.backlog_bytes:
@@ -75,18 +64,18 @@ def _fault(
     if sent + dropped + sender.occupancy != sender.next:
         return _LOG
     gained = 0.0
-    for t in range(len(topics)):
-        now, given = item(topics, t), item(rules, t)
+    for t in range(batch.topics.shape[1]):
+        now, given = at(batch.topics, i, t), item(rules, t)
         if now.priority != given.priority or now.weight != given.weight or now.no_drop != given.no_drop:
             return _TOPIC
         if now.period_us != given.period_us or now.limit != given.limit or now.deadline_us != given.deadline_us:
             return _TOPIC
         if now.v_start != given.v_start:
             return _TOPIC
-        several, received, x = len(topics) > 1, 0, 0.0
-        own_v = v[given.v_start if several else sender.v_start :]
+        several, received, x = batch.topics.shape[1] > 1, 0, 0.0
+        own_v = batch.v[given.v_start if several else sender.v_start :]
         for k in range(sender.credited):
-            message = item(arrivals, order[k])
+            message = item(arrivals, at(batch.order, i, k))
             if several and message.topic != t:
                 continue
             if received > 0:

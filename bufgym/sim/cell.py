@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
+from bufgym.model.checks import whole
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
-from bufgym.scenario.fleet import FleetEpisode, check_robots
+from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode
 from bufgym.sim.senders import Senders
 from bufgym.sim.shared_link import load_cell, new_shares
 
@@ -18,7 +19,7 @@ class Fleet:
 
     def __init__(self, senders: Senders, robots: int) -> None:
         """Make as many cells of N = ``robots`` robots as there are senders for; nothing is loaded yet."""
-        self.robots = check_robots(robots)
+        self.robots = whole("robots", robots, 1, MAX_ROBOTS)
         if len(senders) % self.robots or senders.topics:
             raise BufgymError(
                 f"a fleet of {self.robots} robots needs a multiple of that many senders, of one queue each"
@@ -69,14 +70,8 @@ def run_fleet(
     longest = max(len(arrivals) for episode in episodes for arrivals in episode.arrivals)
     if policy.unbounded:
         capacity, max_bytes = longest, None
-    senders = Senders(
-        robots * len(episodes),
-        capacity,
-        v,
-        max_messages=longest,
-        max_bytes=max_bytes,
-        decide_at=decide_at,
-    )
+    n = robots * len(episodes)
+    senders = Senders(n, capacity, v, max_messages=longest, max_bytes=max_bytes, decide_at=decide_at)
     fleet = Fleet(senders, robots)
     for c, episode in enumerate(episodes):
         fleet.load(c, episode)

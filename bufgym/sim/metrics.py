@@ -68,7 +68,6 @@ def outcome(senders: Senders, i: int) -> Outcome:
     messages = received(senders, i)
     log = np.asarray(batch.log[i])[: sender["arrivals"]]
     transmitted_us = log["transmitted_us"][messages["seq"]]
-    mean_sojourn, p95_sojourn = sojourns_s(transmitted_us - messages["arrival_us"])
     mean_age, peak_age, max_age = ages_s(transmitted_us + sender["propagation_us"], messages["arrival_us"])
     return Outcome(
         qoi=weighted_qoi(senders, i, messages) if senders.topics else senders.value_of(i).information(messages["x"]),
@@ -79,8 +78,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
         buffered=int(sender["occupancy"]),
         longest_gap=float(np.diff(messages["x"]).max(initial=0)),
         longest_gap_s=float(np.diff(messages["arrival_us"]).max(initial=0)) / 1e6,
-        mean_sojourn_s=mean_sojourn,
-        p95_sojourn_s=p95_sojourn,
+        **sojourns_s(transmitted_us - messages["arrival_us"]),
         mean_age_s=mean_age,
         peak_age_s=peak_age,
         max_age_s=max_age,
@@ -136,7 +134,6 @@ def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
         limited = int((dropped & (log["limited"] == 1)).sum())
         received_us = log["transmitted_us"][messages["seq"]] + sender["propagation_us"]
         sojourn_us = received_us - messages["arrival_us"]
-        mean_sojourn, p95_sojourn = sojourns_s(sojourn_us)
         first_us = int(arrivals["arrival_us"][arrived][0]) if arrived.any() else until_us
         mean_age, peak_age = ages_between_s(received_us, messages["arrival_us"], first_us, until_us)
         outcomes.append(
@@ -149,8 +146,7 @@ def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
                 lost=int(dropped.sum()) - limited,
                 buffered=int(arrived.sum() - dropped.sum()) - len(messages),
                 bytes_delivered=int(messages["size_bytes"].sum()),
-                mean_sojourn_s=mean_sojourn,
-                p95_sojourn_s=p95_sojourn,
+                **sojourns_s(sojourn_us),
                 mean_age_s=mean_age,
                 peak_age_s=peak_age,
                 late=int((sojourn_us / 1e6 > topic.deadline_s).sum()) if topic.deadline_s is not None else 0,
@@ -167,12 +163,10 @@ def weighted_qoi(senders: Senders, i: int, messages: NDArray[Any]) -> float:
     return total
 
 
-def sojourns_s(sojourn_us: NDArray[np.int64]) -> tuple[float, float]:
-    """Mean and 95th percentile of these sojourn times, s; NaN if there are none."""
-    if len(sojourn_us) == 0:
-        return NAN, NAN
-    sojourn_s = sojourn_us / 1e6
-    return float(sojourn_s.mean()), float(np.percentile(sojourn_s, 95))
+def sojourns_s(sojourn_us: NDArray[np.int64]) -> dict[str, float]:
+    """Mean and 95th percentile of these sojourn times, s, by the names in an outcome; NaN if there are none."""
+    sojourn_s = sojourn_us / 1e6 if len(sojourn_us) else np.array([NAN])
+    return {"mean_sojourn_s": float(sojourn_s.mean()), "p95_sojourn_s": float(np.percentile(sojourn_s, 95))}
 
 
 def ages_between_s(

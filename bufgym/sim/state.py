@@ -164,18 +164,10 @@ class Batch(NamedTuple):
 
 def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.float64]) -> Batch:
     """Make arrays for n senders with L = ``capacity`` and at most ``messages`` arriving messages; no traces yet."""
-    return Batch(
-        records(n, SENDER),
-        records((n, row_width(capacity)), MESSAGE),
-        records((n, messages), MESSAGE),
-        records((n, messages), LOG_ENTRY),
-        np.zeros((n, messages), np.int64),
-        np.zeros(0, np.int64),
-        np.zeros(0, np.int64),
-        v,
-        records((n, topics), TOPIC),
-        several=True if topics > 1 else None,
-    )
+    slots, rules, several = records((n, row_width(capacity)), MESSAGE), records((n, topics), TOPIC), topics > 1 or None
+    arrivals, log = records((n, messages), MESSAGE), records((n, messages), LOG_ENTRY)
+    order, knot_us, knot_bytes = np.zeros((n, messages), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
+    return Batch(records(n, SENDER), slots, arrivals, log, order, knot_us, knot_bytes, v, rules, several=several)
 
 
 @kernel
@@ -190,17 +182,12 @@ def batch_type(several: bool) -> Any:
     return cast(Any, numba).typeof(new_batch(1, 1, 1, 2 if several else 1, exponential().array))
 
 
-def words(dtype: np.dtype[Any], **values: float) -> NDArray[np.int64]:
-    """int64[fields]: one record with these values and 0 elsewhere, as whole words.
+def beginning(**settings: int) -> NDArray[np.int64]:
+    """int64[fields]: SENDER at the beginning of an episode, as whole words: empty buffer, idle socket, nothing arrived.
 
     NumPy copies records field by field; it copies words five times as fast.
     """
-    record = np.zeros(1, dtype)
-    for name, value in values.items():
-        record[name] = value
+    record = np.zeros(1, SENDER)
+    for name, number in {"first": 1, "finish_us": FOREVER, "measures": 1, "shows_left": 1, **settings}.items():
+        record[name] = number
     return record.view(np.int64)
-
-
-def beginning(**settings: int) -> NDArray[np.int64]:
-    """int64[fields]: SENDER at the beginning of an episode: empty buffer, idle socket, nothing arrived."""
-    return words(SENDER, first=1, finish_us=FOREVER, measures=1, shows_left=1, **settings)

@@ -49,38 +49,15 @@ def view(batch: Batch, i: int) -> Buffer:
         left_fraction = left_bytes / total_bytes
     remaining_us = max(sender.ends_us - sender.now_us, 0) if sender.ends_us < FOREVER else FOREVER
     return Buffer(
-        stretch(batch.slots, i, first, occupancy),
-        sender.capacity,
-        sender.max_bytes,
-        sender.backlog_bytes,
-        sender.now_us,
-        sender.forgotten + sender.dequeued,
-        dequeued_arrival_us,
-        dequeued_x,
-        dequeued_seq,
-        previous_us,
-        previous_x,
-        min(sender.busy, 1),
-        left_bytes,
-        left_fraction,
-        sender.now_us - sender.last_dequeue_us,
-        sender.period_us,
-        sender.arrival_bytes,
-        sender.departures,
-        sender.service_ratio,
-        sender.drained_bytes,
-        sender.drained_us,
-        1e6 * sender.short_rate,
-        1e6 * sender.medium_rate,
-        1e6 * sender.long_rate,
-        batch.v[sender.v_start :],
-        stretch(batch.topics, i, 0, sender.topics),
-        sender.window,
-        sender.dequeued - sender.acked,
-        sender.evictions,
-        remaining_us,
-        batch.parameters,
-    )
+        stretch(batch.slots, i, first, occupancy), sender.capacity, sender.max_bytes, sender.backlog_bytes,
+        sender.now_us, sender.forgotten + sender.dequeued, dequeued_arrival_us, dequeued_x, dequeued_seq,
+        previous_us, previous_x, min(sender.busy, 1), left_bytes, left_fraction,
+        sender.now_us - sender.last_dequeue_us, sender.period_us, sender.arrival_bytes,
+        sender.departures, sender.service_ratio, sender.drained_bytes, sender.drained_us,
+        1e6 * sender.short_rate, 1e6 * sender.medium_rate, 1e6 * sender.long_rate,
+        batch.v[sender.v_start :], stretch(batch.topics, i, 0, sender.topics),
+        sender.window, sender.dequeued - sender.acked, sender.evictions, remaining_us, batch.parameters,
+    )  # fmt: skip
 
 
 @kernel

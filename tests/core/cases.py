@@ -29,6 +29,17 @@ assert (ACCEPT, REJECT) == (-2, -1)
 ANYTHING = Policy("test-anything", decide_anything, compile=True)
 
 
+def watched(what: Any, decide: Any = lambda buffer, arrival, memory: ACCEPT) -> tuple[Policy, list[Any]]:
+    """(a policy in Python that decides so, what(buffer, arrival) at each of its decisions)."""
+    seen: list[Any] = []
+
+    def on_arrival(buffer: Any, arrival: Any, memory: Any) -> int:
+        seen.append(what(buffer, arrival))
+        return int(decide(buffer, arrival, memory))
+
+    return Policy("watched", on_arrival), seen
+
+
 def queue_of(s: int, capacity: int, parameters: NDArray[np.float64] = NO_PARAMETERS) -> Buffer:
     """What a policy sees of s queued messages without bytes to speak of; the rest is 0."""
     fields: dict[str, Any] = dict.fromkeys(Buffer._fields, 0)
@@ -107,16 +118,8 @@ def drawn_messages(
 
 def twin_messages(arrivals: NDArray[Any]) -> list[dict[str, Any]]:
     """MESSAGE[n] as the twins have it."""
-    return [
-        {
-            "seq": k,
-            "us": int(a["arrival_us"]),
-            "bytes": int(a["size_bytes"]),
-            "x": float(a["x"]),
-            "uniform": a["uniform"],
-        }
-        for k, a in enumerate(np.asarray(arrivals))
-    ]
+    fields = {"seq": "seq", "us": "arrival_us", "bytes": "size_bytes", "topic": "topic", "x": "x", "uniform": "uniform"}
+    return [{name: a[field].item() for name, field in fields.items()} for a in np.asarray(arrivals)]
 
 
 @st.composite

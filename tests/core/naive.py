@@ -54,12 +54,8 @@ class Link:
         position -= laps * self.bytes
         for (t0, b0), (t1, b1) in itertools.pairwise(self.knots):
             if position <= b1:
-                return (
-                    laps * self.us
-                    + t0
-                    + math.ceil(Fraction(position - b0) * (t1 - t0) / max(1, b1 - b0))
-                    - self.offset_us
-                )
+                within = Fraction(position - b0) * (t1 - t0) / max(1, b1 - b0)
+                return laps * self.us + t0 + math.ceil(within) - self.offset_us
         return None
 
 

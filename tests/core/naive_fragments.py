@@ -35,17 +35,12 @@ class Pipe:
 
 
 class ZenohDrop(Policy):
-    def __init__(
-        self,
-        batch_size=65_535,
-        queue_size=2,
-        so_sndbuf=131_072,
-        wait_before_drop=1_000,
-        max_wait_before_drop_fragments=50_000,
-        rate_memory_s=1,
-    ):
-        self.batch, self.room = batch_size, queue_size * batch_size + 2 * so_sndbuf
-        self.wait, self.more, self.pipe = wait_before_drop, max_wait_before_drop_fragments, Pipe(rate_memory_s)
+    settings = {"batch_size": 65_535, "queue_size": 2, "so_sndbuf": 131_072, "wait_before_drop": 1_000}
+    settings |= {"max_wait_before_drop_fragments": 50_000, "rate_memory_s": 1}
+
+    def __init__(self, **given):
+        self.batch, queued, buffered, self.wait, self.more, memory_s = {**self.settings, **given}.values()
+        self.room, self.pipe = queued * self.batch + 2 * buffered, Pipe(memory_s)
 
     def deadlines(self):
         """wait (1 + 2 + 4 + ...), the first left as it is and the others cut at ``more`` in all."""

@@ -5,12 +5,11 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from cases import newcomer, queue_of
+from cases import newcomer, queue_of, watched
 from test_sender import line
 
 from bufgym.model.buffer import ACCEPT
 from bufgym.model.observe import ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, observe_on_board, observe_on_board_slots
-from bufgym.policies import Policy
 
 pytestmark = pytest.mark.kernels
 
@@ -76,14 +75,12 @@ def test_gap_per_byte():
 
 def test_what_arrives_counts_although_it_is_not_kept():
     # The policy keeps messages of 1000 bytes alone; half of those that arrive have 9000.
-    loads = []
     load = next(field for field in ON_BOARD_FIELDS if field.name == "load").function
-
-    def on_arrival(buffer, arrival, memory):
-        loads.append((buffer.arrival_bytes, load(buffer, arrival)))
-        return ACCEPT if arrival.size_bytes == 1_000 else -1
-
-    line([0, 1, 2, 3], sizes=[1_000, 9_000, 1_000, 9_000], capacity=8).run(Policy("small-only", on_arrival))
+    policy, loads = watched(
+        lambda buffer, arrival: (buffer.arrival_bytes, load(buffer, arrival)),
+        lambda buffer, arrival, memory: ACCEPT if arrival.size_bytes == 1_000 else -1,
+    )
+    line([0, 1, 2, 3], sizes=[1_000, 9_000, 1_000, 9_000], capacity=8).run(policy)
     assert [bytes for bytes, _ in loads] == [1_000, 2_000, 1_875, 2_765.625]
     # 1 MB/s and a message each ms: 1000 bytes leave where 2765.625 arrive.
     assert loads[3][1] == pytest.approx(2_765.625 / 3_765.625)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import naive_oracle
 import numpy as np
 import pytest
-from cases import VALUES, Case, cases, trace, traces
+from cases import VALUES, Case, cases, trace, traces, twin_messages
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -82,10 +82,9 @@ def small(draw: st.DrawFn, equal: bool, windows: bool = False) -> Case:
     episode = Episode(messages(us, size, x), Link(trace(knots, after), int(rng.integers(0, 3 * knots[-1][0]))))
     if windows:
         episode = replace(episode, first_decision=int(rng.integers(0, 3)), last_decision=int(rng.integers(0, n + 1)))
-    twins = [{"seq": k, "us": int(us[k]), "bytes": int(size[k]), "x": float(x[k]), "uniform": 0.0} for k in range(n)]
     max_bytes = draw(st.sampled_from([None, None, unit, 2 * unit, 7 * unit, 3 * unit - 1]))
     decide_at = draw(st.sampled_from(["arrival", "overflow"])) if windows else "arrival"
-    return Case(episode, twins, knots, draw(st.integers(1, 3)), max_bytes or None, decide_at)
+    return Case(episode, twin_messages(episode.arrivals), knots, draw(st.integers(1, 3)), max_bytes or None, decide_at)
 
 
 SMALL = {

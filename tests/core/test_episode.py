@@ -22,6 +22,7 @@ from bufgym.traces.workload import Workload
 STEADY = Link(Trace.constant(1e6, 10))
 THREE = messages(np.array([0, 10, 20]), 5)
 V = qoi.exponential()
+PRIVILEGED = policies.Policy("p", len, privileged=lambda *_: 0)
 PLAYED = Workload("played", np.array([0, 10]), np.array([1, 1]))
 
 
@@ -95,13 +96,8 @@ def test_another_encoding_keeps_the_rules_too() -> None:
 def test_nobody_writes_to_an_episode(name: str) -> None:
     streams = Streams.seeded(1)
     drawn, cell = scenario.get(name).draw(streams), FleetScenario.of(2).draw(streams)
-    for episode in (
-        drawn,
-        drawn.with_uniforms(streams.policy),
-        drawn.encoded("json"),
-        drawn.copied(9),
-        cell.episode(1),
-    ):
+    others = drawn.with_uniforms(streams.policy), drawn.encoded("json"), drawn.copied(9), cell.episode(1)
+    for episode in (drawn, *others):
         with pytest.raises(ValueError, match="read-only"):
             episode.arrivals["x"] = 7
 
@@ -194,10 +190,8 @@ def test_the_cell_grows_with_the_robots() -> None:
     uplink = scenario.get("lte", scale=(0.5, 2.0))
     mean = {t.name: t.total_bytes for t in uplink.traces}
     for robots in (1, 3, 256):
-        drawn = [
-            FleetScenario(robots, uplink).draw(Streams.seeded(k)).link.trace for k in range(8 if robots < 9 else 1)
-        ]
-        for found in drawn:
+        for k in range(8 if robots < 9 else 1):
+            found = FleetScenario(robots, uplink).draw(Streams.seeded(k)).link.trace
             assert round(found.total_bytes / mean[found.name] / robots, 3) in (0.5, 2.0)
 
 
@@ -214,12 +208,7 @@ def test_the_cell_grows_with_the_robots() -> None:
         (lambda: Fleet(Senders(3, 2, V, max_messages=1), 2), "multiple of that many senders"),
         (lambda: Fleet(Senders(2, 2, V, max_messages=9), 2).load(0, FleetScenario(3).draw(Streams.seeded(0))), "has 2"),
         (lambda: FleetScenario.of(2, "lte", workload=PLAYED, motion=()), "one robot's workload"),
-        (
-            lambda: run_fleet(
-                policies.Policy("p", len, privileged=lambda *_: 0), [FleetEpisode((THREE,), STEADY)], 2, V
-            ),
-            "link of its own",
-        ),
+        (lambda: run_fleet(PRIVILEGED, [FleetEpisode((THREE,), STEADY)], 2, V), "link of its own"),
     ],
 )
 def test_bad_input_is_told_apart(build: Any, complaint: str) -> None:

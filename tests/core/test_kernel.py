@@ -35,13 +35,8 @@ def run(tmp_path: Path, before: str = "", source: str = TALE, **environment: str
     """Run ``source``, a module whose kernels print 42."""
     file = tmp_path / "tale.py"
     file.write_text(source.format(before=before))
-    done = subprocess.run(
-        [sys.executable, str(file)],
-        env={"PYTHONPATH": str(Path(cache.__file__).parents[2]), **os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    environment = {"PYTHONPATH": str(Path(cache.__file__).parents[2]), **os.environ, **environment}
+    done = subprocess.run([sys.executable, str(file)], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "42\n"
     return done

@@ -6,7 +6,7 @@ from types import FunctionType
 import naive
 import numpy as np
 import pytest
-from cases import ANYTHING, cases, newcomer, queue_of
+from cases import ANYTHING, cases, newcomer, queue_of, watched
 from hypothesis import given
 from test_sender import MS, V, line
 
@@ -20,23 +20,18 @@ from bufgym.sim import rollout, run
 pytestmark = pytest.mark.kernels
 
 
-def recorder(seen):
-    """A policy of one's own that accepts what fits, and notes what it sees."""
-
-    def on_arrival(buffer, arrival, memory):
-        rates = buffer.short_rate_bytes_per_s, buffer.medium_rate_bytes_per_s, buffer.long_rate_bytes_per_s
-        seen.append((buffer.drained_bytes, buffer.drained_us, *rates))
-        return ACCEPT
-
-    return policies.Policy("recorder", on_arrival)
+def drained(buffer, arrival):
+    """What a policy sees of the link's rate."""
+    rates = buffer.short_rate_bytes_per_s, buffer.medium_rate_bytes_per_s, buffer.long_rate_bytes_per_s
+    return (buffer.drained_bytes, buffer.drained_us, *rates)
 
 
 def test_the_links_rate_follows_a_change():
     # 1 MB/s for 0.2 s, then nothing: arrivals each 100 ms. Of 100 ms that carried nothing the mean over 0.1 s takes
     # 100 / (100 + 100), that over 0.5 s 100 / (100 + 200): before, no more than 0.2 s were seen.
-    seen = []
+    policy, seen = watched(drained)
     senders = line([0, 100, 200, 300, 400], sizes=900_000, knots=((0, 0), (200 * MS, 200_000), (900 * MS, 200_000)))
-    senders.run(recorder(seen))
+    senders.run(policy)
     short, medium, long = np.array(seen).T[2:]
     np.testing.assert_allclose(short, [0, 1e6, 1e6, 5e5, 2.5e5])
     np.testing.assert_allclose(medium, [0, 1e6, 1e6, 2e6 / 3, 5e5])
@@ -46,9 +41,9 @@ def test_the_links_rate_follows_a_change():
 @given(cases())
 def test_the_links_rate_as_the_twin_measures_it(case):
     case = replace(case, decide_at="arrival", episode=replace(case.episode, first_decision=0, last_decision=2**31))
+    policy, seen = watched(drained)
     case = replace(case, max_bytes=None)
-    seen = []
-    case.run(recorder(seen), V)
+    case.run(policy, V)
     measured = case.run_twin(naive.policy("drop-newest", V)).measured
     twin = [(m["drained"], m["drained_us"], *(1e6 * m[n] for n in ("short", "medium", "long"))) for m in measured]
     assert seen == twin

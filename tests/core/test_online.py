@@ -49,6 +49,7 @@ def test_laws_by_hand():
     ln = math.log
     assert law(Interruption("fixed", t_max=3)).tolist() == [0, 0, 0, 1]
     assert law(Interruption("uniform", t_min=2, t_max=5)).tolist() == [0, 0, 0.25, 0.25, 0.25, 0.25]
+    assert law(Interruption("uniform", t_min=1, t_max=4, lengths=(1, 2))).tolist() == [0, 0.5, 0.5, 0, 0]
     # Weights ln((T + 1) / T) over T = 1, 2, 3 add up to ln 4.
     assert law(Interruption("log-uniform", t_max=3)) == pytest.approx(
         [0, ln(2) / ln(4), ln(1.5) / ln(4), ln(4 / 3) / ln(4)]

@@ -12,12 +12,9 @@ from hypothesis import strategies as st
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.oracle import by_length, ideal, integer, law
+from bufgym.oracle import by_length, ideal, integer
 from bufgym.scenario import Interruption, Streams, registry
 from bufgym.sim import run
-
-# The number of examples is set where one of them is hundreds of runs.
-
 
 kernels = pytest.mark.kernels
 
@@ -32,12 +29,6 @@ def test_by_hand():
     # With room for all, nothing is lost: T + 1 gaps of 1.
     assert integer(5, 3, v) == ideal(5, 3, v) == 4 * 0.5
     assert integer(1, 0, v) == 0.5
-
-
-@kernels
-def test_the_law_of_t_by_hand():
-    assert law(Interruption(law="uniform", t_min=1, t_max=4)).tolist() == [0, 0.25, 0.25, 0.25, 0.25]
-    assert law(Interruption(law="uniform", t_min=1, t_max=4, lengths=(1, 2))).tolist() == [0, 0.5, 0.5, 0, 0]
 
 
 @kernels

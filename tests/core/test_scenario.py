@@ -4,14 +4,13 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
-from cases import log, trace
+from cases import log, trace, watched
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bufgym import policies, scenario
+from bufgym import scenario
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import FOREVER
-from bufgym.policies import Policy
 from bufgym.scenario import LAWS, SCENARIOS, FleetScenario, Interruption, Streams, Uplink, messages
 from bufgym.scenario.arrivals import check_messages
 from bufgym.scenario.draws import place
@@ -38,13 +37,8 @@ def test_lengths_keep_their_bounds(law, t_min, more, mean, seed):
 def test_an_interruption_is_one(T):
     # Message 0 is on the link when it stops, 1..T meet the policy, then all that is kept is sent, and T + 1 after it.
     made = Interruption(t_max=40, rate_hz=30)
-    asked = []
-
-    def note(buffer, arrival, memory):
-        asked.append((int(arrival.seq), buffer.busy, buffer.left_bytes))
-        return policies.ACCEPT
-
-    senders = run(policies.Policy("note", note), [made.episode(T)], 50, made.value)
+    policy, asked = watched(lambda buffer, arrival: (int(arrival.seq), buffer.busy, buffer.left_bytes))
+    senders = run(policy, [made.episode(T)], 50, made.value)
     assert asked == [(k, 1, 230_000) for k in range(1, T + 1)]
     transmitted_us = log(senders)["transmitted_us"]
     assert len(transmitted_us) == T + 2
@@ -55,15 +49,8 @@ def test_an_interruption_is_one(T):
 
 @given(st.floats(0, 1), st.floats(1, 200), st.floats(0, 3), st.booleans(), st.integers(0, 2**32))
 def test_uplink_draws_are_well_formed(jitter, rate_hz, size_cv, random_offset, seed):
-    drawn = Uplink(
-        traces=(STEADY, FADING),
-        motion=(WALK,),
-        rate_hz=rate_hz,
-        jitter=jitter,
-        size_cv=size_cv,
-        duration_s=3,
-        random_offset=random_offset,
-    )
+    varied = {"rate_hz": rate_hz, "jitter": jitter, "size_cv": size_cv, "random_offset": random_offset}
+    drawn = Uplink((STEADY, FADING), (WALK,), duration_s=3, **varied)
     episode = drawn.draw(Streams.seeded(seed))
     arrivals = episode.arrivals
     n = len(arrivals)
@@ -165,25 +152,20 @@ def test_other_rates_jitters_and_sizes_meet_the_same_motion_and_link(changes, mo
         (lambda: uplink(duration_s=1e9, rate_hz=1e-6), "duration_s = 1000000000.0: must be at most 10000000"),
         (lambda: uplink(rate_hz=1e-300), "rate_hz = 1e-300: must be at most 100000, and at least 1e-07"),
         (lambda: uplink(propagation_us=-5), "propagation_us = -5: must be a whole number from 0 to 10000000000000"),
-        (lambda: check_messages(messages(np.array([]), 5)), "at least one message"),
-        (
-            lambda: check_messages(messages(np.array([0, 2, 1]), 5)),
-            "message 2: arrival_us = 1: times must be >= 0, must not decrease",
-        ),
-        (
-            lambda: check_messages(messages(np.array([0, 1]), np.array([5, 0]))),
-            "message 1: size_bytes = 0: must be at least 1 byte",
-        ),
-        (
-            lambda: check_messages(messages(np.arange(2), 5, np.array([1.0, 0.5]))),
-            "message 1: x = 0.5: must be a finite number",
-        ),
+        (lambda: checked([], 5), "at least one message"),
+        (lambda: checked([0, 2, 1], 5), "message 2: arrival_us = 1: times must be >= 0, must not decrease"),
+        (lambda: checked([0, 1], [5, 0]), "message 1: size_bytes = 0: must be at least 1 byte"),
+        (lambda: checked([0, 1], 5, np.array([1.0, 0.5])), "message 1: x = 0.5: must be a finite number"),
         (lambda: Streams.seeded(-1), "seed = -1"),
     ],
 )
 def test_what_is_refused(build, rule):
     with pytest.raises(BufgymError, match=rule):
         build()
+
+
+def checked(arrival_us, size_bytes, x=None):
+    return check_messages(messages(np.array(arrival_us), np.array(size_bytes), x))
 
 
 def uplink(**parameters):
@@ -198,14 +180,9 @@ def test_the_sender_is_told_how_long_the_stream_lasts_if_the_scenario_says_so(wo
     assert np.array_equal(drawn.arrivals, not_told.arrivals)
     if workload is None:
         assert FleetScenario(2, told).draw(Streams.seeded(1)).episode(1).ends_us == 2_500_000
-    seen = []
-
-    def on_arrival(buffer, arrival, memory):
-        seen.append(buffer.remaining_us)
-        return policies.REJECT
-
+    policy, seen = watched(lambda buffer, arrival: buffer.remaining_us)
     for episode in (drawn, not_told):
-        run(Policy("watches", on_arrival), [episode], 3, told.value)
+        run(policy, [episode], 3, told.value)
     n = len(drawn.arrivals)
     assert seen[:n] == (drawn.ends_us - drawn.arrivals["arrival_us"]).tolist()
     assert set(seen[n:]) == {FOREVER}

@@ -43,10 +43,6 @@ def dropped(senders):
     return [seq for _, seq in sorted((us, seq) for seq, us in log(senders)["dropped_us"].items())]
 
 
-def count(senders, what):
-    return int(np.asarray(senders.batch.senders)[0][what])
-
-
 def dequeued_ms(senders):
     return {seq: us / MS for seq, us in log(senders)["dequeued_us"].items()}
 
@@ -101,6 +97,8 @@ def test_the_common_drop_rule(name):
 
 
 ROBOFLEET = "0 A, 10 B, 20 A, 30 B, 40 N, 50 N"
+EACH_40_MS = "0 A, 40 A, 80 A, 120 A, 160 A, 200 A, 220 A"
+WOKEN_BY_B = "0 A, 40 A, 80 A, 105 B, 120 A, 160 A, 205 A"
 LIMITED = topics({"rate_limit_hz": 10.0})
 OPEN = {"blocked_ms": 0}
 PONGS = {**OPEN, "window": 2, "ack_ms": 50}
@@ -121,24 +119,10 @@ PONGS = {**OPEN, "window": 2, "ack_ms": 50}
         ("robofleet-released", "0 A, 1 N, 2 N, 3 N", topics(), PONGS, [], {0: 0, 1: 1, 2: 51, 3: 51}),
         # 10 Hz. At arrival: 40 and 80 come too soon after 0; then 160 and 200 after 120. Exactly 100 ms later is not
         # too soon: 220 is.
-        (
-            "robofleet",
-            "0 A, 40 A, 80 A, 120 A, 160 A, 200 A, 220 A",
-            LIMITED,
-            OPEN,
-            [1, 2, 4, 5],
-            {0: 0, 3: 120, 6: 220},
-        ),
+        ("robofleet", EACH_40_MS, LIMITED, OPEN, [1, 2, 4, 5], {0: 0, 3: 120, 6: 220}),
         # At the socket the latest waits for its time: 2 has overwritten 1, and at 105 something wakes the scheduler: 2
         # goes, whose priority x wait is 105 against 2 x 105. 3 came at 120, sooner than 205: it is overwritten.
-        (
-            "robofleet-released",
-            "0 A, 40 A, 80 A, 105 B, 120 A, 160 A, 205 A",
-            LIMITED,
-            OPEN,
-            [1, 4, 5],
-            {0: 0, 2: 105, 3: 106, 6: 205},
-        ),
+        ("robofleet-released", WOKEN_BY_B, LIMITED, OPEN, [1, 4, 5], {0: 0, 2: 105, 3: 106, 6: 205}),
         # A publisher's queue of 2: 1 goes for 4. At 101 ms A was sent from at 0, and C never, which counts as 0 too: A,
         # the first topic; then C, then A again.
         ("ros-native", "0 A, 1 A, 2 A, 3 C, 4 A", topics({"limit": 2}), {}, [1], {0: 0, 2: 101, 3: 102, 4: 103}),

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import log, order, same, trace
+from cases import log, order, same, trace, watched
 
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
@@ -49,13 +49,8 @@ def test_a_departure_makes_room_for_the_arrival_at_its_instant(third_us, dropped
 
 @kernels
 def test_what_the_policy_sees():
-    views = []
-
-    def note(buffer, arrival, memory):
-        views.append(buffer._replace(slots=buffer.slots["seq"].tolist()))
-        return ACCEPT
-
-    line([0, 0, 4, 4], sizes=[8_000, 500, 700, 1], capacity=3).run(Policy("note", note))
+    policy, views = watched(lambda buffer, arrival: buffer._replace(slots=buffer.slots["seq"].tolist()))
+    line([0, 0, 4, 4], sizes=[8_000, 500, 700, 1], capacity=3).run(policy)
     last = views[3]
     assert last.slots == [1, 2]
     assert (last.capacity, last.backlog_bytes, last.dequeued, last.dequeued_x, last.busy) == (3, 1_200, 1, 0.0, 1)
@@ -70,13 +65,8 @@ def test_running_means_by_hand():
     # Arrivals at 0, 8, 10 and 10 ms. The first gap, 8 ms, is the period; then 8 + (2 - 8) / 8, 7.25 + (0 - 7.25) / 8.
     # Message 0 is dequeued before 1, then 1 before 2, and none before 3; each weighs a sixteenth in the service ratio.
     # An eighth of the way to each newcomer's bytes: 1000, + 7000 / 8, - 1874 / 8, - 1639.75 / 8.
-    views = []
-
-    def note(buffer, arrival, memory):
-        views.append((buffer.period_us / MS, buffer.service_ratio, buffer.arrival_bytes))
-        return ACCEPT
-
-    line([0, 8, 10, 10], sizes=[1_000, 8_000, 1, 1], capacity=3).run(Policy("note", note))
+    policy, views = watched(lambda buffer, _: (buffer.period_us / MS, buffer.service_ratio, buffer.arrival_bytes))
+    line([0, 8, 10, 10], sizes=[1_000, 8_000, 1, 1], capacity=3).run(policy)
     ratio = 1 / 16 + (1 - 1 / 16) / 16
     assert [view[:2] for view in views] == [(0, 0), (8, 1 / 16), (7.25, ratio), (7.25 * 7 / 8, ratio * 15 / 16)]
     assert [view[2] for view in views] == [1_000, 1_875, 1_640.75, 1_435.78125]
@@ -197,15 +187,13 @@ def played(name, sizes, limit, **more):
 
 @kernels
 def test_asks_again_about_the_same_arrival():
-    asked = []
-
     def on_arrival(buffer, arrival, memory):
-        asked.append((int(arrival.seq), buffer.slots.seq.tolist(), buffer.evictions))
         if buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes:
             return ACCEPT
         return REJECT if arrival.seq == 5 and buffer.evictions == 1 else 0
 
-    senders = played(Policy("test-asked", on_arrival), [100, 1_000, 1_000, 500, 2_000, 2_400, 2_501], 2_500)
+    policy, asked = watched(lambda b, arrival: (int(arrival.seq), b.slots.seq.tolist(), b.evictions), on_arrival)
+    senders = played(policy, [100, 1_000, 1_000, 500, 2_000, 2_400, 2_501], 2_500)
     assert asked == [
         (0, [], 0),
         (1, [], 0),

@@ -36,12 +36,8 @@ def frames_at_30_hz(*frames, sent=0, now=8, per_frame=1.0, **known):
     for name, scale in (("arrival_us", 33_333), ("x", per_frame), ("seq", 1)):
         buffer.slots[name] = scale * np.array(frames)
     arrival = newcomer()
-    arrival["arrival_us"], arrival["x"], arrival["seq"], arrival["size_bytes"] = (
-        33_333 * now,
-        per_frame * now,
-        now,
-        1000,
-    )
+    arrival["arrival_us"], arrival["x"] = 33_333 * now, per_frame * now
+    arrival["seq"], arrival["size_bytes"] = now, 1000
     seen = {"busy": 1, "left_bytes": 1000, "backlog_bytes": 1000 * len(frames), "period_us": 33_333.0}
     seen |= {"dequeued_arrival_us": 33_333 * sent, "dequeued_x": per_frame * sent, "dequeued_seq": sent}
     seen |= {"previous_us": 33_333 * (now - 1), "previous_x": per_frame * (now - 1)}

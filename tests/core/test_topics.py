@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cases import log, order, trace
+from cases import log, order, trace, watched
 
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
@@ -76,14 +76,10 @@ def test_a_pong_comes_before_an_arrival_at_its_instant(third_ms, dropped):
 
 def test_10_hz_of_a_30_hz_stream_is_every_third():
     camera = (Topic("camera", rate_limit_hz=10),)
-    asked = []
-
-    def note(buffer, arrival, memory):
-        asked.append(int(arrival.seq))
-        return ACCEPT
-
+    policy, asked = watched(lambda buffer, arrival: int(arrival.seq))
     # 0, 33.333, 66.667, 100, ... ms: those kept are exactly 1 / rate apart. Of the others nobody is asked.
-    senders = after_run(episode([round(k * 1e6 / 30) / MS for k in range(10)]), camera, on_arrival=note)
+    played = episode([round(k * 1e6 / 30) / MS for k in range(10)])
+    senders = after_run(played, camera, on_arrival=policy.on_arrival)
     assert order(senders) == asked == [0, 3, 6, 9]
     assert log(senders)["dropped_us"].keys() == {1, 2, 4, 5, 7, 8}
     assert np.asarray(senders.batch.log[0])["limited"].tolist() == [0, 1, 1] * 3 + [0]
@@ -126,13 +122,8 @@ def test_age_of_information_and_lateness():
 def test_a_rate_limit_comes_before_no_drop():
     # 10 Hz: 1 comes too soon and is dropped, though there is room and its topic is no_drop; nobody is asked.
     command = (Topic("command", no_drop=True, rate_limit_hz=10), Topic("camera"))
-    asked = []
-
-    def note(buffer, arrival, memory):
-        asked.append(int(arrival.seq))
-        return ACCEPT
-
-    senders = after_run(episode([0, 50, 100]), command, on_arrival=note)
+    policy, asked = watched(lambda buffer, arrival: int(arrival.seq))
+    senders = after_run(episode([0, 50, 100]), command, on_arrival=policy.on_arrival)
     assert order(senders) == asked == [0, 2]
     log_row, sender = np.asarray(senders.batch.log[0]), senders.batch.senders[0]
     assert log_row["limited"].tolist() == [0, 1, 0] and (sender["rejected"], sender["invalid"]) == (1, 0)

@@ -44,9 +44,8 @@ def test_agrees_with_twin_event_by_event(case):
             agree_on_gaps(senders, twin)
         if event == "send":
             can = [twin.sendable(m) for m in twin.slots()]
-            assert [decisions.can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can] + [False] * (
-                L + 1 - len(can)
-            )
+            beyond = [False] * (L + 1 - len(can))
+            assert [decisions.can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can, *beyond]
             assert decisions.can_hold(batch, 0) == twin.may_hold()
 
     senders, twin = case.beside_its_twin(check)
@@ -81,19 +80,11 @@ def agree(senders, twin, until=None, to_the_end=False):
     assert sender["aged"] == pytest.approx(twin.aged(until, to_the_end), rel=1e-9, abs=1e-12)
     assert sender["late"] == pytest.approx(twin.late(until))
     for k, row in enumerate(np.asarray(batch.topics[0])[: len(twin.rules)]):
-        assert (row["queued"], row["arrived"], row["dequeued"], row["received"]) == (
-            len(twin.queues[k]),
-            len(twin.arrived[k]),
-            len(twin.sent[k]),
-            len(twin.received(k, until)),
-        )
-        if twin.sent[k]:
-            last = twin.sent[k][-1]
-            assert (row["dequeued_arrival_us"], row["dequeued_x"], row["last_dequeue_us"]) == (
-                last["us"],
-                last["x"],
-                twin.dequeued[last["seq"]],
-            )
+        counted = twin.queues[k], twin.arrived[k], twin.sent[k], twin.received(k, until)
+        assert [row[what] for what in ("queued", "arrived", "dequeued", "received")] == list(map(len, counted))
+        for last in twin.sent[k][-1:]:
+            sent = row["dequeued_arrival_us"], row["dequeued_x"], row["last_dequeue_us"]
+            assert sent == (last["us"], last["x"], twin.dequeued[last["seq"]])
 
 
 def agree_on_gaps(senders, twin):

@@ -9,7 +9,7 @@ from typing import Any
 import naive
 import naive_sender
 import numpy as np
-from cases import Case, cases
+from cases import Case, cases, twin_messages
 from hypothesis import strategies as st
 
 from bufgym import policies
@@ -65,10 +65,8 @@ class TopicCase:
     def senders(self) -> Senders:
         """With the episode loaded and the policy's flags set, as ``Senders.run`` does."""
         case = self.case
-        limits = {"max_bytes": case.max_bytes, "decide_at": case.decide_at}
-        senders = Senders(
-            1, case.capacity, self.v, max_messages=len(case.episode.arrivals), topics=self.topics, **limits
-        )
+        rules = {"max_bytes": case.max_bytes, "decide_at": case.decide_at, "topics": self.topics}
+        senders = Senders(1, case.capacity, self.v, max_messages=len(case.episode.arrivals), **rules)
         senders.load(0, case.episode)
         rows = senders.batch.senders
         rows["ask_at_send"], rows["ask_at_dequeue"] = self.schedules, self.drops_heads
@@ -83,31 +81,19 @@ class TopicCase:
 
     def policy(self, *, compile: bool) -> policies.Policy:
         """One that answers as ``decide_anything``, ``send_anything`` and ``drop_some`` do."""
-        hooks: dict[str, Any] = {}
-        if self.schedules:
-            hooks["on_send"] = send_anything
-        if self.drops_heads:
-            hooks["on_dequeue"] = drop_some
+        hooks: dict[str, Any] = {"on_send": send_anything} if self.schedules else {}
+        hooks |= {"on_dequeue": drop_some} if self.drops_heads else {}
         return policies.Policy("test-anything", decide_anything, client=self.client, compile=compile, **hooks)
 
     def twin(self) -> naive_sender.Sender:
         case, episode = self.case, self.case.episode
-        rules: Any = naive_sender.Rules(TWIN_V[self.v])
-        if self.topics:
-            rules = [twin_rules(topic, self.v) for topic in self.topics]
-        return naive_sender.Sender(
-            naive.Link(case.knots, episode.link.trace.after, episode.link.offset_us),
-            rules,
-            case.capacity,
-            max_bytes=case.max_bytes,
-            decide_at=case.decide_at,
-            window=episode.window,
-            ack_delay_us=episode.ack_delay_us,
-            propagation_us=episode.link.propagation_us,
-            schedules=self.schedules,
-            drops_heads=self.drops_heads,
-            **{rule: getattr(self.client, rule) for rule in CLIENT_RULES},
-        )
+        rules: Any = [twin_rules(topic, self.v) for topic in self.topics] or naive_sender.Rules(TWIN_V[self.v])
+        link = naive.Link(case.knots, episode.link.trace.after, episode.link.offset_us)
+        settings = {rule: getattr(self.client, rule) for rule in CLIENT_RULES}
+        settings |= {"window": episode.window, "ack_delay_us": episode.ack_delay_us}
+        settings |= {"propagation_us": episode.link.propagation_us, "decide_at": case.decide_at}
+        settings |= {"schedules": self.schedules, "drops_heads": self.drops_heads, "max_bytes": case.max_bytes}
+        return naive_sender.Sender(link, rules, case.capacity, **settings)
 
     def beside_its_twin(self, check: Callable[[str, Senders, Any], None]) -> tuple[Senders, Any]:
         """Product and twin after the same answers to the same events; ``check(event, senders, twin)`` sees each."""
@@ -193,20 +179,11 @@ def topic_cases(draw: st.DrawFn, min_topics: int = 0, max_messages: int = 60) ->
     if n > 0:
         arrivals["topic"] = np.random.default_rng(draw(st.integers(0, 2**32))).integers(0, n, len(arrivals))
     window, ack_delay_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 1, 700, 20_000]))
-    case = replace(
-        case,
-        episode=replace(case.episode, arrivals=arrivals, window=window, ack_delay_us=ack_delay_us),
-        twin_messages=[
-            {**m, "topic": int(k)} for m, k in zip(case.twin_messages, np.asarray(arrivals)["topic"], strict=True)
-        ],
-    )
+    episode = replace(case.episode, arrivals=arrivals, window=window, ack_delay_us=ack_delay_us)
+    case = replace(case, episode=episode, twin_messages=twin_messages(arrivals))
     topics = tuple(draw(topic_rules(f"topic {k}")) for k in range(n))
     client = ClientSettings(**{rule: draw(st.booleans()) for rule in CLIENT_RULES})
-    return TopicCase(
-        case,
-        topics,
-        draw(V),
-        draw(st.sampled_from([True, True, False])),
-        draw(st.sampled_from([False, False, True])),
-        client,
+    v, schedules, drops_heads = (
+        draw(each) for each in (V, st.sampled_from([True, True, False]), st.sampled_from([False, False, True]))
     )
+    return TopicCase(case, topics, v, schedules, drops_heads, client)

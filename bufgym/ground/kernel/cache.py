@@ -77,7 +77,7 @@ class Code:
         target.refresh()
         try:
             kept = pickle.loads(self._file(signature, target.codegen()).read_bytes())
-            return _rebuilt(target, *kept)
+            return _rebuilt(target, kept)
         except Exception:  # a file that is missing, or cut short, which ends in many kinds of error
             if _ONLY_KEPT.get():
                 raise NotKeptError from None
@@ -105,19 +105,9 @@ class Code:
         return Path(FOLDER, f"{self._name}-{hashlib.sha256(depends_on.encode()).hexdigest()[:20]}.nbc")
 
 
-def _rebuilt(
-    target: Any,
-    library: Any,
-    description: Any,
-    environment: Any,
-    signature: Any,
-    objectmode: bool,
-    lifted: Any,
-    annotation: str,
-    reload: Any,
-    environments: Any,
-) -> Any:
-    """Rebuild a compile result from the output of ``CompileResult._reduce``."""
+def _rebuilt(target: Any, kept: tuple[Any, ...]) -> Any:
+    """Rebuild a compile result from ``kept``, the output of ``CompileResult._reduce``."""
+    library, description, environment, signature, objectmode, lifted, annotation, reload, environments = kept
     for function in reload:
         function()
     code = PartLibrary.read(target, library) if library[1] == PART else target.codegen().unserialize_library(library)

@@ -8,10 +8,7 @@ from pathlib import Path
 
 from bufgym.model import qoi
 from bufgym.scenario.suites.suite import Setting, Suite
-from bufgym.scenario.suites.synthetic import EPISODE_S, FIRST_SEED, RATE_HZ, SIZE_BYTES, motions_of
-from bufgym.scenario.uplink import Uplink
-from bufgym.traces import synthetic_lte
-from bufgym.traces.generate.lte import LTE_MODES
+from bufgym.scenario.suites.synthetic import FIRST_SEED, SIZE_BYTES, camera, lte_links, motions_of
 
 LAWS = ("jpeg", "gop", "depth-colour", "motion", "equal")
 MEANS = {"heavy": (0.4e6, 0.5e6, 0.6e6), "light": (0.9e6, 1.2e6, 1.6e6, 2e6)}
@@ -22,26 +19,12 @@ PLACES, MANY = 8, 31
 """Mean messages that the byte limit has room for, and L there."""
 
 
-def _cameras(split: str, data: Path | None) -> dict[str, Setting]:
-    settings, modes, first = {}, list(LTE_MODES), FIRST_SEED[split]
-    for load, means in MEANS.items():
-        seeds = (
-            range(first, first + LINKS[split]) if load == "heavy" else range(first + 500, first + 500 + LINKS[split])
-        )
-        traces = tuple(
-            synthetic_lte(seed, mean_bytes_per_s=means[k % len(means)], mode=modes[k % 3])
-            for k, seed in enumerate(seeds)
-        )
+def _cameras(split: str, data: Path) -> dict[str, Setting]:
+    settings = {}
+    for k, (load, means) in enumerate(MEANS.items()):
+        traces = lte_links(FIRST_SEED[split] + 500 * k, LINKS[split], means)
         for law in LAWS:
-            scenario = Uplink(
-                traces=traces,
-                motion=motions_of(split, 8),
-                rate_hz=RATE_HZ,
-                size_bytes=SIZE_BYTES,
-                sizes=law,
-                duration_s=EPISODE_S,
-                value=qoi.exponential(0.05),
-            )
+            scenario = camera(traces=traces, motion=motions_of(split, 8), sizes=law, value=qoi.exponential(0.05))
             about = f"sizes of the law {law}, mean 230 kB, 30 Hz; {load} load; x is the camera's motion"
             settings[f"{law}-{load}"] = Setting(scenario, about)
             room = f"{about}; room for {PLACES} mean messages' bytes"

@@ -39,8 +39,7 @@ def _there(path: Path) -> Path:
     return path
 
 
-def _belgium(split: str, data: Path | None) -> dict[str, Setting]:
-    assert data is not None
+def _belgium(split: str, data: Path) -> dict[str, Setting]:
     traces = [read_trace(_there(data / f"belgium_4g/csv/report_{name}.csv")) for name in _BELGIUM[split].split()]
     return both_sizes(traces, _tum(split, data))
 
@@ -51,8 +50,7 @@ _MOST_TRACES = 12  # most recordings in a split; a larger folder gives evenly sp
 def _every_fifth(pattern: str, size_bytes: int) -> Build:
     """All files of a pattern, by name: of every five, three are for training, one validates and one tests."""
 
-    def build(split: str, data: Path | None) -> dict[str, Setting]:
-        assert data is not None
+    def build(split: str, data: Path) -> dict[str, Setting]:
         names = sorted(path for path in data.glob(pattern) if not path.name.startswith(("README", "LICENSE", "copy")))
         rests = {"train": (0, 1, 2), "validation": (3,), "test": (4,)}[split]
         chosen = [path for k, path in enumerate(names) if k % 5 in rests]
@@ -67,8 +65,7 @@ def _every_fifth(pattern: str, size_bytes: int) -> Build:
 def _by_name(pattern: str, belongs: Callable[[str, str], bool]) -> Build:
     """The files of a pattern that belong to (name, split), at most as many as other suites have traces."""
 
-    def build(split: str, data: Path | None) -> dict[str, Setting]:
-        assert data is not None
+    def build(split: str, data: Path) -> dict[str, Setting]:
         paths = sorted(path for path in data.glob(pattern) if belongs(path.name, split))
         if not paths:
             raise BufgymError(f"{data / pattern}: holds no recording of the split {split}; this suite needs some")
@@ -97,8 +94,7 @@ _MMWAVE = {
 """Files of runs, by split: no two share a place. Runs of 15 s (static) and 50 s (walking) begin again at their end."""
 
 
-def _uplink_mmwave(split: str, data: Path | None) -> dict[str, Setting]:
-    assert data is not None
+def _uplink_mmwave(split: str, data: Path) -> dict[str, Setting]:
     traces = []
     for name in _MMWAVE[split]:
         path = _there(data / f"uplink_mmwave/{name}.list.gz")
@@ -125,26 +121,20 @@ SUITES = tuple(
         ("uplink-5g-v1", "over 5G uplinks of a drive, split by day", _uplink_5g, "uplink_5g/*.out.gz"),
         ("uplink-wifi-v1", "over WiFi uplinks in a shipyard, split by place", _uplink_wifi, "uplink_wifi/*.json.gz"),
         ("uplink-mmwave-v1", "over 5G mmWave uplinks, split by place", _uplink_mmwave, "uplink_mmwave/*.list.gz"),
-        ("lumos5g-v1", "over Lumos5G's 4G traces", _every_fifth("lumos5g/4G/*", SIZE_BYTES), "lumos5g/4G/*"),
-        (
-            "norway-hsdpa-v1",
-            "of 8 kB frames over the Norway HSDPA logs",
-            _every_fifth("norway_hsdpa/cooked/*", 8_000),
-            "norway_hsdpa/cooked/*",
-        ),
-        (
-            "mahimahi-v1",
-            "of 30 kB frames over Mahimahi's cellular traces",
-            _every_fifth("mahimahi/*.gz", 30_000),
-            "mahimahi/*.gz",
+        *(
+            (name, over, _every_fifth(pattern, size_bytes), pattern)
+            for name, over, pattern, size_bytes in (
+                ("lumos5g-v1", "over Lumos5G's 4G traces", "lumos5g/4G/*", SIZE_BYTES),
+                ("norway-hsdpa-v1", "of 8 kB frames over the Norway HSDPA logs", "norway_hsdpa/cooked/*", 8_000),
+                ("mahimahi-v1", "of 30 kB frames over Mahimahi's cellular traces", "mahimahi/*.gz", 30_000),
+            )
         ),
     )
 )
 
 
-def _afr(split: str, data: Path | None) -> dict[str, Setting]:
+def _afr(split: str, data: Path) -> dict[str, Setting]:
     """To learn from there are made-up links of cars; the paper's own is the test."""
-    assert data is not None
     seeds = {"train": range(6), "validation": range(6, 9)}
     links = [read_trace(_there(data / LINK))] if split == "test" else [markov_link("car", seed=k) for k in seeds[split]]
     return {"evaluation": Setting(evaluation(*links), "794 frames of 160 kB at 30 Hz, from the link's start")}

@@ -9,9 +9,8 @@ from bufgym.scenario.client import Client, robofleet_example
 from bufgym.scenario.fleet import FleetScenario
 from bufgym.scenario.suites import synthetic
 from bufgym.scenario.suites.suite import Setting, Suite
-from bufgym.scenario.suites.synthetic import EPISODE_S, FIRST_SEED, TRACES, motions_of
-from bufgym.traces import Trace, synthetic_lte
-from bufgym.traces.generate.lte import LTE_MODES
+from bufgym.scenario.suites.synthetic import EPISODE_S, FIRST_SEED, TRACES, lte_links, motions_of
+from bufgym.traces import Trace
 
 _DROPOUT_S = (3.0, 20.0)
 _BETWEEN_DROPOUTS_S = 45.0
@@ -38,16 +37,12 @@ CLIENT_WINDOWS = {"": 1, "-window-5": 5}
 """n_T in Robofleet's experiments, where an ack may take longer than a message, and in its released client."""
 
 
-def _topics(split: str, data: Path | None) -> dict[str, Setting]:
+def _topics(split: str, data: Path) -> dict[str, Setting]:
     """Robofleet's example client over LTE links with dropouts, at three mean capacities and two n_T."""
-    first, modes = FIRST_SEED[split], list(LTE_MODES)
     settings = {}
     for number, (label, mean) in enumerate(CLIENT_MEANS.items()):
-        seeds = [first + 100 * number + k for k in range(TRACES[split] // 2)]
-        links = [
-            _with_dropouts(synthetic_lte(seed, mean_bytes_per_s=mean, mode=modes[k % 3]), seed)
-            for k, seed in enumerate(seeds)
-        ]
+        first = FIRST_SEED[split] + 100 * number
+        links = [_with_dropouts(t, first + k) for k, t in enumerate(lte_links(first, TRACES[split] // 2, (mean,)))]
         client = Client(robofleet_example(), tuple(links), motions_of(split), duration_s=EPISODE_S)
         for suffix, window in CLIENT_WINDOWS.items():
             about = f"Robofleet's example client over LTE with dropouts, {mean / 1e6:g} MB/s, n_T = {window}"
@@ -55,7 +50,7 @@ def _topics(split: str, data: Path | None) -> dict[str, Setting]:
     return settings
 
 
-def _fleet(split: str, data: Path | None) -> dict[str, Setting]:
+def _fleet(split: str, data: Path) -> dict[str, Setting]:
     """The motion setting of lte-v1 for 16 robots: the cell has 16 times that capacity."""
     alone = synthetic.LTE.settings(split)["motion"]
     about = f"{alone.about}, of each robot"
@@ -63,13 +58,7 @@ def _fleet(split: str, data: Path | None) -> dict[str, Setting]:
 
 
 SUITES = (
-    Suite(
-        "topics-v1",
-        "Robofleet's example client, 8 topics, over LTE with dropouts",
-        _topics,
-        capacities=(32,),
-        kind="topics",
-    ),
+    Suite("topics-v1", "Robofleet's example client, 8 topics, over LTE with dropouts", _topics, (32,), kind="topics"),
     Suite(
         "fleet-v1",
         "16 robots share a cell; 30 Hz camera over synthetic LTE links, x is each camera's motion",

@@ -99,7 +99,7 @@ def _blackouts(split: str) -> tuple[Trace, ...]:
     return tuple(traces)
 
 
-def _stress(split: str, data: Path | None) -> dict[str, Setting]:
+def _stress(split: str, data: Path) -> dict[str, Setting]:
     settings = _valued(split)
     for percent in (10, 30, 50, 70, 90):
         links = steady_links(split, f"{percent}%", percent / 100, _TRACES)
@@ -128,11 +128,6 @@ def _stress(split: str, data: Path | None) -> dict[str, Setting]:
 
 SUITES = (
     Suite(
-        "stress-v1",
-        "conditions that nobody trained on, by the worst cell",
-        _stress,
-        capacities=CAPACITIES,
-        seeds=2,
-        kind="stress",
+        "stress-v1", "conditions that nobody trained on, by the worst cell", _stress, CAPACITIES, seeds=2, kind="stress"
     ),
 )

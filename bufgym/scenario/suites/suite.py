@@ -30,8 +30,8 @@ class Setting:
     """L of this scenario, messages; empty for the suite's."""
 
 
-Build = Callable[[str, Path | None], dict[str, Setting]]
-"""(split, folder of recordings or None) -> settings by label."""
+Build = Callable[[str, Path], dict[str, Setting]]
+"""(split, folder of recordings, which only a suite that ``needs`` one looks at) -> settings by label."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class Suite:
             raise BufgymError(f"split = {split!r}: must be one of {', '.join(SPLITS)}")
         if self.needs and data is None:
             raise BufgymError(f"suite {self.name} needs a folder of recordings (--data DIR) with {self.needs}")
-        return _built(self.build, split, None if data is None else Path(data))
+        return _built(self.build, split, Path(data or ""))
 
 
 @functools.lru_cache(maxsize=16)
-def _built(build: Build, split: str, data: Path | None) -> dict[str, Setting]:
+def _built(build: Build, split: str, data: Path) -> dict[str, Setting]:
     return build(split, data)

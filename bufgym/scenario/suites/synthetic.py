@@ -22,6 +22,8 @@ SIZE_BYTES = 230_000
 """AFR's RGB-D frames: about 200 kB of depth and a JPEG."""
 DEMAND_BYTES_PER_S = RATE_HZ * SIZE_BYTES
 EPISODE_S = 60.0
+camera = functools.partial(Uplink, rate_hz=RATE_HZ, size_bytes=SIZE_BYTES, duration_s=EPISODE_S)
+"""An ``Uplink`` with this stream."""
 
 
 # Checking a Value takes compiled code, which is slow to load: it is made at its first use, not for `bufgym list`.
@@ -53,20 +55,24 @@ def motions_of(split: str, count: int = 4) -> tuple[Motion, ...]:
     return tuple(drive_motion(FIRST_SEED[split] + k) for k in range(count))
 
 
+def lte_links(first: int, count: int, means: Sequence[float]) -> tuple[Trace, ...]:
+    """Synthetic LTE links with seeds from ``first`` on; they take the means (bytes/s) and the modes in turn."""
+    modes = list(LTE_MODES)
+    return tuple(
+        synthetic_lte(first + k, mean_bytes_per_s=means[k % len(means)], mode=modes[k % 3]) for k in range(count)
+    )
+
+
 def both_values(
     traces: Sequence[Trace], motions: tuple[Motion, ...], size_bytes: int = SIZE_BYTES, suffix: str = ""
 ) -> dict[str, Setting]:
     """The same links, once with time-based and once with motion-based QoI."""
     about = f"{RATE_HZ:g} messages/s of {size_bytes / 1000:g} kB for {EPISODE_S:g} s"
-    timed = Uplink(
-        traces=tuple(traces), rate_hz=RATE_HZ, size_bytes=size_bytes, duration_s=EPISODE_S, value=time_value()
-    )
+    timed = camera(traces=tuple(traces), size_bytes=size_bytes, value=time_value())
+    moving = replace(timed, motion=motions, value=motion_value())
     return {
         f"time{suffix}": Setting(timed, f"{about}; x is the frame index"),
-        f"motion{suffix}": Setting(
-            replace(timed, motion=motions, value=motion_value()),
-            f"{about}; x is the camera's motion, in fields of view",
-        ),
+        f"motion{suffix}": Setting(moving, f"{about}; x is the camera's motion, in fields of view"),
     }
 
 
@@ -75,20 +81,15 @@ def both_sizes(traces: Sequence[Trace], motions: tuple[Motion, ...]) -> dict[str
     return both_values(traces, motions, 230_000, "-230kB") | both_values(traces, motions, 900_000, "-900kB")
 
 
-def _lte(split: str, data: Path | None, count: Mapping[str, int] = TRACES) -> dict[str, Setting]:
+def _lte(split: str, data: Path, count: Mapping[str, int] = TRACES) -> dict[str, Setting]:
     """Means of 3, 5, 7 and 9 MB/s around the demand of 6.9 MB/s, in turn; modes likewise."""
-    first, modes = FIRST_SEED[split], list(LTE_MODES)
-    traces = [
-        synthetic_lte(first + k, mean_bytes_per_s=(3e6, 5e6, 7e6, 9e6)[k % 4], mode=modes[k % 3])
-        for k in range(count[split])
-    ]
-    return both_values(traces, motions_of(split))
+    return both_values(lte_links(FIRST_SEED[split], count[split], (3e6, 5e6, 7e6, 9e6)), motions_of(split))
 
 
 _MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
 
 
-def _generated(split: str, data: Path | None, count: Mapping[str, int] = TRACES) -> dict[str, Setting]:
+def _generated(split: str, data: Path, count: Mapping[str, int] = TRACES) -> dict[str, Setting]:
     """The settings of lte-belgium-v1 over generated links and motions; the ways of moving take turns."""
     traces = [markov_link(_MOVING[k % 6], FIRST_SEED[split] + k) for k in range(count[split])]
     return both_sizes(traces, motions_of(split))
@@ -98,23 +99,15 @@ OUTAGES_S = (5, 10, 20, 40, 60)
 _AROUND_S = 60  # seconds of the episode outside the blackout
 
 
-def _outage(split: str, data: Path | None) -> dict[str, Setting]:
+def _outage(split: str, data: Path) -> dict[str, Setting]:
     settings = {}
     for outage_s in OUTAGES_S:
-        traces = [_blackout(FIRST_SEED[split] + k, outage_s) for k in range(TRACES[split] // 3)]
-        settings[f"outage-{outage_s}s"] = Setting(
-            Uplink(
-                traces=tuple(traces),
-                motion=motions_of(split),
-                rate_hz=RATE_HZ,
-                size_bytes=SIZE_BYTES,
-                duration_s=float(outage_s + _AROUND_S),
-                link_offset_s=(0.0, 10.0),
-                value=motion_value(),
-            ),
-            f"one blackout of {outage_s} s within {outage_s + _AROUND_S} s; x is the camera's motion",
-            float(outage_s),
-        )
+        whole_s = outage_s + _AROUND_S
+        traces = tuple(_blackout(FIRST_SEED[split] + k, outage_s) for k in range(TRACES[split] // 3))
+        moving = camera(traces=traces, motion=motions_of(split), value=motion_value())
+        scenario = replace(moving, duration_s=float(whole_s), link_offset_s=(0.0, 10.0))
+        about = f"one blackout of {outage_s} s within {whole_s} s; x is the camera's motion"
+        settings[f"outage-{outage_s}s"] = Setting(scenario, about, float(outage_s))
     return settings
 
 
@@ -139,7 +132,7 @@ def steady_links(split: str, label: str, share: float, count: int) -> tuple[Trac
     )
 
 
-def _sustained(split: str, data: Path | None) -> dict[str, Setting]:
+def _sustained(split: str, data: Path) -> dict[str, Setting]:
     settings: dict[str, Setting] = {}
     for label, share in SHARES.items():
         links = steady_links(split, label, share, TRACES[split] // 3)
@@ -147,7 +140,7 @@ def _sustained(split: str, data: Path | None) -> dict[str, Setting]:
     return settings
 
 
-def _interruption(split: str, data: Path | None) -> dict[str, Setting]:
+def _interruption(split: str, data: Path) -> dict[str, Setting]:
     """T up to 400; lengths with T mod 5 = 3 are for validation, 4 for testing, the others for training."""
     rests = {"train": (0, 1, 2), "validation": (3,), "test": (4,)}[split]
     lengths = tuple(T for T in range(1, 401) if T % 5 in rests)
@@ -156,12 +149,9 @@ def _interruption(split: str, data: Path | None) -> dict[str, Setting]:
         "exponential-0.9": qoi.exponential(0.9),
         "saturating-8": qoi.saturating(8),
     }
+    about = f"one interruption of T messages, T log-uniform on 1..400 with T mod 5 in {rests}"
     return {
-        label: Setting(
-            Interruption(lengths=lengths, value=v),
-            f"one interruption of T messages, T log-uniform on 1..400 with T mod 5 in {rests}; V = {v.name}",
-        )
-        for label, v in values.items()
+        label: Setting(Interruption(lengths=lengths, value=v), f"{about}; V = {v.name}") for label, v in values.items()
     }
 
 
@@ -189,24 +179,16 @@ def switching_link(seed: int, top: float, stay: float) -> Trace:
     return Trace.steps([*steps, (1.0, demand)], name=f"switching-{seed}", after="hold")
 
 
-def _switching(split: str, data: Path | None) -> dict[str, Setting]:
+def _switching(split: str, data: Path) -> dict[str, Setting]:
     links = tuple(
         switching_link(FIRST_SEED[split] + k, TOPS[k % len(TOPS)], STAYS[k % len(STAYS)])
         for k in range(SWITCHING_LINKS[split])
     )
+    stream = Uplink(links, rate_hz=SWITCHING_HZ, jitter=0.0, size_bytes=SWITCHING_BYTES, random_offset=False)
+    stream = replace(stream, duration_s=SWITCHING_MESSAGES / SWITCHING_HZ)
+    about = "100 messages of 100 kB at 10 Hz over links that switch among four rates"
     return {
-        f"switching-{base:g}": Setting(
-            Uplink(
-                traces=links,
-                rate_hz=SWITCHING_HZ,
-                jitter=0.0,
-                size_bytes=SWITCHING_BYTES,
-                duration_s=SWITCHING_MESSAGES / SWITCHING_HZ,
-                random_offset=False,
-                value=qoi.exponential(base),
-            ),
-            f"100 messages of 100 kB at 10 Hz over links that switch among four rates; V = 1 - {base:g}^d",
-        )
+        f"switching-{base:g}": Setting(replace(stream, value=qoi.exponential(base)), f"{about}; V = 1 - {base:g}^d")
         for base in (0.5, 0.618, 0.8)
     }
 
@@ -226,11 +208,13 @@ SUITES = (
     Suite("sustained-v1", "steady links of a quarter, half and three quarters of the demand", _sustained),
     Suite("switching-v1", "short queues over links that switch among four rates", _switching, (2, 3, 4, 5), seeds=1),
     Suite("generated-v1", "30 Hz camera over links generated like recordings of six ways of moving", _generated),
-    Suite("lte-v2", "lte-v1 on four times as many test links", functools.partial(_lte, count=MORE_TRACES), seeds=2),
-    Suite(
-        "generated-v2",
-        "generated-v1 on four times as many test links",
-        functools.partial(_generated, count=MORE_TRACES),
-        seeds=2,
+    *(
+        Suite(
+            f"{name}-v2",
+            f"{name}-v1 on four times as many test links",
+            functools.partial(build, count=MORE_TRACES),
+            seeds=2,
+        )
+        for name, build in (("lte", _lte), ("generated", _generated))
     ),
 )
