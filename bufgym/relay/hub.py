@@ -92,7 +92,7 @@ class Hub:
         self.audit = Audit(config.folder, config.audit)
         self.quotas = Quotas(config.limits, clock)
         self.store = Store(config.folder, config.store, config.limits.sessions)
-        recorder = Recorder.of(config)
+        recorder = Recorder.of(config, self.audit)
         self.own: list[Recorder | Window] = [] if recorder is None else [recorder]
         self.members: dict[StoredSession, Member] = {}
         self.received = 0

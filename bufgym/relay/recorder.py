@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bufgym.relay import wire
+from bufgym.relay.audit import Audit
 from bufgym.relay.config import Config, Rotation
 from bufgym.relay.rules import RECORDER, Permissions
 from bufgym.robot.mcap_file import McapFile
@@ -17,22 +18,27 @@ SCHEMAS: Final = {"json": "jsonschema", "cdr": "ros2msg", "ros1": "ros1msg"}
 
 
 class Recorder:
-    """Writes each message that it may receive; after ``rotation.bytes`` it begins the next file."""
+    """Writes each message that it may receive; after ``rotation.bytes`` it begins the next file.
 
-    def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions) -> None:
+    A message that needs one channel too many (``robot.mcap_file``) is left out, which the audit log says once a file.
+    """
+
+    def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Audit) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self._rotation = rotation
         self._permissions = permissions
+        self._audit = audit
         self._file: McapFile | None = None
+        self._full = False  # whether it was said of this file
 
     @classmethod
-    def of(cls, config: Config) -> Recorder | None:
+    def of(cls, config: Config, audit: Audit) -> Recorder | None:
         """Make the recorder if the relay has a folder and a rule that lets it record."""
         permissions = Permissions(config.rules, RECORDER)
         if config.folder is None or not permissions.rules:
             return None
-        return cls(config.folder / FOLDER, config.recording, permissions)
+        return cls(config.folder / FOLDER, config.recording, permissions, audit)
 
     def __call__(self, message: wire.Message) -> None:
         """Write a message if a rule allows it."""
@@ -45,7 +51,10 @@ class Recorder:
         times_ns, encoding = (time.time_ns(), max(0, message.stamp_us) * 1000), message.encoding
         schema = message.type or ("object" if encoding == "json" else "")
         form: dict[str, Any] = {"encoding": encoding, "schema": schema, "schema_encoding": SCHEMAS.get(encoding, "")}
-        self._file.write(message.topic, bytes(message.payload), *times_ns, seq=message.seq, **form)
+        written = self._file.write(message.topic, bytes(message.payload), *times_ns, seq=message.seq, **form)
+        if not (written or self._full):
+            self._full = True
+            self._audit("recording_full", file=self._file.path.name, topic=message.topic, sender=message.sender)
 
     def _next(self) -> McapFile:
         """Begin the next file and delete the oldest."""
@@ -59,4 +68,4 @@ class Recorder:
         """Finish the file."""
         if self._file is not None:
             self._file.close()
-            self._file = None
+            self._file, self._full = None, False

@@ -192,12 +192,16 @@ class Recording(contextlib.AbstractContextManager["Recording"]):
 
     def __init__(self, path: str | Path) -> None:
         self._file = McapFile(path)
+        self.left_out = 0
+        """Messages on topics beyond the channels of a file (``robot.mcap_file``)."""
 
     def __call__(self, message: Received) -> None:
         """Write one message; an ``on_message`` of ``Receiver``."""
         times, seq = (message.received_ns, message.at_us * 1000), message.seq
         body, encoding = bytes(message.body), "application/octet-stream"
-        self._file.write(f"/topic_{message.topic}", body, *times, encoding=encoding, seq=seq)
+        if not self._file.write(f"/topic_{message.topic}", body, *times, encoding=encoding, seq=seq):
+            self.left_out += 1
+            return
         about = {**message._asdict(), "size_bytes": len(body)}
         del about["body"]
         self._file.write("/received", json.dumps(about).encode(), *times, schema="bufgym.live.Received", seq=seq)

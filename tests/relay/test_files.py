@@ -34,7 +34,8 @@ async def test_what_a_rule_allows_is_recorded(tmp_path: Path) -> None:
 
 def recorder(folder: Path, payloads: list[bytes], file_bytes: int = 10**6) -> Recorder:
     """One that has written these, of encoding json and jpeg in turn, and has not been closed."""
-    one = Recorder.of(settings(folder=folder, rules=(RECORD,), recording=Rotation(bytes=file_bytes, files=3)))
+    config = settings(folder=folder, rules=(RECORD,), recording=Rotation(bytes=file_bytes, files=3))
+    one = Recorder.of(config, Audit(None, config.audit))
     assert one is not None
     for k, payload in enumerate(payloads):
         one(Message(f"/robots/{'ab'[k % 2]}", payload, ("json", "jpeg")[k % 2], seq=k))
@@ -46,6 +47,24 @@ def test_recordings_take_turns(tmp_path: Path) -> None:
     files = sorted((tmp_path / FOLDER).glob("*.mcap"))
     assert len(files) == 3 and all(file.stat().st_size < 13_000 for file in files)
     assert sum(len(bags.read_bag(file).size_bytes) for file in files) < 50
+
+
+def test_ever_new_types_fill_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic has 16 channels at most, a file 20: of 40 types on /a 16 are kept, then of five topics more four."""
+    monkeypatch.setattr("bufgym.robot.mcap_file.MAX_CHANNELS", 20)
+    record = recorder(tmp_path, [])
+    for k in range(40):
+        record(Message("/robots/a", b"1", "cdr", f"my/type{k}", "robot"))
+    for k in range(5):
+        record(Message(f"/robots/{k}", b"1", "cdr"))
+    record(Message("/robots/a", b"again", "cdr", "my/type0"))
+    record.close()
+    (path,) = (tmp_path / FOLDER).glob("*.mcap")
+    bag = bags.read_bag(path)
+    assert list(bag.topics) == ["/robots/0", "/robots/1", "/robots/2", "/robots/3", "/robots/a"]
+    assert bag.size_bytes.tolist() == [1] * 20 + [5]
+    (said,) = record._audit.recent
+    assert (said["event"], said["topic"], said["sender"]) == ("recording_full", "/robots/a", "robot")
 
 
 def every(topic: str) -> bool:
