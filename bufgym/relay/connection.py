@@ -136,10 +136,10 @@ class Connection:
             policy = await asyncio.to_thread(policies.warm, name) if name in config.policies else None
             self._quota.subscribe(said["id"], self.subscriptions)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
+            self._hub.subscribe(self, subscription)
         except BufgymError as error:
             self._refuse("subscribe", error, id=said["id"])
             return
-        self._hub.subscribe(self, subscription)
         self.tell("subscribed", id=subscription.id, policy=subscription.policy.name, capacity=subscription.capacity)
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:

@@ -13,6 +13,7 @@ from bufgym.relay.rules import RECORDER, Permissions
 from bufgym.robot.mcap_file import McapFile
 
 FOLDER: Final = "recordings"
+PAUSE_S: Final = 10.0
 SCHEMAS: Final = {"json": "jsonschema", "cdr": "ros2msg", "ros1": "ros1msg"}
 """Encoding -> format of its schemas in MCAP."""
 
@@ -21,6 +22,7 @@ class Recorder:
     """Writes each message that it may receive; after ``rotation.bytes`` it begins the next file.
 
     A message that needs one channel too many (``robot.mcap_file``) is left out, which the audit log says once a file.
+    If the disk takes nothing, the recorder pauses for ``PAUSE_S`` and then begins the next file.
     """
 
     def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Audit) -> None:
@@ -31,6 +33,7 @@ class Recorder:
         self._audit = audit
         self._file: McapFile | None = None
         self._full = False  # whether it was said of this file
+        self._again_s = 0.0  # end of the pause after a failure, 0 if there was none
 
     @classmethod
     def of(cls, config: Config, audit: Audit) -> Recorder | None:
@@ -42,8 +45,18 @@ class Recorder:
 
     def __call__(self, message: wire.Message) -> None:
         """Write a message if a rule allows it."""
-        if not self._permissions.allow("receive", message.topic):
+        if not self._permissions.allow("receive", message.topic) or time.monotonic() < self._again_s:
             return
+        try:
+            self._write(message)
+        except OSError as error:
+            self._failed(error)
+            return
+        if self._again_s:
+            self._again_s = 0.0
+            self._audit("recording_resumed")
+
+    def _write(self, message: wire.Message) -> None:
         if self._file is not None and self._file.file.tell() + len(message.payload) > self._rotation.bytes:
             self.close()
         if self._file is None:
@@ -64,8 +77,28 @@ class Recorder:
         now_s, now_ns = divmod(time.time_ns(), 10**9)  # a single clock reading keeps names in the order of the files
         return McapFile(self.folder / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now_s))}-{now_ns:09}.mcap", "xb")
 
+    def flush(self) -> None:
+        """Hand what was written to the system."""
+        try:
+            if self._file is not None:
+                self._file.flush()
+        except OSError as error:
+            self._failed(error)
+
+    def _failed(self, error: OSError) -> None:
+        """Give the file up, with what it holds, and pause."""
+        if not self._again_s:
+            self._audit("recording_failed", why=error.strerror or str(error), pause_s=PAUSE_S)
+        self._again_s = time.monotonic() + PAUSE_S
+        file, self._file, self._full = self._file, None, False
+        if file is not None:
+            file.abandon()
+
     def close(self) -> None:
         """Finish the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file, self._full = None, False
+        file, self._file, self._full = self._file, None, False
+        if file is not None:
+            try:
+                file.close()
+            except OSError:
+                file.abandon()  # it can be read as far as it goes

@@ -273,7 +273,8 @@ class Server:
     async def _tick(self) -> None:
         while True:
             await asyncio.sleep(TICK_S)
-            self.hub.tick()
+            with self.hub.spared("tick"):
+                self.hub.tick()
 
 
 async def serve_forever(config: Config, say: Any = print) -> None:

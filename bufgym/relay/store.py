@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
+from bufgym.relay.audit import Audit
 from bufgym.relay.config import StoreLimits
 from bufgym.relay.rules import Identity
 from bufgym.relay.wire import RefusedError
@@ -72,8 +73,8 @@ class Settled(NamedTuple):
 class Store:
     """Sessions and the messages held for them; without a folder they are in memory only."""
 
-    def __init__(self, folder: Path | None, limits: StoreLimits, sessions: int = 64) -> None:
-        self.limits = limits
+    def __init__(self, folder: Path | None, limits: StoreLimits, audit: Audit, sessions: int = 64) -> None:
+        self.limits, self._audit = limits, audit
         self._most_sessions = sessions
         path = ":memory:" if folder is None else str(folder / FILE)
         try:
@@ -115,9 +116,7 @@ class Store:
             self.sessions[session.key] = session
         session.identity, session.seen_s = identity, time.time()
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
-        if session.id is not None:
-            with self._transaction():
-                self._save(session)
+        self._save(session)
         return session
 
     def left(self, session: StoredSession) -> list[Settled]:
@@ -125,33 +124,36 @@ class Store:
         session.seen_s = time.time()
         if session.temporary or session.id is None:
             return self.forget(session)
-        with self._transaction():
-            self._save(session)
+        self._save(session)
         return []
 
     def forget(self, session: StoredSession) -> list[Settled]:
-        """Forget a session; messages held for it are lost."""
-        self.sessions.pop(session.key, None)
+        """Forget a session; messages held for it are lost. A disk that cannot be written keeps it for later."""
+        settled: list[Settled] = []
+        if session.id is not None:
+            gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
+            with self._bearable():
+                settled = self._settle(session, 0, 2**62, 1, *gone)
+                del self._by_id[session.id]
+                session.id = None
         if session.id is None:
-            return []
-        with self._transaction():
-            settled = self._settle(session, 0, 2**62, lost=1)
-            self._db.execute("DELETE FROM session WHERE id = ?", (session.id,))
-            self._db.execute("DELETE FROM durable WHERE session = ?", (session.id,))
-        self._by_id.pop(session.id, None)
+            self.sessions.pop(session.key, None)
         return settled
 
     def want(self, session: StoredSession, id: str, pattern: str | None) -> None:
-        """Hold matching messages while the session is away; the pattern None ends that."""
-        if pattern is None and session.durable.pop(id, None) is None:
+        """Hold matching messages while the session is away; the pattern None ends that.
+
+        Raises RefusedError: the disk cannot be written.
+        """
+        if pattern is None:
+            if session.durable.pop(id, None) is not None:
+                with self._bearable(), self._transaction():
+                    self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
             return
         self._remember(session)
         with self._transaction():
-            if pattern is None:
-                self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
-            else:
-                session.durable[id] = pattern
-                self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
+            self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
+        session.durable[id] = pattern
 
     def hold(
         self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
@@ -167,21 +169,18 @@ class Store:
             raise RefusedError("store_full", f"session {full.name} has not acked {self.limits.messages} messages")
         if self.bytes + len(frame) > self.limits.bytes:
             raise RefusedError("store_full", f"no room for {len(frame)} bytes beside {self.bytes}")
-        try:
-            for session in (sender, *receivers):
-                self._remember(session)
-            with self._transaction():
-                if receivers:
-                    row = sender.id, seq, topic, frame, len(receivers), len(receivers)
-                    columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
-                    message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
-                for receiver in receivers:
-                    number = receiver.numbered + 1
-                    self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
-                    self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
-                self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
-        except sqlite3.Error as error:
-            raise RefusedError("store_full", f"the store cannot be written: {error}") from None
+        for session in (sender, *receivers):
+            self._remember(session)
+        with self._transaction():
+            if receivers:
+                row = sender.id, seq, topic, frame, len(receivers), len(receivers)
+                columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
+                message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
+            for receiver in receivers:
+                number = receiver.numbered + 1
+                self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
+                self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
+            self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
         sender.received = seq
         self.bytes += len(frame) if receivers else 0
         for receiver in receivers:
@@ -199,16 +198,20 @@ class Store:
         return self._db.execute(query, (session.id, after, most)).fetchall()
 
     def acked(self, session: StoredSession, number: int) -> list[Settled]:
-        """Note that the session has processed all messages up to this number; return the settled ones."""
-        if session.id is None or session.held == 0:
-            return []
-        with self._transaction():
-            return self._settle(session, 0, number, lost=0)
+        """Note that the session has processed all messages up to this number; return the settled ones.
+
+        If the disk cannot be written, a later ack does it.
+        """
+        if session.id is not None and session.held > 0:
+            with self._bearable():
+                return self._settle(session, 0, number, 0)
+        return []
 
     def denied(self, session: StoredSession, number: int) -> list[Settled]:
         """Drop a message that no rule lets the session have any more; return the settled ones."""
-        with self._transaction():
-            return self._settle(session, number, number, lost=1)
+        with self._bearable():
+            return self._settle(session, number, number, 1)
+        return []
 
     def expired(self, connected: Sequence[StoredSession]) -> list[StoredSession]:
         """List the sessions that have been away for too long."""
@@ -222,20 +225,41 @@ class Store:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        self._db.execute("BEGIN IMMEDIATE")
+        """Raises RefusedError: the disk cannot be written; then nothing has changed."""
+        try:
+            self._db.execute("BEGIN IMMEDIATE")
+            yield
+            self._db.execute("COMMIT")
+        except BaseException as error:
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
+            if isinstance(error, sqlite3.Error):
+                raise RefusedError("store_full", f"the store cannot be written: {error}") from None
+            raise
+
+    @contextmanager
+    def _bearable(self) -> Iterator[None]:
+        """Log that the store cannot be written, and go on."""
         try:
             yield
-        except BaseException:
-            self._db.execute("ROLLBACK")
-            raise
-        self._db.execute("COMMIT")
+        except RefusedError as refused:
+            self._audit.repeated(what="store", code=refused.code, why=str(refused))
 
-    def _settle(self, session: StoredSession, first: int, last: int, lost: int) -> list[Settled]:
-        settled = []
+    def _settle(self, session: StoredSession, first: int, last: int, lost: int, *also: str) -> list[Settled]:
+        """End deliveries to a session; ``also`` are statements about its id for the same transaction."""
+        with self._transaction():
+            settled, deliveries, freed_bytes = self._settled(session, first, last, lost)
+            for statement in also:
+                self._db.execute(statement, (session.id,))
+        session.held -= deliveries
+        self.bytes -= freed_bytes
+        return settled
+
+    def _settled(self, session: StoredSession, first: int, last: int, lost: int) -> tuple[list[Settled], int, int]:
+        settled, freed_bytes = [], 0
         chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
         rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
         self._db.execute(f"DELETE {chosen}", (session.id, first, last))
-        session.held -= len(rows)
         for (message,) in rows:
             (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
                 "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
@@ -244,19 +268,23 @@ class Store:
             ).fetchone()
             if waiting == 0:
                 self._db.execute("DELETE FROM message WHERE id = ?", (message,))
-                self.bytes -= size_bytes
+                freed_bytes += size_bytes
                 if sender in self._by_id:
                     settled.append(Settled(self._by_id[sender], seq, receivers, gone))
-        return settled
+        return settled, len(rows), freed_bytes
 
     def _remember(self, session: StoredSession) -> None:
         """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
             insert = f"INSERT INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
-            session.id = self._db.execute(insert, session.columns).lastrowid
-            assert session.id is not None
+            with self._transaction():
+                id = self._db.execute(insert, session.columns).lastrowid
+            assert id is not None
+            session.id = id
             self._by_id[session.id] = session
 
     def _save(self, session: StoredSession) -> None:
-        places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
-        self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))
+        if session.id is not None:
+            places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
+            with self._bearable(), self._transaction():
+                self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))

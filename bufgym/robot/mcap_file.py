@@ -2,6 +2,7 @@
 
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +30,7 @@ class McapFile:
         self._channels: dict[tuple[str, str, str], int] = {}
         self._forms: Counter[str] = Counter()
         self._flushed_s = 0.0
+        self._holds = False  # whether a message was written
 
     def write(
         self,
@@ -55,11 +57,15 @@ class McapFile:
             self._channels[key] = self._writer.register_channel(topic, encoding, id)
         times = {"log_time": min(log_ns, _MOST_NS), "publish_time": min(publish_ns, _MOST_NS)}
         self._writer.add_message(self._channels[key], **times, sequence=seq % 2**32, data=data)
-        now_s = time.monotonic()
-        if now_s - self._flushed_s >= _FLUSH_S:
-            self.file.flush()
-            self._flushed_s = now_s
+        if time.monotonic() - self._flushed_s >= _FLUSH_S:
+            self.flush()
+        self._holds = True
         return True
+
+    def flush(self) -> None:
+        """Hand what was written to the system."""
+        self.file.flush()
+        self._flushed_s = time.monotonic()
 
     def _schema(self, name: str, encoding: str) -> int:
         if (name, encoding) not in self._schemas:
@@ -72,3 +78,10 @@ class McapFile:
         if not self.file.closed:
             self._writer.finish()
             self.file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is, and delete it if it holds no message."""
+        with suppress(OSError):
+            self.file.close()
+        if not self._holds:
+            self.path.unlink(missing_ok=True)

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
-from relay_cases import ALL, client, relay, settings
+from relay_cases import ALL, client, full_disk, nothing, relay, settings, until, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay.audit import FILE, Audit
@@ -108,6 +108,51 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
             piece(tmp_path, name, 0, 1, every)
     with pytest.raises(BufgymError, match=r"recording own\.mcap: must be an MCAP file"):
         piece(tmp_path, "own.mcap", 0, 1, every)
+
+
+async def test_a_full_disk_stops_no_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What needs the disk is refused or left out, and logged; the rest is forwarded, and all recovers."""
+    monkeypatch.setattr("bufgym.relay.server.TICK_S", 0.01)
+    monkeypatch.setattr("bufgym.relay.recorder.PAUSE_S", 0.01)
+    async with relay(settings(folder=tmp_path, rules=(ALL, RECORD))) as server:
+
+        def events() -> list[str]:
+            return [entry["event"] for entry in server.hub.audit.recent]
+
+        async with client(server.port, session="v") as viewer, client(server.port) as robot:
+            await viewer.subscribe("^/robots/a/", durable=True)
+            await robot.acked("/robots/a/command", 1)
+            await viewer.came(1)
+            with full_disk():
+                await viewer.say("subscribe", id="status", topic="^/relay/status$")
+                assert (await viewer.next())["op"] == "subscribed"
+                for _ in range(20):  # ticks
+                    assert (await viewer.next()).topic == "/relay/status"
+                await viewer.say("unsubscribe", id="status")
+                await viewer.rest()
+                await robot.put("/robots/a/odom", b"12")
+                assert (await viewer.next()).payload == b"12"
+                await robot.command(2, "/robots/a/command")
+                assert (await robot.next())["code"] == "store_full"
+                await viewer.say("ack", seq=1)
+                assert (await viewer.subscribe("b", "b", durable=True))["code"] == "store_full"
+                await until("its log", lambda: "recording_failed" in events())
+                async with client(server.port) as another:
+                    assert another.welcome["op"] == "welcome"
+            await robot.acked("/robots/a/command", 2)
+            await viewer.came(2)
+            assert (await viewer.subscribe("b", "b", durable=True))["op"] == "subscribed"
+            await viewer.say("ack", seq=2)
+            assert await nothing(viewer)
+            assert server.hub.status()["held"] == 0
+            async with within("the recorder"):
+                while "recording_resumed" not in events():
+                    await robot.put("/robots/b/odom")
+                    await robot.rest()
+    assert events().count("recording_failed") == events().count("recording_resumed") == 1 and "failed" not in events()
+    written = [entry["event"] for entry in entries(tmp_path)]
+    assert written.count("lost") == 1 and written[-1] == "left"
+    assert len(list((tmp_path / FOLDER).glob("*.mcap"))) == 2
 
 
 def entries(folder: Path) -> list[dict[str, object]]:
