@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import signal
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -29,6 +30,7 @@ from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
 from bufgym.relay.wire import RefusedError
 from bufgym.robot.sockets import DEAD_AFTER_S, set_option, small_buffers
+from bufgym.robot.tasks import until_one_ends
 
 if TYPE_CHECKING:
     from bufgym.relay.foxglove import Window
@@ -238,10 +240,11 @@ class Server:
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
-            await asyncio.wait([self._warming])
         if self.hub.peers is not None:
             await self.hub.peers.close()
         self.hub.close()
+        if self._server is not None:
+            await asyncio.wait([self._warming])  # after the files: a first compilation takes long
 
     async def _serve(self, socket: ServerConnection) -> None:
         assert isinstance(socket, Accepted)
@@ -278,15 +281,27 @@ class Server:
 
 
 async def serve_forever(config: Config, say: Any = print) -> None:
-    """Run a relay until cancelled."""
+    """Run a relay until cancelled, or until the process gets SIGTERM."""
     server = Server(config)
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
     if server.window is not None:
         say(f"ws://{server.window.address}: Foxglove, Lichtblick")
-    try:
+    told = asyncio.Event()
+    with contextlib.suppress(
+        NotImplementedError, RuntimeError, ValueError
+    ):  # Windows; a thread that is not the main one
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+
+    async def ends() -> None:
+        await told.wait()
+
+    async def works() -> None:
         await server.warm()
-        await asyncio.Event().wait()
+        await ends()
+
+    try:
+        await until_one_ends(works(), ends())
     finally:
         await server.close()

@@ -2,10 +2,12 @@
 
 import base64
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
-from relay_cases import ALL, client, full_disk, nothing, relay, settings, until, within
+from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, until, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay.audit import FILE, Audit
@@ -13,6 +15,7 @@ from bufgym.relay.config import Rotation, Rule
 from bufgym.relay.recorder import FOLDER, Recorder
 from bufgym.relay.replay import piece, recordings
 from bufgym.relay.wire import Message
+from bufgym.robot.sockets import free_port
 from bufgym.traces.formats import bags
 
 pytest.importorskip("mcap", reason="no mcap here: the extra relay")
@@ -108,6 +111,26 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
             piece(tmp_path, name, 0, 1, every)
     with pytest.raises(BufgymError, match=r"recording own\.mcap: must be an MCAP file"):
         piece(tmp_path, "own.mcap", 0, 1, every)
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+async def test_a_recording_outlives_its_relay(tmp_path: Path, end: signal.Signals) -> None:
+    """Asked to end, the relay finishes its files. Killed, it leaves all that it had written."""
+    port = free_port("127.0.0.1")
+    rule = '[[rules]]\nrecorder = true\nreceive = true\ntopic = "/robots/.*"\n'
+    async with process(port, tmp_path, rule) as one, client(port) as robot:
+        for _ in range(20):
+            await robot.put("/robots/a/odom", bytes(1_000))
+        await robot.rest()
+        (path,) = (tmp_path / "held" / FOLDER).glob("*.mcap")
+        if end == signal.SIGKILL:
+            await until("a tick, which writes", lambda: path.stat().st_size > 20_000)
+        one.send_signal(end)
+        assert await wait("its end", one.wait()) == (0 if end == signal.SIGTERM else -end)
+    assert bags.read_bag(path).size_bytes.tolist() == [1_000] * 20
+    if end == signal.SIGKILL:
+        os.truncate(path, path.stat().st_size - 10)  # in the midst of its last message
+        assert bags.read_bag(path).size_bytes.tolist() == [1_000] * 19
 
 
 async def test_a_full_disk_stops_no_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
