@@ -51,7 +51,8 @@ class Audit:
     def __init__(self, folder: Path | None, rotation: Rotation) -> None:
         self.recent: deque[dict[str, Any]] = deque(maxlen=_RECENT)
         """The last entries."""
-        self.refused = 0
+        self.refusals: Counter[str] = Counter()
+        """Code -> how often it was refused."""
         self.lost = 0
         """Entries that the disk did not take; the next one that it takes follows their count."""
         self._repeated: Counter[tuple[str, ...]] = Counter()
@@ -66,7 +67,7 @@ class Audit:
         entry |= {name: _short(value) for name, value in fields.items()}
         self.recent.append(entry)
         if event == "refused":
-            self.refused += fields.get("times", 1)
+            self.refusals[str(fields.get("code", "other"))] += fields.get("times", 1)
         if self._lines is not None:
             gap = [{"at": entry["at"], "event": "lost", "entries": self.lost}] if self.lost else []
             text = "".join(json.dumps(one, separators=(",", ":")) + "\n" for one in (*gap, entry))
@@ -75,6 +76,11 @@ class Audit:
                 self.lost = 0
             except OSError:
                 self.lost += 1
+
+    @property
+    def refused(self) -> int:
+        """Refusals of all codes."""
+        return self.refusals.total()
 
     def repeated(self, **fields: str) -> bool:
         """Log a refusal that may come often: write the first at once, and leave the count of the rest to ``flush``.

@@ -24,11 +24,12 @@ from bufgym.relay import connection, pages, policies, wire
 from bufgym.relay.caller import Caller
 from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
-from bufgym.relay.hub import Hub
+from bufgym.relay.hub import STATUS, Hub
 from bufgym.relay.identity import Verifier, server_context
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
 from bufgym.relay.wire import RefusedError
+from bufgym.robot.extra import needs
 from bufgym.robot.sockets import DEAD_AFTER_S, set_option, small_buffers
 from bufgym.robot.tasks import until_one_ends
 
@@ -271,7 +272,25 @@ class Server:
             return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")
         if _is_ours(request) or (self.config.robofleet and "Upgrade" in request.headers):
             return None
+        match request.path.partition("?")[0]:
+            case "/healthz":
+                runs = self._ticking is not None and not self._ticking.done()
+                return pages.response(
+                    *((HTTPStatus.OK, "ok\n") if runs else (HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n"))
+                )
+            case "/metrics":
+                return self._metrics(address)
         return pages.answer(request.path)
+
+    def _metrics(self, address: str) -> Response:
+        if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):
+            why = f"no rule lets this address receive {STATUS}\n"
+            return pages.response(HTTPStatus.FORBIDDEN, why)
+        with needs("prometheus_client", "relay"):
+            from bufgym.relay import metrics  # not at start-up: few need it
+
+        counts = metrics.text(self.hub.status(), self.hub.audit.refusals)
+        return pages.response(HTTPStatus.OK, counts, metrics.CONTENT_TYPE)
 
     async def _tick(self) -> None:
         while True:

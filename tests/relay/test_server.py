@@ -1,7 +1,10 @@
 """Robots and viewers at one relay: who gets what, and what is refused."""
 
+import asyncio
+import contextlib
 import subprocess
 import sys
+from http.client import HTTPConnection
 
 import pytest
 from relay_cases import Corner, client, nothing, relay, settings, wait
@@ -75,6 +78,32 @@ async def test_each_refusal_says_why() -> None:
         assert sum(entry.get("times", 1) for entry in written) == 40 - 14
         await one.put("/open/a", bytes(200_001))
         await wait("the end of a connection beyond the limit", one.socket.wait_closed())
+
+
+async def test_it_answers_monitors() -> None:
+    """Of 5 messages beyond 20 at a time, the counts are those of the audit log. A stranger's address gets none."""
+
+    def get(port: int, path: str, local: str = "127.0.0.1") -> tuple[int, str]:
+        with contextlib.closing(HTTPConnection("127.0.0.1", port, 60, (local, 0))) as asking:
+            asking.request("GET", path)
+            answer = asking.getresponse()
+            return answer.status, answer.read().decode()
+
+    rules = (Rule(address="127.0.0.1", send=True, receive=True), Rule(address="127.0.0.2", send=True))
+    async with relay(settings(limits=Limits(messages_per_s=20), rules=rules)) as server:
+        server.hub.clock = lambda: 0.0
+        async with client(server.port) as robot:
+            for _ in range(25):
+                await robot.put("/a")
+            await robot.rest()
+            server.hub.audit.flush()
+            counts = await asyncio.to_thread(get, server.port, "/metrics")
+        assert counts[0] == 200 and counts[1].endswith("# EOF\n")
+        for line in ("connections 1.0", "held 0.0", "received_total 20.0", 'refused_total{code="too_fast"} 5.0'):
+            assert f"\nbufgym_relay_{line}\n" in counts[1]
+        assert (await asyncio.to_thread(get, server.port, "/metrics", "127.0.0.2"))[0] == 403
+        assert await asyncio.to_thread(get, server.port, "/healthz", "127.0.0.2") == (200, "ok\n")
+        assert (await asyncio.to_thread(get, server.port, "/healthz", "127.0.0.3"))[0] == 403
 
 
 async def test_the_relay_tells_how_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
