@@ -99,9 +99,9 @@ class StoreLimits(Section, frozen=True):
     """Limits of the store, which holds no_drop messages until their receivers have acked them."""
 
     messages: Count = 1_000
-    """Messages held for one session; further messages are refused to their sender."""
+    """Messages held for one session. A further one is refused, unless others can take it: then the oldest here goes."""
     bytes: Count = 2**26
-    """Bytes held in total."""
+    """Bytes held in total. The identity for which the most is held loses its oldest, or gets no more."""
     keep_s: Seconds = 86_400.0
     """Absence after which a session is forgotten, with the messages held for it."""
     window: Annotated[int, Meta(ge=1, le=MAX_WINDOW)] = 5

@@ -200,7 +200,7 @@ class Hub:
             raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it")
         frame = wire.encode(message)
         number = message.seq if taken is None else taken
-        self.store.hold(sender.session, number, message.topic, frame, receivers)
+        self.settled(self.store.hold(sender.session, number, message.topic, frame, receivers))
         self._show(message)
         for session in receivers:
             if session in self.members:

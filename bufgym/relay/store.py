@@ -2,12 +2,13 @@
 
 A session outlives its connections. The relay numbers the messages that it sends to a session, and knows the highest
 number received from it. Both are committed with the message itself, before anything is acked. So a message is taken
-once however often it is sent again, and a killed relay resumes where it was. Space is bounded: a message that has no
-room is refused to its sender.
+once however often it is sent again, and a killed relay resumes where it was. Space is bounded. A message that has no
+room is refused to its sender; but a receiver that acks nothing loses its own oldest before others wait for it.
 """
 
 import sqlite3
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -45,6 +46,7 @@ class StoredSession:
     received: int = 0  # highest number of a no_drop message taken from it
     numbered: int = 0  # highest number of a no_drop message for it
     held: int = 0  # number of messages for it that are not acked
+    held_bytes: int = 0
     durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
     seen_s: float = 0.0  # time of its last connection, s since 1970
     id: int | None = None  # id in the store; None while there is nothing to remember
@@ -96,7 +98,8 @@ class Store:
                 name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s
             )
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
-            (session.held,) = self._db.execute("SELECT count(*) FROM delivery WHERE session = ?", (id,)).fetchone()
+            held = "SELECT count(*), coalesce(sum(length(frame)), 0) FROM delivery JOIN message ON id = message"
+            session.held, session.held_bytes = self._db.execute(f"{held} WHERE session = ?", (id,)).fetchone()
             self.sessions[session.key] = self._by_id[id] = session
         (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
         for session in list(self.sessions.values()):
@@ -157,18 +160,14 @@ class Store:
 
     def hold(
         self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
-    ) -> None:
-        """Store the sender's message number ``seq`` on disk for these receivers.
+    ) -> list[Settled]:
+        """Store the sender's message number ``seq`` on disk for these receivers; return those settled by making room.
 
         Without receivers, whom other relays have, the number alone is taken.
 
-        Raises RefusedError: no room; then its number is not used.
+        Raises RefusedError: there is no room; then its number is not used.
         """
-        full = next((each for each in receivers if each.held >= self.limits.messages), None)
-        if full is not None:
-            raise RefusedError("store_full", f"session {full.name} has not acked {self.limits.messages} messages")
-        if self.bytes + len(frame) > self.limits.bytes:
-            raise RefusedError("store_full", f"no room for {len(frame)} bytes beside {self.bytes}")
+        gone = self._make_room(len(frame), receivers) if receivers else []
         for session in (sender, *receivers):
             self._remember(session)
         with self._transaction():
@@ -186,6 +185,33 @@ class Store:
         for receiver in receivers:
             receiver.numbered += 1
             receiver.held += 1
+            receiver.held_bytes += len(frame)
+        return gone
+
+    def _make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> list[Settled]:
+        """Let the oldest go: of a full session, and of the identity with the most bytes, so that others get theirs.
+
+        Raises RefusedError: nobody but these has to wait; or the message is larger than the store.
+        """
+        full = [each for each in receivers if each.held >= self.limits.messages]
+        if len(full) == len(receivers):
+            raise RefusedError("store_full", f"session {full[0].name} has not acked {self.limits.messages} messages")
+        gone = [settled for each in full for settled in self._let_go(each)]
+        while self.bytes + size_bytes > self.limits.bytes:
+            shares: Counter[str] = Counter()
+            for session in self.sessions.values():
+                shares[session.identity.key] += session.held_bytes
+            largest = max(self.sessions.values(), key=lambda one: (shares[one.identity.key], one.held_bytes))
+            alone = all(each.identity.key == largest.identity.key for each in receivers)
+            if alone or size_bytes > self.limits.bytes:
+                raise RefusedError("store_full", f"no room for {size_bytes} bytes beside {self.bytes}")
+            gone += self._let_go(largest)
+        return gone
+
+    def _let_go(self, session: StoredSession) -> list[Settled]:
+        (oldest,) = self._db.execute("SELECT min(number) FROM delivery WHERE session = ?", (session.id,)).fetchone()
+        self._audit.repeated(what="held", code="store_full", session=session.name, identity=session.identity.key)
+        return self._settle(session, oldest, oldest, 1)
 
     def waiting(self, session: StoredSession, after: int, most: int) -> list[tuple[int, str, bytes]]:
         """List number, topic and frame of the session's next messages."""
@@ -247,31 +273,29 @@ class Store:
 
     def _settle(self, session: StoredSession, first: int, last: int, lost: int, *also: str) -> list[Settled]:
         """End deliveries to a session; ``also`` are statements about its id for the same transaction."""
+        settled, sizes, freed_bytes = [], [], 0
+        chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
         with self._transaction():
-            settled, deliveries, freed_bytes = self._settled(session, first, last, lost)
+            rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
+            self._db.execute(f"DELETE {chosen}", (session.id, first, last))
             for statement in also:
                 self._db.execute(statement, (session.id,))
-        session.held -= deliveries
+            for (message,) in rows:
+                (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
+                    "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
+                    "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
+                    (lost, message),
+                ).fetchone()
+                sizes.append(size_bytes)
+                if waiting == 0:
+                    self._db.execute("DELETE FROM message WHERE id = ?", (message,))
+                    freed_bytes += size_bytes
+                    if sender in self._by_id:
+                        settled.append(Settled(self._by_id[sender], seq, receivers, gone))
+        session.held -= len(sizes)
+        session.held_bytes -= sum(sizes)
         self.bytes -= freed_bytes
         return settled
-
-    def _settled(self, session: StoredSession, first: int, last: int, lost: int) -> tuple[list[Settled], int, int]:
-        settled, freed_bytes = [], 0
-        chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
-        rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
-        self._db.execute(f"DELETE {chosen}", (session.id, first, last))
-        for (message,) in rows:
-            (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
-                "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
-                "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
-                (lost, message),
-            ).fetchone()
-            if waiting == 0:
-                self._db.execute("DELETE FROM message WHERE id = ?", (message,))
-                freed_bytes += size_bytes
-                if sender in self._by_id:
-                    settled.append(Settled(self._by_id[sender], seq, receivers, gone))
-        return settled, len(rows), freed_bytes
 
     def _remember(self, session: StoredSession) -> None:
         """Give the session an id in a transaction of its own, so that the id is never rolled back."""

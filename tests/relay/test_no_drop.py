@@ -17,8 +17,11 @@ from relay_cases import Corner, client, nothing, process, relay, settings, until
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import backoff
-from bufgym.relay.config import Rule, StoreLimits
+from bufgym.relay.audit import Audit
+from bufgym.relay.config import Rotation, Rule, StoreLimits
+from bufgym.relay.rules import Identity
 from bufgym.relay.session import Session
+from bufgym.relay.store import Settled, Store
 from bufgym.robot.sockets import free_port
 
 CONFIG = settings(store=StoreLimits(window=2, messages=4))
@@ -80,6 +83,48 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
         # It had not asked to be waited for.
         async with corner.client(session="b") as viewer:
             assert await nothing(viewer)
+
+
+async def test_who_acks_nothing_blocks_nobody(corner: Corner) -> None:
+    """A viewer wants all commands and acks none: of more than four the oldest goes, and robots get every one."""
+    async with (
+        corner.client() as operator,
+        corner.client(session="robot") as robot,
+        corner.client(session="hog", local="127.0.0.9") as hog,
+    ):
+        for one in (robot, hog):
+            await one.subscribe(f"^{corner.command}$", durable=True)
+        for seq in range(1, 7):
+            await operator.command(seq, corner.command)
+            said = [await operator.next()]
+            if seq > 4:
+                said.append(await operator.next())
+                assert {"op": "delivered", "seq": seq - 4, "receivers": 2, "lost": 1} in said
+            assert {"op": "ack", "seq": seq} in said
+            await robot.came(seq)
+            await robot.say("ack", seq=seq)
+            await robot.rest()
+        corner.hub.audit.flush()
+        (first, again) = [entry for entry in corner.hub.audit.recent if entry.get("what") == "held"]
+        assert (first["session"], first["identity"], again["times"]) == ("hog", "127.0.0.9", 1)
+
+
+def test_the_identity_with_most_bytes_makes_room() -> None:
+    """10 bytes of room: the hog's two sessions hold 3 and 4, the robot's one 3. So 2 more cost the hog its 4."""
+    audit = Audit(None, Rotation())
+    store = Store(None, StoreLimits(bytes=10), audit)
+    sender, robot, *hogs = (
+        store.open(name, Identity(address), False, 0, 0)
+        for name, address in (("s", "1.1.1.1"), ("r", "1.1.1.2"), ("a", "1.1.1.3"), ("b", "1.1.1.3"))
+    )
+    for seq, (size, receiver) in enumerate(((3, robot), (3, hogs[0]), (4, hogs[1])), start=1):
+        assert store.hold(sender, seq, "/a", bytes(size), [receiver]) == []
+    assert store.hold(sender, 4, "/a", bytes(2), [robot]) == [Settled(sender, 3, 1, 1)]
+    assert [one.held_bytes for one in (robot, *hogs)] == [5, 3, 0] and store.bytes == 8
+    with pytest.raises(BufgymError, match="no room for 3 bytes beside 8"):
+        store.hold(sender, 5, "/a", bytes(3), [robot])  # now the robot has the most
+    with pytest.raises(BufgymError, match="no room for 11 bytes beside 8"):
+        store.hold(sender, 5, "/a", bytes(11), [robot, hogs[0]])
 
 
 async def test_the_same_session_takes_over(corner: Corner) -> None:
