@@ -103,7 +103,8 @@ class StoreLimits(Section, frozen=True):
     bytes: Count = 2**26
     """Bytes held in total. The identity for which the most is held loses its oldest, or gets no more."""
     keep_s: Seconds = 86_400.0
-    """Absence after which a session is forgotten, with the messages held for it."""
+    """Absence after which a session is forgotten, with the messages held for it. Only time in which the relay runs
+    counts, and a restart begins it again; the system's clock may jump."""
     window: Annotated[int, Meta(ge=1, le=MAX_WINDOW)] = 5
     """n_T, no_drop messages on their way to or from a client and not acked, at most."""
 

@@ -92,7 +92,7 @@ class Hub:
             config.folder.mkdir(parents=True, exist_ok=True)
         self.audit = Audit(config.folder, config.audit)
         self.quotas = Quotas(config.limits, clock)
-        self.store = Store(config.folder, config.store, self.audit, config.limits.sessions)
+        self.store = Store(config.folder, config.store, self.audit, config.limits.sessions, clock)
         self.recorder = Recorder.of(config, self.audit)
         self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
         self._failed: set[str] = set()

@@ -80,6 +80,7 @@ def welcome(config: Config, admitted: Admitted, identity: Identity, received: in
         "received": received,
         "no_drop": config.no_drop,
         "window": config.store.window,
+        "keep_s": config.store.keep_s,
         "max_message_bytes": config.limits.message_bytes,
         "policies": config.policies,
         "default_policy": config.policies[0],

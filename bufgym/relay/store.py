@@ -9,7 +9,7 @@ room is refused to its sender; but a receiver that acks nothing loses its own ol
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,14 +48,14 @@ class StoredSession:
     held: int = 0  # number of messages for it that are not acked
     held_bytes: int = 0
     durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
-    seen_s: float = 0.0  # time of its last connection, s since 1970
+    away_s: float = 0.0  # beginning of its absence, by the store's clock
     id: int | None = None  # id in the store; None while there is nothing to remember
 
     @property
     def columns(self) -> tuple[Any, ...]:
         """The session as a row of the store."""
         who = self.identity
-        return self.name, who.address, who.email, self.temporary, self.received, self.numbered, self.seen_s
+        return self.name, who.address, who.email, self.temporary, self.received, self.numbered, time.time()
 
     @property
     def key(self) -> tuple[str, str]:
@@ -75,8 +75,15 @@ class Settled(NamedTuple):
 class Store:
     """Sessions and the messages held for them; without a folder they are in memory only."""
 
-    def __init__(self, folder: Path | None, limits: StoreLimits, audit: Audit, sessions: int = 64) -> None:
-        self.limits, self._audit = limits, audit
+    def __init__(
+        self,
+        folder: Path | None,
+        limits: StoreLimits,
+        audit: Audit,
+        sessions: int = 64,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.limits, self._audit, self._clock = limits, audit, clock
         self._most_sessions = sessions
         path = ":memory:" if folder is None else str(folder / FILE)
         try:
@@ -93,10 +100,9 @@ class Store:
 
     def _load(self) -> None:
         for row in self._db.execute(f"SELECT id, {_COLUMNS} FROM session").fetchall():
-            id, name, address, email, temporary, received, numbered, seen_s = row
-            session = StoredSession(
-                name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s
-            )
+            id, name, address, email, temporary, received, numbered, _ = row
+            session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
+            session.away_s = self._clock()
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
             held = "SELECT count(*), coalesce(sum(length(frame)), 0) FROM delivery JOIN message ON id = message"
             session.held, session.held_bytes = self._db.execute(f"{held} WHERE session = ?", (id,)).fetchone()
@@ -117,14 +123,14 @@ class Store:
                 raise RefusedError("too_many", f"must be at most {self._most_sessions} sessions")
             session = StoredSession(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
-        session.identity, session.seen_s = identity, time.time()
+        session.identity, session.away_s = identity, self._clock()
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
         self._save(session)
         return session
 
     def left(self, session: StoredSession) -> list[Settled]:
         """Note the end of a session's connection; forget messages that nobody will ask for."""
-        session.seen_s = time.time()
+        session.away_s = self._clock()
         if session.temporary or session.id is None:
             return self.forget(session)
         self._save(session)
@@ -240,10 +246,10 @@ class Store:
         return []
 
     def expired(self, connected: Sequence[StoredSession]) -> list[StoredSession]:
-        """List the sessions that have been away for too long."""
-        before_s = time.time() - self.limits.keep_s
+        """List the sessions that have been away for too long, counted while the relay runs."""
+        before_s = self._clock() - self.limits.keep_s
         here = set(map(id, connected))
-        return [each for each in self.sessions.values() if id(each) not in here and each.seen_s < before_s]
+        return [each for each in self.sessions.values() if id(each) not in here and each.away_s < before_s]
 
     def close(self) -> None:
         """Close the file; everything is on disk already."""

@@ -127,6 +127,29 @@ def test_the_identity_with_most_bytes_makes_room() -> None:
         store.hold(sender, 5, "/a", bytes(11), [robot, hogs[0]])
 
 
+def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot is kept for 100 s. Neither a year's jump of the system's clock nor a year off ends that, but 101 s do."""
+    now_s = 10.0
+
+    def opened() -> Store:
+        return Store(tmp_path, StoreLimits(keep_s=100.0), Audit(None, Rotation()), clock=lambda: now_s)
+
+    store = opened()
+    robot = store.open("robot", Identity("1.1.1.1"), False, 0, 0)
+    store.want(robot, "a", "command$")
+    store.left(robot)
+    year_s = time.time() + 366 * 86_400
+    monkeypatch.setattr("time.time", lambda: year_s)
+    now_s += 99
+    assert store.expired([]) == []
+    store.close()
+    store, now_s = opened(), now_s + 99
+    assert store.expired([]) == []
+    now_s += 2
+    assert [one.name for one in store.expired([])] == ["robot"] and store.expired(list(store.sessions.values())) == []
+    store.close()
+
+
 async def test_the_same_session_takes_over(corner: Corner) -> None:
     async with corner.client() as operator, corner.client(session="a") as old, corner.client(session="a") as new:
         await wait("the end of the old", old.socket.wait_closed())
@@ -157,7 +180,7 @@ async def test_what_a_forgotten_session_had_to_get_is_told(corner: Corner) -> No
             await robot.subscribe(f"^{corner.command}$", durable=True)
         await until("the others' ends", lambda: len(corner.hub.members) == 1)
         await operator.acked(corner.command, 1)
-        corner.hub.store.sessions[corner.address, "a"].seen_s -= corner.hub.config.store.keep_s + 1
+        corner.hub.store.sessions[corner.address, "a"].away_s -= corner.hub.config.store.keep_s + 1
         corner.hub.tick()
         assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1}
         forgotten = [entry for entry in corner.hub.audit.recent if entry["event"] == "forgotten"]
