@@ -77,17 +77,20 @@ class Rule(Section, frozen=True, kw_only=True):
 
 
 class Limits(Section, frozen=True):
-    """Limits of one identity over all its connections, unless a field says otherwise."""
+    """Limits of one identity over all its connections, unless a field says otherwise.
+
+    The defaults admit 60 robots behind one address, with ten topics of 10 messages a second each.
+    """
 
     message_bytes: Count = 2**23
     """Size of a frame."""
-    topics: Count = 256
+    topics: Count = 1_024
     """Topics that it publishes on."""
-    subscriptions: Count = 64
-    sessions: Count = 64
+    subscriptions: Count = 512
+    sessions: Count = 256
     """Sessions that the relay keeps, with the messages held for them."""
-    connections: Count = 32
-    messages_per_s: Count = 2_000
+    connections: Count = 128
+    messages_per_s: Count = 10_000
     bytes_per_s: Count = 10**8
     all_connections: Count = 4_096
     """Connections of all identities together."""

@@ -7,7 +7,7 @@ import sys
 from http.client import HTTPConnection
 
 import pytest
-from relay_cases import Corner, client, nothing, relay, settings, wait
+from relay_cases import Client, Corner, client, nothing, relay, settings, wait
 
 from bufgym.relay import server as serving
 from bufgym.relay.config import Limits, Rule
@@ -78,6 +78,28 @@ async def test_each_refusal_says_why() -> None:
         assert sum(entry.get("times", 1) for entry in written) == 40 - 14
         await one.put("/open/a", bytes(200_001))
         await wait("the end of a connection beyond the limit", one.socket.wait_closed())
+
+
+async def test_sixty_robots_come_from_one_address() -> None:
+    """By the default limits, each with ten topics of ten messages at once, and two subscriptions; more are refused."""
+
+    async def robot(stack: contextlib.AsyncExitStack, k: int) -> Client:
+        one = await stack.enter_async_context(client(server.port, session=f"r{k}"))
+        assert one.welcome["op"] == "welcome"
+        for id in ("command", "stop"):
+            assert (await one.subscribe(f"^/robots/{k}/{id}$", id))["op"] == "subscribed"
+        for name in 10 * [f"/robots/{k}/{topic}" for topic in range(10)]:
+            await one.put(name)
+        return one
+
+    async with relay() as server, contextlib.AsyncExitStack() as stack:
+        for one in await asyncio.gather(*(robot(stack, k) for k in range(60))):
+            assert await one.rest() == []
+        assert server.hub.received >= 6_000 and server.hub.audit.refused == 0
+        for k in range(60, 128):
+            await stack.enter_async_context(client(server.port, session=f"r{k}"))
+        async with client(server.port) as one:
+            assert one.welcome["code"] == "too_many"
 
 
 async def test_it_answers_monitors() -> None:
