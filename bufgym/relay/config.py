@@ -92,6 +92,8 @@ class Limits(Section, frozen=True):
     connections: Count = 128
     messages_per_s: Count = 10_000
     bytes_per_s: Count = 10**8
+    json_bytes_per_s: Count = 2**23
+    """Bytes of JSON that it may have parsed; beyond, its frames wait. A text frame counts for 500 bytes more."""
     all_connections: Count = 4_096
     """Connections of all identities together."""
     hello_s: Seconds = 5.0

@@ -7,7 +7,8 @@ import sys
 from http.client import HTTPConnection
 
 import pytest
-from relay_cases import Client, Corner, client, nothing, relay, settings, wait
+from loop_cases import beside
+from relay_cases import Client, Corner, client, nothing, relay, settings, until, wait
 
 from bufgym.relay import server as serving
 from bufgym.relay.config import Limits, Rule
@@ -100,6 +101,26 @@ async def test_sixty_robots_come_from_one_address() -> None:
             await stack.enter_async_context(client(server.port, session=f"r{k}"))
         async with client(server.port) as one:
             assert one.welcome["code"] == "too_many"
+
+
+async def test_a_flood_of_json_waits_and_others_are_served() -> None:
+    """Of 40 texts of 9,500 bytes at 10,000 a second one is parsed each second; another's requests are answered."""
+    limits = Limits(json_bytes_per_s=10_000)
+    async with relay(settings(limits=limits)) as server, client(server.port, local="127.0.0.3") as flood:
+
+        async def send() -> None:
+            for k in range(40):
+                if k % 2:
+                    await flood.put("/a", b'"%s"' % bytes(9_998).replace(b"\0", b"a"), encoding="json")
+                else:
+                    await flood.say("publish", topic="/a", data="a" * 9_440)
+
+        async with beside(send()), client(server.port) as other:
+            await until("the first", lambda: server.hub.received > 0)
+            for _ in range(5):
+                await other.put("/b")
+                await other.rest()
+            assert server.hub.received < 40
 
 
 async def test_it_answers_monitors() -> None:
