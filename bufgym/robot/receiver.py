@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.bus_channel import BusServer
 from bufgym.robot.buses import BUSES, MQTT_PORT
-from bufgym.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
+from bufgym.robot.channels import TRANSPORTS, Channel, Room, TcpChannel, WebSocketChannel
 from bufgym.robot.extra import needs
 from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
 from bufgym.robot.mcap_file import McapFile
@@ -23,6 +23,12 @@ from bufgym.robot.tasks import Tasks
 
 MAX_STREAMS: Final = 64
 """Number of latest senders that are remembered."""
+MAX_PEERS: Final = 2 * MAX_STREAMS
+"""Connections at a time, with those that senders have given up."""
+MAX_ARRIVING_BYTES: Final = 2**28
+"""Bodies that arrive at the same time over TCP; a sender beyond is hung up on, and tries again."""
+IDLE_S: Final = 600.0
+"""Time for a whole frame; later the connection is closed. A sender that is still there connects again."""
 _GREETING_S: Final = 20.0  # time for a sender's greeting; later the connection is closed
 
 
@@ -67,6 +73,8 @@ class Receiver:
         self._on_message = on_message
         self._max_body_bytes = max_body_bytes
         self._streams: OrderedDict[bytes, _Talk] = OrderedDict()
+        self._room = Room(max(MAX_ARRIVING_BYTES, max_body_bytes))
+        self._peers = 0
         self._tasks = Tasks()
         self._listener: socket.socket | None = None
         self._server: Any = None
@@ -114,15 +122,19 @@ class Receiver:
             connection, _ = await asyncio.get_running_loop().sock_accept(listening)
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes)))
+            self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes, self._room)))
 
     async def _serve(self, channel: Channel) -> None:
         """Serve one connection to its end."""
+        self._peers += 1
         try:
+            if self._peers > MAX_PEERS:
+                raise ConnectionRefusedError(f"must be at most {MAX_PEERS} connections")
             await self._take(channel, await asyncio.wait_for(channel.receive(), _GREETING_S))
         except (OSError, TimeoutError) as error:
             self.faults.append(f"{type(error).__name__}: {error}")
         finally:
+            self._peers -= 1
             channel.close()
 
     async def _take(self, channel: Channel, greeting: Frame) -> None:
@@ -141,7 +153,7 @@ class Receiver:
                 oldest.task.cancel()
         await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes))
         while True:
-            frame = await channel.receive()
+            frame = await asyncio.wait_for(channel.receive(), IDLE_S)
             if frame.kind == GOODBYE:
                 self._streams.pop(name, None)
                 return
