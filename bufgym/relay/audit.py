@@ -4,8 +4,10 @@ A client that is refused the same thing a thousand times a second makes one line
 """
 
 import json
+import os
 import time
 from collections import Counter, deque
+from contextlib import suppress
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any, Final
@@ -21,13 +23,26 @@ _RECENT: Final = 1_000
 class _Lines(RotatingFileHandler):
     """Rotated files without the ceremony of log records."""
 
-    def write(self, line: str) -> None:
-        if self.stream is None:
-            self.stream = self._open()
-        if self.stream.tell() + len(line) + 1 > self.maxBytes:
-            self.doRollover()
-        self.stream.write(f"{line}\n")
-        self.stream.flush()
+    def write(self, text: str) -> None:
+        """Write whole lines; raise OSError and leave no part of them if they cannot be written."""
+        before = None
+        try:
+            if self.stream is None:
+                self.stream = self._open()
+            if self.stream.tell() + len(text) > self.maxBytes:
+                self.doRollover()
+            before = self.stream.tell()
+            self.stream.write(text)
+            self.stream.flush()
+        except OSError:
+            stream, self.stream = self.stream, None
+            with suppress(OSError):
+                if stream is not None:
+                    stream.close()
+            with suppress(OSError):
+                if before is not None:
+                    os.truncate(self.baseFilename, before)
+            raise
 
 
 class Audit:
@@ -36,7 +51,10 @@ class Audit:
     def __init__(self, folder: Path | None, rotation: Rotation) -> None:
         self.recent: deque[dict[str, Any]] = deque(maxlen=_RECENT)
         """The last entries."""
-        self.refused = 0
+        self.refusals: Counter[str] = Counter()
+        """Code -> how often it was refused."""
+        self.lost = 0
+        """Entries that the disk did not take; the next one that it takes follows their count."""
         self._repeated: Counter[tuple[str, ...]] = Counter()
         self._lines = None
         if folder is not None:
@@ -49,9 +67,20 @@ class Audit:
         entry |= {name: _short(value) for name, value in fields.items()}
         self.recent.append(entry)
         if event == "refused":
-            self.refused += fields.get("times", 1)
+            self.refusals[str(fields.get("code", "other"))] += fields.get("times", 1)
         if self._lines is not None:
-            self._lines.write(json.dumps(entry, separators=(",", ":")))
+            gap = [{"at": entry["at"], "event": "lost", "entries": self.lost}] if self.lost else []
+            text = "".join(json.dumps(one, separators=(",", ":")) + "\n" for one in (*gap, entry))
+            try:
+                self._lines.write(text)
+                self.lost = 0
+            except OSError:
+                self.lost += 1
+
+    @property
+    def refused(self) -> int:
+        """Refusals of all codes."""
+        return self.refusals.total()
 
     def repeated(self, **fields: str) -> bool:
         """Log a refusal that may come often: write the first at once, and leave the count of the rest to ``flush``.
@@ -78,7 +107,8 @@ class Audit:
         """Finish the file."""
         self.flush()
         if self._lines is not None:
-            self._lines.close()
+            with suppress(OSError):
+                self._lines.close()
 
 
 def _short(value: Any) -> Any:

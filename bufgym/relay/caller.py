@@ -16,6 +16,8 @@ from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError
 
 POLICY_VIOLATION: Final = 1008
+_FRAME_BYTES: Final = 500  # bytes of JSON whose parsing takes as long as all else that is done for a frame
+_PACE_S: Final = 0.05
 
 
 class Caller:
@@ -39,6 +41,19 @@ class Caller:
             email, until_s = await self._verifier.email(token)
         self.identity = Identity(self.identity.address, email, until_s=until_s)
         return self.identity
+
+    async def heard(self) -> bytes | str:
+        """Receive a frame; a text frame is kept back until its identity may have it parsed."""
+        data = await self.socket.recv()
+        if isinstance(data, str):
+            await self.pace(len(data) + _FRAME_BYTES)
+        return data
+
+    async def pace(self, json_bytes: int) -> None:
+        """Wait until the identity's budget allows to parse so much JSON."""
+        budget, loop = self.hub.quotas.of(self.identity.key).json, asyncio.get_running_loop()
+        while not budget.take(json_bytes, loop.time()):
+            await asyncio.sleep(_PACE_S)
 
     def tell(self, op: str, **fields: Any) -> None:
         """Have this sent before any message."""

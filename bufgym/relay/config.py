@@ -77,18 +77,23 @@ class Rule(Section, frozen=True, kw_only=True):
 
 
 class Limits(Section, frozen=True):
-    """Limits of one identity over all its connections, unless a field says otherwise."""
+    """Limits of one identity over all its connections, unless a field says otherwise.
+
+    The defaults admit 60 robots behind one address, with ten topics of 10 messages a second each.
+    """
 
     message_bytes: Count = 2**23
     """Size of a frame."""
-    topics: Count = 256
+    topics: Count = 1_024
     """Topics that it publishes on."""
-    subscriptions: Count = 64
-    sessions: Count = 64
+    subscriptions: Count = 512
+    sessions: Count = 256
     """Sessions that the relay keeps, with the messages held for them."""
-    connections: Count = 32
-    messages_per_s: Count = 2_000
+    connections: Count = 128
+    messages_per_s: Count = 10_000
     bytes_per_s: Count = 10**8
+    json_bytes_per_s: Count = 2**23
+    """Bytes of JSON that it may have parsed; beyond, its frames wait. A text frame counts for 500 bytes more."""
     all_connections: Count = 4_096
     """Connections of all identities together."""
     hello_s: Seconds = 5.0
@@ -99,11 +104,12 @@ class StoreLimits(Section, frozen=True):
     """Limits of the store, which holds no_drop messages until their receivers have acked them."""
 
     messages: Count = 1_000
-    """Messages held for one session; further messages are refused to their sender."""
+    """Messages held for one session. A further one is refused, unless others can take it: then the oldest here goes."""
     bytes: Count = 2**26
-    """Bytes held in total."""
+    """Bytes held in total. The identity for which the most is held loses its oldest, or gets no more."""
     keep_s: Seconds = 86_400.0
-    """Absence after which a session is forgotten, with the messages held for it."""
+    """Absence after which a session is forgotten, with the messages held for it. Only time in which the relay runs
+    counts, and a restart begins it again; the system's clock may jump."""
     window: Annotated[int, Meta(ge=1, le=MAX_WINDOW)] = 5
     """n_T, no_drop messages on their way to or from a client and not acked, at most."""
 

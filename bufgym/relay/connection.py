@@ -42,7 +42,7 @@ class Connection:
     @staticmethod
     async def greet(caller: Caller) -> Admitted:
         """Take the client's hello."""
-        said = protocol.hello(await caller.socket.recv())
+        said = protocol.hello(await caller.heard())
         identity = await caller.prove(said.get("token"))
         return protocol.admit(said, identity, caller.hub.config.rules, secrets.token_hex(8))
 
@@ -74,8 +74,10 @@ class Connection:
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
         while self._ending is None:
-            match protocol.asked(await self._socket.recv(), self._hub.config.limits.message_bytes):
+            match protocol.asked(await self._caller.heard(), self._hub.config.limits.message_bytes):
                 case wire.Message() as message:
+                    if message.encoding == "json":
+                        await self._caller.pace(len(message.payload))
                     await self._publish(message)
                 case {"op": "subscribe"} as said:
                     await self._subscribe(said)
@@ -136,10 +138,10 @@ class Connection:
             policy = await asyncio.to_thread(policies.warm, name) if name in config.policies else None
             self._quota.subscribe(said["id"], self.subscriptions)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
+            self._hub.subscribe(self, subscription)
         except BufgymError as error:
             self._refuse("subscribe", error, id=said["id"])
             return
-        self._hub.subscribe(self, subscription)
         self.tell("subscribed", id=subscription.id, policy=subscription.policy.name, capacity=subscription.capacity)
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:

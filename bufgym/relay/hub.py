@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -91,9 +92,10 @@ class Hub:
             config.folder.mkdir(parents=True, exist_ok=True)
         self.audit = Audit(config.folder, config.audit)
         self.quotas = Quotas(config.limits, clock)
-        self.store = Store(config.folder, config.store, config.limits.sessions)
-        recorder = Recorder.of(config)
-        self.own: list[Recorder | Window] = [] if recorder is None else [recorder]
+        self.store = Store(config.folder, config.store, self.audit, config.limits.sessions, clock)
+        self.recorder = Recorder.of(config, self.audit)
+        self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
+        self._failed: set[str] = set()
         self.members: dict[StoredSession, Member] = {}
         self.received = 0
         self._sent = 0
@@ -123,13 +125,16 @@ class Hub:
         self._routes.clear()
 
     def subscribe(self, member: Member, subscription: Subscription) -> None:
-        """Add a subscription; it replaces one with the same id."""
+        """Add a subscription; it replaces one with the same id.
+
+        Raises RefusedError: it is durable, and the store cannot be written.
+        """
+        wanted = subscription.pattern.text if subscription.durable else None
+        self.store.want(member.session, subscription.id, wanted)
         old = member.subscriptions.pop(subscription.id, None)
         self._dropped += old.dropped if old else 0
         member.subscriptions[subscription.id] = subscription
         self._routes.clear()
-        wanted = subscription.pattern.text if subscription.durable else None
-        self.store.want(member.session, subscription.id, wanted)
 
     def unsubscribe(self, member: Member, id: str) -> None:
         """Remove a subscription if there is one of this id."""
@@ -144,13 +149,29 @@ class Hub:
 
     def publish(self, sender: Member | None, message: wire.Message) -> None:
         """Offer a message to each subscriber's queue except its sender's."""
-        self.received += 1
-        for each in self.own:
-            each(message)
+        self._show(message)
         frame = Outgoing(message)
         for member, subscription in self._route(message.topic):
             if member is not sender:
                 member.offer(subscription, frame)
+
+    def _show(self, message: wire.Message) -> None:
+        """Count a message, and show it to the relay's own parts."""
+        self.received += 1
+        for each in self.own:
+            with self.spared(type(each).__name__):
+                each(message)
+
+    @contextmanager
+    def spared(self, part: str) -> Iterator[None]:
+        """Log the first fault of each kind in a part of the relay, without which the rest goes on."""
+        try:
+            yield
+        except Exception as error:
+            fault = f"{part}: {type(error).__name__}"
+            if fault not in self._failed:
+                self._failed.add(fault)
+                self.audit("failed", part=part, why=f"{type(error).__name__}: {error}")
 
     def _route(self, topic: str) -> list[tuple[Member, Subscription]]:
         """Find the receivers: each member once, by its first matching subscription."""
@@ -179,10 +200,8 @@ class Hub:
             raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it")
         frame = wire.encode(message)
         number = message.seq if taken is None else taken
-        self.store.hold(sender.session, number, message.topic, frame, receivers)
-        self.received += 1
-        for each in self.own:
-            each(message)
+        self.settled(self.store.hold(sender.session, number, message.topic, frame, receivers))
+        self._show(message)
         for session in receivers:
             if session in self.members:
                 self.members[session].wake()
@@ -228,6 +247,8 @@ class Hub:
         payload = json.dumps(self.status()).encode()
         self.publish(None, wire.Message(STATUS, payload, sender=OWN, stamp_us=time.time_ns() // 1000))
         self.audit.flush()
+        if self.recorder is not None:
+            self.recorder.flush()
         self.quotas.tidy()
         for session in self.store.expired(list(self.members)):
             self.audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
@@ -236,7 +257,8 @@ class Hub:
     def close(self) -> None:
         """Finish the files."""
         for each in self.own:
-            each.close()
+            with self.spared(type(each).__name__):
+                each.close()
         self.audit.close()
         self.store.close()
 

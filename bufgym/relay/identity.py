@@ -60,8 +60,10 @@ class Verifier:
         except (self._jwt.PyJWTError, ValueError, TypeError, OverflowError, RecursionError) as error:
             raise error if isinstance(error, RefusedError) else _unauthorized(f"token: {error}") from None
         email = claims.get("email")
-        if not isinstance(email, str) or not email or not email.isprintable() or claims.get("email_verified") is False:
-            raise _unauthorized("token: names no verified email")
+        if not isinstance(email, str) or not email or not email.isprintable():
+            raise _unauthorized("token: names no email")
+        if claims.get("email_verified") is not True:
+            raise _unauthorized(f"token: email_verified must be true, not {claims.get('email_verified')!r:.20}")
         return email, float(claims["exp"])
 
     async def _key(self, kid: str | None) -> Any:

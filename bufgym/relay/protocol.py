@@ -5,7 +5,6 @@ All functions are pure but ``check``, which counts the message in its sender's q
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -81,6 +80,7 @@ def welcome(config: Config, admitted: Admitted, identity: Identity, received: in
         "received": received,
         "no_drop": config.no_drop,
         "window": config.store.window,
+        "keep_s": config.store.keep_s,
         "max_message_bytes": config.limits.message_bytes,
         "policies": config.policies,
         "default_policy": config.policies[0],
@@ -121,7 +121,7 @@ def check(
         if len(message.payload) > MAX_JSON_BYTES:
             raise RefusedError("too_large", f"topic {topic}: JSON must be at most {MAX_JSON_BYTES} bytes")
         try:
-            json.loads(bytes(message.payload), parse_constant=wire.no_constant)
+            wire.loads(bytes(message.payload))
         except (ValueError, RecursionError) as error:
             raise RefusedError("wrong", f"topic {topic}: payload must be JSON: {error}") from None
     if message.no_drop and message.seq != received + 1:

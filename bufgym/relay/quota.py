@@ -32,6 +32,7 @@ class Quota:
     def __init__(self, limits: Limits, idle_since_s: float) -> None:
         self.limits, self.idle_since_s = limits, idle_since_s
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
+        self.json = Bucket(limits.json_bytes_per_s)
         self.topics: set[str] = set()
         self.connections: list[Mapping[str, object]] = []
         """The subscriptions of each of its connections, by id."""

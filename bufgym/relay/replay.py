@@ -7,7 +7,6 @@ times is kept, so that a piece from its middle can be read directly.
 import base64
 import bisect
 import io
-import json
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import lru_cache
@@ -19,6 +18,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 
 from bufgym.ground.errors import BufgymError
+from bufgym.relay import wire
 
 MOST_BYTES: Final = 4 * 2**20
 """Limit on the payloads of a piece."""
@@ -56,7 +56,7 @@ def piece(
         if not may_receive(topic):
             continue
         try:
-            data = json.loads(record.data) if encoding == "json" else base64.b64encode(record.data).decode()
+            data = wire.loads(record.data) if encoding == "json" else base64.b64encode(record.data).decode()
         except ValueError:
             continue
         left_bytes -= len(record.data)

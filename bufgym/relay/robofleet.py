@@ -94,14 +94,14 @@ class RobofleetConnection(Connection):
         """Admit the client by its address or certificate, or once it has sent its token; it sends no hello."""
         identity, rules = await caller.prove(None), caller.hub.config.rules
         while not Permissions(rules, identity).rules:
-            data = await caller.socket.recv()
+            data = await caller.heard()
             if isinstance(data, str) and (proof := token(data)) is not None:
                 identity = await caller.prove(proof)
         return protocol.admit({"form": ROBOFLEET}, identity, rules, secrets.token_hex(8))
 
     async def _read(self) -> None:
         while self._ending is None:
-            data = await self._socket.recv()
+            data = await self._caller.heard()
             if isinstance(data, str):
                 before, proof = self._caller.identity, token(data)
                 if proof is not None and (await self._caller.prove(proof)).key != before.key:

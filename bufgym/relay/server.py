@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import signal
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -23,12 +24,14 @@ from bufgym.relay import connection, pages, policies, wire
 from bufgym.relay.caller import Caller
 from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
-from bufgym.relay.hub import Hub
+from bufgym.relay.hub import STATUS, Hub
 from bufgym.relay.identity import Verifier, server_context
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
 from bufgym.relay.wire import RefusedError
+from bufgym.robot.extra import needs
 from bufgym.robot.sockets import DEAD_AFTER_S, set_option, small_buffers
+from bufgym.robot.tasks import until_one_ends
 
 if TYPE_CHECKING:
     from bufgym.relay.foxglove import Window
@@ -238,10 +241,11 @@ class Server:
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
-            await asyncio.wait([self._warming])
         if self.hub.peers is not None:
             await self.hub.peers.close()
         self.hub.close()
+        if self._server is not None:
+            await asyncio.wait([self._warming])  # after the files: a first compilation takes long
 
     async def _serve(self, socket: ServerConnection) -> None:
         assert isinstance(socket, Accepted)
@@ -268,24 +272,55 @@ class Server:
             return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")
         if _is_ours(request) or (self.config.robofleet and "Upgrade" in request.headers):
             return None
+        match request.path.partition("?")[0]:
+            case "/healthz":
+                runs = self._ticking is not None and not self._ticking.done()
+                return pages.response(
+                    *((HTTPStatus.OK, "ok\n") if runs else (HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n"))
+                )
+            case "/metrics":
+                return self._metrics(address)
         return pages.answer(request.path)
+
+    def _metrics(self, address: str) -> Response:
+        if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):
+            why = f"no rule lets this address receive {STATUS}\n"
+            return pages.response(HTTPStatus.FORBIDDEN, why)
+        with needs("prometheus_client", "relay"):
+            from bufgym.relay import metrics  # not at start-up: few need it
+
+        counts = metrics.text(self.hub.status(), self.hub.audit.refusals)
+        return pages.response(HTTPStatus.OK, counts, metrics.CONTENT_TYPE)
 
     async def _tick(self) -> None:
         while True:
             await asyncio.sleep(TICK_S)
-            self.hub.tick()
+            with self.hub.spared("tick"):
+                self.hub.tick()
 
 
 async def serve_forever(config: Config, say: Any = print) -> None:
-    """Run a relay until cancelled."""
+    """Run a relay until cancelled, or until the process gets SIGTERM."""
     server = Server(config)
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
     if server.window is not None:
         say(f"ws://{server.window.address}: Foxglove, Lichtblick")
-    try:
+    told = asyncio.Event()
+    with contextlib.suppress(
+        NotImplementedError, RuntimeError, ValueError
+    ):  # Windows; a thread that is not the main one
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+
+    async def ends() -> None:
+        await told.wait()
+
+    async def works() -> None:
         await server.warm()
-        await asyncio.Event().wait()
+        await ends()
+
+    try:
+        await until_one_ends(works(), ends())
     finally:
         await server.close()

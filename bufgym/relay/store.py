@@ -2,19 +2,21 @@
 
 A session outlives its connections. The relay numbers the messages that it sends to a session, and knows the highest
 number received from it. Both are committed with the message itself, before anything is acked. So a message is taken
-once however often it is sent again, and a killed relay resumes where it was. Space is bounded: a message that has no
-room is refused to its sender.
+once however often it is sent again, and a killed relay resumes where it was. Space is bounded. A message that has no
+room is refused to its sender; but a receiver that acks nothing loses its own oldest before others wait for it.
 """
 
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
+from bufgym.relay.audit import Audit
 from bufgym.relay.config import StoreLimits
 from bufgym.relay.rules import Identity
 from bufgym.relay.wire import RefusedError
@@ -44,15 +46,16 @@ class StoredSession:
     received: int = 0  # highest number of a no_drop message taken from it
     numbered: int = 0  # highest number of a no_drop message for it
     held: int = 0  # number of messages for it that are not acked
+    held_bytes: int = 0
     durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
-    seen_s: float = 0.0  # time of its last connection, s since 1970
+    away_s: float = 0.0  # beginning of its absence, by the store's clock
     id: int | None = None  # id in the store; None while there is nothing to remember
 
     @property
     def columns(self) -> tuple[Any, ...]:
         """The session as a row of the store."""
         who = self.identity
-        return self.name, who.address, who.email, self.temporary, self.received, self.numbered, self.seen_s
+        return self.name, who.address, who.email, self.temporary, self.received, self.numbered, time.time()
 
     @property
     def key(self) -> tuple[str, str]:
@@ -72,8 +75,15 @@ class Settled(NamedTuple):
 class Store:
     """Sessions and the messages held for them; without a folder they are in memory only."""
 
-    def __init__(self, folder: Path | None, limits: StoreLimits, sessions: int = 64) -> None:
-        self.limits = limits
+    def __init__(
+        self,
+        folder: Path | None,
+        limits: StoreLimits,
+        audit: Audit,
+        sessions: int = 64,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.limits, self._audit, self._clock = limits, audit, clock
         self._most_sessions = sessions
         path = ":memory:" if folder is None else str(folder / FILE)
         try:
@@ -90,12 +100,12 @@ class Store:
 
     def _load(self) -> None:
         for row in self._db.execute(f"SELECT id, {_COLUMNS} FROM session").fetchall():
-            id, name, address, email, temporary, received, numbered, seen_s = row
-            session = StoredSession(
-                name, Identity(address, email), bool(temporary), received, numbered, id=id, seen_s=seen_s
-            )
+            id, name, address, email, temporary, received, numbered, _ = row
+            session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
+            session.away_s = self._clock()
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
-            (session.held,) = self._db.execute("SELECT count(*) FROM delivery WHERE session = ?", (id,)).fetchone()
+            held = "SELECT count(*), coalesce(sum(length(frame)), 0) FROM delivery JOIN message ON id = message"
+            session.held, session.held_bytes = self._db.execute(f"{held} WHERE session = ?", (id,)).fetchone()
             self.sessions[session.key] = self._by_id[id] = session
         (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
         for session in list(self.sessions.values()):
@@ -113,80 +123,101 @@ class Store:
                 raise RefusedError("too_many", f"must be at most {self._most_sessions} sessions")
             session = StoredSession(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
-        session.identity, session.seen_s = identity, time.time()
+        session.identity, session.away_s = identity, self._clock()
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
-        if session.id is not None:
-            with self._transaction():
-                self._save(session)
+        self._save(session)
         return session
 
     def left(self, session: StoredSession) -> list[Settled]:
         """Note the end of a session's connection; forget messages that nobody will ask for."""
-        session.seen_s = time.time()
+        session.away_s = self._clock()
         if session.temporary or session.id is None:
             return self.forget(session)
-        with self._transaction():
-            self._save(session)
+        self._save(session)
         return []
 
     def forget(self, session: StoredSession) -> list[Settled]:
-        """Forget a session; messages held for it are lost."""
-        self.sessions.pop(session.key, None)
+        """Forget a session; messages held for it are lost. A disk that cannot be written keeps it for later."""
+        settled: list[Settled] = []
+        if session.id is not None:
+            gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
+            with self._bearable():
+                settled = self._settle(session, 0, 2**62, 1, *gone)
+                del self._by_id[session.id]
+                session.id = None
         if session.id is None:
-            return []
-        with self._transaction():
-            settled = self._settle(session, 0, 2**62, lost=1)
-            self._db.execute("DELETE FROM session WHERE id = ?", (session.id,))
-            self._db.execute("DELETE FROM durable WHERE session = ?", (session.id,))
-        self._by_id.pop(session.id, None)
+            self.sessions.pop(session.key, None)
         return settled
 
     def want(self, session: StoredSession, id: str, pattern: str | None) -> None:
-        """Hold matching messages while the session is away; the pattern None ends that."""
-        if pattern is None and session.durable.pop(id, None) is None:
+        """Hold matching messages while the session is away; the pattern None ends that.
+
+        Raises RefusedError: the disk cannot be written.
+        """
+        if pattern is None:
+            if session.durable.pop(id, None) is not None:
+                with self._bearable(), self._transaction():
+                    self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
             return
         self._remember(session)
         with self._transaction():
-            if pattern is None:
-                self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
-            else:
-                session.durable[id] = pattern
-                self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
+            self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
+        session.durable[id] = pattern
 
     def hold(
         self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
-    ) -> None:
-        """Store the sender's message number ``seq`` on disk for these receivers.
+    ) -> list[Settled]:
+        """Store the sender's message number ``seq`` on disk for these receivers; return those settled by making room.
 
         Without receivers, whom other relays have, the number alone is taken.
 
-        Raises RefusedError: no room; then its number is not used.
+        Raises RefusedError: there is no room; then its number is not used.
         """
-        full = next((each for each in receivers if each.held >= self.limits.messages), None)
-        if full is not None:
-            raise RefusedError("store_full", f"session {full.name} has not acked {self.limits.messages} messages")
-        if self.bytes + len(frame) > self.limits.bytes:
-            raise RefusedError("store_full", f"no room for {len(frame)} bytes beside {self.bytes}")
-        try:
-            for session in (sender, *receivers):
-                self._remember(session)
-            with self._transaction():
-                if receivers:
-                    row = sender.id, seq, topic, frame, len(receivers), len(receivers)
-                    columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
-                    message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
-                for receiver in receivers:
-                    number = receiver.numbered + 1
-                    self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
-                    self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
-                self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
-        except sqlite3.Error as error:
-            raise RefusedError("store_full", f"the store cannot be written: {error}") from None
+        gone = self._make_room(len(frame), receivers) if receivers else []
+        for session in (sender, *receivers):
+            self._remember(session)
+        with self._transaction():
+            if receivers:
+                row = sender.id, seq, topic, frame, len(receivers), len(receivers)
+                columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
+                message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
+            for receiver in receivers:
+                number = receiver.numbered + 1
+                self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
+                self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
+            self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
         sender.received = seq
         self.bytes += len(frame) if receivers else 0
         for receiver in receivers:
             receiver.numbered += 1
             receiver.held += 1
+            receiver.held_bytes += len(frame)
+        return gone
+
+    def _make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> list[Settled]:
+        """Let the oldest go: of a full session, and of the identity with the most bytes, so that others get theirs.
+
+        Raises RefusedError: nobody but these has to wait; or the message is larger than the store.
+        """
+        full = [each for each in receivers if each.held >= self.limits.messages]
+        if len(full) == len(receivers):
+            raise RefusedError("store_full", f"session {full[0].name} has not acked {self.limits.messages} messages")
+        gone = [settled for each in full for settled in self._let_go(each)]
+        while self.bytes + size_bytes > self.limits.bytes:
+            shares: Counter[str] = Counter()
+            for session in self.sessions.values():
+                shares[session.identity.key] += session.held_bytes
+            largest = max(self.sessions.values(), key=lambda one: (shares[one.identity.key], one.held_bytes))
+            alone = all(each.identity.key == largest.identity.key for each in receivers)
+            if alone or size_bytes > self.limits.bytes:
+                raise RefusedError("store_full", f"no room for {size_bytes} bytes beside {self.bytes}")
+            gone += self._let_go(largest)
+        return gone
+
+    def _let_go(self, session: StoredSession) -> list[Settled]:
+        (oldest,) = self._db.execute("SELECT min(number) FROM delivery WHERE session = ?", (session.id,)).fetchone()
+        self._audit.repeated(what="held", code="store_full", session=session.name, identity=session.identity.key)
+        return self._settle(session, oldest, oldest, 1)
 
     def waiting(self, session: StoredSession, after: int, most: int) -> list[tuple[int, str, bytes]]:
         """List number, topic and frame of the session's next messages."""
@@ -199,22 +230,26 @@ class Store:
         return self._db.execute(query, (session.id, after, most)).fetchall()
 
     def acked(self, session: StoredSession, number: int) -> list[Settled]:
-        """Note that the session has processed all messages up to this number; return the settled ones."""
-        if session.id is None or session.held == 0:
-            return []
-        with self._transaction():
-            return self._settle(session, 0, number, lost=0)
+        """Note that the session has processed all messages up to this number; return the settled ones.
+
+        If the disk cannot be written, a later ack does it.
+        """
+        if session.id is not None and session.held > 0:
+            with self._bearable():
+                return self._settle(session, 0, number, 0)
+        return []
 
     def denied(self, session: StoredSession, number: int) -> list[Settled]:
         """Drop a message that no rule lets the session have any more; return the settled ones."""
-        with self._transaction():
-            return self._settle(session, number, number, lost=1)
+        with self._bearable():
+            return self._settle(session, number, number, 1)
+        return []
 
     def expired(self, connected: Sequence[StoredSession]) -> list[StoredSession]:
-        """List the sessions that have been away for too long."""
-        before_s = time.time() - self.limits.keep_s
+        """List the sessions that have been away for too long, counted while the relay runs."""
+        before_s = self._clock() - self.limits.keep_s
         here = set(map(id, connected))
-        return [each for each in self.sessions.values() if id(each) not in here and each.seen_s < before_s]
+        return [each for each in self.sessions.values() if id(each) not in here and each.away_s < before_s]
 
     def close(self) -> None:
         """Close the file; everything is on disk already."""
@@ -222,41 +257,64 @@ class Store:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        self._db.execute("BEGIN IMMEDIATE")
+        """Raises RefusedError: the disk cannot be written; then nothing has changed."""
+        try:
+            self._db.execute("BEGIN IMMEDIATE")
+            yield
+            self._db.execute("COMMIT")
+        except BaseException as error:
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
+            if isinstance(error, sqlite3.Error):
+                raise RefusedError("store_full", f"the store cannot be written: {error}") from None
+            raise
+
+    @contextmanager
+    def _bearable(self) -> Iterator[None]:
+        """Log that the store cannot be written, and go on."""
         try:
             yield
-        except BaseException:
-            self._db.execute("ROLLBACK")
-            raise
-        self._db.execute("COMMIT")
+        except RefusedError as refused:
+            self._audit.repeated(what="store", code=refused.code, why=str(refused))
 
-    def _settle(self, session: StoredSession, first: int, last: int, lost: int) -> list[Settled]:
-        settled = []
+    def _settle(self, session: StoredSession, first: int, last: int, lost: int, *also: str) -> list[Settled]:
+        """End deliveries to a session; ``also`` are statements about its id for the same transaction."""
+        settled, sizes, freed_bytes = [], [], 0
         chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
-        rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
-        self._db.execute(f"DELETE {chosen}", (session.id, first, last))
-        session.held -= len(rows)
-        for (message,) in rows:
-            (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
-                "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
-                "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
-                (lost, message),
-            ).fetchone()
-            if waiting == 0:
-                self._db.execute("DELETE FROM message WHERE id = ?", (message,))
-                self.bytes -= size_bytes
-                if sender in self._by_id:
-                    settled.append(Settled(self._by_id[sender], seq, receivers, gone))
+        with self._transaction():
+            rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
+            self._db.execute(f"DELETE {chosen}", (session.id, first, last))
+            for statement in also:
+                self._db.execute(statement, (session.id,))
+            for (message,) in rows:
+                (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
+                    "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
+                    "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
+                    (lost, message),
+                ).fetchone()
+                sizes.append(size_bytes)
+                if waiting == 0:
+                    self._db.execute("DELETE FROM message WHERE id = ?", (message,))
+                    freed_bytes += size_bytes
+                    if sender in self._by_id:
+                        settled.append(Settled(self._by_id[sender], seq, receivers, gone))
+        session.held -= len(sizes)
+        session.held_bytes -= sum(sizes)
+        self.bytes -= freed_bytes
         return settled
 
     def _remember(self, session: StoredSession) -> None:
         """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
             insert = f"INSERT INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
-            session.id = self._db.execute(insert, session.columns).lastrowid
-            assert session.id is not None
+            with self._transaction():
+                id = self._db.execute(insert, session.columns).lastrowid
+            assert id is not None
+            session.id = id
             self._by_id[session.id] = session
 
     def _save(self, session: StoredSession) -> None:
-        places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
-        self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))
+        if session.id is not None:
+            places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
+            with self._bearable(), self._transaction():
+                self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final, Protocol
 
@@ -35,12 +35,33 @@ class Channel(Protocol):
         """Close at once."""
 
 
+class Room:
+    """Room for the bodies that arrive at one receiver at the same time, over all its connections."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.left_bytes = most_bytes
+
+    @contextlib.contextmanager
+    def taken(self, size_bytes: int) -> Iterator[None]:
+        """Take room until the block ends; raise a FrameError if too little is left."""
+        if size_bytes > self.left_bytes:
+            raise FrameError(f"body of {size_bytes} bytes: must wait, {self.left_bytes} are left for all senders")
+        self.left_bytes -= size_bytes
+        try:
+            yield
+        finally:
+            self.left_bytes += size_bytes
+
+
 class TcpChannel:
     """Frames on a TCP socket, one after the other."""
 
-    def __init__(self, connection: socket.socket, max_body_bytes: int = MAX_BODY_BYTES) -> None:
+    def __init__(
+        self, connection: socket.socket, max_body_bytes: int = MAX_BODY_BYTES, room: Room | None = None
+    ) -> None:
         self._socket = connection
         self._max_body_bytes = max_body_bytes
+        self._room = room or Room(max_body_bytes)
         self._unwritten_bytes = 0
 
     @classmethod
@@ -60,7 +81,8 @@ class TcpChannel:
 
     async def receive(self) -> Frame:
         frame, body_bytes = parse(await self._exactly(HEADER_BYTES), self._max_body_bytes)
-        return frame._replace(body=await self._exactly(body_bytes)) if body_bytes else frame
+        with self._room.taken(body_bytes):
+            return frame._replace(body=await self._exactly(body_bytes)) if body_bytes else frame
 
     async def _exactly(self, size_bytes: int) -> memoryview:
         loop, data, got = asyncio.get_running_loop(), memoryview(bytearray(size_bytes)), 0

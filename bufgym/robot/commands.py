@@ -124,6 +124,7 @@ async def receive(
         out: Write received messages to this file (.mcap).
         messages: Stop after so many.
     """
+    from bufgym.robot.mcap_file import MAX_CHANNELS
     from bufgym.robot.receiver import Received, Receiver, Recording
 
     enough, taken = asyncio.Event(), 0
@@ -147,6 +148,8 @@ async def receive(
             await asyncio.sleep(0.1)  # for the last ack
         finally:
             await receiver.close()
+            if recording is not None and recording.left_out:
+                say(f"{out}: {recording.left_out} messages left out: must be of at most {MAX_CHANNELS} topics")
             say(f"{taken} received; {len(receiver.faults)} broken connections {list(receiver.faults)[-1:]}")
 
 

@@ -1,11 +1,18 @@
 """One writer of MCAP files, for logs, received messages and a relay's recordings (extra ``live``)."""
 
 import time
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
 from bufgym.robot.extra import needs
 
+MAX_CHANNELS: Final = 30_000
+"""Channels of a file. MCAP itself numbers at most 65,535."""
+MAX_FORMS: Final = 16
+"""Channels of one topic, which differ in encoding or schema."""
+_MOST_NS: Final = 2**64 - 1
 _FLUSH_S: Final = 0.5  # time between flushes; a killed program loses what it has written since the last one
 
 
@@ -21,7 +28,9 @@ class McapFile:
         self._writer.start(profile="", library="bufgym")
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels: dict[tuple[str, str, str], int] = {}
+        self._forms: Counter[str] = Counter()
         self._flushed_s = 0.0
+        self._holds = False  # whether a message was written
 
     def write(
         self,
@@ -34,27 +43,44 @@ class McapFile:
         schema: str = "",
         schema_encoding: str = "jsonschema",
         seq: int = 0,
-    ) -> None:
-        """Add a message; ``schema`` is the name of its type, empty for none."""
+    ) -> bool:
+        """Add a message; ``schema`` is the name of its type, empty for none.
+
+        Return False and add nothing if it needs one channel more than ``MAX_CHANNELS`` or ``MAX_FORMS``.
+        """
         key, kind = (topic, encoding, schema), (schema, schema_encoding)
-        if schema and kind not in self._schemas:
-            text = b'{"type": "object"}' if schema_encoding == "jsonschema" else b""
-            self._schemas[kind] = self._writer.register_schema(schema, schema_encoding, text)
         if key not in self._channels:
+            if len(self._channels) >= MAX_CHANNELS or self._forms[topic] >= MAX_FORMS:
+                return False
+            self._forms[topic] += 1
+            if schema and kind not in self._schemas:
+                text = b'{"type": "object"}' if schema_encoding == "jsonschema" else b""
+                self._schemas[kind] = self._writer.register_schema(schema, schema_encoding, text)
             self._channels[key] = self._writer.register_channel(topic, encoding, self._schemas.get(kind, 0))
-        self._writer.add_message(
-            self._channels[key], log_time=log_ns, publish_time=publish_ns, sequence=seq % 2**32, data=data
-        )
-        now_s = time.monotonic()
-        if now_s - self._flushed_s >= _FLUSH_S:
-            self.file.flush()
-            self._flushed_s = now_s
+        times = {"log_time": min(log_ns, _MOST_NS), "publish_time": min(publish_ns, _MOST_NS)}
+        self._writer.add_message(self._channels[key], **times, sequence=seq % 2**32, data=data)
+        if time.monotonic() - self._flushed_s >= _FLUSH_S:
+            self.flush()
+        self._holds = True
+        return True
+
+    def flush(self) -> None:
+        """Hand what was written to the system."""
+        self.file.flush()
+        self._flushed_s = time.monotonic()
 
     def close(self) -> None:
         """Finish the file."""
         if not self.file.closed:
             self._writer.finish()
             self.file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is, and delete it if it holds no message."""
+        with suppress(OSError):
+            self.file.close()
+        if not self._holds:
+            self.path.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.bus_channel import BusServer
 from bufgym.robot.buses import BUSES, MQTT_PORT
-from bufgym.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
+from bufgym.robot.channels import TRANSPORTS, Channel, Room, TcpChannel, WebSocketChannel
 from bufgym.robot.extra import needs
 from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
 from bufgym.robot.mcap_file import McapFile
@@ -21,6 +21,12 @@ from bufgym.robot.tasks import Tasks
 
 MAX_STREAMS: Final = 64
 """Number of latest senders that are remembered."""
+MAX_PEERS: Final = 2 * MAX_STREAMS
+"""Connections at a time, with those that senders have given up."""
+MAX_ARRIVING_BYTES: Final = 2**28
+"""Bodies that arrive at the same time over TCP; a sender beyond is hung up on, and tries again."""
+IDLE_S: Final = 600.0
+"""Time for a whole frame; later the connection is closed. A sender that is still there connects again."""
 _GREETING_S: Final = 20.0  # time for a sender's greeting; later the connection is closed
 
 
@@ -65,6 +71,8 @@ class Receiver:
         self._on_message = on_message
         self._max_body_bytes = max_body_bytes
         self._streams: OrderedDict[bytes, _Talk] = OrderedDict()
+        self._room = Room(max(MAX_ARRIVING_BYTES, max_body_bytes))
+        self._peers = 0
         self._tasks = Tasks()
         self._listener: socket.socket | None = None
         self._server: Any = None
@@ -107,15 +115,19 @@ class Receiver:
             connection, _ = await asyncio.get_running_loop().sock_accept(listening)
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes)))
+            self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes, self._room)))
 
     async def _serve(self, channel: Channel) -> None:
         """Serve one connection to its end."""
+        self._peers += 1
         try:
+            if self._peers > MAX_PEERS:
+                raise ConnectionRefusedError(f"must be at most {MAX_PEERS} connections")
             await self._take(channel, await asyncio.wait_for(channel.receive(), _GREETING_S))
         except (OSError, TimeoutError) as error:
             self.faults.append(f"{type(error).__name__}: {error}")
         finally:
+            self._peers -= 1
             channel.close()
 
     async def _take(self, channel: Channel, greeting: Frame) -> None:
@@ -134,7 +146,7 @@ class Receiver:
                 oldest.task.cancel()
         await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes))
         while True:
-            frame = await channel.receive()
+            frame = await asyncio.wait_for(channel.receive(), IDLE_S)
             if frame.kind == GOODBYE:
                 self._streams.pop(name, None)
                 return
@@ -172,11 +184,16 @@ class Recording(McapFile):
     """Recording of received messages in an MCAP file, with bodies on ``/topic_0`` and so on, the rest on
     ``/received``."""
 
+    left_out = 0
+    """Messages on topics beyond the channels of a file (``robot.mcap_file``)."""
+
     def __call__(self, message: Received) -> None:
         """Write one message; an ``on_message`` of ``Receiver``."""
         times, seq = (message.received_ns, message.at_us * 1000), message.seq
         body, encoding = bytes(message.body), "application/octet-stream"
-        self.write(f"/topic_{message.topic}", body, *times, encoding=encoding, seq=seq)
+        if not self.write(f"/topic_{message.topic}", body, *times, encoding=encoding, seq=seq):
+            self.left_out += 1
+            return
         about = {**message._asdict(), "size_bytes": len(body)}
         del about["body"]
         self.write("/received", json.dumps(about).encode(), *times, schema="bufgym.live.Received", seq=seq)

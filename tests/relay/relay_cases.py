@@ -5,7 +5,7 @@ import contextlib
 import socket
 import ssl
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +166,18 @@ async def relay(config: Config | None = None) -> AsyncIterator[Server]:
         yield server
     finally:
         await wait("a relay's end", server.close())
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[None]:
+    """No file can grow while this lasts."""
+    resource = pytest.importorskip("resource", reason="needs POSIX")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @contextlib.asynccontextmanager

@@ -2,10 +2,12 @@
 
 import base64
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
-from relay_cases import ALL, client, relay, settings
+from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, until, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay.audit import FILE, Audit
@@ -13,6 +15,7 @@ from bufgym.relay.config import Rotation, Rule
 from bufgym.relay.recorder import FOLDER, Recorder
 from bufgym.relay.replay import piece, recordings
 from bufgym.relay.wire import Message
+from bufgym.robot.sockets import free_port
 from bufgym.traces.formats import bags
 
 pytest.importorskip("mcap", reason="no mcap here: the extra relay")
@@ -34,7 +37,8 @@ async def test_what_a_rule_allows_is_recorded(tmp_path: Path) -> None:
 
 def recorder(folder: Path, payloads: list[bytes], file_bytes: int = 10**6) -> Recorder:
     """One that has written these, of encoding json and jpeg in turn, and has not been closed."""
-    one = Recorder.of(settings(folder=folder, rules=(RECORD,), recording=Rotation(bytes=file_bytes, files=3)))
+    config = settings(folder=folder, rules=(RECORD,), recording=Rotation(bytes=file_bytes, files=3))
+    one = Recorder.of(config, Audit(None, config.audit))
     assert one is not None
     for k, payload in enumerate(payloads):
         one(Message(f"/robots/{'ab'[k % 2]}", payload, ("json", "jpeg")[k % 2], seq=k))
@@ -46,6 +50,24 @@ def test_recordings_take_turns(tmp_path: Path) -> None:
     files = sorted((tmp_path / FOLDER).glob("*.mcap"))
     assert len(files) == 3 and all(file.stat().st_size < 13_000 for file in files)
     assert sum(len(bags.read_bag(file).size_bytes) for file in files) < 50
+
+
+def test_ever_new_types_fill_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic has 16 channels at most, a file 20: of 40 types on /a 16 are kept, then of five topics more four."""
+    monkeypatch.setattr("bufgym.robot.mcap_file.MAX_CHANNELS", 20)
+    record = recorder(tmp_path, [])
+    for k in range(40):
+        record(Message("/robots/a", b"1", "cdr", f"my/type{k}", "robot"))
+    for k in range(5):
+        record(Message(f"/robots/{k}", b"1", "cdr"))
+    record(Message("/robots/a", b"again", "cdr", "my/type0"))
+    record.close()
+    (path,) = (tmp_path / FOLDER).glob("*.mcap")
+    bag = bags.read_bag(path)
+    assert list(bag.topics) == ["/robots/0", "/robots/1", "/robots/2", "/robots/3", "/robots/a"]
+    assert bag.size_bytes.tolist() == [1] * 20 + [5]
+    (said,) = record._audit.recent
+    assert (said["event"], said["topic"], said["sender"]) == ("recording_full", "/robots/a", "robot")
 
 
 def every(topic: str) -> bool:
@@ -89,6 +111,71 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
             piece(tmp_path, name, 0, 1, every)
     with pytest.raises(BufgymError, match=r"recording own\.mcap: must be an MCAP file"):
         piece(tmp_path, "own.mcap", 0, 1, every)
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+async def test_a_recording_outlives_its_relay(tmp_path: Path, end: signal.Signals) -> None:
+    """Asked to end, the relay finishes its files. Killed, it leaves all that it had written."""
+    port = free_port("127.0.0.1")
+    rule = '[[rules]]\nrecorder = true\nreceive = true\ntopic = "/robots/.*"\n'
+    async with process(port, tmp_path, rule) as one, client(port) as robot:
+        for _ in range(20):
+            await robot.put("/robots/a/odom", bytes(1_000))
+        await robot.rest()
+        (path,) = (tmp_path / "held" / FOLDER).glob("*.mcap")
+        if end == signal.SIGKILL:
+            await until("a tick, which writes", lambda: path.stat().st_size > 20_000)
+        one.send_signal(end)
+        assert await wait("its end", one.wait()) == (0 if end == signal.SIGTERM else -end)
+    assert bags.read_bag(path).size_bytes.tolist() == [1_000] * 20
+    if end == signal.SIGKILL:
+        os.truncate(path, path.stat().st_size - 10)  # in the midst of its last message
+        assert bags.read_bag(path).size_bytes.tolist() == [1_000] * 19
+
+
+async def test_a_full_disk_stops_no_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What needs the disk is refused or left out, and logged; the rest is forwarded, and all recovers."""
+    monkeypatch.setattr("bufgym.relay.server.TICK_S", 0.01)
+    monkeypatch.setattr("bufgym.relay.recorder.PAUSE_S", 0.01)
+    async with relay(settings(folder=tmp_path, rules=(ALL, RECORD))) as server:
+
+        def events() -> list[str]:
+            return [entry["event"] for entry in server.hub.audit.recent]
+
+        async with client(server.port, session="v") as viewer, client(server.port) as robot:
+            await viewer.subscribe("^/robots/a/", durable=True)
+            await robot.acked("/robots/a/command", 1)
+            await viewer.came(1)
+            with full_disk():
+                await viewer.say("subscribe", id="status", topic="^/relay/status$")
+                assert (await viewer.next())["op"] == "subscribed"
+                for _ in range(20):  # ticks
+                    assert (await viewer.next()).topic == "/relay/status"
+                await viewer.say("unsubscribe", id="status")
+                await viewer.rest()
+                await robot.put("/robots/a/odom", b"12")
+                assert (await viewer.next()).payload == b"12"
+                await robot.command(2, "/robots/a/command")
+                assert (await robot.next())["code"] == "store_full"
+                await viewer.say("ack", seq=1)
+                assert (await viewer.subscribe("b", "b", durable=True))["code"] == "store_full"
+                await until("its log", lambda: "recording_failed" in events())
+                async with client(server.port) as another:
+                    assert another.welcome["op"] == "welcome"
+            await robot.acked("/robots/a/command", 2)
+            await viewer.came(2)
+            assert (await viewer.subscribe("b", "b", durable=True))["op"] == "subscribed"
+            await viewer.say("ack", seq=2)
+            assert await nothing(viewer)
+            assert server.hub.status()["held"] == 0
+            async with within("the recorder"):
+                while "recording_resumed" not in events():
+                    await robot.put("/robots/b/odom")
+                    await robot.rest()
+    assert events().count("recording_failed") == events().count("recording_resumed") == 1 and "failed" not in events()
+    written = [entry["event"] for entry in entries(tmp_path)]
+    assert written.count("lost") == 1 and written[-1] == "left"
+    assert len(list((tmp_path / FOLDER).glob("*.mcap"))) == 2
 
 
 def entries(folder: Path) -> list[dict[str, object]]:

@@ -44,7 +44,8 @@ class Issuer:
 
     def token(self, kid: str = "", algorithm: str = "ES256", key: Any = None, **changed: Any) -> str:
         kid = kid or self.kid
-        claims = {"iss": ISSUER, "aud": "fleet", "exp": time.time() + 60, "email": "anna@x.org", **changed}
+        claims = {"iss": ISSUER, "aud": "fleet", "exp": time.time() + 60, "email": "anna@x.org"}
+        claims |= {"email_verified": True, **changed}
         claims = {name: value for name, value in claims.items() if value is not None}
         key = None if algorithm == "none" else key or self.keys[kid]
         return str(jwt.encode(claims, key, algorithm, headers={"kid": kid}))
@@ -108,6 +109,10 @@ SHARED = "a secret of thirty-two bytes and more"
         {"email": None},
         {"email": ["anna@x.org"]},
         {"email_verified": False},
+        {"email_verified": "false"},
+        {"email_verified": "true"},
+        {"email_verified": 1},
+        {"email_verified": None},
         {"algorithm": "HS256", "key": SHARED},
         {"algorithm": "none"},
         {"key": ec.generate_private_key(ec.SECP256R1())},

@@ -17,8 +17,11 @@ from relay_cases import Corner, client, nothing, process, relay, settings, until
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import backoff
-from bufgym.relay.config import Rule, StoreLimits
+from bufgym.relay.audit import Audit
+from bufgym.relay.config import Rotation, Rule, StoreLimits
+from bufgym.relay.rules import Identity
 from bufgym.relay.session import Session
+from bufgym.relay.store import Settled, Store
 from bufgym.robot.sockets import free_port
 
 CONFIG = settings(store=StoreLimits(window=2, messages=4))
@@ -82,6 +85,71 @@ async def test_held_while_its_receiver_is_away(corner: Corner) -> None:
             assert await nothing(viewer)
 
 
+async def test_who_acks_nothing_blocks_nobody(corner: Corner) -> None:
+    """A viewer wants all commands and acks none: of more than four the oldest goes, and robots get every one."""
+    async with (
+        corner.client() as operator,
+        corner.client(session="robot") as robot,
+        corner.client(session="hog", local="127.0.0.9") as hog,
+    ):
+        for one in (robot, hog):
+            await one.subscribe(f"^{corner.command}$", durable=True)
+        for seq in range(1, 7):
+            await operator.command(seq, corner.command)
+            said = [await operator.next()]
+            if seq > 4:
+                said.append(await operator.next())
+                assert {"op": "delivered", "seq": seq - 4, "receivers": 2, "lost": 1} in said
+            assert {"op": "ack", "seq": seq} in said
+            await robot.came(seq)
+            await robot.say("ack", seq=seq)
+            await robot.rest()
+        corner.hub.audit.flush()
+        (first, again) = [entry for entry in corner.hub.audit.recent if entry.get("what") == "held"]
+        assert (first["session"], first["identity"], again["times"]) == ("hog", "127.0.0.9", 1)
+
+
+def test_the_identity_with_most_bytes_makes_room() -> None:
+    """10 bytes of room: the hog's two sessions hold 3 and 4, the robot's one 3. So 2 more cost the hog its 4."""
+    audit = Audit(None, Rotation())
+    store = Store(None, StoreLimits(bytes=10), audit)
+    sender, robot, *hogs = (
+        store.open(name, Identity(address), False, 0, 0)
+        for name, address in (("s", "1.1.1.1"), ("r", "1.1.1.2"), ("a", "1.1.1.3"), ("b", "1.1.1.3"))
+    )
+    for seq, (size, receiver) in enumerate(((3, robot), (3, hogs[0]), (4, hogs[1])), start=1):
+        assert store.hold(sender, seq, "/a", bytes(size), [receiver]) == []
+    assert store.hold(sender, 4, "/a", bytes(2), [robot]) == [Settled(sender, 3, 1, 1)]
+    assert [one.held_bytes for one in (robot, *hogs)] == [5, 3, 0] and store.bytes == 8
+    with pytest.raises(BufgymError, match="no room for 3 bytes beside 8"):
+        store.hold(sender, 5, "/a", bytes(3), [robot])  # now the robot has the most
+    with pytest.raises(BufgymError, match="no room for 11 bytes beside 8"):
+        store.hold(sender, 5, "/a", bytes(11), [robot, hogs[0]])
+
+
+def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot is kept for 100 s. Neither a year's jump of the system's clock nor a year off ends that, but 101 s do."""
+    now_s = 10.0
+
+    def opened() -> Store:
+        return Store(tmp_path, StoreLimits(keep_s=100.0), Audit(None, Rotation()), clock=lambda: now_s)
+
+    store = opened()
+    robot = store.open("robot", Identity("1.1.1.1"), False, 0, 0)
+    store.want(robot, "a", "command$")
+    store.left(robot)
+    year_s = time.time() + 366 * 86_400
+    monkeypatch.setattr("time.time", lambda: year_s)
+    now_s += 99
+    assert store.expired([]) == []
+    store.close()
+    store, now_s = opened(), now_s + 99
+    assert store.expired([]) == []
+    now_s += 2
+    assert [one.name for one in store.expired([])] == ["robot"] and store.expired(list(store.sessions.values())) == []
+    store.close()
+
+
 async def test_the_same_session_takes_over(corner: Corner) -> None:
     async with corner.client() as operator, corner.client(session="a") as old, corner.client(session="a") as new:
         await wait("the end of the old", old.socket.wait_closed())
@@ -112,7 +180,7 @@ async def test_what_a_forgotten_session_had_to_get_is_told(corner: Corner) -> No
             await robot.subscribe(f"^{corner.command}$", durable=True)
         await until("the others' ends", lambda: len(corner.hub.members) == 1)
         await operator.acked(corner.command, 1)
-        corner.hub.store.sessions[corner.address, "a"].seen_s -= corner.hub.config.store.keep_s + 1
+        corner.hub.store.sessions[corner.address, "a"].away_s -= corner.hub.config.store.keep_s + 1
         corner.hub.tick()
         assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1}
         forgotten = [entry for entry in corner.hub.audit.recent if entry["event"] == "forgotten"]

@@ -1,7 +1,9 @@
 """The page in a browser: robots, map, senses, queue, a command, a recording; on a desk and on a phone."""
 
 import asyncio
+import json
 import queue
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +17,7 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
 import fleet_demo as demo  # noqa: E402
+from relay_cases import client  # noqa: E402
 
 pytestmark = compiled
 
@@ -82,6 +85,60 @@ def test_it_shows_the_robots(browser: Any, port: int, scheme: str, width: int) -
         for canvas, colours in (("#camera", 20), ("#scan", 3), ("#map", 5), ("#slots", 1)):
             until(page, f"({SEES})(document.querySelector('{canvas}')) >= {colours}")
         assert page.text_content("#state") == "live"
+
+
+BAD_NUMBERS = (1e17, -1e300, "far", None, [1], {"x": 1})
+FRAMES = "window.frames_drawn = 0, (function count() { window.frames_drawn++; requestAnimationFrame(count); })()"
+
+
+def cdr(x: float, rays: int | None = None) -> bytes:
+    """A PoseStamped at x, or a LaserScan that says to have so many rays and has one."""
+    head = bytes([0, 1, 0, 0]) + struct.pack("<iIIxxxx", 0, 0, 0)
+    if rays is None:
+        return head + struct.pack("<7d", x, 0, 0, 0, 0, 0, 1)
+    return head + struct.pack("<7fIf", 0, 1, 1, 0, 0, 0, 9, rays, max(-3e38, x))
+
+
+@pytest.mark.parametrize("number", [*BAD_NUMBERS, float("nan"), float("inf")], ids=str)
+def test_no_number_freezes_the_page(browser: Any, port: int, number: Any) -> None:
+    """A robot says it everywhere, as JSON and in ROS's encoding; the page goes on, and shows the others."""
+
+    async def rave(page: Any) -> None:
+        async with client(port, name="mad") as robot:
+            for _ in range(3):
+                if not isinstance(number, float) or abs(number) < 1e301:  # what JSON can say
+                    at = {"x": number, "y": number, "yaw": number}
+                    queue = {"capacity": number, "queued": number, "waiting": number, "topics": {"a": number}}
+                    scan = {"angle_min": 0, "angle_increment": number, "ranges": [number] * 9}
+                    said = {"odom": at, "scan": scan, "queue": queue, "status": {"location": at, "queue": queue}}
+                    for name, what in [*said.items(), ("status", number), ("queue", number), ("scan", number)]:
+                        await robot.put(f"/robots/mad/{name}", json.dumps(what).encode(), encoding="json")
+                if isinstance(number, float):
+                    pose, scan_type = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/LaserScan"
+                    await robot.put("/robots/mad/localization", cdr(number), encoding="cdr", type=pose)
+                    await robot.put("/robots/mad/laser", cdr(number, 2**32 - 1), encoding="cdr", type=scan_type)
+            await robot.put("/robots/mad/status", b"{}", encoding="json")
+            assert await robot.rest() == []
+
+    with shows(browser, f"http://127.0.0.1:{port}/") as page:
+        until(page, "[...document.querySelectorAll('.card b')].map(card => card.textContent).includes('robot-1')")
+        threading_run(rave(page))
+        mad = "[...document.querySelectorAll('.card')].find(card => card.textContent.includes('mad'))"
+        until(page, f"{mad} !== undefined")
+        page.evaluate(f"{mad}.click()")
+        threading_run(rave(page))
+        page.evaluate(FRAMES)
+        until(page, "window.frames_drawn > 30")
+        page.evaluate("[...document.querySelectorAll('.card')].find(c => c.textContent.includes('robot-2')).click()")
+        until(page, f"({SEES})(document.querySelector('#scan')) >= 3")
+
+
+def threading_run(work: Any) -> None:
+    """Run it in a thread: playwright has this one's loop."""
+    thread = threading.Thread(target=lambda: asyncio.run(work))
+    thread.start()
+    thread.join(120)
+    assert not thread.is_alive(), "waited 120 s for a robot"
 
 
 @pytest.mark.nightly

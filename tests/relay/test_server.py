@@ -1,10 +1,14 @@
 """Robots and viewers at one relay: who gets what, and what is refused."""
 
+import asyncio
+import contextlib
 import subprocess
 import sys
+from http.client import HTTPConnection
 
 import pytest
-from relay_cases import Corner, client, nothing, relay, settings, wait
+from loop_cases import beside
+from relay_cases import Client, Corner, client, nothing, relay, settings, until, wait
 
 from bufgym.relay import server as serving
 from bufgym.relay.config import Limits, Rule
@@ -75,6 +79,74 @@ async def test_each_refusal_says_why() -> None:
         assert sum(entry.get("times", 1) for entry in written) == 40 - 14
         await one.put("/open/a", bytes(200_001))
         await wait("the end of a connection beyond the limit", one.socket.wait_closed())
+
+
+async def test_sixty_robots_come_from_one_address() -> None:
+    """By the default limits, each with ten topics of ten messages at once, and two subscriptions; more are refused."""
+
+    async def robot(stack: contextlib.AsyncExitStack, k: int) -> Client:
+        one = await stack.enter_async_context(client(server.port, session=f"r{k}"))
+        assert one.welcome["op"] == "welcome"
+        for id in ("command", "stop"):
+            assert (await one.subscribe(f"^/robots/{k}/{id}$", id))["op"] == "subscribed"
+        for name in 10 * [f"/robots/{k}/{topic}" for topic in range(10)]:
+            await one.put(name)
+        return one
+
+    async with relay() as server, contextlib.AsyncExitStack() as stack:
+        for one in await asyncio.gather(*(robot(stack, k) for k in range(60))):
+            assert await one.rest() == []
+        assert server.hub.received >= 6_000 and server.hub.audit.refused == 0
+        for k in range(60, 128):
+            await stack.enter_async_context(client(server.port, session=f"r{k}"))
+        async with client(server.port) as one:
+            assert one.welcome["code"] == "too_many"
+
+
+async def test_a_flood_of_json_waits_and_others_are_served() -> None:
+    """Of 40 texts of 9,500 bytes at 10,000 a second one is parsed each second; another's requests are answered."""
+    limits = Limits(json_bytes_per_s=10_000)
+    async with relay(settings(limits=limits)) as server, client(server.port, local="127.0.0.3") as flood:
+
+        async def send() -> None:
+            for k in range(40):
+                if k % 2:
+                    await flood.put("/a", b'"%s"' % bytes(9_998).replace(b"\0", b"a"), encoding="json")
+                else:
+                    await flood.say("publish", topic="/a", data="a" * 9_440)
+
+        async with beside(send()), client(server.port) as other:
+            await until("the first", lambda: server.hub.received > 0)
+            for _ in range(5):
+                await other.put("/b")
+                await other.rest()
+            assert server.hub.received < 40
+
+
+async def test_it_answers_monitors() -> None:
+    """Of 5 messages beyond 20 at a time, the counts are those of the audit log. A stranger's address gets none."""
+
+    def get(port: int, path: str, local: str = "127.0.0.1") -> tuple[int, str]:
+        with contextlib.closing(HTTPConnection("127.0.0.1", port, 60, (local, 0))) as asking:
+            asking.request("GET", path)
+            answer = asking.getresponse()
+            return answer.status, answer.read().decode()
+
+    rules = (Rule(address="127.0.0.1", send=True, receive=True), Rule(address="127.0.0.2", send=True))
+    async with relay(settings(limits=Limits(messages_per_s=20), rules=rules)) as server:
+        server.hub.clock = lambda: 0.0
+        async with client(server.port) as robot:
+            for _ in range(25):
+                await robot.put("/a")
+            await robot.rest()
+            server.hub.audit.flush()
+            counts = await asyncio.to_thread(get, server.port, "/metrics")
+        assert counts[0] == 200 and counts[1].endswith("# EOF\n")
+        for line in ("connections 1.0", "held 0.0", "received_total 20.0", 'refused_total{code="too_fast"} 5.0'):
+            assert f"\nbufgym_relay_{line}\n" in counts[1]
+        assert (await asyncio.to_thread(get, server.port, "/metrics", "127.0.0.2"))[0] == 403
+        assert await asyncio.to_thread(get, server.port, "/healthz", "127.0.0.2") == (200, "ok\n")
+        assert (await asyncio.to_thread(get, server.port, "/healthz", "127.0.0.3"))[0] == 403
 
 
 async def test_the_relay_tells_how_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,7 +80,9 @@ GOOD = wire.encode(Message("/a", b"12"))
         (wire.from_json, {"topic": "/a", "encoding": "jpeg", "data": "*"}, "must be base64"),
         (wire.from_json, {"topic": "/a", "encoding": "jpeg", "data": 3}, "must be base64"),
         (wire.from_json, {"topic": "/a", "encoding": "", "data": ""}, "must not be empty"),
+        (wire.heard, '{"op": "publish", "topic": "/a", "data": -1e400}', "the number -1e400 is no JSON"),
         (wire.to_json, Message("/a", b"{"), "payload must be JSON"),
+        (wire.to_json, Message("/a", b"1e400"), "payload must be JSON"),
     ],
 )
 def test_each_fault_is_named(read: Any, given: Any, error: str) -> None:

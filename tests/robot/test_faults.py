@@ -283,11 +283,15 @@ def test_a_log_of_a_killed_sender_can_be_read(tmp_path: Path) -> None:
             read_log(tmp_path / f"{name}.mcap")
 
 
-def test_what_comes_is_recorded(tmp_path: Path) -> None:
+def test_what_comes_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also from a clock far beyond any; a topic beyond the file's two channels is left out."""
     from mcap.reader import make_reader
 
+    monkeypatch.setattr("bufgym.robot.mcap_file.MAX_CHANNELS", 2)
     with Recording(tmp_path / "came.mcap") as recording:
-        recording(Received("ab", 0, 7, 5_000, 1.5, 2, b"frame", 10**9))
+        for topic, at_us in ((2, 2**64 - 1), (3, 5_000), (2, 5_000)):
+            recording(Received("ab", 0, 7, at_us, 1.5, topic, b"frame", 10**9))
+    assert recording.left_out == 1
     with (tmp_path / "came.mcap").open("rb") as file:
         found = {channel.topic: message for _, channel, message in make_reader(file).iter_messages()}
     assert found["/topic_2"].data == b"frame" and found["/topic_2"].sequence == 7

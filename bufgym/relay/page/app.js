@@ -3,7 +3,7 @@
 
 import {bits, drawHistory, drawPicture, drawScan, drawSlots, hue, percent, seconds, whenColoursChange} from "./draw.js";
 import {Map2D} from "./map.js";
-import {json, kindOf, picture, pose, scan} from "./messages.js";
+import {json, kindOf, picture, pose, queue, scan, status} from "./messages.js";
 import {Relay} from "./relay.js";
 import {Replay} from "./replay.js";
 
@@ -26,7 +26,7 @@ const relay = new Relay({
     $("state").className = "state" + (replay ? " replay" : isOn ? " on" : "");
   },
   welcome() { offerPolicies(); },
-  message(message) { if (!replay) take(message); },
+  message(message) { if (!replay) tried(message); },
   said(said) {
     if (said.op === "recordings") listFiles(said.files);
     else if (said.op === "replayed") replay?.take(said);
@@ -59,6 +59,15 @@ function robotOf(name) {
   return robots.get(name);
 }
 
+// A message that is not what it says it is changes nothing.
+function tried(message) {
+  try {
+    take(message);
+  } catch {
+    return;
+  }
+}
+
 function take(message) {
   if (message.topic === "/relay/status") return sayRelay(json(message));
   const [, name, topic] = ROBOT.exec(message.topic) ?? [];
@@ -67,8 +76,8 @@ function take(message) {
   robot.heardMs = nowMs();
   // A robot's clock may be wrong; how late a message is shows beside the promptest of them.
   robot.skewMs = Math.min(robot.skewMs, nowMs() - message.stampMs);
-  if (topic === "status") return takeStatus(robot, json(message), message.stampMs + robot.skewMs);
-  if (topic === "queue") return takeQueue(robot, json(message), message.stampMs + robot.skewMs);
+  if (topic === "status") return takeStatus(robot, status(json(message)), message.stampMs + robot.skewMs);
+  if (topic === "queue") return takeQueue(robot, queue(json(message)), message.stampMs + robot.skewMs);
   robot.kinds[topic] ??= kindOf(topic, message);
   if (robot.kinds[topic] === "pose") takePose(robot, pose(message), message.stampMs + robot.skewMs);
   else if (robot.kinds[topic] === "scan" && name === chosen) {
@@ -86,7 +95,7 @@ function take(message) {
 function takeStatus(robot, status, ms) {
   robot.status = status;
   for (const [topic, what] of Object.entries(status.publishes ?? {})) robot.kinds[topic] ??= kindOf(topic, what);
-  if (status.location && !(robot.poseMs > ms - 3000) && status.location.x !== undefined) takePose(robot, status.location, ms);
+  if (status.location && !(robot.poseMs > ms - 3000)) takePose(robot, status.location, ms);
   if (status.queue && !(robot.queueMs > ms - 3000)) takeQueue(robot, status.queue, ms, false);
   subscribe();
   if (robot.name === chosen) offerPolicies();
@@ -107,7 +116,7 @@ function takeQueue(robot, queue, ms, own = true) {
 }
 
 function takePose(robot, at, ms) {
-  if (robot.poseMs > ms) return;
+  if (!at || robot.poseMs > ms) return;
   robot.pose = at;
   robot.poseMs = ms;
   robot.poses.push({...at, ms});
@@ -268,7 +277,7 @@ function forget() {
 function play(file) {
   forget();
   for (const id of ["status", "poses", "chosen"]) relay.unsubscribe(id);
-  replay = new Replay(relay, file, take, () => {
+  replay = new Replay(relay, file, tried, () => {
     for (const robot of robots.values()) Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0});
     map.forget();
   });

@@ -40,7 +40,7 @@ export function drawPicture(canvas, bitmap) {
 export function drawScan(canvas, scan, tint) {
   const [drawing, width, height] = context(canvas);
   if (!scan) return;
-  const far = Math.max(1, ...scan.ranges.filter(Number.isFinite));
+  const far = scan.ranges.reduce((most, range) => range > most ? range : most, 1);
   const reach = Math.min(far, SENSES_RANGE_M), scale = Math.min(width, height) / 2 / reach * 0.94;
   drawing.translate(width / 2, height / 2);
   drawing.strokeStyle = colour("rule");

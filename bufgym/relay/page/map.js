@@ -103,6 +103,7 @@ export class Map2D {
       if (!Number.isFinite(range)) return;
       const angle = pose.yaw + scan.angle_min + k * scan.angle_increment;
       const x = pose.x + range * Math.cos(angle), y = pose.y + range * Math.sin(angle);
+      if (!(Math.max(Math.abs(x - this.origin.x), Math.abs(y - this.origin.y)) < half)) return;  // beyond the walls' canvas
       const [low, high] = this.seen;
       this.seen = low ? [{x: Math.min(low.x, x), y: Math.min(low.y, y)}, {x: Math.max(high.x, x), y: Math.max(high.y, y)}] : [{x, y}, {x, y}];
       drawing.fillRect(Math.floor((x - this.origin.x + half) / CELL_M), Math.floor((this.origin.y - y + half) / CELL_M), 1, 1);

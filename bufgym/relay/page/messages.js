@@ -1,6 +1,14 @@
 // What goes over the wire, and what is in it: the relay's binary frames, and ROS 2 messages in CDR.
 
 const text = new TextDecoder();
+const FAR_M = 1e6, MOST = 1e12, MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64;
+
+// A number from outside as it may be drawn: finite, from -most to most. Nothing else is a number.
+function number(value, most = MOST) {
+  return Number.isFinite(value) ? Math.min(most, Math.max(-most, value)) : undefined;
+}
+const numbers = (said, ...names) => Object.fromEntries(names.map(name => [name, number(said?.[name])]));
+const object = value => value !== null && typeof value === "object" ? value : {};
 
 // A message of a binary frame: {topic, type, encoding, sender, seq, stampMs, noDrop, payload}.
 export function decode(buffer) {
@@ -60,7 +68,7 @@ class Cdr {
   scan() {
     const [angle_min, , angle_increment] = [this.float(), this.float(), this.float()];
     this.float(); this.float(); this.float(); this.float();
-    const ranges = new Float32Array(this.uint());
+    const ranges = new Float32Array(Math.min(this.uint(), this.view.byteLength / 4));
     for (let k = 0; k < ranges.length; k++) ranges[k] = this.float();
     return {angle_min, angle_increment, ranges};
   }
@@ -78,19 +86,52 @@ export function kindOf(name, {type, encoding}) {
   if (encoding === "json") return {odom: "pose", scan: "scan"}[name];
 }
 
+// A place on the map, or undefined if this is none.
+export function place(said) {
+  const {x, y, yaw} = object(said), at = {x: number(x, FAR_M), y: number(y, FAR_M), yaw: number(yaw) ?? 0};
+  return at.x === undefined || at.y === undefined ? undefined : at;
+}
+
 export function pose(message) {
-  if (message.encoding === "json") return json(message);
+  if (message.encoding === "json") return place(json(message));
   const cdr = new Cdr(message.payload);
   cdr.header();
   if (message.type === "nav_msgs/msg/Odometry") cdr.string();
-  return cdr.pose();
+  return place(cdr.pose());
 }
 
+// Distances in metres; NaN where a ray met nothing.
 export function scan(message) {
-  if (message.encoding === "json") return json(message);
-  const cdr = new Cdr(message.payload);
-  cdr.header();
-  return cdr.scan();
+  let said;
+  if (message.encoding === "json") said = object(json(message));
+  else {
+    const cdr = new Cdr(message.payload);
+    cdr.header();
+    said = cdr.scan();
+  }
+  const ranges = Array.from(said.ranges.slice(0, MOST_RAYS), range => number(range, FAR_M) ?? NaN);
+  return {angle_min: number(said.angle_min) ?? 0, angle_increment: number(said.angle_increment) ?? 0, ranges};
+}
+
+export function queue(said) {
+  const {policy, waiting, topics} = object(said), slots = Array.isArray(waiting) ? waiting : [];
+  const {capacity, ...counts} = numbers(said, "capacity", "queued", "put", "dropped", "rate_bps", "qoi");
+  return {
+    ...counts, queued: counts.queued ?? 0, dropped: counts.dropped ?? 0,
+    capacity: Math.min(MOST_SLOTS, Math.max(1, capacity ?? 1)), policy: String(policy ?? ""),
+    waiting: slots.slice(0, MOST_SLOTS).map(topic => number(topic) ?? 0),
+    topics: Object.fromEntries(Object.entries(object(topics)).slice(0, MOST_TOPICS).map(
+      ([name, of]) => [name, numbers(of, "age_s", "left", "dropped", "qoi")])),
+  };
+}
+
+export function status(said) {
+  const {location, network, policies, publishes, recording, queue: its} = object(said);
+  return {
+    ...numbers(said, "battery"), network: numbers(network, "rtt_ms"), location: place(location), recording: String(recording ?? ""),
+    policies: (Array.isArray(policies) ? policies : []).slice(0, MOST_TOPICS).map(String), queue: its && queue(its),
+    publishes: Object.fromEntries(Object.entries(object(publishes)).slice(0, MOST_TOPICS).map(([topic, of]) => [topic, object(of)])),
+  };
 }
 
 // A promise of something that a canvas can draw.
@@ -111,6 +152,7 @@ function plain(cdr) {
   cdr.at++;                                         // whether it is big endian
   const step = cdr.uint(), data = cdr.bytes(cdr.uint());
   const [red, green, blue, bytes] = {rgb8: [0, 1, 2, 3], bgr8: [2, 1, 0, 3], rgba8: [0, 1, 2, 4], bgra8: [2, 1, 0, 4]}[order] ?? [0, 0, 0, 1];
+  if (Math.max(width * bytes, step) * height > data.length) throw new Error("a picture without its pixels");
   const image = new ImageData(width, height);
   for (let y = 0, to = 0; y < height; y++)
     for (let x = 0, from = y * step; x < width; x++, from += bytes, to += 4) {

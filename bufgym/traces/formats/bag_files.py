@@ -53,11 +53,15 @@ class _Unpacked:
 class _Bounded(io.BufferedReader):
     """A file that reads no more than it holds, so that a damaged length does not become an allocation."""
 
+    ends_early = False  # whether a read beyond the end is the file's end, and not a part of what was asked for
+
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(_regular(path)))
         self._left = self.size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1) -> bytes:
+        if self.ends_early and size is not None and size > self._left:
+            raise EOFError
         data = super().read(self._left if size is None or size < 0 else min(size, self._left))
         self._left -= len(data)
         return data
@@ -94,7 +98,7 @@ def _mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
     with _Bounded(path) as file:
         unpacked = _Unpacked(file.size)
         reader = StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK_BYTES)
-        for record in reader.records:
+        for record in _ours_may_end(reader.records, file):
             declared(record)
             if isinstance(record, records.Message):
                 yield channels[record.channel_id], record.log_time, record.data
@@ -107,6 +111,16 @@ def _mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
                         declared(records.Schema.read(ReadDataStream(io.BytesIO(content))))
                     elif kind == Opcode.CHANNEL:
                         declared(records.Channel.read(ReadDataStream(io.BytesIO(content))))
+
+
+def _ours_may_end(records: Iterator[Any], file: _Bounded) -> Iterator[Any]:
+    """The records; a file that bufgym was writing when it was killed ends with its last whole record."""
+    try:
+        for record in records:
+            file.ends_early = file.ends_early or getattr(record, "library", "") == "bufgym"
+            yield record
+    except EOFError:
+        return
 
 
 def _records(chunk: bytes) -> Iterator[tuple[int, memoryview]]:

@@ -11,7 +11,8 @@ message without content counts as 1 byte. Poses come from nav_msgs/Odometry, geo
 PoseWithCovarianceStamped, and from tf, at the same arrival times.
 
 A recording that breaks off (as when a robot loses power) is refused as a whole; the recorder's own tools (``mcap
-recover``, ``rosbag reindex``) save what can be saved.
+recover``, ``rosbag reindex``) save what can be saved. Files that bufgym itself wrote are read to their last whole
+message.
 """
 
 from __future__ import annotations

@@ -1,0 +1,36 @@
+"""A relay's counts as OpenMetrics text, for Prometheus and what reads its format."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST as CONTENT_TYPE
+from prometheus_client.openmetrics.exposition import generate_latest
+
+__all__ = ["CONTENT_TYPE", "text"]
+_NOW = {"connections": "Connections that have said hello.", "held": "No_drop messages that receivers have not acked."}
+_SO_FAR = {
+    "received": "Messages taken from clients.",
+    "sent": "Messages sent to clients.",
+    "dropped": "Messages that a receiver's policy dropped.",
+}
+
+
+class _Counts:
+    def __init__(self, status: Mapping[str, int], refusals: Mapping[str, int]) -> None:
+        self._status, self._refusals = status, refusals
+
+    def collect(self) -> Iterator[Any]:
+        for name, about in _NOW.items():
+            yield GaugeMetricFamily(f"bufgym_relay_{name}", about, self._status[name])
+        for name, about in _SO_FAR.items():
+            yield CounterMetricFamily(f"bufgym_relay_{name}", about, self._status[name])
+        refused = CounterMetricFamily("bufgym_relay_refused", "Refusals, also those beyond a quota.", labels=["code"])
+        for code, times in sorted(self._refusals.items()):
+            refused.add_metric([code], times)
+        yield refused
+
+
+def text(status: Mapping[str, int], refusals: Mapping[str, int]) -> bytes:
+    """Write the counts of ``Hub.status``, and how often each code was refused."""
+    return bytes(generate_latest(_Counts(status, refusals)))  # type: ignore[no-untyped-call]
