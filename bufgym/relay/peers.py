@@ -13,7 +13,7 @@ import ssl
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import policies, wire
+from bufgym.relay import policies, protocol, wire
 from bufgym.relay.config import DEFAULT_CAPACITY, Nats
 from bufgym.relay.hub import OWN, Hub, Outgoing
 from bufgym.relay.patterns import pattern
@@ -140,7 +140,8 @@ class Peers:
         """Decode a message of another relay; None if it is none, or may not come in."""
         try:
             message = wire.decode(heard.data, _MAX_FRAME_BYTES)
-        except wire.WireError as error:
+            protocol.check_json(message)
+        except BufgymError as error:
             await self._note(error)
             return None
         return message if self._goes("send", message.topic) else None
@@ -172,8 +173,14 @@ class Peers:
 
     async def _take(self, heard: Any) -> None:
         """Hold a no_drop message of another relay for the receivers here; if there is no room, try again later."""
-        number = int(hashlib.blake2b(heard.headers.get("Nats-Msg-Id", "").encode(), digest_size=6).hexdigest(), 16)
-        message = None if heard.headers.get("Relay") == self._settings.name else await self._read(heard)
+        headers = heard.headers or {}
+        id, relay = headers.get("Nats-Msg-Id", ""), headers.get("Relay", "")
+        if not (id and relay):
+            await self._note(wire.WireError(f"{HOLD}: a message without the headers Nats-Msg-Id and Relay"))
+            await heard.term()
+            return
+        number = int(hashlib.blake2b(id.encode(errors="replace"), digest_size=6).hexdigest(), 16)
+        message = None if relay == self._settings.name else await self._read(heard)
         if message is not None and self._hub.is_no_drop(message.topic) and number != self.session.received:
             try:
                 self._hub.hold(self, message, taken=number)

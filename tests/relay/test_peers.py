@@ -13,10 +13,10 @@ from relay_cases import ALL, client, nothing, relay, settings, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import Nats, Rule, Server, StoreLimits
-from bufgym.relay.wire import Message
+from bufgym.relay.wire import Message, encode
 from bufgym.robot.sockets import free_port
 
-pytest.importorskip("nats", reason="no nats here: the extra mesh")
+nats: Any = pytest.importorskip("nats", reason="no nats here: the extra mesh")
 NATS_SERVER = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin")
 pytestmark = pytest.mark.skipif(NATS_SERVER is None, reason="no nats-server here")
 SHARED = Rule(nats=True, send=True, receive=True, topic="/robots/[^/]+/(odom|secret|command)")
@@ -130,6 +130,31 @@ async def test_a_relay_without_room_is_given_the_message_again(relays: list[Serv
         await one.came(2, payload=b'"%s"' % (b"y" * 200))
         await one.say("ack", seq=2)
         await one.came(3)
+
+
+async def test_what_comes_from_the_bus_is_doubted(relays: list[Server], robot: str) -> None:
+    """A stranger on the bus sends rubbish: it is audited, nobody's connection ends, and commands go on."""
+    a, b, _ = relays
+    command, odometry = f"{robot}/command", f"{robot}/odom"
+    assert a.config.nats is not None
+    bus = await wait("a connection to NATS", nats.connect(a.config.nats.url))
+    async with client(a.port) as operator, client(b.port, form="json") as viewer, client(b.port) as one:
+        await viewer.subscribe(f"^{odometry}$")
+        await one.subscribe(f"^{command}$")
+        headers = {"Nats-Msg-Id": robot, "Relay": "x"}
+        frame = encode(Message(command, b"{", "json", no_drop=True))
+        for data, extra in ((b"no frame", {}), (b"no frame", {"Relay": "x"}), (b"no frame", headers), (frame, headers)):
+            await bus.publish("bufgym.relay.hold", data, headers=extra or None)
+        for data in (b"", b"no frame", encode(Message(odometry, b"{", "json"))):
+            await bus.publish("bufgym.relay.message", data)
+        await wait("NATS to have all", bus.flush())
+        await operator.acked(command, 1)
+        await one.came(1)
+        await operator.put(odometry, b"2", encoding="json")
+        assert (await viewer.next())["data"] == 2
+        said = " ".join(entry["why"] for entry in b.hub.audit.recent if entry.get("what") == "nats")
+        assert "without the headers" in said and "payload must be JSON" in said and "frame of 8 bytes" in said
+    await bus.close()
 
 
 async def test_without_nats_commands_wait_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
