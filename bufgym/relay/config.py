@@ -6,6 +6,7 @@ Whatever no rule allows is denied, so a configuration without rules serves nobod
 import ipaddress
 from pathlib import Path
 from typing import Annotated, Any, Final
+from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Meta
@@ -145,6 +146,19 @@ class Nats(Section, frozen=True):
     """The server's file of a user's credentials (``.creds``); empty if it wants none."""
     authority: str = ""
     """PEM file of the authority that signs the server's certificate; empty for the system's."""
+
+    def __post_init__(self) -> None:
+        try:
+            _ = urlsplit(self.url).port
+        except ValueError:
+            rule = "must be nats://HOST:PORT, with %23 and the like for signs in a password"
+            raise BufgymError(f"nats: url = {self.place!r}: {rule}") from None
+
+    @property
+    def place(self) -> str:
+        """The URL without its user and password."""
+        scheme, _, rest = self.url.partition("://")
+        return f"{scheme}://{rest.rpartition('@')[2]}"
 
 
 class Foxglove(Section, frozen=True):

@@ -4,15 +4,19 @@ import asyncio
 import contextlib
 import itertools
 import shutil
+import signal
+import sys
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from relay_cases import ALL, client, nothing, relay, settings, wait, within
+from relay_cases import ALL, client, nothing, relay, settings, stranger, until, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import Nats, Rule, Server, StoreLimits
+from bufgym.relay.hub import Hub
+from bufgym.relay.peers import Peers
 from bufgym.relay.wire import Message, encode
 from bufgym.robot.sockets import free_port
 
@@ -24,8 +28,8 @@ _NUMBERS = itertools.count()
 
 
 @contextlib.asynccontextmanager
-async def nats_server(port: int, folder: Path) -> AsyncIterator[Any]:
-    words = ["-js", "-a", "127.0.0.1", "-p", str(port), "-sd", str(folder)]
+async def nats_server(port: int, folder: Path, *more: str) -> AsyncIterator[Any]:
+    words = [*more, "-js", "-a", "127.0.0.1", "-p", str(port), "-sd", str(folder)]
     quiet = asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(str(NATS_SERVER), *words, stdout=quiet, stderr=quiet)
     try:
@@ -115,6 +119,21 @@ async def test_a_command_arrives_once_at_a_robot_of_another_relay(relays: list[S
             assert await nothing(one)
 
 
+async def test_a_command_too_large_for_nats_is_refused_and_the_next_goes_on(relays: list[Server], robot: str) -> None:
+    """NATS takes 1 MiB with the headers, for which 256 bytes are left."""
+    a, b, _ = relays
+    command = f"{robot}/command"
+    async with client(a.port) as operator, client(b.port) as one:
+        await one.subscribe(f"^{command}$")
+        await operator.put(command, bytes(2**20), seq=1, no_drop=True)
+        refused = await operator.next()
+        assert (refused["op"], refused["code"], refused["seq"]) == ("refused", "too_large", 1)
+        frame_bytes = 32 + len(command) + len("raw") + len("127.0.0.1") + 2**20
+        assert refused["why"] == f"topic {command}: {frame_bytes} bytes: must be at most 1048320 for NATS"
+        await operator.acked(command, 1)
+        await one.came(1)
+
+
 async def test_a_relay_without_room_is_given_the_message_again(relays: list[Server], robot: str) -> None:
     a, b, _ = relays
     command = f"{robot}/command"
@@ -157,34 +176,129 @@ async def test_what_comes_from_the_bus_is_doubted(relays: list[Server], robot: s
     await bus.close()
 
 
-async def test_without_nats_commands_wait_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sender's connection ends, unanswered. Once NATS is back it sends the same again, which arrives once."""
-    port, command = free_port("127.0.0.1"), "/robots/a/command"
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relays wait little for NATS."""
     for name in ("ANSWER_S", "ASK_S"):
-        monkeypatch.setattr(f"bufgym.relay.peers.{name}", 0.3)
-    with pytest.raises(BufgymError, match=f"nats: nats://127.0.0.1:{port}"):
-        async with shared(port, "a"):
+        monkeypatch.setattr(f"bufgym.relay.bus.{name}", 0.5)
+    monkeypatch.setattr("bufgym.relay.backoff.MOST_S", 0.1)
+
+
+async def connected(*relays: Server) -> None:
+    await until("relays to have NATS", lambda: all(each.hub.peers.state == "connected" for each in relays))
+
+
+async def alone(*relays: Server) -> None:
+    await until("relays to miss NATS", lambda: all(each.hub.peers.state != "connected" for each in relays))
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_relays_hear_each_other_again_after_nats_has_stood_still(tmp_path: Path) -> None:
+    """A stopped server still holds its connections. The relays give them up, and find each other on new ones."""
+    port = free_port("127.0.0.1")
+    async with (
+        nats_server(port, tmp_path) as server,
+        shared(port, "a") as a,
+        shared(port, "b") as b,
+        client(a.port) as robot,
+        client(b.port) as viewer,
+    ):
+        await viewer.subscribe("odom$")
+        server.send_signal(signal.SIGSTOP)
+        await robot.put("/robots/a/odom", b"1")
+        await alone(a, b)
+        server.send_signal(signal.SIGCONT)
+        await connected(a, b)
+        await robot.put("/robots/a/odom", b"2")
+        while bytes((await viewer.next()).payload) != b"2":
             pass
-    async with contextlib.AsyncExitStack() as stack:
-        async with nats_server(port, tmp_path):
-            a, b = [await stack.enter_async_context(shared(port, name)) for name in "ab"]
-            one = await stack.enter_async_context(client(b.port))
-            await one.subscribe("^/robots/")
-        here = await stack.enter_async_context(client(a.port))
-        await here.subscribe("odom$")
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_a_relay_connects_again_whose_library_has_stopped_to_read(tmp_path: Path) -> None:
+    """A header that is no text ends the reader of the library, which tells nobody."""
+    port, broken = free_port("127.0.0.1"), b"NATS/1.0 \xff\xff\xff x\r\n\r\n"
+    async with nats_server(port, tmp_path), shared(port, "a") as a, stranger(port) as (_, bus):
+        bus.write(b'CONNECT {"verbose": false, "headers": true}\r\n')
+        bus.write(b"HPUB bufgym.relay.message %d %d\r\n%b\r\n" % (len(broken), len(broken), broken))
+        await wait("NATS to have it", bus.drain())
+        await alone(a)
+        await connected(a)
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_without_nats_a_relay_serves_its_own_robots_and_joins_when_it_comes(tmp_path: Path) -> None:
+    """It says how it stands. A command for a robot elsewhere is refused, not held for nobody."""
+    port, command = free_port("127.0.0.1"), "/robots/a/command"
+    async with shared(port, "a") as a, shared(port, "b") as b, client(a.port) as operator, client(a.port) as here:
+        await here.subscribe("^/robots/a/")
+        await here.subscribe("^/relay/status$", id="status")
+        while b"nats" not in bytes((status := await here.next()).payload):
+            pass
+        assert f'"nats": "nats: nats://127.0.0.1:{port}: ' in bytes(status.payload).decode()
+        assert a.hub.audit.recent[0]["event"] == "nats"
+        await here.say("unsubscribe", id="status")
+        await operator.acked(command, 1)
+        await here.came(1)
+        await operator.command(2, "/robots/b/command")
+        refused = await operator.next()
+        assert (refused["code"], refused["why"][-39:]) == ("no_receiver", ", and the other relays are out of reach")
+        async with nats_server(port, tmp_path), client(b.port) as there:
+            await connected(a, b)
+            await there.subscribe("^/robots/b/")
+            await operator.acked("/robots/b/command", 2)
+            await there.came(1, payload=b"2")
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path) -> None:
+    """NATS stands still: the sender's connection ends, unanswered. It comes again and sends the same again."""
+    port, command = free_port("127.0.0.1"), "/robots/a/command"
+    async with (
+        nats_server(port, tmp_path) as server,
+        shared(port, "a") as a,
+        shared(port, "b") as b,
+        client(b.port) as one,
+    ):
+        await one.subscribe("^/robots/")
         async with client(a.port, session="operator") as operator:
-            await operator.put("/robots/a/odom", b"1")
-            assert bytes((await here.next()).payload) == b"1"
+            server.send_signal(signal.SIGSTOP)
             await operator.command(1, command, stamp_us=1)
             with pytest.raises(Exception, match="NATS does not answer"):
                 await operator.next()
-        await stack.enter_async_context(nats_server(port, tmp_path))
-        while True:
-            async with within("an ack over NATS"), client(a.port, session="operator") as operator:
-                assert operator.welcome["received"] == 0
-                await operator.command(1, command, stamp_us=1)
-                with contextlib.suppress(Exception):
-                    assert (await operator.next())["op"] == "ack"
-                    break
-        await one.came(1)
-        assert await nothing(one)
+        server.send_signal(signal.SIGCONT)
+        await connected(a, b)
+        async with client(a.port, session="operator") as operator:
+            assert operator.welcome["received"] == 0
+            await operator.acked(command, 1, stamp_us=1)
+            await one.came(1)
+            assert await nothing(one)
+
+
+async def test_a_wrong_password_ends_the_start_at_once_and_is_not_told(tmp_path: Path) -> None:
+    port = free_port("127.0.0.1")
+    async with nats_server(port, tmp_path, "--user", "west", "--pass", "r#ght"):
+        async with relay(settings(nats=Nats(f"nats://west:r%23ght@127.0.0.1:{port}", "a"))) as a:
+            assert a.hub.status()["nats"] == "connected"
+        with pytest.raises(BufgymError) as failed:
+            async with relay(settings(nats=Nats(f"nats://west:wrong@127.0.0.1:{port}", "a"))):
+                pass
+        assert str(failed.value) == f"nats: nats://127.0.0.1:{port}: 'Authorization Violation'"
+
+
+def test_credentials_are_looked_at_before_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The library that signs with them may be missing, and so may they."""
+    credentials = tmp_path / "west.creds"
+    with_them = settings(nats=Nats("nats://127.0.0.1:1", "a", str(credentials)))
+    monkeypatch.setitem(sys.modules, "nkeys", None)
+    with pytest.raises(BufgymError, match=r"bufgym\.relay needs nkeys: pip install "):
+        Peers(Hub(with_them), with_them.nats)
+    monkeypatch.setitem(sys.modules, "nkeys", object())
+    with pytest.raises(BufgymError, match=r"west\.creds: no such file"):
+        Peers(Hub(with_them), with_them.nats)
+    credentials.write_text("a password\n")
+    with pytest.raises(BufgymError, match=r"west\.creds: no NATS credentials: must have -----BEGIN NATS USER JWT-----"):
+        Peers(Hub(with_them), with_them.nats)
+    with pytest.raises(BufgymError, match=r"url = 'nats://west\.example': must be nats://HOST:PORT") as failed:
+        Nats("nats://west:p#ss@west.example", "a")
+    assert "p#ss" not in str(failed.value)
