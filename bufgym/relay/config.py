@@ -146,6 +146,8 @@ class Nats(Section, frozen=True):
     """The server's file of a user's credentials (``.creds``); empty if it wants none."""
     authority: str = ""
     """PEM file of the authority that signs the server's certificate; empty for the system's."""
+    late_s: Seconds = 2.0
+    """Time beyond its relay's usual delay after which a message, other than a no_drop one, is dropped as late."""
 
     def __post_init__(self) -> None:
         try:

@@ -9,13 +9,17 @@ own receivers. NATS keeps it until every relay has taken it, also one that is aw
 
 import asyncio
 import hashlib
+import math
+import re
+import time
+from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import policies, protocol, wire
 from bufgym.relay.backoff import Backoff
-from bufgym.relay.bus import HOLD, TRIES, Bus, options
+from bufgym.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
 from bufgym.relay.config import DEFAULT_CAPACITY, Nats
 from bufgym.relay.hub import OWN, Hub, Outgoing
 from bufgym.relay.patterns import pattern
@@ -26,7 +30,23 @@ from bufgym.robot.tasks import Tasks, until_one_ends
 
 CONNECTED: Final = "connected"
 _RETRY_S: Final = 1.0
+_MINUTE_S: Final = 60.0
+_MOST_RELAYS: Final = 1_000
 _MAX_FRAME_BYTES: Final = 2**26
+
+
+class Delays:
+    """Delays of another relay's messages beyond the least of the last minutes, as no clock is that of another."""
+
+    def __init__(self) -> None:
+        self._since_s, self._before_s, self._least_s = -math.inf, math.inf, math.inf
+
+    def extra_s(self, delay_s: float, now_s: float) -> float:
+        """Take a message's delay by two clocks; give what exceeds the usual."""
+        if now_s - self._since_s > _MINUTE_S:
+            self._since_s, self._before_s, self._least_s = now_s, self._least_s, math.inf
+        self._least_s = min(self._least_s, delay_s)
+        return delay_s - min(self._before_s, self._least_s)
 
 
 class Peers:
@@ -44,6 +64,7 @@ class Peers:
         """``CONNECTED``, or why there is no connection."""
         self._bus: Bus | None = None
         self._known: set[str] = set()
+        self._delays: defaultdict[str, Delays] = defaultdict(Delays)
         self._awake = asyncio.Event()
         self._tasks = Tasks()
 
@@ -109,7 +130,7 @@ class Peers:
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message of this relay."""
         if not frame.message.no_drop and self._goes("receive", frame.message.topic):
-            subscription.offer(frame.message.topic, frame, frame.size_bytes)
+            subscription.offer(frame.message.topic, (frame, time.time_ns() // 1000), frame.size_bytes)
             self._awake.set()
 
     async def _send_all(self, bus: Bus) -> None:
@@ -120,11 +141,23 @@ class Peers:
             while (lane := next_lane(list(self.subscriptions.values()), self._hub.clock())) is not None:
                 item = lane.take(self._hub.clock())
                 if item is not None:
-                    await bus.publish(item.message.binary, {})
+                    frame, put_us = item.message
+                    await bus.publish(frame.binary, {"Relay": self._settings.name, "Put": str(put_us)})
                     self.sent += 1
                 lane.gone()
 
     async def _heard(self, heard: Any) -> None:
+        headers = heard.headers or {}
+        relay, put = headers.get("Relay", ""), headers.get("Put", "")
+        if not (relay and re.fullmatch("[0-9]{1,17}", put)):
+            self._note(f"{MESSAGE}: a message without the headers Relay and Put")
+            return
+        if len(self._delays) > _MOST_RELAYS:
+            self._delays.clear()
+        delay_s = time.time() - int(put) / 1e6
+        if self._delays[relay].extra_s(delay_s, self._hub.clock()) > self._settings.late_s:
+            self._note(f"relay {relay}: a message later than late_s = {self._settings.late_s:g}")
+            return
         message = self._read(heard)
         if message is not None and not self._hub.is_no_drop(message.topic):
             self._hub.publish(self, message._replace(no_drop=False))

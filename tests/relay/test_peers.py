@@ -6,6 +6,7 @@ import itertools
 import shutil
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from relay_cases import ALL, client, nothing, relay, settings, stranger, until, 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import Nats, Rule, Server, StoreLimits
 from bufgym.relay.hub import Hub
-from bufgym.relay.peers import Peers
+from bufgym.relay.peers import Delays, Peers
 from bufgym.relay.wire import Message, encode
 from bufgym.robot.sockets import free_port
 
@@ -166,13 +167,19 @@ async def test_what_comes_from_the_bus_is_doubted(relays: list[Server], robot: s
             await bus.publish("bufgym.relay.hold", data, headers=extra or None)
         for data in (b"", b"no frame", encode(Message(odometry, b"{", "json"))):
             await bus.publish("bufgym.relay.message", data)
+            await bus.publish("bufgym.relay.message", data, headers={"Relay": "x", "Put": "1"})
         await wait("NATS to have all", bus.flush())
         await operator.acked(command, 1)
         await one.came(1)
         await operator.put(odometry, b"2", encoding="json")
         assert (await viewer.next())["data"] == 2
         said = " ".join(entry["why"] for entry in b.hub.audit.recent if entry.get("what") == "nats")
-        assert "without the headers" in said and "payload must be JSON" in said and "frame of 8 bytes" in said
+        assert (
+            "without the headers Nats" in said
+            and "headers Relay and Put" in said
+            and "payload must be JSON" in said
+            and "frame of 8 bytes" in said
+        )
     await bus.close()
 
 
@@ -248,6 +255,63 @@ async def test_without_nats_a_relay_serves_its_own_robots_and_joins_when_it_come
             await there.subscribe("^/robots/b/")
             await operator.acked("/robots/b/command", 2)
             await there.came(1, payload=b"2")
+
+
+async def test_a_message_that_comes_late_is_not_shown_as_new(relays: list[Server], robot: str) -> None:
+    """Relay x's clock is an hour behind. Its messages come at once, but one 3 s late, after a freeze on the way."""
+    a, _, _ = relays
+    topic, now_us = f"{robot}/odom", time.time_ns() // 1000
+    assert a.config.nats is not None
+    bus = await wait("a connection to NATS", nats.connect(a.config.nats.url))
+    async with client(a.port) as viewer:
+        await viewer.subscribe(f"^{topic}$")
+        for payload, late_us in ((b"1", 0), (b"2", 3_000_000), (b"3", 0)):
+            headers = {"Relay": robot, "Put": str(now_us - 3_600_000_000 - late_us)}
+            await bus.publish("bufgym.relay.message", encode(Message(topic, payload, "raw")), headers=headers)
+        assert [bytes((await viewer.next()).payload) for _ in range(2)] == [b"1", b"3"]
+        assert "later than late_s = 2" in a.hub.audit.recent[-1]["why"]
+    await bus.close()
+
+
+def test_a_clock_that_is_set_back_makes_messages_late_for_two_minutes_at_most() -> None:
+    delays = Delays()
+    assert [delays.extra_s(delay_s, now_s) for now_s, delay_s in ((0, 5), (1, 4), (30, 4.5))] == [0, 0, 0.5]
+    assert [delays.extra_s(14, now_s) for now_s in (40, 61, 122)] == [10, 10, 0]
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_commands_outlive_the_loss_of_the_stream(tmp_path: Path) -> None:
+    """NATS comes back with nothing on its disk. Relay b is away meanwhile: a keeps b's place among the relays."""
+    port, command = free_port("127.0.0.1"), "/robots/a/command"
+    async with shared(port, "a") as a, client(a.port) as operator:
+        async with nats_server(port, tmp_path / "1"), shared(port, "b", folder=tmp_path / "b") as b:
+            async with client(b.port, session="robot") as one:
+                await one.subscribe("^/robots/", durable=True)
+                await until("a to know b", lambda: a.hub.peers._known == {"a", "b"})
+        await alone(a)
+        async with nats_server(port, tmp_path / "2"):
+            await connected(a)
+            await operator.acked(command, 1)
+            async with shared(port, "b", folder=tmp_path / "b") as b, client(b.port, session="robot") as one:
+                await one.came(1)
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_a_relay_that_is_gone_for_good_is_forgotten(tmp_path: Path) -> None:
+    """Commands are kept for it no longer than for a session, here for a second. So it does not fill the stream."""
+    port = free_port("127.0.0.1")
+    async with nats_server(port, tmp_path), shared(port, "a", store=StoreLimits(keep_s=1.0)) as a:
+        async with shared(port, "b", store=StoreLimits(keep_s=1.0)):
+            await until("a to know b", lambda: a.hub.peers._known == {"a", "b"})
+        await until("a to forget b", lambda: a.hub.peers._known == {"a"})
+
+
+async def test_a_second_relay_of_a_name_is_refused(relays: list[Server]) -> None:
+    """Both would take from one place, each some of the commands."""
+    a, _, _ = relays
+    with pytest.raises(BufgymError, match="nats: name = 'a': another relay has it; each needs its own"):
+        async with relay(settings(nats=a.config.nats)):
+            pass
 
 
 @pytest.mark.usefixtures("hasty")
