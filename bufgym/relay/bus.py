@@ -116,6 +116,8 @@ class Bus:
 
         try:
             await self._stream.stream_info(STREAM)
+        except errors.ServiceUnavailableError:
+            raise ConnectionError("no JetStream, which nats-server -js has") from None
         except errors.NotFoundError:
             await self._stream.add_stream(
                 name=STREAM,
@@ -150,11 +152,12 @@ class Bus:
 
         if isinstance(error, BufgymError):
             return error
-        if isinstance(error, NoServersError) and self._last is not None:
+        if isinstance(error, NoServersError | TimeoutError) and self._last is not None:
             error = self._last
-        text = f"nats: {self._settings.place}: {_why(error)}"
-        passing = isinstance(error, OSError | TimeoutError | Error) and not isinstance(error, ssl.SSLError)
-        return ConnectionError(text) if passing and "uthori" not in text else BufgymError(text)
+        why = _why(error)
+        passing = isinstance(error, OSError | TimeoutError) and not isinstance(error, ssl.SSLError)
+        passing |= isinstance(error, Error) and "auth" not in why.lower()
+        return (ConnectionError if passing else BufgymError)(f"nats: {self._settings.place}: {why}")
 
     async def close(self) -> None:
         """End the connection; a server that takes nothing does not hold it up."""
@@ -163,15 +166,25 @@ class Bus:
             async with asyncio.timeout(ANSWER_S):
                 await self._client.close()
 
-    async def publish(self, frame: bytes, headers: Mapping[str, str]) -> None:
-        """Send a message, and wait until the server has it.
+    async def publish(self, topic: str, frame: bytes, headers: dict[str, str]) -> None:
+        """Send a message, and wait until the server has it; one that is too large is dropped.
 
         Raises an error if the server takes it too late; the connection must be given up then.
         """
-        await self._client.publish(MESSAGE, frame, headers=dict(headers))
+        try:
+            self._check_size(topic, frame)
+        except RefusedError as refused:
+            self._note(str(refused))
+            return
+        await self._client.publish(MESSAGE, frame, headers=headers)
         await self._client.flush(ANSWER_S)
 
-    async def hold(self, topic: str, frame: bytes, headers: Mapping[str, str]) -> bool:
+    def _check_size(self, topic: str, frame: bytes) -> None:
+        most = self._client.max_payload - _HEADER_BYTES
+        if len(frame) > most:
+            raise RefusedError("too_large", f"topic {topic}: {len(frame)} bytes: must be at most {most} for NATS")
+
+    async def hold(self, topic: str, frame: bytes, headers: dict[str, str]) -> bool:
         """Put a no_drop message into the stream; return whether the server has it, False if it does not answer.
 
         Raises RefusedError: the server does not take it.
@@ -179,11 +192,9 @@ class Bus:
         from nats.errors import Error
         from nats.js.errors import APIError
 
-        most = self._client.max_payload - _HEADER_BYTES
-        if len(frame) > most:
-            raise RefusedError("too_large", f"topic {topic}: {len(frame)} bytes: must be at most {most} for NATS")
+        self._check_size(topic, frame)
         try:
-            await self._stream.publish(HOLD, frame, headers=dict(headers))
+            await self._stream.publish(HOLD, frame, headers=headers)
         except APIError as error:
             raise RefusedError("store_full", f"topic {topic}: NATS does not take it: {error.description}") from None
         except (TimeoutError, Error) as error:

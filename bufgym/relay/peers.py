@@ -142,7 +142,8 @@ class Peers:
                 item = lane.take(self._hub.clock())
                 if item is not None:
                     frame, put_us = item.message
-                    await bus.publish(frame.binary, {"Relay": self._settings.name, "Put": str(put_us)})
+                    headers = {"Relay": self._settings.name, "Put": str(put_us)}
+                    await bus.publish(frame.message.topic, frame.binary, headers)
                     self.sent += 1
                 lane.gone()
 

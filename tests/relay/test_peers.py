@@ -131,8 +131,11 @@ async def test_a_command_too_large_for_nats_is_refused_and_the_next_goes_on(rela
         assert (refused["op"], refused["code"], refused["seq"]) == ("refused", "too_large", 1)
         frame_bytes = 32 + len(command) + len("raw") + len("127.0.0.1") + 2**20
         assert refused["why"] == f"topic {command}: {frame_bytes} bytes: must be at most 1048320 for NATS"
+        await operator.put(f"{robot}/odom", bytes(2**20))  # any other is dropped, and ends no connection either
         await operator.acked(command, 1)
         await one.came(1)
+        await until("the audit", lambda: f"topic {robot}/odom: " in str(a.hub.audit.recent))
+        assert a.hub.status()["nats"] == "connected"
 
 
 async def test_a_relay_without_room_is_given_the_message_again(relays: list[Server], robot: str) -> None:
@@ -284,10 +287,13 @@ async def test_commands_outlive_the_loss_of_the_stream(tmp_path: Path) -> None:
     """NATS comes back with nothing on its disk. Relay b is away meanwhile: a keeps b's place among the relays."""
     port, command = free_port("127.0.0.1"), "/robots/a/command"
     async with shared(port, "a") as a, client(a.port) as operator:
-        async with nats_server(port, tmp_path / "1"), shared(port, "b", folder=tmp_path / "b") as b:
-            async with client(b.port, session="robot") as one:
-                await one.subscribe("^/robots/", durable=True)
-                await until("a to know b", lambda: a.hub.peers._known == {"a", "b"})
+        async with (
+            nats_server(port, tmp_path / "1"),
+            shared(port, "b", folder=tmp_path / "b") as b,
+            client(b.port, session="robot") as one,
+        ):
+            await one.subscribe("^/robots/", durable=True)
+            await until("a to know b", lambda: a.hub.peers._known == {"a", "b"})
         await alone(a)
         async with nats_server(port, tmp_path / "2"):
             await connected(a)
