@@ -7,7 +7,7 @@ faults: an answer that comes after its time ends the library's reader, without a
 import asyncio
 import contextlib
 import ssl
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from importlib import import_module
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
@@ -29,30 +29,29 @@ ASK_S: Final = 5.0
 """Time between two questions whether the server still knows this relay."""
 TRIES: Final = 30
 """Times that a message is tried for which this relay has no room, once a second."""
-_TWIN_S: Final = 1.0
-_TAKE_S: Final = 10.0
-"""Time after which the server gives a message again that this relay has neither taken nor put back."""
+_TWIN_S: Final = 1.0  # time for another relay of this name to answer
+_TAKE_S: Final = 10.0  # time after which a message is given again that was neither taken nor put back
 _HEADER_BYTES: Final = 256
 _CREDENTIALS: Final = ("-----BEGIN NATS USER JWT-----", "-----BEGIN USER NKEY SEED-----")
 
 
 def options(settings: Nats) -> dict[str, Any]:
-    """Read the files that a connection needs, and give the library's options.
+    """Give the library's options for a connection.
 
     Raises BufgymError: a file or a library is missing, or holds something else.
     """
-    url = urlsplit(settings.url)
+    url, file = urlsplit(settings.url), settings.credentials
+    found: dict[str, Any] = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0}
+    found |= {"name": settings.name, "no_echo": True, "connect_timeout": ANSWER_S}
     names = ("user", "password") if url.password is not None else ("token",)
-    found: dict[str, Any] = {
-        name: unquote(value) for name, value in zip(names, (url.username, url.password), strict=False) if value
-    }
-    if settings.credentials:
+    found |= {name: unquote(value) for name, value in zip(names, (url.username, url.password), strict=False) if value}
+    if file:
         with needs("nkeys", "mesh", "bufgym.relay"):
             import_module("nkeys")
-        text = read_utf8(settings.credentials, 2**16)
+        text = read_utf8(file, 2**16)
         if not all(f"{line}\n" in text for line in _CREDENTIALS):  # the library would look for them for ever
-            raise BufgymError(f"{settings.credentials}: no NATS credentials: must have {' and '.join(_CREDENTIALS)}")
-        found["user_credentials"] = settings.credentials
+            raise BufgymError(f"{file}: no NATS credentials: must have {' and '.join(_CREDENTIALS)}")
+        found["user_credentials"] = file
     if url.scheme == "tls":
         try:
             found["tls"] = ssl.create_default_context(cafile=settings.authority or None)
@@ -67,78 +66,53 @@ class Bus:
     def __init__(self, settings: Nats, limits: StoreLimits, note: Callable[[str], None]) -> None:
         """``note`` is told of faults that leave the connection as it is."""
         with needs("nats", "mesh", "bufgym.relay"):
-            from nats.aio.client import Client
-        self._client: Any = Client()
+            import nats.aio.client
+        self._library: Any = nats
+        self._client: Any = nats.aio.client.Client()
         self._settings, self._limits, self._note = settings, limits, note
         self._open = False
         self._last: Exception | None = None
         self._doubted = asyncio.Event()
 
-    async def open(self, given: Mapping[str, Any], heard: Callable[[Any], Awaitable[None]], known: set[str]) -> None:
+    async def open(self, given: dict[str, Any], heard: Callable[[Any], Awaitable[None]], known: set[str]) -> None:
         """Connect, and take this relay's place in the stream; other ``known`` relays keep theirs.
 
         Raises BufgymError: NATS does not let this relay in, or another relay has its name. Any other error may pass.
         """
         async with asyncio.timeout(ANSWER_S + _TWIN_S):
-            await self._client.connect(
-                self._settings.place,
-                name=self._settings.name,
-                no_echo=True,
-                allow_reconnect=False,
-                connect_timeout=ANSWER_S,
-                max_reconnect_attempts=1,
-                reconnect_time_wait=0,
-                error_cb=self._wrong,
-                **given,
-            )
+            await self._client.connect(self._settings.place, error_cb=self._wrong, **given)
             await self._take_name()
-            self._stream: Any = self._client.jetstream(timeout=ANSWER_S)
+            self._stream = self._client.jetstream(timeout=ANSWER_S)
             await self._take_place(known)
             await self._client.subscribe(MESSAGE, cb=heard)
         self._open = True
 
     async def _take_name(self) -> None:
         """Make sure that no other relay has this relay's name."""
-        from nats.errors import NoRespondersError
 
         async def here(asked: Any) -> None:
             await asked.respond(b"")
 
         subject = f"{NAME}.{self._settings.name}"
         await self._client.subscribe(subject, cb=here)
-        with contextlib.suppress(NoRespondersError, TimeoutError):
+        with contextlib.suppress(self._library.errors.NoRespondersError, TimeoutError):
             await self._client.request(subject, timeout=_TWIN_S)
             raise BufgymError(f"nats: name = {self._settings.name!r}: another relay has it; each needs its own")
 
     async def _take_place(self, known: set[str]) -> None:
         """Make the stream of no_drop messages unless it is there, and the relays' places in it."""
-        from nats.js import api, errors
-
+        errors, keep_s = self._library.js.errors, self._limits.keep_s
         try:
             await self._stream.stream_info(STREAM)
         except errors.ServiceUnavailableError:
             raise ConnectionError("no JetStream, which nats-server -js has") from None
         except errors.NotFoundError:
-            await self._stream.add_stream(
-                name=STREAM,
-                subjects=[HOLD],
-                retention=api.RetentionPolicy.INTEREST,
-                discard=api.DiscardPolicy.NEW,
-                max_age=self._limits.keep_s,
-                max_bytes=self._limits.bytes,
-            )
+            kind = {"subjects": [HOLD], "retention": "interest", "discard": "new"}
+            await self._stream.add_stream(name=STREAM, max_age=keep_s, max_bytes=self._limits.bytes, **kind)
+        one_by_one = {"filter_subject": HOLD, "deliver_policy": "new", "max_ack_pending": 1}
+        limits = {"max_deliver": TRIES, "ack_wait": _TAKE_S, "inactive_threshold": keep_s}
         for name in {self._settings.name, *known}:
-            await self._stream.add_consumer(
-                STREAM,
-                name=name,
-                durable_name=name,
-                filter_subject=HOLD,
-                deliver_policy=api.DeliverPolicy.NEW,
-                max_ack_pending=1,  # one after the other
-                max_deliver=TRIES,
-                ack_wait=_TAKE_S,
-                inactive_threshold=self._limits.keep_s,
-            )
+            await self._stream.add_consumer(STREAM, name=name, durable_name=name, **one_by_one, **limits)
         self._place = await self._stream.pull_subscribe_bind(durable=self._settings.name, stream=STREAM)
 
     async def _wrong(self, error: Exception) -> None:
@@ -148,15 +122,14 @@ class Bus:
 
     def fault(self, error: Exception) -> Exception:
         """Say why the connection could not be made or has ended: a BufgymError if it needs a person."""
-        from nats.errors import Error, NoServersError
-
+        errors = self._library.errors
         if isinstance(error, BufgymError):
             return error
-        if isinstance(error, NoServersError | TimeoutError) and self._last is not None:
+        if isinstance(error, errors.NoServersError | TimeoutError) and self._last is not None:
             error = self._last
         why = _why(error)
         passing = isinstance(error, OSError | TimeoutError) and not isinstance(error, ssl.SSLError)
-        passing |= isinstance(error, Error) and "auth" not in why.lower()
+        passing |= isinstance(error, errors.Error) and "auth" not in why.lower()
         return (ConnectionError if passing else BufgymError)(f"nats: {self._settings.place}: {why}")
 
     async def close(self) -> None:
@@ -189,15 +162,12 @@ class Bus:
 
         Raises RefusedError: the server does not take it.
         """
-        from nats.errors import Error
-        from nats.js.errors import APIError
-
         self._check_size(topic, frame)
         try:
             await self._stream.publish(HOLD, frame, headers=headers)
-        except APIError as error:
+        except self._library.js.errors.APIError as error:
             raise RefusedError("store_full", f"topic {topic}: NATS does not take it: {error.description}") from None
-        except (TimeoutError, Error) as error:
+        except (TimeoutError, self._library.errors.Error) as error:
             self._note(_why(error))
             self._doubted.set()
             return False
