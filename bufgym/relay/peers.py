@@ -77,11 +77,7 @@ class Peers:
         self._hub.join(self)
         tried: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._tasks.begin(self._run(policy, tried))
-        try:
-            await tried
-        except BufgymError:
-            await self.close()
-            raise
+        await tried
 
     async def _run(self, policy: Any, tried: asyncio.Future[None]) -> None:
         """Connect, and again whenever the connection ends; say by ``tried`` how the first try ended."""
@@ -151,14 +147,12 @@ class Peers:
         headers = heard.headers or {}
         relay, put = headers.get("Relay", ""), headers.get("Put", "")
         if not (relay and re.fullmatch("[0-9]{1,17}", put)):
-            self._note(f"{MESSAGE}: a message without the headers Relay and Put")
-            return
+            return self._note(f"{MESSAGE}: a message without the headers Relay and Put")
         if len(self._delays) > _MOST_RELAYS:
             self._delays.clear()
         delay_s = time.time() - int(put) / 1e6
         if self._delays[relay].extra_s(delay_s, self._hub.clock()) > self._settings.late_s:
-            self._note(f"relay {relay}: a message later than late_s = {self._settings.late_s:g}")
-            return
+            return self._note(f"relay {relay}: a message later than late_s = {self._settings.late_s:g}")
         message = self._read(heard)
         if message is not None and not self._hub.is_no_drop(message.topic):
             self._hub.publish(self, message._replace(no_drop=False))

@@ -111,12 +111,19 @@ async def test_commands_outlive_the_loss_of_the_stream(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("hasty")
 async def test_a_relay_that_is_gone_for_good_is_forgotten(tmp_path: Path) -> None:
-    """Commands are kept for it no longer than for a session, here for a second. So it does not fill the stream."""
-    port = free_port("127.0.0.1")
-    async with nats_server(port, tmp_path), shared(port, "a", store=StoreLimits(keep_s=1.0)) as a:
-        async with shared(port, "b", store=StoreLimits(keep_s=1.0)):
+    """Commands are kept for it no longer than for a session, here for a second; then there is room again."""
+    port, command, limits = free_port("127.0.0.1"), "/robots/a/command", StoreLimits(keep_s=1.0, bytes=1_000)
+    async with nats_server(port, tmp_path), shared(port, "a", store=limits) as a, client(a.port) as operator:
+        async with shared(port, "b", store=limits):
             await until("a to know b", lambda: a.hub.peers._known == {"a", "b"})
+        for seq in range(1, 5):
+            await operator.put(command, bytes(300), seq=seq, no_drop=True)
+            answer = await operator.next()
+            if answer["op"] == "refused":
+                break
+        assert answer["code"] == "store_full" and seq in (2, 3)
         await until("a to forget b", lambda: a.hub.peers._known == {"a"})
+        await operator.acked(command, seq)
 
 
 @pytest.mark.usefixtures("hasty")
