@@ -6,6 +6,7 @@ Whatever no rule allows is denied, so a configuration without rules serves nobod
 import ipaddress
 from pathlib import Path
 from typing import Annotated, Any, Final
+from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Meta
@@ -151,6 +152,21 @@ class Nats(Section, frozen=True):
     """The server's file of a user's credentials (``.creds``); empty if it wants none."""
     authority: str = ""
     """PEM file of the authority that signs the server's certificate; empty for the system's."""
+    late_s: Seconds = 2.0
+    """Time beyond its relay's usual delay after which a message, other than a no_drop one, is dropped as late."""
+
+    def __post_init__(self) -> None:
+        try:
+            _ = urlsplit(self.url).port
+        except ValueError:
+            rule = "must be nats://HOST:PORT, with %23 and the like for signs in a password"
+            raise BufgymError(f"nats: url = {self.place!r}: {rule}") from None
+
+    @property
+    def place(self) -> str:
+        """The URL without its user and password."""
+        scheme, _, rest = self.url.partition("://")
+        return f"{scheme}://{rest.rpartition('@')[2]}"
 
 
 class Foxglove(Section, frozen=True):

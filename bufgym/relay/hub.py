@@ -197,7 +197,9 @@ class Hub:
         """
         receivers = self._holders(sender, message.topic)
         if not receivers and not shared:
-            raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it")
+            alone = self.peers is not None and self.peers.state != "connected"
+            other = ", and the other relays are out of reach" if alone else ""
+            raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it{other}")
         frame = wire.encode(message)
         number = message.seq if taken is None else taken
         self.settled(self.store.hold(sender.session, number, message.topic, frame, receivers))
@@ -229,8 +231,8 @@ class Hub:
             if sender in self.members:
                 self.members[sender].tell("delivered", seq=seq, receivers=receivers, lost=lost)
 
-    def status(self) -> dict[str, int]:
-        """The relay's counts."""
+    def status(self) -> dict[str, Any]:
+        """The relay's counts, and how it stands with the other relays."""
         members = list(self.members.values())
         subscriptions = [each for member in members for each in member.subscriptions.values()]
         return {
@@ -240,6 +242,7 @@ class Hub:
             "dropped": self._dropped + sum(each.dropped for each in subscriptions),
             "refused": self.audit.refused,
             "held": sum(session.held for session in self.store.sessions.values()),
+            **({} if self.peers is None else {"nats": self.peers.state}),
         }
 
     def tick(self) -> None:

@@ -9,102 +9,116 @@ own receivers. NATS keeps it until every relay has taken it, also one that is aw
 
 import asyncio
 import hashlib
-import ssl
+import math
+import re
+import time
+from collections import defaultdict
+from collections.abc import Mapping
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import policies, wire
+from bufgym.relay import policies, protocol, wire
+from bufgym.relay.backoff import Backoff
+from bufgym.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
 from bufgym.relay.config import DEFAULT_CAPACITY, Nats
 from bufgym.relay.hub import OWN, Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import NATS, Permissions
 from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription, next_lane
-from bufgym.robot.extra import needs
-from bufgym.robot.tasks import Tasks
+from bufgym.robot.tasks import Tasks, until_one_ends
 
-MESSAGE: Final = "bufgym.relay.message"
-HOLD: Final = "bufgym.relay.hold"
-STREAM: Final = "bufgym-relay"
-ANSWER_S: Final = 3.0
-"""Time for the server to take a message."""
-TRIES: Final = 30
-"""Times that a message is tried for which this relay has no room, once a second."""
-ASK_S: Final = 5.0
-"""Time after which the server is asked for messages again; it forgets who asked when it is restarted."""
+CONNECTED: Final = "connected"
 _RETRY_S: Final = 1.0
+_MINUTE_S: Final = 60.0
+_MOST_RELAYS: Final = 1_000
 _MAX_FRAME_BYTES: Final = 2**26
 
 
+class Delays:
+    """Delays of another relay's messages beyond the least of the last minutes, as no clock is that of another."""
+
+    def __init__(self) -> None:
+        self._since_s, self._before_s, self._least_s = -math.inf, math.inf, math.inf
+
+    def extra_s(self, delay_s: float, now_s: float) -> float:
+        """Take a message's delay by two clocks; give what exceeds the usual."""
+        if now_s - self._since_s > _MINUTE_S:
+            self._since_s, self._before_s, self._least_s = now_s, self._least_s, math.inf
+        self._least_s = min(self._least_s, delay_s)
+        return delay_s - min(self._before_s, self._least_s)
+
+
 class Peers:
-    """All other relays as one ``hub.Member``."""
+    """All other relays as one ``hub.Member``; it has no subscription while NATS is away."""
 
     acks = False
 
     def __init__(self, hub: Hub, settings: Nats) -> None:
-        with needs("nats", "mesh", "bufgym.relay"):
-            import nats
-        self._library: Any = nats
-        self._hub, self._settings = hub, settings
+        self._hub, self._settings, self._options = hub, settings, options(settings)
         self.session: StoredSession = hub.store.open("nats", NATS, False, 0, 0)
         self.permissions = Permissions(hub.config.rules, NATS)
         self.subscriptions: dict[str, Subscription] = {}
         self.sent = 0
+        self.state = "connecting"
+        """``CONNECTED``, or why there is no connection."""
+        self._bus: Bus | None = None
+        self._known: set[str] = set()
+        self._delays: defaultdict[str, Delays] = defaultdict(Delays)
         self._awake = asyncio.Event()
         self._tasks = Tasks()
-        self._nats: Any = None
 
     async def start(self) -> None:
-        """Connect, and begin to share; the connection is made again whenever it breaks."""
+        """Begin to share. Without NATS the relay goes on alone, and tries again until NATS is there.
+
+        Raises BufgymError: NATS does not let this relay in, or another relay has its name.
+        """
         policy = await asyncio.to_thread(policies.warm, self._hub.config.policies[0])
-        self.subscriptions = {"all": Subscription("all", pattern(""), policy, DEFAULT_CAPACITY)}
-        where = self._settings
-        options: dict[str, Any] = {"user_credentials": where.credentials} if where.credentials else {}
-        try:
-            if where.url.startswith("tls:"):
-                options["tls"] = ssl.create_default_context(cafile=where.authority or None)
-            async with asyncio.timeout(ANSWER_S):
-                self._nats = await self._library.connect(
-                    where.url, name=where.name, no_echo=True, max_reconnect_attempts=-1, error_cb=self._note, **options
-                )
-            await self._nats.subscribe(MESSAGE, cb=self._heard)
-            self._stream = self._nats.jetstream(timeout=ANSWER_S)
-            self._commands = await self._subscribed()
-        except (OSError, TimeoutError, self._library.errors.Error) as error:
-            await self.close()
-            raise BufgymError(f"nats: {where.url}: {error or type(error).__name__}") from None
         self._hub.join(self)
-        self._tasks.begin(self._send_all())
-        self._tasks.begin(self._take_all())
+        tried: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._tasks.begin(self._run(policy, tried))
+        await tried
 
-    async def _subscribed(self) -> Any:
-        """Make the stream of no_drop messages unless another relay has, and this relay's place in it."""
-        from nats.js import api, errors
+    async def _run(self, policy: Any, tried: asyncio.Future[None]) -> None:
+        """Connect, and again whenever the connection ends; say by ``tried`` how the first try ended."""
+        backoff = Backoff()
+        while True:
+            bus = Bus(self._settings, self._hub.config.store, self._note)
+            try:
+                await bus.open(self._options, self._heard, self._known)
+                self._bus = bus
+                backoff.connected()
+                self._hub.subscribe(self, Subscription("all", pattern(""), policy, DEFAULT_CAPACITY))
+                self._becomes(CONNECTED)
+                if not tried.done():
+                    tried.set_result(None)
+                await until_one_ends(self._send_all(bus), self._take_all(bus), bus.watch(self._known))
+            except Exception as error:  # whatever it is, the relay goes on alone
+                fault = bus.fault(error)
+                self._becomes(str(fault))
+            finally:
+                self._bus = None
+                self._hub.unsubscribe(self, "all")
+                await bus.close()
+            if not tried.done():
+                if isinstance(fault, BufgymError):
+                    tried.set_exception(fault)
+                    return
+                tried.set_result(None)
+            await asyncio.sleep(backoff.delay_s())
 
-        limits = self._hub.config.store
-        try:
-            await self._stream.stream_info(STREAM)
-        except errors.NotFoundError:
-            await self._stream.add_stream(
-                name=STREAM,
-                subjects=[HOLD],
-                retention=api.RetentionPolicy.INTEREST,
-                discard=api.DiscardPolicy.NEW,
-                max_age=limits.keep_s,
-                max_bytes=limits.bytes,
-            )
-        in_order = api.ConsumerConfig(max_ack_pending=1, max_deliver=TRIES, deliver_policy=api.DeliverPolicy.NEW)
-        return await self._stream.pull_subscribe(HOLD, durable=self._settings.name, stream=STREAM, config=in_order)
+    def _becomes(self, state: str) -> None:
+        if state != self.state:
+            self.state = state
+            self._hub.audit("nats", state=state)
 
     async def close(self) -> None:
         """Leave the others."""
         await self._tasks.end()
         self._hub.leave(self)
-        if self._nats is not None:
-            await self._nats.close()
 
-    async def _note(self, error: Exception) -> None:
-        self._hub.audit.repeated(what="nats", code="wrong", why=f"{type(error).__name__}: {error}")
+    def _note(self, why: object) -> None:
+        self._hub.audit.repeated(what="nats", code="wrong", why=str(why))
 
     def _goes(self, verb: Any, topic: str) -> bool:
         return not topic.startswith(f"/{OWN}/") and self.permissions.allow(verb, topic)
@@ -112,76 +126,85 @@ class Peers:
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message of this relay."""
         if not frame.message.no_drop and self._goes("receive", frame.message.topic):
-            subscription.offer(frame.message.topic, frame, frame.size_bytes)
+            subscription.offer(frame.message.topic, (frame, time.time_ns() // 1000), frame.size_bytes)
             self._awake.set()
 
-    async def _send_all(self) -> None:
+    async def _send_all(self, bus: Bus) -> None:
         """Send one message after the other, so that little waits outside the queue."""
         while True:
             await self._awake.wait()
             self._awake.clear()
             while (lane := next_lane(list(self.subscriptions.values()), self._hub.clock())) is not None:
                 item = lane.take(self._hub.clock())
-                try:
-                    if item is not None and self._nats.is_connected:  # else it is lost, as on any broken link
-                        await self._nats.publish(MESSAGE, item.message.binary)
-                        await self._nats.flush(ANSWER_S)
-                        self.sent += 1
-                except (TimeoutError, self._library.errors.Error) as error:
-                    await self._note(error)
+                if item is not None:
+                    frame, put_us = item.message
+                    headers = {"Relay": self._settings.name, "Put": str(put_us)}
+                    await bus.publish(frame.message.topic, frame.binary, headers)
+                    self.sent += 1
                 lane.gone()
 
     async def _heard(self, heard: Any) -> None:
-        message = await self._read(heard)
+        headers = heard.headers or {}
+        relay, put = headers.get("Relay", ""), headers.get("Put", "")
+        if not (relay and re.fullmatch("[0-9]{1,17}", put)):
+            return self._note(f"{MESSAGE}: a message without the headers Relay and Put")
+        if len(self._delays) > _MOST_RELAYS:
+            self._delays.clear()
+        delay_s = time.time() - int(put) / 1e6
+        if self._delays[relay].extra_s(delay_s, self._hub.clock()) > self._settings.late_s:
+            return self._note(f"relay {relay}: a message later than late_s = {self._settings.late_s:g}")
+        message = self._read(heard)
         if message is not None and not self._hub.is_no_drop(message.topic):
             self._hub.publish(self, message._replace(no_drop=False))
 
-    async def _read(self, heard: Any) -> wire.Message | None:
+    def _read(self, heard: Any) -> wire.Message | None:
         """Decode a message of another relay; None if it is none, or may not come in."""
         try:
             message = wire.decode(heard.data, _MAX_FRAME_BYTES)
-        except wire.WireError as error:
-            await self._note(error)
+            protocol.check_json(message)
+        except BufgymError as error:
+            self._note(error)
             return None
         return message if self._goes("send", message.topic) else None
 
     async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
-        """Give a no_drop message to the other relays; return whether they may have it, None if NATS does not answer."""
-        if not self._goes("receive", message.topic):
+        """Give a no_drop message to the other relays.
+
+        Return whether they may have it, None if NATS does not say whether it has it. Without NATS, they have not.
+
+        Raises RefusedError: NATS does not take it.
+        """
+        if self._bus is None or not self._goes("receive", message.topic):
             return False
         frame = wire.encode(message)
         origin = f"{self._settings.name}\n{sender.identity.key}\n{sender.name}\n".encode()
         id = hashlib.blake2b(origin + frame, digest_size=16).hexdigest()  # the same when it is sent again
-        try:
-            await self._stream.publish(HOLD, frame, headers={"Nats-Msg-Id": id, "Relay": self._settings.name})
-        except (TimeoutError, self._library.errors.Error) as error:
-            await self._note(error)
-            return None
-        return True
+        headers = {"Nats-Msg-Id": id, "Relay": self._settings.name}
+        return await self._bus.hold(message.topic, frame, headers) or None
 
-    async def _take_all(self) -> None:
+    async def _take_all(self, bus: Bus) -> None:
         while True:
-            try:
-                for heard in await self._commands.fetch(1, timeout=ASK_S):
-                    await self._take(heard)
-            except TimeoutError:
-                pass  # there was none
-            except self._library.errors.Error as error:
-                await self._note(error)
-                await asyncio.sleep(_RETRY_S)
+            await self._take(await bus.next())
 
     async def _take(self, heard: Any) -> None:
         """Hold a no_drop message of another relay for the receivers here; if there is no room, try again later."""
-        number = int(hashlib.blake2b(heard.headers.get("Nats-Msg-Id", "").encode(), digest_size=6).hexdigest(), 16)
-        message = None if heard.headers.get("Relay") == self._settings.name else await self._read(heard)
+        headers: Mapping[str, str] = heard.headers or {}
+        id, relay = headers.get("Nats-Msg-Id", ""), headers.get("Relay", "")
+        if not (id and relay):
+            self._note(f"{HOLD}: a message without the headers Nats-Msg-Id and Relay")
+            await heard.term()
+            return
+        number = int(hashlib.blake2b(id.encode(errors="replace"), digest_size=6).hexdigest(), 16)
+        message = None if relay == self._settings.name else self._read(heard)
         if message is not None and self._hub.is_no_drop(message.topic) and number != self.session.received:
             try:
                 self._hub.hold(self, message, taken=number)
             except wire.RefusedError as refused:
                 if refused.code != "no_receiver":
-                    await self._note(refused)
-                    await heard.nak(delay=_RETRY_S)
-                    return
+                    self._note(refused)
+                    if heard.metadata.num_delivered < TRIES:
+                        await heard.nak(delay=_RETRY_S)
+                        return
         await heard.ack()
 
     def _ignore(self, *words: Any, **fields: Any) -> None:

@@ -117,6 +117,15 @@ def check(
     quota.topic(topic)
     if message.no_drop != no_drop:
         raise RefusedError("wrong", f"topic {topic}: is {'not ' if message.no_drop else ''}no_drop here")
+    check_json(message)
+    if message.no_drop and message.seq != received + 1:
+        raise RefusedError("out_of_order", f"seq = {message.seq}: must be {received + 1}")
+    return True
+
+
+def check_json(message: wire.Message) -> None:
+    """Raise RefusedError if the payload is not the JSON that its encoding promises."""
+    topic = message.topic
     if message.encoding == "json":
         if len(message.payload) > MAX_JSON_BYTES:
             raise RefusedError("too_large", f"topic {topic}: JSON must be at most {MAX_JSON_BYTES} bytes")
@@ -124,9 +133,6 @@ def check(
             wire.loads(bytes(message.payload))
         except (ValueError, RecursionError) as error:
             raise RefusedError("wrong", f"topic {topic}: payload must be JSON: {error}") from None
-    if message.no_drop and message.seq != received + 1:
-        raise RefusedError("out_of_order", f"seq = {message.seq}: must be {received + 1}")
-    return True
 
 
 def subscription(

@@ -305,6 +305,8 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
+    if server.hub.peers is not None and server.hub.peers.state != "connected":
+        say(f"{server.hub.peers.state}; goes on without the other relays until NATS is there")
     if server.window is not None:
         say(f"ws://{server.window.address}: Foxglove, Lichtblick")
     told = asyncio.Event()

@@ -3,49 +3,20 @@
 import asyncio
 import contextlib
 import itertools
-import shutil
-from collections.abc import AsyncIterator, Iterator
-from pathlib import Path
-from typing import Any
+import time
+from collections.abc import Iterator
 
 import pytest
-from relay_cases import ALL, client, nothing, relay, settings, wait, within
+from nats_cases import SHARED, nats, nats_server, needs_server, shared
+from relay_cases import client, nothing, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import Nats, Rule, Server, StoreLimits
-from bufgym.relay.wire import Message
+from bufgym.relay import Rule, Server, StoreLimits
+from bufgym.relay.wire import Message, encode
 from bufgym.robot.sockets import free_port
 
-pytest.importorskip("nats", reason="no nats here: the extra mesh")
-NATS_SERVER = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin")
-pytestmark = pytest.mark.skipif(NATS_SERVER is None, reason="no nats-server here")
-SHARED = Rule(nats=True, send=True, receive=True, topic="/robots/[^/]+/(odom|secret|command)")
+pytestmark = needs_server
 _NUMBERS = itertools.count()
-
-
-@contextlib.asynccontextmanager
-async def nats_server(port: int, folder: Path) -> AsyncIterator[Any]:
-    words = ["-js", "-a", "127.0.0.1", "-p", str(port), "-sd", str(folder)]
-    quiet = asyncio.subprocess.DEVNULL
-    process = await asyncio.create_subprocess_exec(str(NATS_SERVER), *words, stdout=quiet, stderr=quiet)
-    try:
-        async with within("NATS to listen"):
-            while True:
-                with contextlib.suppress(OSError):
-                    _, writer = await asyncio.open_connection("127.0.0.1", port)
-                    writer.close()
-                    break
-                await asyncio.sleep(0.02)
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await wait("the end of NATS", process.wait())
-
-
-def shared(port: int, name: str, **changed: Any) -> contextlib.AbstractAsyncContextManager[Server]:
-    where = Nats(f"nats://127.0.0.1:{port}", name)
-    return relay(settings(**{"policies": ("drop-oldest",), "nats": where, "rules": (ALL, SHARED), **changed}))
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +86,24 @@ async def test_a_command_arrives_once_at_a_robot_of_another_relay(relays: list[S
             assert await nothing(one)
 
 
+async def test_a_command_too_large_for_nats_is_refused_and_the_next_goes_on(relays: list[Server], robot: str) -> None:
+    """NATS takes 1 MiB with the headers, for which 256 bytes are left."""
+    a, b, _ = relays
+    command = f"{robot}/command"
+    async with client(a.port) as operator, client(b.port) as one:
+        await one.subscribe(f"^{command}$")
+        await operator.put(command, bytes(2**20), seq=1, no_drop=True)
+        refused = await operator.next()
+        assert (refused["op"], refused["code"], refused["seq"]) == ("refused", "too_large", 1)
+        frame_bytes = 32 + len(command) + len("raw") + len("127.0.0.1") + 2**20
+        assert refused["why"] == f"topic {command}: {frame_bytes} bytes: must be at most 1048320 for NATS"
+        await operator.put(f"{robot}/odom", bytes(2**20))  # any other is dropped, and ends no connection either
+        await operator.acked(command, 1)
+        await one.came(1)
+        await until("the audit", lambda: f"topic {robot}/odom: " in str(a.hub.audit.recent))
+        assert a.hub.status()["nats"] == "connected"
+
+
 async def test_a_relay_without_room_is_given_the_message_again(relays: list[Server], robot: str) -> None:
     a, b, _ = relays
     command = f"{robot}/command"
@@ -132,34 +121,56 @@ async def test_a_relay_without_room_is_given_the_message_again(relays: list[Serv
         await one.came(3)
 
 
-async def test_without_nats_commands_wait_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sender's connection ends, unanswered. Once NATS is back it sends the same again, which arrives once."""
-    port, command = free_port("127.0.0.1"), "/robots/a/command"
-    for name in ("ANSWER_S", "ASK_S"):
-        monkeypatch.setattr(f"bufgym.relay.peers.{name}", 0.3)
-    with pytest.raises(BufgymError, match=f"nats: nats://127.0.0.1:{port}"):
-        async with shared(port, "a"):
-            pass
-    async with contextlib.AsyncExitStack() as stack:
-        async with nats_server(port, tmp_path):
-            a, b = [await stack.enter_async_context(shared(port, name)) for name in "ab"]
-            one = await stack.enter_async_context(client(b.port))
-            await one.subscribe("^/robots/")
-        here = await stack.enter_async_context(client(a.port))
-        await here.subscribe("odom$")
-        async with client(a.port, session="operator") as operator:
-            await operator.put("/robots/a/odom", b"1")
-            assert bytes((await here.next()).payload) == b"1"
-            await operator.command(1, command, stamp_us=1)
-            with pytest.raises(Exception, match="NATS does not answer"):
-                await operator.next()
-        await stack.enter_async_context(nats_server(port, tmp_path))
-        while True:
-            async with within("an ack over NATS"), client(a.port, session="operator") as operator:
-                assert operator.welcome["received"] == 0
-                await operator.command(1, command, stamp_us=1)
-                with contextlib.suppress(Exception):
-                    assert (await operator.next())["op"] == "ack"
-                    break
+async def test_what_comes_from_the_bus_is_doubted(relays: list[Server], robot: str) -> None:
+    """A stranger on the bus sends rubbish: it is audited, nobody's connection ends, and commands go on."""
+    a, b, _ = relays
+    command, odometry = f"{robot}/command", f"{robot}/odom"
+    assert a.config.nats is not None
+    bus = await wait("a connection to NATS", nats.connect(a.config.nats.url))
+    async with client(a.port) as operator, client(b.port, form="json") as viewer, client(b.port) as one:
+        await viewer.subscribe(f"^{odometry}$")
+        await one.subscribe(f"^{command}$")
+        headers = {"Nats-Msg-Id": robot, "Relay": "x"}
+        frame = encode(Message(command, b"{", "json", no_drop=True))
+        for data, extra in ((b"no frame", {}), (b"no frame", {"Relay": "x"}), (b"no frame", headers), (frame, headers)):
+            await bus.publish("bufgym.relay.hold", data, headers=extra or None)
+        for data in (b"", b"no frame", encode(Message(odometry, b"{", "json"))):
+            await bus.publish("bufgym.relay.message", data)
+            await bus.publish("bufgym.relay.message", data, headers={"Relay": "x", "Put": "1"})
+        await wait("NATS to have all", bus.flush())
+        await operator.acked(command, 1)
         await one.came(1)
-        assert await nothing(one)
+        await operator.put(odometry, b"2", encoding="json")
+        assert (await viewer.next())["data"] == 2
+        said = " ".join(entry["why"] for entry in b.hub.audit.recent if entry.get("what") == "nats")
+        assert (
+            "without the headers Nats" in said
+            and "headers Relay and Put" in said
+            and "payload must be JSON" in said
+            and "frame of 8 bytes" in said
+        )
+    await bus.close()
+
+
+async def test_a_message_that_comes_late_is_not_shown_as_new(relays: list[Server], robot: str) -> None:
+    """Relay x's clock is an hour behind. Its messages come at once, but one 3 s late, after a freeze on the way."""
+    a, _, _ = relays
+    topic, now_us = f"{robot}/odom", time.time_ns() // 1000
+    assert a.config.nats is not None
+    bus = await wait("a connection to NATS", nats.connect(a.config.nats.url))
+    async with client(a.port) as viewer:
+        await viewer.subscribe(f"^{topic}$")
+        for payload, late_us in ((b"1", 0), (b"2", 3_000_000), (b"3", 0)):
+            headers = {"Relay": robot, "Put": str(now_us - 3_600_000_000 - late_us)}
+            await bus.publish("bufgym.relay.message", encode(Message(topic, payload, "raw")), headers=headers)
+        assert [bytes((await viewer.next()).payload) for _ in range(2)] == [b"1", b"3"]
+        assert "later than late_s = 2" in a.hub.audit.recent[-1]["why"]
+    await bus.close()
+
+
+async def test_a_second_relay_of_a_name_is_refused(relays: list[Server]) -> None:
+    """Both would take from one place, each some of the commands."""
+    a, _, _ = relays
+    with pytest.raises(BufgymError, match="nats: name = 'a': another relay has it; each needs its own"):
+        async with relay(settings(nats=a.config.nats)):
+            pass

@@ -205,7 +205,8 @@ $("policy").onchange = async () => {
 };
 
 function sayRelay(status) {
-  $("relay").textContent = `${status.connections} connected, ${status.dropped} dropped here`;
+  const alone = (status.nats ?? "connected") === "connected" ? "" : `, without other relays: ${status.nats}`;
+  $("relay").textContent = `${status.connections} connected, ${status.dropped} dropped here${alone}`;
 }
 
 function sayRobots() {
