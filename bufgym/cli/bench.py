@@ -12,8 +12,8 @@ from cyclopts import Group, Parameter
 from bufgym.cli.options import (
     RESULTS,
     WHO,
+    Bytes,
     ByTopic,
-    Count,
     OutOptions,
     SuiteOptions,
     WhoOptions,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 @Parameter(name="*", group=Group.create_ordered("How the buffer decides"))
 @dataclass(frozen=True)
 class BufferOptions:
-    max_bytes: Count | None = None
+    max_bytes: Bytes | None = None
     """Also at most so many bytes queued (default: no limit)."""
     decide_at: Literal["arrival", "overflow"] | None = None
     """Ask at every arrival (default), or when full."""

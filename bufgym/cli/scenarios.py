@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cyclopts import Group, Parameter
 
-from bufgym.cli.options import Count, Least0, Positive, Whole, given, refuse
+from bufgym.cli.options import Bytes, Count, Least0, Positive, Whole, given, refuse
 from bufgym.cli.trace_bags import MOTION, MotionOptions, RecordingOptions, workload_lines
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, printable
@@ -45,7 +45,7 @@ class LinkOptions:
 class StreamOptions(LinkOptions):
     fps: Positive | None = None
     """Messages a second."""
-    bytes: Count | None = None
+    bytes: Bytes | None = None
     """Mean message size, bytes."""
     size_cv: Least0 | None = None
     """Coefficient of variation of the size; 0: all equal."""
