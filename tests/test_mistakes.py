@@ -1,11 +1,20 @@
 """Natural mistakes at the command line end in one sentence; natural inputs are understood."""
 
+import json
+import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import gymnasium as gym
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
 
+import bufgym
+from agents.report import Trained, agent_name
+from bufgym import scenario, traces
 from bufgym.benchmark.rows import read_rows
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.ground.units import bytes_of, rate_of
 from bufgym.policies import registry
@@ -68,6 +77,64 @@ def test_natural_inputs(tmp_path: Path, capsys: Capsys) -> None:
     fails([*QUICK, "--out", out], "rows.csv: holds an earlier run's rows; choose another --out", capsys)
     shown(["trace", "generate", "steady", "--rate", "20Mbit/s", "--out", tmp_path / "s.csv"], capsys)
     assert "2,500" in shown(["trace", "info", tmp_path / "s.csv"], capsys)
+
+
+def test_a_link_as_a_spreadsheet_has_it(tmp_path: Path) -> None:
+    """8 and 4 Mbit/s for a second each, then nothing for as long; times in seconds, of any clock, or as dates."""
+    clock = "1790000000.5", "1790000001.5", "1790000002.5"
+    day = "2026-10-25T02:59:59+02:00", "2026-10-25T02:00:00+01:00", "2026-10-25 01:00:01"
+    for header, times in (("time,mbps", ("0", "1", "2")), ("Time, Mbps", clock), ("timestamp,mbit/s", day)):
+        file = tmp_path / "link.csv"
+        rows = [f"{time},{rate}" for time, rate in zip(times, (8, 4, 0), strict=True)]
+        file.write_text("\n".join([header, *rows]), encoding="utf-8")
+        trace = traces.load(file)
+        assert trace.time_us.tolist() == [0, 10**6, 2 * 10**6, 3 * 10**6]
+        assert trace.cumulative_bytes.tolist() == [0, 10**6, 1_500_000, 1_500_000]
+    file.write_text("time,mbps\n2026-13-01,8\n", encoding="utf-8")
+    with pytest.raises(BufgymError, match=r"link.csv, line 2: time in s = 2026-13-01: must be a finite number"):
+        traces.load(file)
+
+
+def uplink(text: str, **changes: Any) -> scenario.Uplink:
+    """The scenario of that text."""
+    made = scenario.get(text, **changes)
+    assert isinstance(made, scenario.Uplink)
+    return made
+
+
+def test_paths_rates_and_parameters_wherever_text_is_taken(tmp_path: Path) -> None:
+    link, client = tmp_path / "link.csv", tmp_path / "client.toml"
+    traces.write_csv(traces.steady(1e6, 2), link)
+    client.write_text('[[topic]]\nname = "a"\nrate_hz = 5\nsize_bytes = 9\n', encoding="utf-8")
+    for path in (link, str(link)):
+        assert [trace.name for trace in uplink("lte", traces=path).traces] == ["link"]
+    assert [topic.name for topic in scenario.get(client).topics] == ["a"]
+    assert traces.load("20Mbit/s").mean_bytes_per_s == 2.5e6
+    given = uplink("lte:rate_hz=5,duration_s=2,motion=none,value=saturating:0.5,traces=8Mbps")
+    assert (given.rate_hz, given.max_messages, given.motion, given.value.name) == (5, 10, (), "saturating:0.5")
+    assert [trace.name for trace in given.traces] == ["8Mbps"]
+    (row,) = bufgym.compare("afr", "lte:duration_s=1,traces=8Mbps", seeds=1, progress=False).rows
+    assert row["arrived"] == 30
+    with pytest.raises(BufgymError, match=r"unknown parameter 'rate'; did you mean 'rate_hz'"):
+        scenario.get("lte:rate=5")
+
+
+def test_masks_of_an_environment_as_it_is_made() -> None:
+    env: Any = gym.make("bufgym/Uplink-v0", capacity=2)
+    _, info = env.reset(seed=0)
+    assert env.action_masks().tolist() == (info["action_mask"] == 1).tolist()
+
+
+def test_results_without_bare_nan(tmp_path: Path) -> None:
+    """JSON has no NaN: no regret is null."""
+    run: Any = SimpleNamespace(seed=0, seconds=1.0, merit=1.0)
+    settings: Any = SimpleNamespace(algo="evolve", values={})
+    trained = Trained(settings, tmp_path, [run], [], {})
+    names = [agent_name(run), "drop-oldest"]
+    scores = [{"policy": name, "qoi": 1.0, "regret": math.nan} for name in names]
+    trained.save(tmp_path, scores=scores, held_out="")
+    text = (tmp_path / "results.json").read_text(encoding="utf-8")
+    assert [row["regret"] for row in json.loads(text, parse_constant=pytest.fail)["scores"]] == [None, None]
 
 
 def test_sizes_and_rates() -> None:
