@@ -58,11 +58,20 @@ def new_problem(
 
     A message that waits for at most ``certain`` bytes finds room, whichever messages wait.
     """
-    n, furthest = len(c), max(0, int((limit + size).max()))
-    grid = max(1, int(size.mean()) // steps, furthest * n // MAX_CELLS)
+    n, grid = len(c), grid_of(size, limit, steps)
     between, idle = np.empty((2, n), np.int64)
     find_idle(c, size, limit, certain, between, idle)
-    return Problem(c, size, limit, x, v, ends, between, idle, grid, np.zeros((n, furthest // grid + 2)))
+    return Problem(c, size, limit, x, v, ends, between, idle, grid, np.zeros((n, reach(size, limit) // grid + 2)))
+
+
+def reach(size: Ints, limit: Ints) -> int:
+    """Bytes after its arrival by which every message has ended."""
+    return max(0, int((limit + size).max()))
+
+
+def grid_of(size: Ints, limit: Ints, steps: int) -> int:
+    """Bytes to a grid step, see ``new_problem``."""
+    return max(1, int(size.mean()) // steps, reach(size, limit) * len(size) // MAX_CELLS)
 
 
 @kernel

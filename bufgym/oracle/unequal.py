@@ -18,13 +18,15 @@ leaves room. Steps have Polyak's length towards the best plan known, and are hal
 round gives a bound; the least of all is returned.
 """
 
+import math
+
 import numpy as np
 
 from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
 from bufgym.oracle import beam
-from bufgym.oracle.programme import Problem, Room, find_priced_future, new_problem
+from bufgym.oracle.programme import Problem, Room, find_priced_future, grid_of, new_problem, reach
 
 ROUNDS = 40
 """Most price updates."""
@@ -42,6 +44,7 @@ def best(
     c: Ints, size: Ints, limit: Ints, certain: Ints, x: Floats, v: Floats, ends: int, capacity: int, max_bytes: int
 ) -> tuple[Ints, float]:
     """Find messages of a plan that keeps to L and B, in order, and an upper bound of any such plan's gain, H - 1."""
+    c, ends = without_idle(c, size, limit, ends)
     n = len(c)
     byte_limit = max_bytes < UNLIMITED_BYTES
     rooms = np.array([[capacity], [max_bytes if byte_limit else 0]], np.float64)
@@ -81,6 +84,21 @@ def best(
         plan, plan_gain = work[:length][::-1].copy(), gain
     _, gain = follow(p, room, message, begin)
     return plan, max(plan_gain, min(bound, gain + float((rooms * kept_prices).sum())))
+
+
+def without_idle(c: Ints, size: Ints, limit: Ints, ends: int) -> tuple[Ints, int]:
+    """Shorten the stretches of link, by whole steps of both grids, that no message reaches; return ``c`` and ``ends``.
+
+    On a fast link they are nearly all of it, and work space grows with the link's bytes. Nothing else changes: all
+    rules compare bytes within the reach of one message.
+    """
+    step = math.lcm(grid_of(size, limit, GRID), grid_of(size, limit, FINE_GRID))
+    spare = np.diff(c, prepend=0) - reach(size, limit) - int(size.max())
+    shorter = np.cumsum(np.maximum(0, spare) // step * step)
+    before = int(np.searchsorted(c, ends, side="right"))  # messages that arrive while the link still carries bytes
+    until = ends - int(shorter[before - 1]) if before else ends
+    short = c - shorter
+    return short, min(until, int(short[before])) if before < len(c) else until
 
 
 def _priced(p: Problem, prices: Floats, capacity: int, max_bytes: int) -> Room:
