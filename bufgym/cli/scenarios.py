@@ -14,6 +14,7 @@ from bufgym.cli.options import Bytes, Count, Least0, Positive, Whole, given, ref
 from bufgym.cli.trace_bags import MOTION, MotionOptions, RecordingOptions, workload_lines
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, printable
+from bufgym.ground.progress import bar
 
 if TYPE_CHECKING:
     from bufgym.traces import Motion
@@ -214,7 +215,8 @@ def _recording(file: str, stream: StreamOptions, recording: RecordingOptions, se
     from bufgym.traces import read_workload
 
     refuse(given(stream, *_MESSAGES), "cannot go with --workload: a recording has its own")
-    workload = read_workload(file, **recording.arguments())
+    with bar(None, True, "message") as advance:
+        workload = read_workload(file, **recording.arguments(), advance=advance)
     motions = _motions(stream.motion or [], recording)
     if recording.odom is None and not motions:
         refuse(given(recording, *MOTION), "needs --odom or --motion")
