@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -135,6 +136,18 @@ def test_results_without_bare_nan(tmp_path: Path) -> None:
     trained.save(tmp_path, scores=scores, held_out="")
     text = (tmp_path / "results.json").read_text(encoding="utf-8")
     assert [row["regret"] for row in json.loads(text, parse_constant=pytest.fail)["scores"]] == [None, None]
+
+
+def test_help_tells_the_defaults_and_wraps_evenly(capsys: Capsys) -> None:
+    """The numbers are those of the scenario; a box's second column begins at one place in every line."""
+    text = shown(["bench", "--help"], capsys)
+    lte = uplink("lte")
+    for option, default in (("fps", lte.rate_hz), ("bytes", lte.size_bytes), ("seconds", lte.duration_s)):
+        told = re.search(rf"--{option} .*?\(default:[ │\n]+([0-9]+)", text, re.DOTALL)
+        assert told and float(told[1]) == default, option
+    box = text[text.index("─ Who runs ─") : text.index("─ The stream and its link")].splitlines()[1:-1]
+    assert {len(line) - len(line[1:].lstrip()) for line in box if not line.startswith(("│ --", "╰"))} == {21}
+    assert "▌" not in shown(["trace", "generate", "link", "--help"], capsys)
 
 
 def test_sizes_and_rates() -> None:

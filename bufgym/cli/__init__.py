@@ -79,7 +79,7 @@ def app() -> App:
         help="A robot's send buffer is full: which message should go?",
         version=f"bufgym {__version__}",
         default_parameter=OPTIONS,
-        help_format="plaintext",
+        help_format="markdown",
         exit_on_error=False,
         print_error=False,
         suppress_keyboard_interrupt=False,

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class BufferOptions:
     max_bytes: Bytes | None = None
-    """Also at most so many bytes queued (default: no limit)."""
+    """Also at most so many bytes queued, as in 9.2MB (default: no limit)."""
     decide_at: Literal["arrival", "overflow"] | None = None
     """Ask at every arrival (default), or when full."""
 

@@ -81,7 +81,8 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'); --out DIR keeps it, a second call resumes it."""
+    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1); --out DIR keeps
+    it, a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None
@@ -105,7 +106,7 @@ class WhoOptions:
     mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what makes one; from the current
     folder too): a zip and a module run code, so use only what you trust."""
     capacity: Capacities | None = None
-    """Capacities L, messages, as in 4,8,16 (default: 8; topics: 32; or the suite's)."""
+    """Capacities L, messages, as in 4,8,16 or 4 8 16 (default: 8; topics: 32; or the suite's)."""
     seeds: Seeds | None = None
     """Episodes on each trace (default: 10; topics: 5; a recording: 1; or the suite's)."""
     policy_file: PolicyFile = None

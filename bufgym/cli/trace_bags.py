@@ -51,7 +51,7 @@ class RecordingOptions(MotionOptions):
     topics: list[str] | None = None
     """Topics, by name or pattern ('/camera/*'); default: all."""
     odom: str | None = None
-    """Take x from the motion on this topic (of tf: TOPIC:PARENT:CHILD)."""
+    """Take x from the motion on this topic, of tf: TOPIC:PARENT:CHILD (default: x is the message's index)."""
     bridge_gaps: bool = False
     """Take motion across gaps in it as even."""
 
