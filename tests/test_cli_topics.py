@@ -214,7 +214,7 @@ def test_a_recording_is_described_before_the_long_work(drive: Path, capsys: Caps
     assert main(["bench", "--trace", "outage.csv", "--workload", str(drive), "--topics", "/status", "/camera/*"]) == 130
     out, err = capsys.readouterr()
     assert "; 3 messages left out" in out and "6 messages, 1,556 bytes in 2.000 s" in out
-    assert err.startswith("bufgym: finding the clairvoyant's 1 plan for 6 messages, then playing every policy\n")
+    assert err.startswith("bufgym: finding the clairvoyant's plans for 1 x 6 messages, then playing every policy\n")
 
 
 def stopped(*_: object, **__: object) -> None:

@@ -117,7 +117,8 @@ def _bench(
     about = _about(made, task, None if made.recorded and who.seeds is None else seeds)
     if made.recorded:  # what was read is of use before the long work
         print(about, flush=True)
-        print(_work(stream, capacity, seeds), file=sys.stderr)
+        plans = f"{len(stream.traces) * seeds * len(capacity)} x {stream.max_messages:,} messages"
+        print(f"bufgym: finding the clairvoyant's plans for {plans}, then playing every policy", file=sys.stderr)
     done = beside(chosen, stream, capacity, seeds, label=made.label, about=about, rival=rival, **queue)
     bounds = _bound_notes(done.rows, stream, buffer.decide_at or "arrival") if made.recorded else []
     print("\n".join([f"\n{done.plain}" if made.recorded else str(done), *bounds]))
@@ -141,13 +142,6 @@ def _about(made: Described, task: Task, seeds: int | None) -> str:
         means = f"Means over {met}{seeds} seeds; every policy meets the same episodes."
         lines.append(task.describe([made.scenario], seeds * traces) or means)
     return "\n".join(lines)
-
-
-def _work(stream: Any, capacity: Sequence[int], seeds: int) -> str:
-    """Say how much there is to bound and to play, before it begins."""
-    plans = len(stream.traces) * seeds * len(capacity)
-    what = f"{plans} plan{'s' * (plans > 1)} for {stream.max_messages:,} messages"
-    return f"bufgym: finding the clairvoyant's {what}, then playing every policy"
 
 
 def _write(

@@ -216,7 +216,7 @@ def test_the_cell_grows_with_the_robots() -> None:
         (lambda: FleetScenario.of(2, "lte", workload=PLAYED, motion=()), "one robot's workload"),
         (
             lambda: run_fleet(
-                policies.Policy("p", len, privileged=lambda *_: 0), [FleetEpisode((THREE,), STEADY)], 2, V
+                policies.Policy("p", lambda *_: 0, privileged=lambda *_: 0), [FleetEpisode((THREE,), STEADY)], 2, V
             ),
             "link of its own",
         ),

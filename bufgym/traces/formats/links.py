@@ -29,20 +29,12 @@ from pathlib import Path
 from typing import Final
 
 from bufgym.ground.errors import BufgymError, TraceError
+from bufgym.traces.formats import tables
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_iperf3, read_nuttcp, read_runs
-from bufgym.traces.formats.tables import (
-    CSV_HEADER,
-    RATES_HEADER,
-    fits_rates,
-    read_belgium,
-    read_csv,
-    read_mbit,
-    read_rates,
-)
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace
 
@@ -66,10 +58,10 @@ def _cells(*patterns: str, between: str = r"\s+") -> Callable[[str], object]:
 
 FORMATS: Final[dict[str, Format]] = {
     "mahimahi": Format("one number, the ms of a packet", _cells(NUMBER), read_mahimahi),
-    "csv": Format(f"header {CSV_HEADER}", lambda text: is_header(text, CSV_HEADER), read_csv),
-    "mbit": Format("two numbers, s and Mbit/s", _cells(NUMBER, NUMBER), read_mbit),
-    "belgium": Format("six numbers", _cells(*[NUMBER] * 6), read_belgium),
-    "rates": Format(f"header {RATES_HEADER} or time,mbps", fits_rates, read_rates),
+    "csv": Format(f"header {tables.CSV_HEADER}", lambda text: is_header(text, tables.CSV_HEADER), tables.read_csv),
+    "mbit": Format("two numbers, s and Mbit/s", _cells(NUMBER, NUMBER), tables.read_mbit),
+    "belgium": Format("six numbers", _cells(*[NUMBER] * 6), tables.read_belgium),
+    "rates": Format(f"header {tables.RATES_HEADER} or time,mbps", tables.fits_rates, tables.read_rates),
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
     "nyu": Format(
         "number,unit with a unit such as Mbits/sec",

@@ -1,6 +1,6 @@
 """Readers of simple tables: bufgym's CSV, the Belgium log, Mbit/s over time, rates over time."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from typing import Final
 
@@ -25,7 +25,7 @@ def read_csv(path: StrPath) -> Knots:
     """Header `t_ms,bytes,interval_ms`; times in ms with up to 3 decimals, so that microseconds survive."""
     intervals = Intervals()
     with open_text(path) as file:
-        for line in after_header(file, CSV_HEADER):
+        for line in below_header(file, CSV_HEADER, lambda text: is_header(text, CSV_HEADER))[1]:
             end_ms, count, length_ms = line.columns(3, ",")
             intervals.add_ending_at(line, end_ms, length_ms, count)
     return intervals.knots(path)
@@ -59,24 +59,20 @@ def fits_rates(text: str) -> bool:
 def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
-        lines = file.lines()
-        header = next(lines, None)
-        if header is None or not fits_rates(header.text):
-            rule = f"must begin with the header {RATES_HEADER} or time,mbps"
-            raise fault(path, rule, line=header and header.number, value=header and header.text)
-        column = split_cells(header.text.lower())[1]
+        header, lines = below_header(file, f"{RATES_HEADER} or time,mbps", fits_rates)
+        column = split_cells(header.lower())[1]
         return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column], _MAX_EPOCH_S) for line in lines))
 
 
-def after_header(file: TextFile, header: str) -> Iterator[Line]:
-    """The lines below the header, which must be there."""
+def below_header(file: TextFile, header: str, fits: Callable[[str], bool]) -> tuple[str, Iterator[Line]]:
+    """The first line, which must be that header, and the lines below it."""
     lines = file.lines()
     first = next(lines, None)
     if first is None:
         raise fault(file.path, f"is empty: must begin with the header {header}")
-    if not is_header(first.text, header):
+    if not fits(first.text):
         raise first.error(first.text, f"must be the header {header}")
-    return lines
+    return first.text, lines
 
 
 def _rate(line: Line, separator: str | None, field: str, unit: float, most_s: int) -> Rate:
@@ -91,9 +87,7 @@ def _rate(line: Line, separator: str | None, field: str, unit: float, most_s: in
 def _date_us(text: str) -> int | None:
     """Microseconds since 1970 of an ISO date, in UTC where it names no zone; None for other text."""
     try:
-        date = datetime.fromisoformat(text) if "-" in text else None
+        date = datetime.fromisoformat(text if "-" in text else "")
     except ValueError:
         return None
-    if date is None:
-        return None
-    return round((date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp() * US_PER_S)
+    return round(date.replace(tzinfo=date.tzinfo or UTC).timestamp() * US_PER_S)
