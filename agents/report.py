@@ -93,9 +93,19 @@ class Trained:
             "training_s": {str(run.seed): run.seconds for run in self.runs},
             **results,
         }
-        (home / "results.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        text = json.dumps(_without_nan(content), indent=2, allow_nan=False)
+        (home / "results.json").write_text(text + "\n", encoding="utf-8")
         qoi = {row["policy"]: row["qoi"] for row in results["scores"]}
         return {"qoi": qoi[agent_name(self.best)], "drop-oldest": qoi["drop-oldest"], "held_out": results["held_out"]}
+
+
+def _without_nan(content: Any) -> Any:
+    """The content with null for numbers that JSON does not know."""
+    if isinstance(content, Mapping):
+        return {key: _without_nan(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_without_nan(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def report(trained: Trained) -> None:

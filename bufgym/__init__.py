@@ -37,22 +37,16 @@ ON_TASKS = {
 }
 """Id -> task, for environments whose reward is a robot's own task; they need the extra ``perception``."""
 
-for _id, (_scenario, _) in ENVIRONMENTS.items():
+for _id, (_scenario, _) in {**ENVIRONMENTS, **ON_TASKS}.items():
     if _id not in _gym.registry:
+        _options = {"capacity": 32} if _scenario == "topics" else {"reward": "covered"} if _id in ON_TASKS else {}
         _gym.register(
             _id,
             entry_point="bufgym.envs:SenderEnv",
             vector_entry_point="bufgym.envs:SenderVectorEnv",
-            kwargs={"scenario": _scenario, **({"capacity": 32} if _scenario == "topics" else {})},
-        )
-
-for _id, (_scenario, _) in ON_TASKS.items():
-    if _id not in _gym.registry:
-        _gym.register(
-            _id,
-            entry_point="bufgym.envs:SenderEnv",
-            vector_entry_point="bufgym.envs:SenderVectorEnv",
-            kwargs={"scenario": _scenario, "reward": "covered"},
+            order_enforce=False,  # the environment itself, with its action_masks: it checks calls and actions
+            disable_env_checker=True,
+            kwargs={"scenario": _scenario, **_options},
         )
 
 __getattr__ = _on_demand(__name__)

@@ -131,13 +131,13 @@ def test_bench_against_a_policy(capsys: Capsys) -> None:
 
 def test_bench_writes_parquet_where_it_can(trace: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pyarrow")
-    command = ["bench", "--trace", trace, *QUICK, "--policies", "afr", "--out", str(tmp_path)]
-    assert main(command) == 0
+    command = ["bench", "--trace", trace, *QUICK, "--policies", "afr", "--out"]
+    assert main([*command, str(tmp_path)]) == 0
     assert len(read_rows(tmp_path / "rows.parquet")) == 2
     monkeypatch.setitem(sys.modules, "pyarrow", None)  # importing it now fails
-    assert main(command) == 0
-    assert (tmp_path / "rows.csv").exists()
-    assert main([*command, "--format", "parquet"]) == 2
+    assert main([*command, str(tmp_path / "other")]) == 0
+    assert (tmp_path / "other" / "rows.csv").exists()
+    assert main([*command, str(tmp_path / "third"), "--format", "parquet"]) == 2
 
 
 def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: Capsys) -> None:

@@ -205,6 +205,20 @@ def test_a_bag_becomes_a_csv_that_plays_the_same(drive: Path, capsys: Capsys) ->
     bench = ["bench", "--trace", "outage.csv", "--capacity", "2", "--policies", "afr", "--workload"]
     one, other = (shown([*bench, *words], capsys) for words in ([drive, *chosen, "/status"], ["drive.csv"]))
     assert one.partition("\n\n")[2] == other.partition("\n\n")[2]
+    assert "; 3 messages left out, on topics not chosen: /odom\n" in text and "; 3 messages left out" in one
+
+
+def test_a_recording_is_described_before_the_long_work(drive: Path, capsys: Capsys, monkeypatch: Patch) -> None:
+    """Stopped at once: what was read, what was left out, and how much work there is have been said."""
+    monkeypatch.setattr("bufgym.benchmark.compare.run", stopped)
+    assert main(["bench", "--trace", "outage.csv", "--workload", str(drive), "--topics", "/status", "/camera/*"]) == 130
+    out, err = capsys.readouterr()
+    assert "; 3 messages left out" in out and "6 messages, 1,556 bytes in 2.000 s" in out
+    assert err.startswith("bufgym: finding the clairvoyant's plans for 1 x 6 messages, then playing every policy\n")
+
+
+def stopped(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
 
 
 # 1 m, then 90 degrees, then nothing for 5 s.

@@ -122,7 +122,8 @@ def compare(
 
     Args:
         policies: as ``make_policy`` takes them.
-        on: a scenario, its name (see ``bufgym list``), or a suite's name such as ``"outage-v1"``.
+        on: a scenario, its name (see ``bufgym list``), also with parameters as in ``"lte:rate_hz=5"``, a client's
+            .toml file, or a suite's name such as ``"outage-v1"``.
         capacity: L, messages, or several; by default 8, or the suite's.
         seeds: so many episodes on each trace, or these; by default 10, or the suite's.
         progress: show a bar on stderr, where that is a terminal.
@@ -141,12 +142,13 @@ def compare(
     words = (*several, against)
     files = [os.fspath(p) for p in words if isinstance(p, Path) or (isinstance(p, str) and sources.is_source(p))]
     capacities = [capacity] if isinstance(capacity, int) else list(capacity or ())
+    on = os.fspath(on) if isinstance(on, os.PathLike) else on
     if isinstance(on, str) and on in suites.SUITES:
         if settings:
             raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
         chosen = _with(chosen, rival, tasks.TASKS[suites.get(on).kind])
         return _on_suite(chosen, files, on, capacities, seeds, progress, named)
-    if isinstance(on, str) and not (on in scenario.SCENARIOS or on.endswith(".toml") or is_named(on)):
+    if isinstance(on, str) and not (on.partition(":")[0] in scenario.SCENARIOS or on.endswith(".toml") or is_named(on)):
         raise unknown("scenario or suite", on, [*scenario.SCENARIOS, *suites.SUITES])
     queue = {name: settings.pop(name) for name in QUEUE if name in settings}
     stream = scenario.get(on) if isinstance(on, str) else on

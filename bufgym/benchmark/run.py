@@ -7,19 +7,18 @@ their difference has no noise from the draw. Each trace of a scenario has the fu
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.progress import bar
 from bufgym.policies import Policy, get, names
 from bufgym.policies.registry import OnArrival
 from bufgym.scenario.numbered import by_trace, draw
 
-__all__ = ["bar", "by_trace", "check_distinct", "draw", "run"]
+__all__ = ["by_trace", "check_distinct", "draw", "run"]
 
 _BATCH_MESSAGES = 1_000_000  # messages held at a time, 88 bytes each; many seeds run in several batches
 
@@ -81,19 +80,3 @@ def check_distinct(policies: Sequence[Policy]) -> None:
             own = [p for p in policies if p.name == name and not p.built_in]
             why = f"; {name!r} is a built-in policy's name, give your own another" if own and name in names() else ""
             raise BufgymError(f"policies: {name!r} is given more than once{why}")
-
-
-@contextmanager
-def bar(total: int, show: bool, unit: str = "run", done: int = 0) -> Iterator[Any]:
-    """Yield a function to call with the number of units just finished; ``done`` units were finished before."""
-    if show and sys.stderr.isatty():
-        try:
-            from tqdm import tqdm
-        except ImportError:
-            pass
-        else:
-            # Work shorter than a second needs no bar.
-            with tqdm(total=total, initial=done, unit=unit, delay=1.0, leave=False, file=sys.stderr) as progress:
-                yield progress.update
-                return
-    yield lambda _: None

@@ -24,12 +24,13 @@ from bufgym import policies
 from bufgym.benchmark import cluster, folder, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
-from bufgym.benchmark.run import bar, by_trace, check_distinct, run
+from bufgym.benchmark.run import by_trace, check_distinct, run
 from bufgym.benchmark.table import apart
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__, modules
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
+from bufgym.ground.progress import bar
 from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE
 from bufgym.scenario.registry import with_parameters

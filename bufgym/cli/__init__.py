@@ -13,7 +13,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, MissingArgumentError
 
 from bufgym.cli.options import OPTIONS
 from bufgym.ground import __version__, modules
@@ -79,7 +79,7 @@ def app() -> App:
         help="A robot's send buffer is full: which message should go?",
         version=f"bufgym {__version__}",
         default_parameter=OPTIONS,
-        help_format="plaintext",
+        help_format="markdown",
         exit_on_error=False,
         print_error=False,
         suppress_keyboard_interrupt=False,
@@ -120,6 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 141
     except KeyboardInterrupt as stop:
         return _failed("; ".join(["stopped", *map(str, stop.args)]), 130)
+    except MissingArgumentError as error:
+        return _failed(_missing(error))
     except (BufgymError, CycloptsError) as error:
         return _failed(str(error))
     except OSError as error:
@@ -162,9 +164,18 @@ def _failed(message: str, code: int = 2) -> int:
     return code
 
 
+def _missing(error: MissingArgumentError) -> str:
+    """Tell an argument that is not there from an option without its value."""
+    argument = error.argument
+    if argument is None or argument.tokens or error.keyword is not None:
+        return str(error)
+    return f"{' '.join(error.command_chain or ('bufgym',))} needs {argument.name}"
+
+
 def _gist(error: Exception) -> str:
     """Extract from Numba's long message the construct that it could not compile and the source line."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    plain = re.sub(r"\x1b\[[\d;]*m", "", str(error))
+    lines = [line.strip() for line in plain.splitlines() if line.strip()]
     # The message ends with "File "mine.py", line 4:".
     place = [line.rstrip(":") for line in lines if line.startswith("File ")][-1:]
     reason = [line for line in lines if not line.startswith(("Failed in", "During:", "File ", "-", "^", "<"))][:1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,8 @@ from cyclopts import Group, Parameter
 from bufgym.cli.options import (
     RESULTS,
     WHO,
+    Bytes,
     ByTopic,
-    Count,
     OutOptions,
     SuiteOptions,
     WhoOptions,
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
 @Parameter(name="*", group=Group.create_ordered("How the buffer decides"))
 @dataclass(frozen=True)
 class BufferOptions:
-    max_bytes: Count | None = None
-    """Also at most so many bytes queued (default: no limit)."""
+    max_bytes: Bytes | None = None
+    """Also at most so many bytes queued, as in 9.2MB (default: no limit)."""
     decide_at: Literal["arrival", "overflow"] | None = None
     """Ask at every arrival (default), or when full."""
 
@@ -114,9 +115,13 @@ def _bench(
     seeds = who.seeds or (1 if made.recorded else task.seeds)
     queue: dict[str, Any] = given(buffer)
     about = _about(made, task, None if made.recorded and who.seeds is None else seeds)
+    if made.recorded:  # what was read is of use before the long work
+        print(about, flush=True)
+        plans = f"{len(stream.traces) * seeds * len(capacity)} x {stream.max_messages:,} messages"
+        print(f"bufgym: finding the clairvoyant's plans for {plans}, then playing every policy", file=sys.stderr)
     done = beside(chosen, stream, capacity, seeds, label=made.label, about=about, rival=rival, **queue)
     bounds = _bound_notes(done.rows, stream, buffer.decide_at or "arrival") if made.recorded else []
-    print("\n".join([str(done), *bounds]))
+    print("\n".join([f"\n{done.plain}" if made.recorded else str(done), *bounds]))
     if made.recorded:
         order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows, alone=done.unranked)))
         _dropped(chosen, stream, capacity, seeds, queue, order, drops)

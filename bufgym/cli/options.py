@@ -11,6 +11,7 @@ from cyclopts import Group, Parameter
 
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, install, printable
+from bufgym.ground.units import bytes_of, rate_or_number
 
 MAX_EPISODES = 100_000
 """Limit on episodes of each trace; memory holds a row for each, times policies and capacities."""
@@ -24,24 +25,35 @@ OPTIONS = Parameter(
 """How all options are: a list takes one word or more, the last of two equal ones counts, and none has a --no-option."""
 
 
-def checked(convert: Callable[[str], Any], holds: Callable[[Any], bool], rule: str) -> Parameter:
-    """The type of an option: ``convert`` reads the text, ``holds`` tests the value, errors name ``rule``."""
+def checked(
+    convert: Callable[[str], Any], holds: Callable[[Any], bool], rule: str, *, several: bool = False
+) -> Parameter:
+    """The type of an option: ``convert`` reads the text, ``holds`` tests the value, errors name ``rule``.
+
+    With ``several`` it takes one word or more, read as one text with commas between them.
+    """
 
     def parse(_: Any, tokens: Sequence[Any]) -> Any:
-        (token,) = tokens
+        text = ",".join(token.value for token in tokens)
         try:
-            value = convert(token.value)
+            value = convert(text)
         except ValueError:
             value = None
         if value is None or not holds(value):
-            raise ValueError(f"{token.value}: must be {rule}")
+            option = "" if len(tokens) == 1 else f"{tokens[0].keyword} "  # named by the caller for a single word
+            raise ValueError(f"{option}{text}: must be {rule}")
         return value
 
-    return Parameter(converter=parse, n_tokens=1, consume_multiple=False, accepts_keys=False)
+    words: dict[str, Any] = {"n_tokens": -1} if several else {"n_tokens": 1, "consume_multiple": False}
+    return Parameter(converter=parse, accepts_keys=False, **words)
 
 
 Whole = Annotated[int, checked(int, lambda number: True, "a whole number")]
 Count = Annotated[int, checked(int, lambda number: number >= 1, "a whole number >= 1")]
+Bytes = Annotated[
+    int, checked(bytes_of, lambda number: number >= 1, "a whole number of bytes >= 1, as in 230000, 1e6 or 4.6MB")
+]
+Rate = Annotated[float, checked(rate_or_number, lambda rate: 0 < rate < math.inf, "bytes/s > 0, or as in 20Mbit/s")]
 Natural = Annotated[int, checked(int, lambda number: number >= 0, "a whole number >= 0")]
 Seeds = Annotated[
     int, checked(int, lambda number: 1 <= number <= MAX_EPISODES, f"a whole number >= 1 and at most {MAX_EPISODES}")
@@ -54,9 +66,10 @@ Capacities = Annotated[
         lambda text: tuple(map(int, text.split(","))),
         lambda Ls: min(Ls) >= 1 and len(set(Ls)) == len(Ls),
         "whole numbers >= 1, no two alike",
+        several=True,
     ),
 ]
-"""Distinct integers, as in ``4,8,16``."""
+"""Distinct integers, as in ``4,8,16`` or ``4 8 16``."""
 PolicyFile: TypeAlias = Annotated[
     str | None,
     Parameter(help="Python file that registers policies of your own; its code is run, so use only files you trust"),
@@ -68,7 +81,8 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'); --out DIR keeps it, a second call resumes it."""
+    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1); --out DIR keeps
+    it, a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None
@@ -92,7 +106,7 @@ class WhoOptions:
     mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what makes one; from the current
     folder too): a zip and a module run code, so use only what you trust."""
     capacity: Capacities | None = None
-    """Capacities L, messages, as in 4,8,16 (default: 8; topics: 32; or the suite's)."""
+    """Capacities L, messages, as in 4,8,16 or 4 8 16 (default: 8; topics: 32; or the suite's)."""
     seeds: Seeds | None = None
     """Episodes on each trace (default: 10; topics: 5; a recording: 1; or the suite's)."""
     policy_file: PolicyFile = None
@@ -132,6 +146,8 @@ class OutOptions:
             raise BufgymError(
                 f"{folder}: holds the run of a suite; choose another --out (its rows are never written over)"
             )
+        for rows in sorted(folder.glob("rows.*")):
+            raise BufgymError(f"{rows}: holds an earlier run's rows; choose another --out, or remove that file")
         return folder
 
 

@@ -2,6 +2,9 @@
 
 import sys
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from bufgym.cli.options import Count, Whole
 from bufgym.ground.errors import BufgymError, printable
@@ -22,7 +25,13 @@ def report(folder: str, /, *, markdown: bool = False) -> None:
     print("\n".join(map(printable, text.split("\n"))))
 
 
-def leaderboard(*suites: str, file: Path = Path(DEFAULT), data: str | None = None, jobs: Whole | None = None) -> None:
+def leaderboard(
+    suites: Annotated[list[str] | None, Parameter(name="--suite")] = None,
+    *,
+    file: Path = Path(DEFAULT),
+    data: str | None = None,
+    jobs: Whole | None = None,
+) -> None:
     """Run suites and write the leaderboard, CSV and Markdown.
 
     Args:

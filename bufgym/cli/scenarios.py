@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cyclopts import Group, Parameter
 
-from bufgym.cli.options import Count, Least0, Positive, Whole, given, refuse
+from bufgym.cli.options import Bytes, Count, Least0, Positive, Whole, given, refuse
 from bufgym.cli.trace_bags import MOTION, MotionOptions, RecordingOptions, workload_lines
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, printable
+from bufgym.ground.progress import bar
 
 if TYPE_CHECKING:
     from bufgym.traces import Motion
@@ -33,9 +34,10 @@ _OF_A_CLIENT = ("trace", "motion", "scale")
 @dataclass(frozen=True)
 class LinkOptions:
     trace: list[str] | None = None
-    """Bandwidth traces: files, shipped names, or module:function, a seed -> Trace (default: shipped LTE)."""
+    """Bandwidth traces: files, shipped names, a rate as in 20Mbit/s, or module:function, a seed -> Trace (default:
+    shipped LTE)."""
     motion: list[str] | None = None
-    """Motion recordings, likewise; 'none': x is the frame index."""
+    """Motion recordings, likewise (default: shipped drives); 'none': x is the frame index."""
     scale: Positive | None = None
     """Multiply the link's capacity (default: 1)."""
 
@@ -44,19 +46,20 @@ class LinkOptions:
 @dataclass(frozen=True)
 class StreamOptions(LinkOptions):
     fps: Positive | None = None
-    """Messages a second."""
-    bytes: Count | None = None
-    """Mean message size, bytes."""
+    """Messages a second (default: 30)."""
+    bytes: Bytes | None = None
+    """Mean message size, bytes, or with a unit as in 4.6MB (default: 4608000; of an interruption: 230000)."""
     size_cv: Least0 | None = None
-    """Coefficient of variation of the size; 0: all equal."""
+    """Coefficient of variation of the size (default: 0, all equal)."""
     sizes: str | None = None
-    """Law of the sizes: jpeg, gop, depth-colour, motion, recorded:NAME; with parameters jpeg:cv=0.3."""
+    """Law of the sizes: jpeg, gop, depth-colour, motion, recorded:NAME; with parameters jpeg:cv=0.3 (default:
+    equal)."""
     seconds: Positive | None = None
-    """Length of an episode, s."""
+    """Length of an episode, s (default: 30)."""
     tells_duration: bool = False
     """The sender is told beforehand how long the stream lasts."""
     jitter: Least0 | None = None
-    """Arrivals move by up to this part of a period."""
+    """Arrivals move by up to this part of a period (default: 0.1)."""
     value: str | None = None
     """V of the QoI: exponential:BASE, saturating:DISTANCE, tabulated:D=V,..., or module:function of your own
     (default: exponential:0.05 over motion, exponential:0.367879 over a recording's motion, exponential:0.618 over
@@ -91,7 +94,7 @@ class OwnOptions:
     scenario_file: str | None = None
     """A Python file that registers it; its code is run."""
     scenario: str | None = None
-    """Which; also any other in 'bufgym list scenarios', or module:function."""
+    """Which; also any other in 'bufgym list scenarios', with parameters as in lte:rate_hz=5, or module:function."""
     config: str | None = None
     """A client's topics and their rules, as in examples/client.toml; --trace, --motion and --scale give its links."""
 
@@ -100,9 +103,9 @@ class OwnOptions:
 @dataclass(frozen=True)
 class SendOptions:
     consumers: Whole | None = None
-    """How many want each message; native ROS sends each a copy."""
+    """How many want each message; native ROS sends each a copy (default: as the scenario says)."""
     window: Whole | None = None
-    """n_T: messages sent and not yet acknowledged, at most."""
+    """n_T: messages sent and not yet acknowledged, at most (default: as the scenario says)."""
 
 
 @Parameter(name="*", group=Group.create_ordered("Several topics or robots, of a suite or a scenario"))
@@ -214,7 +217,8 @@ def _recording(file: str, stream: StreamOptions, recording: RecordingOptions, se
     from bufgym.traces import read_workload
 
     refuse(given(stream, *_MESSAGES), "cannot go with --workload: a recording has its own")
-    workload = read_workload(file, **recording.arguments())
+    with bar(None, True, "message") as advance:
+        workload = read_workload(file, **recording.arguments(), advance=advance)
     motions = _motions(stream.motion or [], recording)
     if recording.odom is None and not motions:
         refuse(given(recording, *MOTION), "needs --odom or --motion")

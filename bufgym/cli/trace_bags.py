@@ -15,6 +15,7 @@ from cyclopts import Parameter
 
 from bufgym.cli.options import Positive, given, refuse
 from bufgym.ground.errors import BufgymError, printable
+from bufgym.ground.progress import bar
 
 if TYPE_CHECKING:
     from bufgym.traces import MotionSettings, Workload
@@ -50,7 +51,7 @@ class RecordingOptions(MotionOptions):
     topics: list[str] | None = None
     """Topics, by name or pattern ('/camera/*'); default: all."""
     odom: str | None = None
-    """Take x from the motion on this topic (of tf: TOPIC:PARENT:CHILD)."""
+    """Take x from the motion on this topic, of tf: TOPIC:PARENT:CHILD (default: x is the message's index)."""
     bridge_gaps: bool = False
     """Take motion across gaps in it as even."""
 
@@ -103,7 +104,8 @@ def from_bag(
     arguments = recording.arguments()
     if recording.odom is None:
         refuse(given(recording, *MOTION), "needs --odom")
-    bag = read_bag(file, arguments.pop("odom", None))
+    with bar(None, True, "message") as advance:
+        bag = read_bag(file, arguments.pop("odom", None), advance)
     if recording.topics is None and out is None and recording.odom is None:
         print(printable(f"{bag.path} ({bag.kind})") + "\n")
         print("\n".join(_listed(bag, workload_from_bag(bag).summary() if len(bag.time_ns) else [])))

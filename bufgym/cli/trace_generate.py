@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from bufgym import traces
-from bufgym.cli.options import Count, Natural, Positive
+from bufgym.cli.options import Bytes, Natural, Positive, Rate
 from bufgym.traces import Trace
 
 
@@ -29,6 +29,7 @@ generate = App(
 Out = Annotated[Path, Parameter(alias="-o", help="The CSV to write.")]
 TYPES: Mapping[str, Any] = {
     "seed": Natural,
+    **dict.fromkeys(("bytes_per_s", "start_bytes_per_s", "end_bytes_per_s"), Rate),
     "links": Annotated[Any, Parameter(converter=lambda _, tokens: traces.read_links(tokens[0].value), n_tokens=1)],
 }
 """Types of parameters that are not as the function says."""
@@ -82,7 +83,7 @@ def workload(
     seed: Natural = 0,
     duration: Positive = 300.0,
     fps: Positive = 30.0,
-    bytes: Count = 230_000,
+    bytes: Bytes = 230_000,
     sizes: str = "equal",
     motion: str = "drive-0",
     out: Out,

@@ -22,7 +22,7 @@ _MOST_DRAWN = 5_000  # most rates in a picture some 1300 pixels wide; more rates
 
 
 Files = Annotated[list[str], Parameter(help="A file, or a shipped name.")]
-Format = Annotated[str | None, Parameter(help="The files' format, where it is not to be detected.")]
+Format = Annotated[str | None, Parameter(help="The files' format (default: detected).")]
 Column = Annotated[str | None, Parameter(help="Of UCC files (DL_bitrate, UL_bitrate), or which run of a list.")]
 
 

@@ -7,7 +7,6 @@ other exception that escapes is a bug in bufgym.
 import difflib
 import importlib.metadata
 import os
-import re
 import traceback
 from collections.abc import Iterable
 from os import PathLike
@@ -88,24 +87,10 @@ def line_in(error: Exception, file: str) -> str | None:
 def install(extra: str) -> str:
     """The command that installs an optional part.
 
-    It lists the extra's packages, so it works both in a checkout and beside an installed bufgym, and no package index
-    needs to know bufgym.
+    pip finds the extra in the bufgym that is installed, so no package index needs to know bufgym.
     """
     try:
-        packages = _packages(importlib.metadata.requires("bufgym") or [], extra)
+        importlib.metadata.version("bufgym")
     except importlib.metadata.PackageNotFoundError:  # a source tree that was never installed
-        packages = []
-    quoted = [name if re.fullmatch(r"[\w.-]+", name) else f'"{name}"' for name in packages]
-    return f"pip install {' '.join(quoted)}" if packages else f'pip install -e ".[{extra}]"'
-
-
-def _packages(requirements: list[str], extra: str) -> list[str]:
-    """Packages that an extra requires, directly or through another extra of bufgym."""
-    found: list[str] = []
-    for requirement in requirements:
-        package, _, condition = requirement.partition(";")
-        if not re.search(rf"""extra == ['"]{re.escape(extra)}['"]""", condition):
-            continue
-        own = re.fullmatch(r"bufgym\[([\w,-]+)\]", package.strip())
-        found += [name for e in own[1].split(",") for name in _packages(requirements, e)] if own else [package.strip()]
-    return found
+        return f'pip install -e ".[{extra}]"'
+    return f'pip install "bufgym[{extra}]"'

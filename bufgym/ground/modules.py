@@ -105,6 +105,17 @@ def needs(function: Any) -> int:
     return sum(parameter.kind in kinds and parameter.default is parameter.empty for parameter in parameters)
 
 
+def takes(function: Any, count: int) -> bool:
+    """Whether the function can be called with so many arguments; True if its signature is unknown."""
+    try:
+        inspect.signature(function).bind(*range(count))
+    except TypeError:
+        return False
+    except ValueError:
+        return True
+    return True
+
+
 def on_demand(package: str) -> Callable[[str], Any]:
     """Make a room's ``__getattr__``: names imported ``if TYPE_CHECKING`` are imported when first asked for."""
 

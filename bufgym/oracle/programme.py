@@ -30,6 +30,15 @@ class Messages(NamedTuple):
     v: Floats  # ``Value.array``
     ends: int  # the link's last byte
 
+    @property
+    def reach(self) -> int:
+        """Bytes after its arrival by which every message has ended."""
+        return max(0, int((self.limit + self.size).max()))
+
+    def grid(self, steps: int) -> int:
+        """Bytes to a grid step, see ``new_problem``."""
+        return max(1, int(self.size.mean()) // steps, self.reach * len(self.c) // MAX_CELLS)
+
 
 class Problem(NamedTuple):
     """``Messages`` and what the kernels look up about them."""
@@ -67,12 +76,10 @@ def new_problem(messages: Messages, certain: Ints, steps: int) -> Problem:
 
     A message that waits for at most ``certain`` bytes finds room, whichever messages wait.
     """
-    c, size, limit = messages[:3]
-    n, furthest = len(c), max(0, int((limit + size).max()))
-    grid = max(1, int(size.mean()) // steps, furthest * n // MAX_CELLS)
+    n, grid = len(messages.c), messages.grid(steps)
     between, idle = np.empty((2, n), np.int64)
-    find_idle(c, size, limit, certain, between, idle)
-    return Problem(*messages, between, idle, grid, np.zeros((n, furthest // grid + 2)))
+    find_idle(*messages[:3], certain, between, idle)
+    return Problem(*messages, between, idle, grid, np.zeros((n, messages.reach // grid + 2)))
 
 
 @kernel

@@ -82,7 +82,7 @@ def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -
 @contextmanager
 def _steps(name: str, runs: int, takes_s: float) -> Iterator[Callable[[], None]]:
     """Show the progress of live runs as a bar, or as lines without a terminal."""
-    from bufgym.benchmark.run import bar
+    from bufgym.ground.progress import bar
 
     def note(text: str) -> None:
         print(f"{name}: {text}", file=sys.stderr, flush=True)

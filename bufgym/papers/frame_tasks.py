@@ -14,10 +14,10 @@ from typing import Any, Literal, NamedTuple, cast
 
 from bufgym.benchmark import cluster
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.run import bar
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
+from bufgym.ground.progress import bar
 from bufgym.papers.perception.recordings import open_sequence
 from bufgym.papers.perception.room import made_up_room
 from bufgym.papers.perception.stage import WIDTH, Stage

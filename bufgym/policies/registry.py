@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.kernel import compile_for
-from bufgym.ground.modules import first_line
+from bufgym.ground.modules import first_line, takes
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.checks import changed, check_name, constants, named_settings
 
@@ -53,6 +53,13 @@ OnDequeue = Callable[[Buffer, Memory], bool]
 OnSend = Callable[[Buffer, Memory], int]
 Privileged = Callable[[Any, int, int, Any], Memory]
 Functions = tuple[OnArrival, OnDeparture, OnDequeue, OnSend]
+
+
+_TAKES = {
+    "on_arrival": ("buffer", "arrival", "memory"),
+    **dict.fromkeys(("on_departure", "on_dequeue", "on_send"), ("buffer", "memory")),
+}
+"""The arguments of each function of a policy."""
 
 
 def _ignore(buffer: Buffer, memory: Memory) -> None:
@@ -132,6 +139,13 @@ class Policy:
     """Whether it is made for several topics; on one queue it is left out unless named."""
     named_only: bool = False
     """Whether ``names`` leaves it out, as it can't play everywhere."""
+
+    def __post_init__(self) -> None:
+        for name, arguments in _TAKES.items():
+            function = getattr(self, name)
+            if not takes(function, len(arguments)):
+                has = f"{getattr(function, '__name__', 'function')}{inspect.signature(function)}"
+                raise BufgymError(f"policy {self.name!r}: {name} = {has}: must take ({', '.join(arguments)})")
 
     @property
     def schedules(self) -> bool:

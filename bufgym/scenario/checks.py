@@ -1,5 +1,6 @@
 """Rules that parameters of scenarios share; each function raises a BufgymError that names the parameter."""
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -78,9 +79,13 @@ def as_tuple(
     ``load`` makes items from text.
     """
     value = getattr(scenario, name)
-    items = list(value if isinstance(value, Sequence) and not isinstance(value, str) else (value,))
+    items = list(value if isinstance(value, Sequence) and not isinstance(value, str | os.PathLike) else (value,))
     if load is not None:
-        items = [made for item in items for made in (load(item) if isinstance(item, str) else [item])]
+        items = [
+            made
+            for item in items
+            for made in (load(os.fspath(item)) if isinstance(item, str | os.PathLike) else [item])
+        ]
     for item in items:
         if not isinstance(item, kind):
             raise BufgymError(f"{name}: {item!r} is not {what}")

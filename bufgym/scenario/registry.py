@@ -1,6 +1,9 @@
 """The one registry of scenarios, by name."""
 
+import ast
 import functools
+import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
@@ -84,14 +87,33 @@ def checked(scenario: Any, name: str) -> Scenario:
     return cast(Scenario, scenario)
 
 
-def get(spec: str | Scenario, options: Iterable[str] = (), /, **overrides: Any) -> Scenario:
+def split_text(text: str) -> tuple[str, dict[str, Any]]:
+    """Split ``"lte:rate_hz=5,motion=none"`` into the name and its parameters, literals of Python or text."""
+    name, _, settings = text.partition(":")
+    found: dict[str, Any] = {}
+    for setting in re.split(r",(?=[A-Za-z_]\w*=)", settings):
+        key, _, value = setting.partition("=")
+        try:
+            found[key] = ast.literal_eval(value)
+        except (SyntaxError, ValueError):
+            found[key] = value
+    return name, found
+
+
+def get(spec: str | os.PathLike[str] | Scenario, options: Iterable[str] = (), /, **overrides: Any) -> Scenario:
     """The scenario of that name, or ``spec`` itself, with changed parameters; BufgymError for unknown ones.
 
     ``options`` are the caller's other arguments, which an unknown parameter may have been meant for.
 
-    A name that ends in .toml names a client's configuration (``read_client``). ``module:function`` is imported (see
-    ``bufgym.ground.modules``); it is a scenario or makes one without arguments.
+    A name that ends in .toml, or a path, names a client's configuration (``read_client``). ``module:function`` is
+    imported (see ``bufgym.ground.modules``); it is a scenario or makes one without arguments. A name may carry
+    parameters, as in ``"lte:rate_hz=5,motion=none"``.
     """
+    if isinstance(spec, os.PathLike):
+        spec = os.fspath(spec)
+    if isinstance(spec, str) and "=" in spec.partition(":")[2]:
+        spec, settings = split_text(spec)
+        overrides = settings | overrides
     if isinstance(spec, str) and spec.endswith(".toml"):
         spec = read_client(spec)
     elif isinstance(spec, str) and modules.is_named(spec):

@@ -3,6 +3,7 @@
 import functools
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -101,7 +102,7 @@ class Uplink:
             raise BufgymError(
                 f"link_offset_s = {self.link_offset_s}: must be (from, to) with 0 <= from <= to <= {MAX_DURATION_S}, s"
             )
-        if isinstance(self.workload, str):
+        if isinstance(self.workload, str | Path):
             object.__setattr__(self, "workload", read_workload(self.workload))
         if self.workload is not None and not isinstance(self.workload, Workload):
             raise BufgymError(f"workload: {self.workload!r} is not a bufgym.traces Workload")

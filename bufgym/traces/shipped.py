@@ -1,11 +1,15 @@
 """The traces and motion recordings that come with bufgym, by name."""
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 from bufgym.ground import files
+from bufgym.ground.units import rate_of
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import read_trace
 from bufgym.traces.formats.motions import read_motion
+from bufgym.traces.generate.rules import steady
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import After, Trace
 
@@ -21,11 +25,16 @@ def shipped() -> dict[str, Path]:
 def load(
     name_or_path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None
 ) -> Trace:
-    """A bandwidth trace by its shipped name or from a file (see `read_trace`); a shipped name takes precedence.
+    """A bandwidth trace by its shipped name, from a file (see `read_trace`), or of one rate, as in `20Mbit/s`.
+
+    A shipped name takes precedence, then a file.
 
     Raises:
         TraceError: neither a shipped name nor a file (the message lists the names), or a broken file.
     """
+    rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
+    if rate is not None:
+        return replace(steady(rate), name=os.fspath(name_or_path))
     return read_trace(_resolve(name_or_path), format, after, column=column)
 
 

@@ -135,7 +135,7 @@ def refusal(folder: Path) -> str:
 
 def test_the_page_needs_an_extra_and_the_tables_do_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
-    assert "pip install jinja2" in refusal(folder)
+    assert "bufgym[report]" in refusal(folder)
     assert "afr" in report.markdown(folder)
 
 

@@ -22,7 +22,7 @@ from bufgym.traces.workload import Workload
 STEADY = Link(Trace.constant(1e6, 10))
 THREE = messages(np.array([0, 10, 20]), 5)
 V = qoi.exponential()
-PRIVILEGED = policies.Policy("p", len, privileged=lambda *_: 0)
+PRIVILEGED = policies.Policy("p", lambda *_: 0, privileged=lambda *_: 0)
 PLAYED = Workload("played", np.array([0, 10]), np.array([1, 1]))
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from bufgym import policies
 from bufgym.model import qoi
+from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
 from bufgym.oracle import clairvoyant, unequal
 from bufgym.oracle.programme import Messages, Room, new_problem, waiting_cost
@@ -131,3 +132,20 @@ def test_leaving_messages_out_while_the_link_is_idle_is_never_worth_it(seed, v):
         room = unequal._priced(p, np.zeros((2, n)), n, 10**6)
         totals.append(unequal.follow(p, room, np.empty(n, np.int64), np.empty(n, np.int64))[1])
     assert totals[0] == pytest.approx(totals[1], abs=1e-12)
+
+
+def test_a_fast_link_costs_no_work_where_no_message_reaches():
+    """Three bursts, 10**8 bytes apart, of which the last comes when the link has ended: plan and bound stay."""
+    rng = np.random.default_rng(7)
+    size, limit, x = rng.integers(100, 900, 30), np.full(30, 2_000), np.arange(30) / 4
+    c = np.repeat([500, 10**8, 2 * 10**8], 10) + np.tile(np.arange(10) * 90, 3)
+    sent = Messages(c, size, limit, x, qoi.exponential(0.5).array, 10**8 + 5_000)
+    short, *_, ends = unequal.without_idle(sent)
+    assert (np.diff(short)[[9, 19]] < 4_000).all() and (np.diff(short)[:9] == 90).all()
+    assert short[0] == 500 and ends - short[10] in (5_000, short[20] - short[10])
+    plan, bound = unequal.best(sent, np.full(30, 100), 3, UNLIMITED_BYTES)
+    assert 0 < len(plan) < 20 and plan.max() < 20
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(unequal, "without_idle", lambda messages: messages)
+        again, same = unequal.best(sent, np.full(30, 100), 3, UNLIMITED_BYTES)
+    assert again.tolist() == plan.tolist() and same == bound

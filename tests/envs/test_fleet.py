@@ -212,7 +212,7 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
         if name == "bufgym.envs.fleet" or name.split(".")[0] == "pettingzoo":
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
-    with pytest.raises(BufgymError, match=r"FleetEnv needs pettingzoo: pip install pettingzoo"):
+    with pytest.raises(BufgymError, match=r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"'):
         bufgym.envs.__getattr__("FleetEnv")
     with pytest.raises(AttributeError, match="no_such_thing"):
         bufgym.envs.__getattr__("no_such_thing")

@@ -132,5 +132,5 @@ def test_images_without_matplotlib_say_what_to_install(monkeypatch: pytest.Monke
     env = SenderEnv("interruption", render_mode="rgb_array")
     env.reset(seed=0)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(gym.error.DependencyNotInstalled, match=r"pip install matplotlib"):
+    with pytest.raises(gym.error.DependencyNotInstalled, match=r"bufgym\[plot\]"):
         env.render()

@@ -80,7 +80,7 @@ def test_without_a_folder_nothing_is_saved_and_without_matplotlib_numbers_are(
     for name in ("matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)  # None there makes the import fail
     text = run("afr-fig4", tmp_path)
-    assert "10 of 10 drops" in text and "pip install matplotlib" in text
+    assert "10 of 10 drops" in text and "bufgym[plot]" in text
     assert [path.name for path in tmp_path.iterdir()] == ["afr-fig4.csv"]
 
 

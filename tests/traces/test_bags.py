@@ -158,7 +158,7 @@ def test_what_is_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     for name in [name for name in sys.modules if name == "mcap" or name.startswith("mcap.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mcap", None)
-    refused(drive, r"reading recordings needs mcap.*: pip install .*mcap")
+    refused(drive, r'reading recordings needs mcap.*: pip install "bufgym\[ros\]"')
 
 
 def test_times_records_chunks_and_counts_out_of_all_proportion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,6 +99,9 @@ class QueueTask(Task):
         self, policies: Sequence[Policy], scenario: Any, episodes: Sequence[Episode], capacity: int
     ) -> Iterator[list[Result]]:
         settings = self.max_bytes, self.decide_at
+        least = min((e.arrivals["size_bytes"].min() for e in episodes if len(e.arrivals)), default=0)
+        if self.max_bytes is not None and least > self.max_bytes:
+            raise BufgymError(f"max_bytes = {self.max_bytes}: no message fits, the smallest has {least} bytes")
         plans = [best(e, capacity, scenario, *settings) if self.bound else None for e in episodes]
         for policy in policies:
             senders = meet(policy, episodes, capacity, scenario, plans, *settings)

@@ -18,7 +18,7 @@ message.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -69,12 +69,13 @@ def is_bag(path: StrPath) -> bool:
     return _kind(Path(path)) != ""
 
 
-def read_bag(path: StrPath, odom: str | None = None) -> Bag:
+def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], object] = int) -> Bag:
     """Read every message's arrival time, size and topic, and the poses of one topic.
 
     Args:
         path: an MCAP file, a ROS 1 bag, a rosbag2 folder or ``.db3`` file.
         odom: topic to take poses from; for tf, which holds many, ``TOPIC:PARENT:CHILD``.
+        advance: called with 1 for each message read, as a progress bar's update.
 
     Raises:
         TraceError: missing, not a recording, cut off, damaged, more than 10**7 messages or 10**4 topics, longer than
@@ -97,6 +98,7 @@ def read_bag(path: StrPath, odom: str | None = None) -> Bag:
             row = (logged_ns, max(1, len(data)), numbers.setdefault(channel.topic, len(numbers)))
             for column, value in zip(columns, row, strict=True):
                 column.append(value)
+            advance(1)
             if collector is not None and channel.topic == collector.topic:
                 collector.add(channel, logged_ns, data)
         time_ns, size_bytes, number = (np.array(column, np.int64) for column in columns)

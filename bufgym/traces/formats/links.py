@@ -6,7 +6,7 @@
 | `csv` | `t_ms,bytes,interval_ms` under that header; t_ms is the interval's END | bufgym's own; Belgium 4G |
 | `mbit` | seconds and Mbit/s separated by white space | Pensieve-cooked Norway HSDPA, Lumos5G, Solis WiFi |
 | `belgium` | epoch ms, ms since start, latitude, longitude, bytes, interval ms | raw Belgium 4G logs |
-| `rates` | `time_s,bytes_per_s` under that header; the rate holds until the next line | any tool |
+| `rates` | `time_s,bytes_per_s` or `time,mbps` under that header; a rate holds until the next line | any tool |
 | `ucc` | under a header with Timestamp, DL_bitrate and UL_bitrate, kbit/s | UCC 4G and 5G data sets |
 | `nyu` | `0.57,Mbits/sec`, a line a second | NYU-METS |
 | `sabre` | JSON: `[{"duration_ms": 1000, "bandwidth_kbps": 33809}, ...]` | Sabre |
@@ -16,7 +16,7 @@
 
 Any of them may be gzip'd. The format is recognised by the first line that is not blank, and stated in the trace's
 `source`; a line that fits two formats is an error. Blank lines are skipped. Every other line must follow its format
-exactly, because a wrong capacity is worse than none.
+exactly, because a wrong capacity is worse than none. Under the header of `rates` a time is in seconds or an ISO date.
 
 Limits beyond which a number counts as a mistake: 10**7 s in all, 86,400 s from one rate to the next, 10**12 bytes in an
 interval, 10**6 Mbit/s. `text.py` has the limits of text files.
@@ -29,12 +29,12 @@ from pathlib import Path
 from typing import Final
 
 from bufgym.ground.errors import BufgymError, TraceError
+from bufgym.traces.formats import tables
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_iperf3, read_nuttcp, read_runs
-from bufgym.traces.formats.tables import CSV_HEADER, RATES_HEADER, read_belgium, read_csv, read_mbit, read_rates
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace
 
@@ -58,10 +58,10 @@ def _cells(*patterns: str, between: str = r"\s+") -> Callable[[str], object]:
 
 FORMATS: Final[dict[str, Format]] = {
     "mahimahi": Format("one number, the ms of a packet", _cells(NUMBER), read_mahimahi),
-    "csv": Format(f"header {CSV_HEADER}", lambda text: is_header(text, CSV_HEADER), read_csv),
-    "mbit": Format("two numbers, s and Mbit/s", _cells(NUMBER, NUMBER), read_mbit),
-    "belgium": Format("six numbers", _cells(*[NUMBER] * 6), read_belgium),
-    "rates": Format(f"header {RATES_HEADER}", lambda text: is_header(text, RATES_HEADER), read_rates),
+    "csv": Format(f"header {tables.CSV_HEADER}", lambda text: is_header(text, tables.CSV_HEADER), tables.read_csv),
+    "mbit": Format("two numbers, s and Mbit/s", _cells(NUMBER, NUMBER), tables.read_mbit),
+    "belgium": Format("six numbers", _cells(*[NUMBER] * 6), tables.read_belgium),
+    "rates": Format(f"header {tables.RATES_HEADER} or time,mbps", tables.fits_rates, tables.read_rates),
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
     "nyu": Format(
         "number,unit with a unit such as Mbits/sec",

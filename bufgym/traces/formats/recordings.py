@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +26,7 @@ def read_workload(
     odom: str | None = None,
     settings: MotionSettings | None = None,
     bridge_gaps: bool = False,
+    advance: Callable[[int], object] = int,
 ) -> Workload:
     """Read a recording of a robot (see `bags.read_bag`) or a workload CSV, recognised by the first bytes.
 
@@ -36,6 +37,7 @@ def read_workload(
         settings: how motion is measured, by default `MotionSettings()`.
         bridge_gaps: take motion across a gap as the straight way from its first pose to its last (before the first
             pose and after the last: none); otherwise a gap is an error.
+        advance: called with 1 for each message of a recording read, as a progress bar's update.
 
     Raises:
         TraceError: a file that cannot be read, or breaks a rule of its format.
@@ -45,7 +47,8 @@ def read_workload(
         if odom is not None:
             raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
         return _with_topics(read_workload_csv(path), topics)
-    return workload_from_bag(bags.read_bag(path, odom), topics=topics, settings=settings, bridge_gaps=bridge_gaps)
+    bag = bags.read_bag(path, odom, advance)
+    return workload_from_bag(bag, topics=topics, settings=settings, bridge_gaps=bridge_gaps)
 
 
 def workload_from_bag(
@@ -66,9 +69,12 @@ def workload_from_bag(
     if bag.poses is not None:
         view = f"{settings.fov_deg:g} degrees, {settings.scene_scale_m:g} m"
         measured = f", motion from {bag.poses.format}: {view}"
-    name = trace_name(bag.path.removesuffix(".mcap").removesuffix(".bag").removesuffix(".db3"))
-    arrival_us, source = (time_ns - time_ns[0]) // 1000, f"{bag.path} ({bag.kind}{measured})"
-    return Workload(name, arrival_us, bag.size_bytes[chosen], topic, names, x, source, gaps)
+    source = f"{bag.path} ({bag.kind}{measured})"
+    if len(names) < len(bag.topics):
+        others = ", ".join(name for name in bag.topics if name not in names)
+        source += f"; {np.count_nonzero(~chosen):,} messages left out, on topics not chosen: {others}"
+    name = trace_name(str(bag.path).removesuffix(".mcap").removesuffix(".bag").removesuffix(".db3"))
+    return Workload(name, (time_ns - time_ns[0]) // 1000, bag.size_bytes[chosen], topic, names, x, source, gaps)
 
 
 def _motion_at(

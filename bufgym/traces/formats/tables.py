@@ -1,27 +1,31 @@
 """Readers of simple tables: bufgym's CSV, the Belgium log, Mbit/s over time, rates over time."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from typing import Final
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.text import Line, TextFile, is_header, open_text
+from bufgym.traces.formats.text import Line, TextFile, is_header, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
 MAX_MBIT_PER_S: Final = 10**6
-MAX_BYTES_PER_S: Final = MAX_MBIT_PER_S * 125_000
+_TIME_COLUMNS: Final = ("time_s", "time", "timestamp", "date")
+_RATE_COLUMNS: Final = {"bytes_per_s": 1e-6, "mbps": 0.125, "mbit/s": 0.125, "kbps": 125e-6, "kbit/s": 125e-6}
+"""Name of a rate's column -> bytes per microsecond of its unit."""
 
 # 2286-11-20, the last epoch in ms with 13 digits.
 _MAX_EPOCH_MS: Final = 10**13
+_MAX_EPOCH_S: Final = 10**10
 
 
 def read_csv(path: StrPath) -> Knots:
     """Header `t_ms,bytes,interval_ms`; times in ms with up to 3 decimals, so that microseconds survive."""
     intervals = Intervals()
     with open_text(path) as file:
-        for line in after_header(file, CSV_HEADER):
+        for line in below_header(file, CSV_HEADER, lambda text: is_header(text, CSV_HEADER))[1]:
             end_ms, count, length_ms = line.columns(3, ",")
             intervals.add_ending_at(line, end_ms, length_ms, count)
     return intervals.knots(path)
@@ -43,28 +47,47 @@ def read_belgium(path: StrPath) -> Knots:
 def read_mbit(path: StrPath) -> Knots:
     """Seconds and Mbit/s separated by white space, by the rules of `held_rates`."""
     with open_text(path) as file:
-        return held_rates(path, (_rate(line, None, "Mbit/s", MAX_MBIT_PER_S, 0.125) for line in file.lines()))
+        return held_rates(path, (_rate(line, None, "Mbit/s", 0.125, MAX_DURATION_S) for line in file.lines()))
+
+
+def fits_rates(text: str) -> bool:
+    """Whether a header names a time and a rate, as `time_s,bytes_per_s` and `time,mbps` do."""
+    time, *rate = split_cells(text.lower())
+    return time in _TIME_COLUMNS and len(rate) == 1 and rate[0] in _RATE_COLUMNS
 
 
 def read_rates(path: StrPath) -> Knots:
-    """Header `time_s,bytes_per_s`, by the rules of `held_rates`."""
+    """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
-        lines = after_header(file, RATES_HEADER)
-        return held_rates(path, (_rate(line, ",", "bytes_per_s", MAX_BYTES_PER_S, 1e-6) for line in lines))
+        header, lines = below_header(file, f"{RATES_HEADER} or time,mbps", fits_rates)
+        column = split_cells(header.lower())[1]
+        return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column], _MAX_EPOCH_S) for line in lines))
 
 
-def after_header(file: TextFile, header: str) -> Iterator[Line]:
-    """The lines below the header, which must be there."""
+def below_header(file: TextFile, header: str, fits: Callable[[str], bool]) -> tuple[str, Iterator[Line]]:
+    """The first line, which must be that header, and the lines below it."""
     lines = file.lines()
     first = next(lines, None)
     if first is None:
         raise fault(file.path, f"is empty: must begin with the header {header}")
-    if not is_header(first.text, header):
+    if not fits(first.text):
         raise first.error(first.text, f"must be the header {header}")
-    return lines
+    return first.text, lines
 
 
-def _rate(line: Line, separator: str | None, field: str, most: float, to_bytes_per_us: float) -> Rate:
-    seconds, rate = line.columns(2, separator)
-    start_us = round(line.decimal("time in s", seconds, 0, MAX_DURATION_S) * US_PER_S)
-    return Rate(line, seconds, start_us, line.decimal(field, rate, 0, most) * to_bytes_per_us)
+def _rate(line: Line, separator: str | None, field: str, unit: float, most_s: int) -> Rate:
+    """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
+    time, rate = line.columns(2, separator)
+    start_us = _date_us(time) if separator else None
+    if start_us is None:
+        start_us = round(line.decimal("time in s", time, 0, most_s) * US_PER_S)
+    return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit)
+
+
+def _date_us(text: str) -> int | None:
+    """Microseconds since 1970 of an ISO date, in UTC where it names no zone; None for other text."""
+    try:
+        date = datetime.fromisoformat(text if "-" in text else "")
+    except ValueError:
+        return None
+    return round(date.replace(tzinfo=date.tzinfo or UTC).timestamp() * US_PER_S)

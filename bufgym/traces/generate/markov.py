@@ -51,7 +51,7 @@ def markov_link(
     Args:
         mode: one of `links`: foot, bicycle, bus, tram, train, car; wifi-cafe, wifi-campus, wifi-office,
             wifi-restr; uplink-5g, uplink-wifi, uplink-mmwave.
-        seed: >= 0. Modes with the same seed share their uniform draws, so they are good and bad at the same times.
+        seed: from 0 up. Modes with the same seed share their uniform draws, so they are good and bad at the same times.
         duration_s: whole seconds, 1 to 10**6.
         mean_bytes_per_s: scale this very trace to that mean, 1 to 10**10; by default rates are the recordings', and the
             mean differs from seed to seed as it does between recordings.

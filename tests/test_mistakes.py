@@ -1,0 +1,157 @@
+"""Natural mistakes at the command line end in one sentence; natural inputs are understood."""
+
+import json
+import math
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from cli_cases import Capsys, Patch, fails, shown
+
+import bufgym
+from agents.report import Trained, agent_name
+from bufgym import scenario, traces
+from bufgym.benchmark.rows import read_rows
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
+from bufgym.ground.units import bytes_of, rate_of
+from bufgym.policies import registry
+
+QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10", "--seeds", "1", "--policies", "afr"]
+"""A benchmark of ten messages."""
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        ("report", "report needs FOLDER"),
+        ("trace convert lte-synthetic-0", "trace convert needs --out"),
+        ("trace convert lte-synthetic-0 --out", "--out requires an argument"),
+        ("leaderboard --suite outage", "unknown suite 'outage'; did you mean 'outage-v1'?"),
+        ("leaderboard outage", "unknown suite 'outage'; did you mean 'outage-v1'?"),
+        ("bench --capacity 4 4", "--capacity 4,4: must be whole numbers >= 1, no two alike"),
+        ("bench --bytes 1.5", "1.5: must be a whole number of bytes >= 1, as in 230000, 1e6 or 4.6MB"),
+        ("bench --bytes 4.6Mbit", "4.6Mbit: must be a whole number of bytes >= 1"),
+        ("trace generate steady --rate 20Mbit --out x.csv", "20Mbit: must be bytes/s > 0, or as in 20Mbit/s"),
+        (" ".join([*QUICK, "--bytes 4.6MB --max-bytes 1150000"]), "no message fits, the smallest has 4600000 bytes"),
+    ],
+)
+def test_a_mistake_ends_in_a_sentence(command: str, told: str, capsys: Capsys) -> None:
+    fails(command.split(), told, capsys)
+
+
+RULE = """
+from bufgym.policies import register
+@register("mine"{})
+def mine(buffer, arrival{}):
+    return {}
+"""
+
+
+@pytest.mark.parametrize(
+    ("compile", "memory", "answer", "told"),
+    [
+        ("", "", "0", "policy 'mine': on_arrival = mine(buffer, arrival): must take (buffer, arrival, memory)"),
+        (", compile=True", ", memory, more", "0", "mine(buffer, arrival, memory, more): must take"),
+        (", on_send=lambda buffer: 0", ", memory", "0", "on_send = <lambda>(buffer): must take (buffer, memory)"),
+        (", compile=True", ", memory", "buffer.no", "attribute 'no' of type Buffer; File \"mine.py\", line 5\n"),
+    ],
+)
+def test_a_rule_that_does_not_fit(
+    compile: str, memory: str, answer: str, told: str, tmp_path: Path, monkeypatch: Patch, capsys: Capsys
+) -> None:
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(RULE.format(compile, memory, answer), encoding="utf-8")
+    if answer == "0" or JIT:
+        fails([*QUICK, "--policy-file", "mine.py", "--policies", "mine"], told, capsys)
+
+
+def test_natural_inputs(tmp_path: Path, capsys: Capsys) -> None:
+    """Capacities as words, sizes with units; an earlier run's rows stay."""
+    out = tmp_path / "out"
+    shown([*QUICK, "--capacity", "2", "4", "--bytes", "4.6MB", "--format", "csv", "--out", out], capsys)
+    assert [row["capacity"] for row in read_rows(out / "rows.csv")] == [2, 4]
+    fails([*QUICK, "--out", out], "rows.csv: holds an earlier run's rows; choose another --out", capsys)
+    shown(["trace", "generate", "steady", "--rate", "20Mbit/s", "--out", tmp_path / "s.csv"], capsys)
+    assert "2,500" in shown(["trace", "info", tmp_path / "s.csv"], capsys)
+
+
+def test_a_link_as_a_spreadsheet_has_it(tmp_path: Path) -> None:
+    """8 and 4 Mbit/s for a second each, then nothing for as long; times in seconds, of any clock, or as dates."""
+    clock = "1790000000.5", "1790000001.5", "1790000002.5"
+    day = "2026-10-25T02:59:59+02:00", "2026-10-25T02:00:00+01:00", "2026-10-25 01:00:01"
+    for header, times in (("time,mbps", ("0", "1", "2")), ("Time, Mbps", clock), ("timestamp,mbit/s", day)):
+        file = tmp_path / "link.csv"
+        rows = [f"{time},{rate}" for time, rate in zip(times, (8, 4, 0), strict=True)]
+        file.write_text("\n".join([header, *rows]), encoding="utf-8")
+        trace = traces.load(file)
+        assert trace.time_us.tolist() == [0, 10**6, 2 * 10**6, 3 * 10**6]
+        assert trace.cumulative_bytes.tolist() == [0, 10**6, 1_500_000, 1_500_000]
+    file.write_text("time,mbps\n2026-13-01,8\n", encoding="utf-8")
+    with pytest.raises(BufgymError, match=r"link.csv, line 2: time in s = 2026-13-01: must be a finite number"):
+        traces.load(file)
+
+
+def uplink(text: str, **changes: Any) -> scenario.Uplink:
+    """The scenario of that text."""
+    made = scenario.get(text, **changes)
+    assert isinstance(made, scenario.Uplink)
+    return made
+
+
+def test_paths_rates_and_parameters_wherever_text_is_taken(tmp_path: Path) -> None:
+    link, client = tmp_path / "link.csv", tmp_path / "client.toml"
+    traces.write_csv(traces.steady(1e6, 2), link)
+    client.write_text('[[topic]]\nname = "a"\nrate_hz = 5\nsize_bytes = 9\n', encoding="utf-8")
+    for path in (link, str(link)):
+        assert [trace.name for trace in uplink("lte", traces=path).traces] == ["link"]
+    assert [topic.name for topic in scenario.get(client).topics] == ["a"]
+    assert traces.load("20Mbit/s").mean_bytes_per_s == 2.5e6
+    given = uplink("lte:rate_hz=5,duration_s=2,motion=none,value=saturating:0.5,traces=8Mbps")
+    assert (given.rate_hz, given.max_messages, given.motion, given.value.name) == (5, 10, (), "saturating:0.5")
+    assert [trace.name for trace in given.traces] == ["8Mbps"]
+    (row,) = bufgym.compare("afr", "lte:duration_s=1,traces=8Mbps", seeds=1, progress=False).rows
+    assert row["arrived"] == 30
+    with pytest.raises(BufgymError, match=r"unknown parameter 'rate'; did you mean 'rate_hz'"):
+        scenario.get("lte:rate=5")
+
+
+def test_masks_of_an_environment_as_it_is_made() -> None:
+    env: Any = gym.make("bufgym/Uplink-v0", capacity=2)
+    _, info = env.reset(seed=0)
+    assert env.action_masks().tolist() == (info["action_mask"] == 1).tolist()
+
+
+def test_results_without_bare_nan(tmp_path: Path) -> None:
+    """JSON has no NaN: no regret is null."""
+    run: Any = SimpleNamespace(seed=0, seconds=1.0, merit=1.0)
+    settings: Any = SimpleNamespace(algo="evolve", values={})
+    trained = Trained(settings, tmp_path, [run], [], {})
+    names = [agent_name(run), "drop-oldest"]
+    scores = [{"policy": name, "qoi": 1.0, "regret": math.nan} for name in names]
+    trained.save(tmp_path, scores=scores, held_out="")
+    text = (tmp_path / "results.json").read_text(encoding="utf-8")
+    assert [row["regret"] for row in json.loads(text, parse_constant=pytest.fail)["scores"]] == [None, None]
+
+
+def test_help_tells_the_defaults_and_wraps_evenly(capsys: Capsys) -> None:
+    """The numbers are those of the scenario; a box's second column begins at one place in every line."""
+    text = shown(["bench", "--help"], capsys)
+    lte = uplink("lte")
+    for option, default in (("fps", lte.rate_hz), ("bytes", lte.size_bytes), ("seconds", lte.duration_s)):
+        told = re.search(rf"--{option} .*?\(default:[ │\n]+([0-9]+)", text, re.DOTALL)
+        assert told and float(told[1]) == default, option
+    box = text[text.index("─ Who runs ─") : text.index("─ The stream and its link")].splitlines()[1:-1]
+    assert {len(line) - len(line[1:].lstrip()) for line in box if not line.startswith(("│ --", "╰"))} == {21}
+    assert "▌" not in shown(["trace", "generate", "link", "--help"], capsys)
+
+
+def test_sizes_and_rates() -> None:
+    sizes = {"7": 7, "1e6": 10**6, "4.6MB": 4_600_000, "4.6 kB": 4600, "2KiB": 2048, "1GB": 10**9, "3B": 3}
+    assert {text: bytes_of(text) for text in sizes} == sizes
+    rates = {"20Mbit/s": 2.5e6, "20 Mbps": 2.5e6, "2.5MB/s": 2.5e6, "8bit/s": 1.0, "8": None, "8MB": None, "x/s": None}
+    assert {text: rate_of(text) for text in rates} == rates
