@@ -87,6 +87,7 @@ class Reproduction(Figure):
             process.stdin.close()
             async with asyncio.timeout(START_S):
                 said: dict[str, float] = json.loads(await process.stdout.readline())
+                await process.wait()  # it sends the rest
         finally:
             if process.returncode is None:
                 process.kill()
@@ -152,7 +153,7 @@ async def _rosbridge() -> AsyncIterator[tuple[int, list[Any]]]:
     came: list[Any] = []
 
     async def take(socket: Any) -> None:
-        with contextlib.suppress(ConnectionClosed):  # the program is killed when it has said its costs
+        with contextlib.suppress(ConnectionClosed):
             async for text in socket:
                 if '"publish"' in text[:200]:
                     came.append(table2_programs.TOPIC)

@@ -13,9 +13,11 @@ for library in ("rosbags", "flatbuffers", "roslibpy", "websockets"):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_both_programs_send_every_cloud_and_say_what_it_cost() -> None:
+def test_both_programs_send_clouds_and_say_what_it_cost() -> None:
+    """Robofleet's rule may drop some on a busy machine; the other keeps all."""
     rows = figure("robofleet-table2", runs=1, seconds=0.5, points=100).simulate()
-    assert [(row["program"], row["received"]) for row in rows] == [("robofleet", 5), ("rosbridge", 5)]
+    assert [row["program"] for row in rows] == ["robofleet", "rosbridge"]
+    assert 1 <= rows[0]["received"] <= rows[1]["received"] == 5
     assert all(row["cpu"] > 0 and row["virtual_mb"] > row["resident_mb"] > 10 for row in rows)
 
 
