@@ -119,8 +119,11 @@ def online_optimum(
     value = math.fsum(weight[t] * (t + 1) * gain[1] for t in range(min(L, t_max + 1)))  # room for all
     decisions = np.zeros(math.comb(t_max, L + 1), np.min_scalar_type(L))
     if t_max >= L:
-        best = np.empty(math.comb(t_max, L))
-        binomials, work = _binomials(t_max, L), np.zeros(L + 2, np.int64)
+        best, work = np.empty(math.comb(t_max, L)), np.zeros(L + 2, np.int64)
+        binomials = np.ones((t_max + 1, L + 2), np.int64)  # C(n, k), int64[t_max + 1, L + 2]
+        binomials[0, 1:] = 0
+        for n in range(1, t_max + 1):
+            binomials[n, 1:] = np.minimum(_MOST, binomials[n - 1, 1:] + binomials[n - 1, :-1])
         interruptible(lambda: _solve(gain, weight, binomials, work, best, decisions))
         value += best[0]  # the set of messages 1..L
     for array in (p, decisions):
@@ -166,15 +169,6 @@ def _solve(gain: Floats, weight: Floats, binomial: Ints, kept: Ints, best: Float
                 kept[k] = k
                 k += 1
             kept[k] += 1
-
-
-def _binomials(t_max: int, L: int) -> Ints:
-    """C(n, k), int64[t_max + 1, L + 2]."""
-    table = np.zeros((t_max + 1, L + 2), np.int64)
-    table[:, 0] = 1
-    for n in range(1, t_max + 1):
-        table[n, 1:] = np.minimum(_MOST, table[n - 1, 1:] + table[n - 1, :-1])
-    return table
 
 
 def _checked(probabilities: ArrayLike) -> Floats:

@@ -32,6 +32,7 @@ room for it.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -151,13 +152,14 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
     return victim if stays(buffer, arrival, best >= own, freed_bytes) else REJECT
 
 
+BOTH: Any = {"parameters": PARAMETERS, "memory": REMEMBERED, "work": chains.SCRATCH, "reads_rate": True}
+"""What both rules are registered with."""
+
+
 @built_in(
     "price-dp",
-    parameters=PARAMETERS,
-    memory=REMEMBERED,
-    work=chains.SCRATCH,
+    **BOTH,
     source="own rule: Lagrangian price of bytes [fisher1981lagrangian], best chains through the queue",
-    reads_rate=True,
 )
 def price_dp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Sends the messages that are worth their bytes at the price that link, queue and motion set."""
@@ -165,14 +167,7 @@ def price_dp(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return decide(buffer, arrival, memory, buffer.parameters, 1.0)
 
 
-@built_in(
-    "gap-price",
-    parameters=PARAMETERS,
-    memory=REMEMBERED,
-    work=chains.SCRATCH,
-    source="own rule: target-gap for equal sizes, price-dp for unequal ones",
-    reads_rate=True,
-)
+@built_in("gap-price", **BOTH, source="own rule: target-gap for equal sizes, price-dp for unequal ones")
 def gap_price(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """Target-gap for messages of equal size, price-dp for unequal ones, mixed by the spread of their sizes."""
     remember(buffer, arrival, memory, buffer.parameters)

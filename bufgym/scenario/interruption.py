@@ -156,9 +156,5 @@ class Interruption:
 @functools.lru_cache(maxsize=64)
 def _blocked_then_open(blocked_us: int, total_bytes: int) -> Trace:
     """Nothing for ``blocked_us``, then ``total_bytes`` in one microsecond, again and again."""
-    return Trace(
-        "interruption",
-        np.array([0, blocked_us, blocked_us + 1], np.int64),
-        np.array([0, 0, total_bytes], np.int64),
-        after="hold",
-    )
+    knots_us, carried = np.array([0, blocked_us, blocked_us + 1], np.int64), np.array([0, 0, total_bytes], np.int64)
+    return Trace("interruption", knots_us, carried, after="hold")

@@ -19,12 +19,8 @@ def over(traces: Sequence[Trace], scale: float = 1.0) -> str:
 
 def moved(motions: Sequence[Motion]) -> str:
     """The recordings of motion by name, with the gaps in them."""
-    return some(
-        [
-            f"{m.name} (gaps bridged: {len(m.gaps)}, the longest {m.longest_gap_s:.1f} s)" if m.gaps else m.name
-            for m in motions
-        ]
-    )
+    gaps = [f" (gaps bridged: {len(m.gaps)}, the longest {m.longest_gap_s:.1f} s)" if m.gaps else "" for m in motions]
+    return some([m.name + bridged for m, bridged in zip(motions, gaps, strict=True)])
 
 
 def rated(scenario: Any) -> str:

@@ -68,7 +68,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
     messages = received(senders, i)
     log = np.asarray(batch.log[i])[: sender["arrivals"]]
     transmitted_us = log["transmitted_us"][messages["seq"]]
-    mean_age, peak_age, max_age = ages_s(transmitted_us + sender["propagation_us"], messages["arrival_us"])
+    ages = ages_s(transmitted_us + sender["propagation_us"], messages["arrival_us"])
     return Outcome(
         qoi=weighted_qoi(senders, i, messages) if senders.topics else senders.value_of(i).information(messages["x"]),
         arrived=int(sender["next"]),
@@ -79,9 +79,7 @@ def outcome(senders: Senders, i: int) -> Outcome:
         longest_gap=float(np.diff(messages["x"]).max(initial=0)),
         longest_gap_s=float(np.diff(messages["arrival_us"]).max(initial=0)) / 1e6,
         **sojourns_s(transmitted_us - messages["arrival_us"]),
-        mean_age_s=mean_age,
-        peak_age_s=peak_age,
-        max_age_s=max_age,
+        **dict(zip(("mean_age_s", "peak_age_s", "max_age_s"), ages, strict=True)),
         peak_backlog_bytes=int(sender["peak_backlog_bytes"]),
         invalid=int(sender["invalid"]),
     )
@@ -135,7 +133,6 @@ def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
         received_us = log["transmitted_us"][messages["seq"]] + sender["propagation_us"]
         sojourn_us = received_us - messages["arrival_us"]
         first_us = int(arrivals["arrival_us"][arrived][0]) if arrived.any() else until_us
-        mean_age, peak_age = ages_between_s(received_us, messages["arrival_us"], first_us, until_us)
         outcomes.append(
             TopicOutcome(
                 topic=topic.name,
@@ -147,8 +144,7 @@ def topic_outcomes(senders: Senders, i: int) -> list[TopicOutcome]:
                 buffered=int(arrived.sum() - dropped.sum()) - len(messages),
                 bytes_delivered=int(messages["size_bytes"].sum()),
                 **sojourns_s(sojourn_us),
-                mean_age_s=mean_age,
-                peak_age_s=peak_age,
+                **ages_between_s(received_us, messages["arrival_us"], first_us, until_us),
                 late=int((sojourn_us / 1e6 > topic.deadline_s).sum()) if topic.deadline_s is not None else 0,
             )
         )
@@ -171,20 +167,20 @@ def sojourns_s(sojourn_us: NDArray[np.int64]) -> dict[str, float]:
 
 def ages_between_s(
     received_us: NDArray[np.int64], arrival_us: NDArray[np.int64], from_us: int, until_us: int
-) -> tuple[float, float]:
-    """Mean and largest age of information from ``from_us`` to ``until_us``, s; at the beginning it is 0.
+) -> dict[str, float]:
+    """Mean and largest age of information from ``from_us`` to ``until_us``, s, by name; at the beginning it is 0.
 
     ``received_us`` must not decrease. NaN for a time of length 0.
     """
     if until_us <= from_us:
-        return NAN, NAN
+        return {"mean_age_s": NAN, "peak_age_s": NAN}
     known = received_us < until_us
     begins_us = np.concatenate([[from_us], received_us[known]])
     ends_us = np.concatenate([received_us[known], [until_us]])
     newest_us = np.maximum.accumulate(np.concatenate([[from_us], arrival_us[known]]))
     low_us, high_us = begins_us - newest_us, ends_us - newest_us
     mean_us = ((low_us + high_us) / 2 * (ends_us - begins_us)).sum() / (until_us - from_us)
-    return float(mean_us) / 1e6, float(high_us.max()) / 1e6
+    return {"mean_age_s": float(mean_us) / 1e6, "peak_age_s": float(high_us.max()) / 1e6}
 
 
 def ages_s(received_us: NDArray[np.int64], arrival_us: NDArray[np.int64]) -> tuple[float, float, float]:

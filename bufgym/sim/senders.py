@@ -68,13 +68,9 @@ class Senders:
         self.batch = new_batch(n, self.capacity, max_messages, len(self.topic_table), values)
         self._rules = self.topic_table.view(np.int64)
         when_full = int(decide_at == "overflow")
-        self._beginning = beginning(
-            capacity=self.capacity,
-            max_bytes=self.max_bytes,
-            ask_when_full=when_full,
-            screens=int(when_full or self.max_bytes < UNLIMITED_BYTES),
-            topics=len(self.topic_table),
-        )
+        limits = {"capacity": self.capacity, "max_bytes": self.max_bytes, "topics": len(self.topic_table)}
+        screens = int(when_full or self.max_bytes < UNLIMITED_BYTES)
+        self._beginning = beginning(ask_when_full=when_full, screens=screens, **limits)
 
     def __len__(self) -> int:
         return len(self.episodes)

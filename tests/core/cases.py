@@ -66,10 +66,9 @@ class Case:
     max_bytes: int | None
     decide_at: str
 
-    def senders(self, v: qoi.Value) -> Senders:
-        n = len(self.episode.arrivals)
-        limits = {"max_bytes": self.max_bytes, "decide_at": self.decide_at}
-        senders = Senders(1, self.capacity, v, max_messages=n, **limits)
+    def senders(self, v: qoi.Value, topics: Any = ()) -> Senders:
+        limits = {"max_bytes": self.max_bytes, "decide_at": self.decide_at, "topics": topics}
+        senders = Senders(1, self.capacity, v, max_messages=len(self.episode.arrivals), **limits)
         senders.load(0, self.episode)
         return senders
 

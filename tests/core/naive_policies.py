@@ -18,9 +18,8 @@ class Reservoir(queues.Policy):
             self.n = max(self.n, s) + 1  # what came unasked is all there
         if self.sender.fits(newcomer):
             return queues.ACCEPT
-        return queues.one_of(
-            [*range(s), *[queues.REJECT] * (0 if again else self.n - s)], queues.uniform_of(newcomer, self.sender)
-        )
+        places = [*range(s), *[queues.REJECT] * (0 if again else self.n - s)]
+        return queues.one_of(places, queues.uniform_of(newcomer, self.sender))
 
     def departed(self, queue):
         self.n = len(queue)

@@ -38,9 +38,7 @@ def hesitant(buffer, memory):
 
 
 ACCEPTS = policies.Policy("test-accept", accept, compile=True)
-HESITANT = policies.Policy(
-    "test-hesitant", cases.decide_anything, on_send=hesitant, memory={"asked": 0.0}, compile=True
-)
+HESITANT = replace(cases.ANYTHING, name="test-hesitant", on_send=hesitant, memory={"asked": 0.0})
 POLICIES = [p for p in (*map(policies.get, policies.names()), HESITANT) if p.privileged is None and not any(p.work)]
 
 
@@ -170,9 +168,8 @@ def test_a_python_policy_does_what_the_compiled_one_does(name):
     made, episodes = drawn_episodes(3)
     compiled = policies.get(name)
     python = replace(compiled, name="test-python", compile=False)
-    assert cases.same(
-        run_fleet(compiled, episodes, 4, made.value).senders, run_fleet(python, episodes, 4, made.value).senders
-    )
+    ours, theirs = (run_fleet(policy, episodes, 4, made.value).senders for policy in (compiled, python))
+    assert cases.same(ours, theirs)
 
 
 @pytest.mark.parametrize(("hook", "given"), [("on_arrival", None), ("on_dequeue", "1"), ("on_send", 0.5)])

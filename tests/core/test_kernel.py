@@ -117,7 +117,7 @@ def test_a_full_disk_keeps_no_code(tmp_path: Path) -> None:
     assert not list((tmp_path / "code").rglob("*.nbc"))
 
 
-@pytest.mark.skipif(not COMPILED, reason="only compiled kernels have types")
+@needs_compilation
 def test_a_direct_call_is_the_call() -> None:
     """Rows are stepped without a look at the types of their arrays: by the code that Numba would have found."""
 

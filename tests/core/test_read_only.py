@@ -121,10 +121,8 @@ def test_honest_policies_are_not_accused() -> None:
 
 def finished() -> Senders:
     """L = 2, a byte a us for 20 us, messages of 10 bytes: 0 and 2 are sent, 3 not all, 4 and 5 wait, 1 is dropped."""
-    episode = Episode(
-        messages(np.array([0, 1, 2, 3, 15, 25]), 10),
-        Link(Trace("ends", np.array([0, 20]), np.array([0, 20]), after="stop")),
-    )
+    ends = Trace("ends", np.array([0, 20]), np.array([0, 20]), after="stop")
+    episode = Episode(messages(np.array([0, 1, 2, 3, 15, 25]), 10), Link(ends))
     senders = Senders(1, 2, V, max_messages=6)
     senders.load(0, episode)
     senders.run(get("drop-oldest"))

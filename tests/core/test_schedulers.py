@@ -49,11 +49,8 @@ def dequeued_ms(senders):
 
 def topics(a=1.0, b=2.0, c=3.0, **more):
     """A, B, C with these priorities (or settings), and N, which may not be dropped."""
-    rules = {
-        name: given if isinstance(given, dict) else {"priority": given}
-        for name, given in zip("ABC", (a, b, c), strict=True)
-    }
-    return [*(Topic(name, **given) for name, given in rules.items()), Topic("N", no_drop=True, **more)]
+    rules = [given if isinstance(given, dict) else {"priority": given} for given in (a, b, c)]
+    return [*(Topic(name, **given) for name, given in zip("ABC", rules, strict=True)), Topic("N", no_drop=True, **more)]
 
 
 WEIGHTED = topics({"weight": 1.0}, {"weight": 1.0}, {"weight": 3.0})

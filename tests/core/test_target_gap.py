@@ -1,6 +1,7 @@
 """Rules that look at gaps: towards the gap that link and room can carry, and thinned on a steady link."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,11 +14,8 @@ from bufgym.benchmark.run import by_trace, draw
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
-from bufgym.policies import Policy
+from bufgym.policies import Policy, target_gap
 from bufgym.policies.target_gap import PACE, PARAMETERS, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, last_chance, needless
-from bufgym.policies.target_gap import approach as approach_by
-from bufgym.policies.target_gap import remember as remember_by
-from bufgym.policies.target_gap import target as target_by
 from bufgym.policies.thinning import send_us, spare, steady
 from bufgym.scenario import Episode, messages, suites
 from bufgym.sim import run
@@ -56,16 +54,9 @@ def remembered(rate=7500e-6, pace=2 / 33_333, seen_us=10e6, square=33_333.0**2):
     return memory
 
 
-def target(buffer, arrival, memory):
-    return target_by(buffer, arrival, memory, NUMBERS)
-
-
-def approach(buffer, arrival, g):
-    return approach_by(buffer, arrival, g, NUMBERS)
-
-
-def remember(buffer, arrival, memory):
-    remember_by(buffer, arrival, memory, NUMBERS)
+target, approach, remember = (
+    partial(rule, numbers=NUMBERS) for rule in (target_gap.target, target_gap.approach, target_gap.remember)
+)
 
 
 @kernels

@@ -64,10 +64,7 @@ class TopicCase:
 
     def senders(self) -> Senders:
         """With the episode loaded and the policy's flags set, as ``Senders.run`` does."""
-        case = self.case
-        rules = {"max_bytes": case.max_bytes, "decide_at": case.decide_at, "topics": self.topics}
-        senders = Senders(1, case.capacity, self.v, max_messages=len(case.episode.arrivals), **rules)
-        senders.load(0, case.episode)
+        senders = self.case.senders(self.v, self.topics)
         rows = senders.batch.senders
         rows["ask_at_send"], rows["ask_at_dequeue"] = self.schedules, self.drops_heads
         for rule in CLIENT_RULES:

@@ -105,29 +105,22 @@ class Code:
         return Path(FOLDER, f"{self._name}-{hashlib.sha256(depends_on.encode()).hexdigest()[:20]}.nbc")
 
 
+_REDUCED = ("fndesc", "environment", "signature", "objectmode", "lifted", "type_annotation", "reload_init")
+"""What ``CompileResult._reduce`` gives after the library and before the environments of other functions."""
+
+
 def _rebuilt(target: Any, kept: tuple[Any, ...]) -> Any:
     """Rebuild a compile result from ``kept``, the output of ``CompileResult._reduce``."""
-    library, description, environment, signature, objectmode, lifted, annotation, reload, environments = kept
-    for function in reload:
+    library, *parts, environments = kept
+    found = dict(zip(_REDUCED, parts, strict=True))
+    for function in found["reload_init"]:
         function()
     code = PartLibrary.read(target, library) if library[1] == PART else target.codegen().unserialize_library(library)
-    entry = target.get_executable(code, description, environment)
+    found["entry_point"] = target.get_executable(code, found["fndesc"], found["environment"])
     for known in environments:
         code.codegen.set_env(known.env_name, known)
-    return cast(Any, compiler).compile_result(
-        target_context=target,
-        typing_context=target.typing_context,
-        library=code,
-        environment=environment,
-        entry_point=entry,
-        fndesc=description,
-        type_annotation=annotation,
-        signature=signature,
-        objectmode=objectmode,
-        lifted=lifted,
-        reload_init=reload,
-        referenced_envs=environments,
-    )
+    found |= {"target_context": target, "typing_context": target.typing_context, "library": code}
+    return cast(Any, compiler).compile_result(**found, referenced_envs=environments)
 
 
 class NotKeptError(Exception):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario.afr_evaluation import LINK, evaluation
@@ -102,14 +102,10 @@ def _uplink_mmwave(split: str, data: Path) -> dict[str, Setting]:
     return both_sizes(_at_most(traces, TRACES[split]), _tum(split, data))
 
 
-Item = TypeVar("Item")
-
-
-def _at_most(items: Sequence[Item], most: int) -> list[Item]:
+def _at_most(items: Sequence[Any], most: int) -> list[Any]:
     """All items, or ``most`` evenly spaced ones if there are more."""
-    if len(items) <= most:
-        return list(items)
-    return [items[k * len(items) // most] for k in range(most)]
+    count = min(most, len(items))
+    return [items[k * len(items) // count] for k in range(count)]
 
 
 _WITH_TUM = "and tum_rgbd/*.groundtruth.txt.gz"
