@@ -11,8 +11,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation, Reused
-from bufgym.envs.rows import Rows, check_render_mode
-from bufgym.ground.errors import BufgymError, unknown
+from bufgym.envs.rows import Rows, check_entries, check_render_mode
+from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
 
@@ -96,9 +96,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         options = options or {}
-        for name in options:
-            if name not in ("reset_mask", "episodes"):
-                raise unknown("entry", name, ("reset_mask", "episodes"), place="options")
+        check_entries(options, ("reset_mask", "episodes"), "options")
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + i for i in range(self.num_envs)]
