@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from env_cases import DYING, FADING, SMALL, same
+from env_cases import DYING, FADING, SMALL, last_info, same
 from gymnasium.utils.env_checker import check_env
 from refusal_cases import refused
 
@@ -31,11 +31,7 @@ def played(case: str, choose: Any, seed: int = 0) -> tuple[SenderEnv, Any]:
     """An episode of the environment, whose actions are chosen by what is observed; the times at which messages go."""
     scenario, options = CASES[case]
     env = SenderEnv(scenario, L, actions="guided", fields="guided", **options)
-    seen, _ = env.reset(seed=seed)
-    ended = False
-    while not ended:
-        seen, _, ended, _, info = env.step(choose(seen))
-    assert info["invalid"] == 0
+    assert last_info(env, lambda seen, _: choose(seen), seed=seed)["invalid"] == 0
     return env, env.rows.senders.batch.log["dropped_us"][0]
 
 

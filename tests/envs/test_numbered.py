@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from env_cases import last_info
 from gymnasium.envs.registration import EnvSpec
 
 from bufgym import policies
@@ -27,11 +28,8 @@ L = 2
 
 def played(env: Any, policy: str, **reset: Any) -> dict[str, Any]:
     """The last info of the episode that ``policy`` plays."""
-    env.reset(**reset)
-    player, ended, info = Player(policies.get(policy)), False, {}
-    while not ended:
-        _, _, ended, _, info = env.step(player.action(env.unwrapped.rows.senders))
-    return info
+    player = Player(policies.get(policy))
+    return last_info(env, lambda *_: player.action(env.unwrapped.rows.senders), **reset)
 
 
 def score(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
@@ -146,15 +144,8 @@ def test_no_such_episode_or_suite(mixed: str, act: Any, says: str) -> None:
 )
 def test_the_bound_worked_by_hand(T: int, action: int, h: float, best: float, score: float) -> None:
     """L = 1, V(d) = 1 - 0.5^d, an interruption of T messages."""
-    env = gym.make(
-        "bufgym/Interruption-v0",
-        capacity=1,
-        law="fixed",
-        t_max=T,
-        value="exponential:0.5",
-        bound=True,
-        disable_env_checker=True,
-    )
+    given: dict[str, Any] = {"law": "fixed", "t_max": T, "value": "exponential:0.5", "disable_env_checker": True}
+    env = gym.make("bufgym/Interruption-v0", capacity=1, bound=True, **given)
     env.reset(seed=0)
     ended, info, first = False, {}, action != 1
     while not ended:
