@@ -29,6 +29,10 @@ def spread(
     """
     joblib = library("joblib", "bench")
     wrapped = (joblib.delayed(function)(*arguments) for function, arguments in calls)
+    # Worker processes end with this process, even before they have work. They never end by themselves, because loky
+    # loses work that reaches a worker at that moment.
+    own: dict[str, Any] = {"initializer": end_with, "initargs": (os.getpid(),), "idle_worker_timeout": 10**6}
+    own = own if backend == "loky" else {}
     with _connected(backend, address):
         # joblib's Ray backend returns results only when all are there, so it gets a few calls at a time.
         ray = backend == "ray"
@@ -36,21 +40,12 @@ def spread(
         for _ in range(0, count, at_once):
             some = itertools.islice(wrapped, at_once)
             try:
-                yield from joblib.Parallel(
-                    n_jobs=jobs, return_as="list" if ray else "generator_unordered", **_own(backend)
-                )(some)
+                form = "list" if ray else "generator_unordered"
+                yield from joblib.Parallel(n_jobs=jobs, return_as=form, **own)(some)
             except BrokenProcessPool:
                 raise WorkerDiedError(
                     "a worker process ended before its work did (killed, or out of memory?)"
                 ) from None
-
-
-def _own(backend: str) -> dict[str, Any]:
-    """Settings of joblib's worker processes: they end with this process, even before they have work. They never end by
-    themselves, because loky loses work that reaches a worker at that moment."""
-    if backend != "loky":
-        return {}
-    return {"initializer": end_with, "initargs": (os.getpid(),), "idle_worker_timeout": 10**6}
 
 
 @contextmanager

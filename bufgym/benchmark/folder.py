@@ -94,11 +94,8 @@ def _timeline(path: Path) -> Mapping[str, Any]:
     check(path, "rate", rate, {"t_s": list, "bytes_per_s": list})
     if len(rate["t_s"]) != len(rate["bytes_per_s"]):
         raise BufgymError(f"{path}: rate.t_s and rate.bytes_per_s must be of one length")
-    for field, numbers in (
-        ("arrival_s", episode["arrival_s"]),
-        ("x", episode["x"]),
-        *((f"rate.{k}", rate[k]) for k in rate),
-    ):
+    series = {"arrival_s": episode["arrival_s"], "x": episode["x"], **{f"rate.{k}": rate[k] for k in rate}}
+    for field, numbers in series.items():
         if not _are_numbers(numbers):
             raise BufgymError(f"{path}: {field} must hold numbers alone")
     for name, lane in episode["policies"].items():

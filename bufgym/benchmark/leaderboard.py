@@ -140,13 +140,11 @@ def read(path: Path) -> dict[str, Entry]:
     for number, row in parsed(path, io.StringIO(text, newline=""), COLUMNS):
         if None in row.values():
             raise BufgymError(where(path, number, None, "must have no empty cell"))
-        listed = task_of(row["suite"]).listed if row["suite"] in suites.SUITES else ()
-        for field, known, rule in (
-            ("suite", row["suite"] in suites.SUITES, "a suite"),
-            ("quantity", row["quantity"] in listed, f"one of {', '.join(listed)}"),
-        ):
-            if not known:
-                raise BufgymError(where(path, number, row[field], f"must be {rule}", field=field))
+        if row["suite"] not in suites.SUITES:
+            raise BufgymError(where(path, number, row["suite"], "must be a suite", field="suite"))
+        if row["quantity"] not in (listed := task_of(row["suite"]).listed):
+            rule = f"must be one of {', '.join(listed)}"
+            raise BufgymError(where(path, number, row["quantity"], rule, field="quantity"))
         entry = Entry(row["suite"], row["policy"], row["rank"], row["cells"], {}, row["bufgym"])
         values = board.get(entry.name, entry).values
         interval = Interval(row["value"], row["low"], row["high"])

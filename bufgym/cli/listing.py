@@ -1,7 +1,7 @@
 """``bufgym list``: environments, scenarios, suites, policies and more, by name."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 from bufgym.cli.options import PolicyFile, columns, load_policies
 from bufgym.ground.modules import first_line
@@ -125,14 +125,5 @@ def _list_traces() -> str:
     return columns(rows) if rows else "  none found"
 
 
-LISTS: dict[str, Callable[[], str]] = {
-    "environments": _list_environments,
-    "scenarios": _list_scenarios,
-    "suites": _list_suites,
-    "policies": _list_policies,
-    "values": _list_values,
-    "rewards": _list_rewards,
-    "observations": _list_observations,
-    "traces": _list_traces,
-}
+LISTS: dict[str, Callable[[], str]] = {kind: globals()[f"_list_{kind}"] for kind in get_args(Kind)}
 """Arguments of ``list``, in the order of its full output."""

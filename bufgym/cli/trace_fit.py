@@ -35,7 +35,14 @@ def fit(
         out: The parameters of links to write (.json).
     """
     if sizes:
-        _print_sizes(files, {"--mode": mode, "--suite": suite, "--data": data, "--out": out})
+        from bufgym.traces.fit_sizes import fits
+
+        others = {"--mode": mode, "--suite": suite, "--data": data, "--out": out}
+        if given := [name for name, value in others.items() if value is not None]:
+            raise BufgymError(f"{given[0]}: cannot go with --sizes")
+        if not files:
+            raise BufgymError("trace fit --sizes: needs recordings, FILE ...")
+        print(columns([(name, "  ".join(laws)) for file in files for name, laws in fits(file).items()]))
         return
     if out is None:
         raise BufgymError("trace fit: needs --out FILE.json")
@@ -47,16 +54,6 @@ def fit(
     write_links(links, out, LOW_BYTES_PER_S, f"bufgym trace fit {words} -o {out.name}")
     print(columns([(mode, f"{link.recordings} recordings", f"{link.seconds} s") for mode, link in links.items()]))
     print(f"wrote {out}")
-
-
-def _print_sizes(files: Sequence[str], others: dict[str, object]) -> None:
-    from bufgym.traces.fit_sizes import fits
-
-    if given := [name for name, value in others.items() if value is not None]:
-        raise BufgymError(f"{given[0]}: cannot go with --sizes")
-    if not files:
-        raise BufgymError("trace fit --sizes: needs recordings, FILE ...")
-    print(columns([(name, "  ".join(laws)) for file in files for name, laws in fits(file).items()]))
 
 
 def recordings_of(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.fleet_rows import FleetRows
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import check_render_mode
+from bufgym.envs.rows import OPTIONS, check_render_mode
 from bufgym.ground.errors import BufgymError, install
 from bufgym.scenario import FleetScenario, Uplink
 
@@ -90,17 +90,8 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         fleet = FleetScenario.of(robots, scenario, **parameters)
         if mask_in_observation and observation == "flat":
             raise BufgymError("mask_in_observation: an observation 'flat' has no place for it; 'dict' and 'slots' have")
-        self.rows = FleetRows(
-            1,
-            fleet,
-            capacity,
-            reward=reward,
-            term=term,
-            max_bytes=max_bytes,
-            fields=fields,
-            observation=observation,
-            info=info,
-        )
+        options = {name: value for name, value in locals().items() if name in ("term", *OPTIONS)}
+        self.rows = FleetRows(1, fleet, capacity, **options)
         self.mask_in_observation = mask_in_observation
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []

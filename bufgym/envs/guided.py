@@ -109,8 +109,3 @@ class Guiding:
             raise BufgymError(f"{name}: {wrong} must lie in -1..1, as np.clip(..., -1, 1) makes it")
         outputs[:] = numbers * SCALES
         return self._nothing
-
-
-def guiding(n: int, capacity: int, actions: str, fields: str | Sequence[str] | None, why_not: str) -> Guiding | None:
-    """The guided part of rows with these options, checked as by ``is_guided``; None where nothing is guided."""
-    return Guiding(n, capacity, actions, fields) if is_guided(actions, fields, why_not) else None

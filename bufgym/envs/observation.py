@@ -94,7 +94,10 @@ class ObservationForm:
         numbers = [np.arange(place.first, place.first + place.entries) for place in self.places]
         self._numbers = None if everything else np.concatenate(numbers)
         self._per_slot = sum(place.field.per == "slot" for place in self.places)
-        self.space = self._space([place.field for place in self.places])
+        low, high = np.zeros((2, self.numbers), np.float32)
+        for field, first, entries in self.places:
+            low[first : first + entries], high[first : first + entries] = field.low, field.high
+        self.space = _space(self.of(low), self.of(high))
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
@@ -111,23 +114,15 @@ class ObservationForm:
         first = self._per_slot * self._width
         slots = rows[..., :first].reshape(*rows.shape[:-1], self._per_slot, self._width)
         parts = {"slots": slots.swapaxes(-1, -2), "context": rows[..., first:]}
-        return {name: parts[name] for name in self.space}
+        return {name: part for name, part in parts.items() if part.size}
 
-    def _space(self, fields: Sequence[Field]) -> Any:
-        boxes = [_box([field], self._width if field.per == "slot" else 1) for field in fields]
-        if self.form == "dict":
-            # Gymnasium sorts the keys of any mapping but an OrderedDict, and so would flatten in another order.
-            return spaces.Dict(OrderedDict((field.name, box) for field, box in zip(fields, boxes, strict=True)))
-        if self.form == "flat":
-            return spaces.Box(np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes]))
-        per_slot, context = ([field for field in fields if field.per == per] for per in ("slot", "context"))
-        parts = OrderedDict[str, Any]()
-        if per_slot:
-            box = _box(per_slot, 1)
-            parts["slots"] = spaces.Box(np.tile(box.low, (self._width, 1)), np.tile(box.high, (self._width, 1)))
-        if context:
-            parts["context"] = _box(context, 1)
-        return spaces.Dict(parts)
+
+def _space(low: Observation, high: Observation) -> Any:
+    """The space of observations between these two."""
+    if not isinstance(low, dict):
+        return spaces.Box(low, high)
+    # Gymnasium sorts the keys of any mapping but an OrderedDict, and so would flatten in another order.
+    return spaces.Dict(OrderedDict((name, spaces.Box(low[name], high[name])) for name in low))
 
 
 Thing = TypeVar("Thing")
@@ -179,9 +174,3 @@ class Handed:
         numbers = np.empty(self._form.numbers, np.float32)
         views = self._form.of(numbers)
         return (numbers, views), [numbers, *views.values()]
-
-
-def _box(fields: Sequence[Field], entries: int) -> spaces.Box:
-    """The bounds of ``entries`` entries of each of ``fields``, in one row."""
-    low, high = (np.array([getattr(field, end) for field in fields], np.float32) for end in ("low", "high"))
-    return spaces.Box(np.repeat(low, entries), np.repeat(high, entries))

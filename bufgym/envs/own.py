@@ -119,7 +119,7 @@ class OwnFields:
 
     def __init__(self, form: ObservationForm) -> None:
         self._places = [(place, place.field) for place in form.places if isinstance(place.field, OwnField)]
-        self._compiled = [_compiled_field(field) if field.compile else None for _, field in self._places]
+        self._compiled = [_compiled("field", field.per, field) if field.compile else None for _, field in self._places]
 
     def __bool__(self) -> bool:
         return bool(self._places)
@@ -173,10 +173,10 @@ def end_of_step(batch: Batch, i: int, ended: bool) -> int:
 
 def write_term(
     batch: Batch,
+    function: Any,
     marks: NDArray[np.int64],
     ended: NDArray[np.bool_],
     memory: NDArray[np.float64],
-    function: Any,
     parameters: NDArray[np.float64],
     column: int,
     reward_terms: NDArray[np.float64],
@@ -193,7 +193,7 @@ class OwnTerms:
         self._terms, self._first = terms, first
         self._parameters = [term.parameter_array for term in terms]
         self._memory = [np.zeros((n, max(1, len(term.memory)))) for term in terms]
-        self._compiled = [_compiled_term(term) if term.compile else None for term in terms]
+        self._compiled = [_compiled("reward term", "term", term) if term.compile else None for term in terms]
         self._marks = np.zeros((n, 4), np.int64)
 
     def __bool__(self) -> bool:
@@ -264,48 +264,24 @@ def _types() -> dict[str, Any]:
     }
 
 
-def _compiled(what: str, name: str, kind: str, function: Callable[..., float]) -> Any:
+@functools.cache
+def _writer(kind: str, several: bool) -> Any:
+    """The compiled loop that writes a "slot" or "context" field or a "term" of all rows."""
+    types, whole = _types(), cast(Any, numba.types).int64
+    rest = [whole, types["flat"]]
+    if kind == "term":
+        rest = [*(types[name] for name in ("marks", "flags", "table", "constants")), whole, types["table"]]
+    signature = numba.types.void(batch_type(several), cast(Any, numba.types).FunctionType(types[kind]), *rest)
+    loops: dict[str, Any] = {"slot": write_slots, "context": write_context, "term": write_term}
+    return compile_for(signature, loops[kind])
+
+
+def _compiled(what: str, kind: str, own: OwnField | OwnTerm) -> Callable[..., None]:
+    """The loop of ``_writer`` over this field's or term's function."""
     try:
-        return compile_for(_types()[kind], function)
+        function = compile_for(_types()[kind], own.function)
     except cast(Any, numba).core.errors.NumbaError as error:
         reason = " ".join(str(error).split())
         rule = "leave out compile=True, and it runs as plain Python"
-        raise BufgymError(f"{what} {name!r}: Numba cannot compile it; {rule}: {reason[-300:]}") from None
-
-
-@functools.cache
-def _writer(per: str, several: bool) -> Any:
-    types = _types()
-    function = cast(Any, numba.types).FunctionType(types[per])
-    signature = numba.types.void(batch_type(several), function, numba.types.int64, types["flat"])
-    return compile_for(signature, write_slots if per == "slot" else write_context)
-
-
-@functools.cache
-def _term_writer(several: bool) -> Any:
-    types = _types()
-    signature = numba.types.void(
-        batch_type(several),
-        types["marks"],
-        types["flags"],
-        types["table"],
-        cast(Any, numba.types).FunctionType(types["term"]),
-        types["constants"],
-        numba.types.int64,
-        types["table"],
-    )
-    return compile_for(signature, write_term)
-
-
-def _compiled_field(field: OwnField) -> Callable[..., None]:
-    function = _compiled("field", field.name, field.per, field.function)
-    return lambda batch, first, flat: _writer(field.per, bool(batch.several))(batch, function, first, flat)
-
-
-def _compiled_term(term: OwnTerm) -> Callable[..., None]:
-    function = _compiled("reward term", term.name, "term", term.function)
-
-    def write(batch: Batch, marks: Any, ended: Any, memory: Any, *rest: Any) -> None:
-        _term_writer(bool(batch.several))(batch, marks, ended, memory, function, *rest)
-
-    return write
+        raise BufgymError(f"{what} {own.name!r}: Numba cannot compile it; {rule}: {reason[-300:]}") from None
+    return lambda batch, *rest: _writer(kind, bool(batch.several))(batch, function, *rest)

@@ -6,7 +6,7 @@
 import inspect
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -15,7 +15,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym import scenario as scenarios
-from bufgym.envs.guided import INPUT_FIELDS, guiding
+from bufgym.envs.guided import INPUT_FIELDS, Guiding, is_guided
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
@@ -87,11 +87,11 @@ NUMBERED = ("scenario", "trace", "seed")
 """Options that name an episode of a benchmark; see ``bufgym.scenario.numbered``."""
 
 
-def _checked(names: Mapping[str, Any]) -> Mapping[str, Any]:
+def check_entries(names: Iterable[str], known: Sequence[str], place: str) -> None:
+    """Check that all ``names`` of entries are ``known``; errors call what has them ``place``."""
     for name in names:
-        if name not in NUMBERED:
-            raise unknown("entry", name, NUMBERED, place="episode")
-    return names
+        if name not in known:
+            raise unknown("entry", name, known, place=place)
 
 
 class Rows:
@@ -147,7 +147,8 @@ class Rows:
         self._term_names = [term.name for term in self.terms]
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
-        self.guiding = guiding(n, self.capacity, actions, fields, "several topics" if topics else "")
+        guided = is_guided(actions, fields, "several topics" if topics else "")
+        self.guiding = Guiding(n, self.capacity, actions, fields) if guided else None
         self._guide = self.guiding and self.guiding.guide
         self._step: Any = None  # found at the next step
         self._acts = self.guiding if self.guiding and self.guiding.acts else None
@@ -229,8 +230,10 @@ class Rows:
             if given is None:
                 begun.append((i, *self._next_episode(i)))
             else:
-                episode = numbered(self.scenario, **_checked(given)) if isinstance(given, Mapping) else given
-                begun.append((i, episode, None))
+                if isinstance(given, Mapping):
+                    check_entries(given, NUMBERED, "episode")
+                    given = numbered(self.scenario, **given)
+                begun.append((i, given, None))
         self.senders.load_all(begun)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1

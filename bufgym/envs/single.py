@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import NUMBERED, OPTIONS, Rows, check_render_mode
-from bufgym.ground.errors import BufgymError, unknown
+from bufgym.envs.rows import NUMBERED, OPTIONS, Rows, check_entries, check_render_mode
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Scenario
 
 _ROW = np.zeros(1, np.int64)
@@ -115,9 +115,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         if seed is not None or self.rows.streams[0] is None:
             self.rows.seed(0, self.np_random)
         options = options or {}
-        for name in options:
-            if name not in ("episode", *NUMBERED):
-                raise unknown("entry", name, ("episode", *NUMBERED), place="options")
+        check_entries(options, ("episode", *NUMBERED), "options")
         if "episode" in options and len(options) > 1:
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
         self.rows.reset(_ROW, [options.get("episode", options or None)])

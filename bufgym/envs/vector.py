@@ -11,8 +11,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation, Reused
-from bufgym.envs.rows import Rows, check_render_mode
-from bufgym.ground.errors import BufgymError, unknown
+from bufgym.envs.rows import Rows, check_entries, check_render_mode
+from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
 
@@ -37,11 +37,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     from a step are never written again while anyone holds them.
     """
 
-    metadata = {
-        "render_modes": ["ansi", "rgb_array"],
-        "render_fps": 10,
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }
+    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self,
@@ -100,9 +96,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         options = options or {}
-        for name in options:
-            if name not in ("reset_mask", "episodes"):
-                raise unknown("entry", name, ("reset_mask", "episodes"), place="options")
+        check_entries(options, ("reset_mask", "episodes"), "options")
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + i for i in range(self.num_envs)]

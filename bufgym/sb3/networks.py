@@ -80,14 +80,7 @@ class SlotScorer(nn.Module):
         self.critic = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU())
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        slots, occupied = self._slots(features)
-        return self._logits(slots, occupied), self._latent(slots, occupied)
-
-    def forward_actor(self, features: Tensor) -> Tensor:
-        return self._logits(*self._slots(features))
-
-    def forward_critic(self, features: Tensor) -> Tensor:
-        return self._latent(*self._slots(features))
+        return self.forward_actor(features), self.forward_critic(features)
 
     def _slots(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Slots [n, slots, inputs] and whether each holds a message [n, slots]."""
@@ -96,15 +89,17 @@ class SlotScorer(nn.Module):
             return slots, torch.ones(slots.shape[:2], dtype=torch.bool)
         return slots, slots[..., self.occupied] > 0
 
-    def _logits(self, slots: Tensor, occupied: Tensor) -> Tensor:
+    def forward_actor(self, features: Tensor) -> Tensor:
+        slots, occupied = self._slots(features)
         if self.masked:
             drop = torch.zeros(occupied.shape).masked_scatter(occupied, self.score(slots[occupied]).squeeze(-1))
         else:
             drop = self.score(slots).squeeze(-1)
         return torch.cat([drop, self.accept(slots[:, -1])], dim=1)
 
-    def _latent(self, slots: Tensor, occupied: Tensor) -> Tensor:
+    def forward_critic(self, features: Tensor) -> Tensor:
         """Latent from the mean over messages and from the newcomer, whose width is independent of L."""
+        slots, occupied = self._slots(features)
         total = torch.zeros(len(slots), self.latent_dim_vf)
         total = total.index_add(0, occupied.nonzero()[:, 0], self.worth(slots[occupied]))
         mean = total / occupied.sum(dim=1, keepdim=True).clamp(min=1)

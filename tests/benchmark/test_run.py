@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusal_cases import refused
 
 from bufgym import oracle, policies
 from bufgym.benchmark import run
@@ -101,33 +102,27 @@ def test_where_only_a_full_buffer_asks_the_bound_is_an_upper_one() -> None:
     assert [row["clairvoyant"] for row in rows] == [row["clairvoyant"] for row in asked]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"capacities": [0]}, "capacity = 0"),
-        ({"seeds": 0}, "seeds = 0"),
-        ({"policies": ["afr", "afr"]}, "'afr' is given more than once"),
-        ({"decide_at": "never"}, "'never'"),
-    ],
+def newest(buffer: Any, arrival: Any, memory: Any) -> int:
+    return policies.ACCEPT if len(buffer.slots) < buffer.capacity else 0
+
+
+test_bad_arguments_are_named = refused(
+    (lambda: run.run(["afr"], UPLINK, [0], 1), "capacity = 0"),
+    (lambda: run.run(["afr"], UPLINK, [2], 0), "seeds = 0"),
+    (lambda: run.run(["afr", "afr"], UPLINK, [2], 1), "'afr' is given more than once"),
+    (lambda: run.run(["afr"], UPLINK, [2], 1, decide_at="never"), "'never'"),
+    (lambda: run.run([3], UPLINK, [2], 1), "policy 3: must be a name, a Policy, or a function"),  # type: ignore[list-item]
+    (
+        lambda: run.run([Policy("afr", newest), "afr"], UPLINK, [2], 1),
+        "'afr' is given more than once; 'afr' is a built-in policy's name",
+    ),
 )
-def test_bad_arguments_are_named(change: dict[str, Any], message: str) -> None:
-    given = {"policies": ["afr"], "capacities": [2], "seeds": 1, **change}
-    chosen = [policies.get(name) for name in given.pop("policies")]
-    with pytest.raises(BufgymError, match=message):
-        run.run(chosen, UPLINK, **given)
 
 
 def test_functions_and_names_are_policies_too() -> None:
-    def newest(buffer: Any, arrival: Any, memory: Any) -> int:
-        return policies.ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
     rows = run.run([newest, "drop-oldest", policies.get("afr")], UPLINK, [2], 1)
     qoi_of = {row["policy"]: row["qoi"] for row in rows if row["trace"] == "slow"}
     assert list(qoi_of) == ["newest", "drop-oldest", "afr"] and qoi_of["newest"] == qoi_of["drop-oldest"]
-    with pytest.raises(BufgymError, match="policy 3: must be a name, a Policy, or a function"):
-        run.run([3], UPLINK, [2], 1)  # type: ignore[list-item]
-    with pytest.raises(BufgymError, match="'afr' is given more than once; 'afr' is a built-in policy's name"):
-        run.run([Policy("afr", newest), "afr"], UPLINK, [2], 1)
 
 
 CHOSEN = [policies.get(spec) for spec in ("drop-oldest", "afr", "random", "codel", "clairvoyant", "rosbridge")]

@@ -1,6 +1,7 @@
 """What the tests of environments share: comparing, choosing valid actions, reading pictures."""
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,15 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
 def valid_action(mask: np.ndarray, rng: np.random.Generator) -> int:
     """A valid action, at random."""
     return int(rng.choice(np.flatnonzero(mask)))
+
+
+def last_info(env: Any, act: Callable[[Any, dict[str, Any]], Any], **reset: Any) -> dict[str, Any]:
+    """The last info of an episode whose actions follow from what is observed and the info."""
+    seen, info = env.reset(**reset)
+    ended = False
+    while not ended:
+        seen, _, ended, _, info = env.step(act(seen, info))
+    return info
 
 
 def text(env: SenderEnv) -> list[str]:

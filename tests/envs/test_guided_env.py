@@ -5,13 +5,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from env_cases import DYING, FADING, SMALL, same
+from env_cases import DYING, FADING, SMALL, last_info, same
 from gymnasium.utils.env_checker import check_env
+from refusal_cases import refused
 
 import bufgym
 from bufgym import policies
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv, expert
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.policies.guided import INPUTS, OUTPUTS, SCALES, linear
 from bufgym.scenario import Uplink
@@ -31,11 +31,7 @@ def played(case: str, choose: Any, seed: int = 0) -> tuple[SenderEnv, Any]:
     """An episode of the environment, whose actions are chosen by what is observed; the times at which messages go."""
     scenario, options = CASES[case]
     env = SenderEnv(scenario, L, actions="guided", fields="guided", **options)
-    seen, _ = env.reset(seed=seed)
-    ended = False
-    while not ended:
-        seen, _, ended, _, info = env.step(choose(seen))
-    assert info["invalid"] == 0
+    assert last_info(env, lambda seen, _: choose(seen), seed=seed)["invalid"] == 0
     return env, env.rows.senders.batch.log["dropped_us"][0]
 
 
@@ -127,31 +123,22 @@ def test_gymnasiums_checker_has_nothing_to_say(env_id: str) -> None:
     assert "action_mask" not in info
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: SenderEnv(actions="guide"), "unknown actions 'guide'; did you mean 'guided'?"),
-        (lambda: SenderEnv(fields="guide"), "fields = 'guide': must be a list of names, or 'guided'"),
-        (lambda: SenderEnv("topics", actions="guided"), "actions = 'guided': .*, not several topics"),
-        (lambda: SenderEnv("topics", fields="guided"), "fields = 'guided': .*, not several topics"),
-        (lambda: FleetVecEnv(actions="guided"), "actions = 'guided': .*, not a cell of robots"),
-        (lambda: expert.policy(SenderEnv(actions="guided"), "afr"), "an expert answers with slots"),
-    ],
-)
-def test_a_wrong_option_ends_in_a_sentence(make: Any, message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        make()
-
-
-def test_a_wrong_action_ends_in_a_sentence() -> None:
+def begun() -> tuple[SenderEnv, SenderVectorEnv]:
     env, envs = SenderEnv(actions="guided"), SenderVectorEnv(2, actions="guided")
     env.reset(seed=0)
     envs.reset(seed=0)
-    with pytest.raises(BufgymError, match=r"action: 2.0 must lie in -1..1"):
-        env.step(np.full(10, 2.0))
-    with pytest.raises(BufgymError, match=r"action: nan must lie in"):
-        env.step(np.full(10, np.nan))
-    with pytest.raises(BufgymError, match=r"action is int64\[\]: must be float\[10\]: threshold, discount"):
-        env.step(3)
-    with pytest.raises(BufgymError, match=r"actions is float64\[10\]: must be float\[2, 10\]"):
-        envs.step(np.zeros(10))
+    return env, envs
+
+
+test_a_wrong_option_or_action_ends_in_a_sentence = refused(
+    (lambda: SenderEnv(actions="guide"), "unknown actions 'guide'; did you mean 'guided'?"),
+    (lambda: SenderEnv(fields="guide"), "fields = 'guide': must be a list of names, or 'guided'"),
+    (lambda: SenderEnv("topics", actions="guided"), "actions = 'guided': .*, not several topics"),
+    (lambda: SenderEnv("topics", fields="guided"), "fields = 'guided': .*, not several topics"),
+    (lambda: FleetVecEnv(actions="guided"), "actions = 'guided': .*, not a cell of robots"),
+    (lambda: expert.policy(SenderEnv(actions="guided"), "afr"), "an expert answers with slots"),
+    (lambda: begun()[0].step(np.full(10, 2.0)), r"action: 2.0 must lie in -1..1"),
+    (lambda: begun()[0].step(np.full(10, np.nan)), r"action: nan must lie in"),
+    (lambda: begun()[0].step(3), r"action is int64\[\]: must be float\[10\]: threshold, discount"),
+    (lambda: begun()[1].step(np.zeros(10)), r"actions is float64\[10\]: must be float\[2, 10\]"),
+)

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from env_cases import SMALL, valid_action
+from refusal_cases import refused
 
 import bufgym
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
@@ -169,15 +170,8 @@ def test_a_batch_is_its_rows() -> None:
 
 
 def test_a_fleet_has_them_too() -> None:
-    envs = FleetVecEnv(
-        2,
-        3,
-        capacity=3,
-        fields=CHOSEN,
-        term={"delay": 1.0, "dropped": 0.1},
-        reward="own",
-        parameters={"duration_s": 1.0},
-    )
+    rewarded: dict[str, Any] = {"term": {"delay": 1.0, "dropped": 0.1}, "reward": "own"}
+    envs = FleetVecEnv(2, 3, capacity=3, fields=CHOSEN, parameters={"duration_s": 1.0}, **rewarded)
     envs.reset(seed=1)
     done = np.zeros(6, np.bool_)
     while not done.any():
@@ -242,29 +236,23 @@ def no_number(compiled: bool) -> None:
     env.step(0)
 
 
-@pytest.mark.parametrize(
-    ("act", "says"),
-    [
-        (lambda: field("rank", per="slot")(waited), "field 'rank': a built-in field has this name"),
-        (lambda: field("my field", per="slot")(waited), "without spaces"),
-        (lambda: field("mine", per="row")(waited), "per = 'row': must be 'slot' or 'context'"),
-        (lambda: field("mine", per="slot", low=1.0, high=2.0)(waited), "need low <= 0 <= high"),
-        (lambda: field("mine", per="context")(waited), r"must be a function \(buffer, arrival\)"),
-        (lambda: reward_term("retained")(dropped), "reward term 'retained': a built-in reward term has this name"),
-        (lambda: reward_term("delay")(dropped), "reward term 'delay': a built-in reward term has this name"),
-        (lambda: reward_term("mine")(waited), r"must be a function \(step, memory\)"),
-        (lambda: SenderEnv(reward={"late:deadline=1": 1}), "reward term late: unknown parameter 'deadline'"),
-        (lambda: SenderEnv(reward={"late:deadline_s=0": 1}), "deadline_s = 0.0: must be a number > 0"),
-        (lambda: SenderEnv(reward={"delay": "much"}), "the weight of 'delay' must be a finite number"),
-        (lambda: SenderEnv("topics", reward="late:deadline_s=1"), "is for one queue; each topic has"),
-        (lambda: SenderEnv(bound="yes"), "bound = 'yes': must be True or False"),
-        *((lambda c=c: out_of_bounds(c), "field 'far': is 1.5: must lie in its bounds, 0..1") for c in (False, True)),
-        *((lambda c=c: no_number(c), "reward term 'n': is no finite number") for c in (False, True)),
-    ],
+test_what_is_refused = refused(
+    (lambda: field("rank", per="slot")(waited), "field 'rank': a built-in field has this name"),
+    (lambda: field("my field", per="slot")(waited), "without spaces"),
+    (lambda: field("mine", per="row")(waited), "per = 'row': must be 'slot' or 'context'"),
+    (lambda: field("mine", per="slot", low=1.0, high=2.0)(waited), "need low <= 0 <= high"),
+    (lambda: field("mine", per="context")(waited), r"must be a function \(buffer, arrival\)"),
+    (lambda: reward_term("retained")(dropped), "reward term 'retained': a built-in reward term has this name"),
+    (lambda: reward_term("delay")(dropped), "reward term 'delay': a built-in reward term has this name"),
+    (lambda: reward_term("mine")(waited), r"must be a function \(step, memory\)"),
+    (lambda: SenderEnv(reward={"late:deadline=1": 1}), "reward term late: unknown parameter 'deadline'"),
+    (lambda: SenderEnv(reward={"late:deadline_s=0": 1}), "deadline_s = 0.0: must be a number > 0"),
+    (lambda: SenderEnv(reward={"delay": "much"}), "the weight of 'delay' must be a finite number"),
+    (lambda: SenderEnv("topics", reward="late:deadline_s=1"), "is for one queue; each topic has"),
+    (lambda: SenderEnv(bound="yes"), "bound = 'yes': must be True or False"),
+    *((lambda c=c: out_of_bounds(c), "field 'far': is 1.5: must lie in its bounds, 0..1") for c in (False, True)),
+    *((lambda c=c: no_number(c), "reward term 'n': is no finite number") for c in (False, True)),
 )
-def test_what_is_refused(act: Any, says: str) -> None:
-    with pytest.raises(BufgymError, match=says):
-        act()
 
 
 @pytest.mark.skipif(not JIT, reason="nothing is compiled")

@@ -66,21 +66,17 @@ class StressTask(QueueTask):
             worst = found[standing.policy].worst
             return not standing.ranked, math.isnan(worst), worst, standing.policy
 
-        overall = [
-            replace(
-                s, values={**s.values, "worst": _alone(found[s.policy].worst), "ratio": _alone(found[s.policy].mean)}
-            )
-            for s in sorted(summary.overall, key=place)
-        ]
-        notes = tuple(
-            f"{s.policy} is worst in {cell[0]} at L = {cell[1]}: {found[s.policy].worst:.3f}, of "
-            f"{found[s.policy].cells} cells"
-            for s in overall
-            if s.ranked and (cell := found[s.policy].cell) is not None
-        )
+        overall, notes = [], []
+        for s in sorted(summary.overall, key=place):
+            worst, cell, average, cells = found[s.policy]
+            overall.append(replace(s, values={**s.values, "worst": _alone(worst), "ratio": _alone(average)}))
+            if s.ranked and cell is not None:
+                notes.append(f"{s.policy} is worst in {cell[0]} at L = {cell[1]}: {worst:.3f}, of {cells} cells")
         scored = replace(summary.scores, standings=sorted(summary.scores.standings, key=place))
         quantities = (*_ratios(), *summary.quantities)
-        return replace(summary, quantities=quantities, rank_by="worst", overall=overall, scores=scored, notes=notes)
+        return replace(
+            summary, quantities=quantities, rank_by="worst", overall=overall, scores=scored, notes=tuple(notes)
+        )
 
     def example(
         self, policies: Sequence[Policy], rows: Sequence[Row], setting_of: Callable[[Row], Setting]

@@ -1,6 +1,5 @@
 """Minari data sets of bufgym's environments (extra ``dataset``), recorded from the native batch."""
 
-import contextlib
 import os
 import tempfile
 import warnings
@@ -45,6 +44,8 @@ def make(
         seed: seed of the batch, as in ``reset``.
         regret: whether to compute each decision's regret, which takes most of the time; equal sizes only.
     """
+    from unittest.mock import patch  # here, as it is slow to import
+
     try:
         import minari
         import pyarrow  # noqa: F401  (Minari's storage format here)
@@ -92,7 +93,7 @@ def make(
     players = {"expert": "clairvoyant", "medium": medium, "random": "random", "mixed": f"clairvoyant, {medium}, random"}
     with tempfile.TemporaryDirectory(prefix=".bufgym-", dir=root) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # Minari asks for an author and the like
-        with _datasets_in(folder):
+        with patch.dict(os.environ, {VARIABLE: folder}):
             try:
                 minari.create_dataset_from_buffers(
                     name,
@@ -107,22 +108,9 @@ def make(
                 if "dataset ID" not in str(error):
                     raise
                 raise BufgymError(f"--name {name}: must be of the form (namespace/)name-v0") from None
-        with _datasets_in(root):
+        with patch.dict(os.environ, {VARIABLE: str(root)}):
             namespace = name.rpartition("/")[0]
             if namespace and namespace not in namespaces.list_local_namespaces():
                 namespaces.create_namespace(namespace)
         os.replace(Path(folder) / name, root / name)
     return name
-
-
-@contextlib.contextmanager
-def _datasets_in(folder: str | Path) -> Iterator[None]:
-    """Make Minari read and write in ``folder`` while the block runs."""
-    before = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = str(folder)
-    try:
-        yield
-    finally:
-        del os.environ[VARIABLE]
-        if before is not None:
-            os.environ[VARIABLE] = before
