@@ -13,12 +13,9 @@ from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
 
-PAPER_S = {"drop-oldest": 23.0, "random": 7.0}
-"""Policy -> second at which tracking fails in the paper."""
-NEAR_S = 2.0
-"""As near to it counts as about it."""
-LIMIT_MM = 50.0
-"""Distance from the reference that is drawn darkest."""
+PAPER_S = {"drop-oldest": 23.0, "random": 7.0}  # Policy -> second at which tracking fails in the paper
+NEAR_S = 2.0  # As near to it counts as about it
+LIMIT_MM = 50.0  # Distance from the reference that is drawn darkest
 
 
 @dataclass(frozen=True)

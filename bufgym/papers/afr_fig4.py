@@ -23,8 +23,7 @@ from bufgym.policies.afr import C, P, R
 from bufgym.scenario import Interruption
 
 PAPER_L = 8
-PAPER_T = (8, 18)
-"""First and last T of the figure."""
+PAPER_T = (8, 18)  # First and last T of the figure
 PAPER_DROPS = {9: 1, 10: 3, 11: 5, 12: 7, 13: 9, 14: 11, 15: 13, 16: 15, 17: 17, 18: 2}
 """T -> the message that the figure strikes out; 17 is the newcomer itself."""
 

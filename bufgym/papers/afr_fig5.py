@@ -26,17 +26,14 @@ from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario import Episode, Interruption
 
 PAPER_L = 8
-PAPER_RUNS = 10_000
-"""Runs of Random for each T."""
+PAPER_RUNS = 10_000  # Runs of Random for each T
 PAPER_PEAKS = (18, 36, 72)
 """T at which the paper says that AFR equals the oracle. The equality holds for these values of T + 1."""
 
 MEAN_OVER = (9, 399)
 """First and last T of the printed mean of (H - 1) / oracle: from L + 1 to the end of a table of 400."""
-EQUAL = 1e-12
-"""Relative difference up to which two sums of V count as equal; it covers rounding only."""
-BATCH = 1000
-"""Senders per batch; a batch fits in the processor's cache."""
+EQUAL = 1e-12  # Relative difference up to which two sums of V count as equal; it covers rounding only
+BATCH = 1000  # Senders per batch; a batch fits in the processor's cache
 
 CURVES = {
     "oracle-ideal": ("oracle-ideal", ":"),

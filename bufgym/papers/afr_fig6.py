@@ -16,10 +16,8 @@ from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario.suites import RATE_HZ
 
-PAPER_LOW = [21, 23]
-"""Seconds under 500 KB/s according to the paper, counted from 0."""
-LOW = 500e3
-"""Bytes/s."""
+PAPER_LOW = [21, 23]  # Seconds under 500 KB/s according to the paper, counted from 0
+LOW = 500e3  # Bytes/s
 
 
 @dataclass(frozen=True)

@@ -21,15 +21,12 @@ from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
 
 RESAMPLES = 2000
-MUCH = 0.1
-"""A change of the error by more than this share counts as much."""
+MUCH = 0.1  # A change of the error by more than this share counts as much
 ONE_WAY, BOTH_WAYS = "to_reference_mm", "rmse_mm"
 PAPER = {"drop-oldest": -0.20, "random": -0.10, "orbbuf-images": -0.10}
 """Policy -> AFR's error relative to the policy's error, less 1, as the paper roughly gives it."""
-SHOWN = ("drop-oldest", "random", "afr")
-"""Policies whose maps are drawn, at the smallest L and the paper's alignment."""
-SLICE = 30_000
-"""Number of points drawn of a map."""
+SHOWN = ("drop-oldest", "random", "afr")  # Policies whose maps are drawn, at the smallest L and the paper's alignment
+SLICE = 30_000  # Number of points drawn of a map
 
 
 def change(rows: FigureRows, column: str, policy: str, other: str) -> Interval:

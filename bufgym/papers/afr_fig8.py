@@ -20,14 +20,10 @@ from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, RESAMPLES, FrameFigur
 from bufgym.papers.perception.stage import IMAGES
 from bufgym.papers.rows import FigureRows
 
-THIRD = 1 / 3
-"""Largest ratio of AFR's failures to Drop Oldest's that passes our own check."""
-HELP = 0.1
-"""A larger queue helps if it lowers the share of runs that fail by this much."""
-HALF = 1 / 2
-"""ORBBuf's failures are greatly reduced if they are at most this share of Drop Oldest's."""
-COLUMNS = 4
-"""Columns of small pictures of the camera's path."""
+THIRD = 1 / 3  # Largest ratio of AFR's failures to Drop Oldest's that passes our own check
+HELP = 0.1  # A larger queue helps if it lowers the share of runs that fail by this much
+HALF = 1 / 2  # ORBBuf's failures are greatly reduced if they are at most this share of Drop Oldest's
+COLUMNS = 4  # Columns of small pictures of the camera's path
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,10 @@ from bufgym.scenario import Interruption
 IMAGES = "orbbuf-images"
 PAPER = {"afr": "< 10 us", "drop-oldest": "< 10 us", "random": "< 10 us", IMAGES: "~ 10 ms"}
 """Decision times in the paper's figure; ORBBuf recomputes its features."""
-NEAR_MS = (1.0, 100.0)
-"""Times within these limits have the paper's order of magnitude, 10 ms."""
-LIMIT_PYTHON_US = 10.0
-"""Our limit for the paper's three fast policies: for the median call from Python."""
-HOW = "compiled loop" if JIT else "Python loop (compilation is off)"
-"""Kind of loop that ``inside_us`` times."""
-REPEATS = 5
-"""Compiled loops timed. The fastest counts, because the others shared the machine with other work."""
+NEAR_MS = (1.0, 100.0)  # Times within these limits have the paper's order of magnitude, 10 ms
+LIMIT_PYTHON_US = 10.0  # Our limit for the paper's three fast policies: for the median call from Python
+HOW = "compiled loop" if JIT else "Python loop (compilation is off)"  # Kind of loop that ``inside_us`` times
+REPEATS = 5  # Compiled loops timed. The fastest counts, because the others shared the machine with other work.
 
 
 def decide_often(

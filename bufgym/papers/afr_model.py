@@ -22,12 +22,9 @@ from bufgym.sim import metrics
 R, THRESHOLD = 2, 2 / 3
 """Algorithm 1 doubles and halves r, and halves it where less than this share of the queue is taken."""
 NESTED = ("afr", "drop-oldest", "min-gap")
-SIZES = (8, 64, 512, 4096)
-"""L at which AFR's decision is timed."""
-CONSTANT = 2.0
-"""Most that the time of a decision may grow over ``SIZES`` for O(1)."""
-ERRORS = 4.5
-"""Most standard errors by which a frequency of ``runs`` may miss its probability."""
+SIZES = (8, 64, 512, 4096)  # L at which AFR's decision is timed
+CONSTANT = 2.0  # Most that the time of a decision may grow over ``SIZES`` for O(1)
+ERRORS = 4.5  # Most standard errors by which a frequency of ``runs`` may miss its probability
 
 
 class Algorithm1:

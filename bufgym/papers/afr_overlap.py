@@ -26,10 +26,8 @@ from bufgym.papers.frame_runs import FrameFigure
 from bufgym.papers.perception.views import overlap_information
 from bufgym.papers.rows import FigureRows
 
-NOISE = 0.05
-"""Violation of a rule that still counts as keeping it, because depth has noise and edges."""
-EVERY = 10
-"""Distance between the starts of interruptions, frames."""
+NOISE = 0.05  # Violation of a rule that still counts as keeping it, because depth has noise and edges
+EVERY = 10  # Distance between the starts of interruptions, frames
 
 
 @dataclass(frozen=True)

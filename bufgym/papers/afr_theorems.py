@@ -31,11 +31,9 @@ from bufgym.papers.rows import FigureRows
 from bufgym.scenario import Interruption
 from bufgym.sim import metrics
 
-ROUNDING = 1e-12
-"""Relative tolerance of comparisons that are not between integers."""
+ROUNDING = 1e-12  # Relative tolerance of comparisons that are not between integers
 
-LEMMA_SUM = 200
-"""Largest sum of two gaps for which Lemma 1 is checked."""
+LEMMA_SUM = 200  # Largest sum of two gaps for which Lemma 1 is checked
 
 VIOLATIONS = ("above_oracle", "oracle_above_ideal", "below_bound", "below_sharper", "below_oldest", "uneven", "unequal")
 """Columns that each count the violations of one statement."""

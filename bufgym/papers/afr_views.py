@@ -26,10 +26,8 @@ from bufgym.model.qoi import Value
 from bufgym.papers.figure import COLOURS, Figure, legend_below
 from bufgym.papers.rows import FigureRows
 
-VIEW_ANGLE = math.radians(60)
-"""The camera's field of view."""
-MESSAGES = 20
-"""V is computed for distances 0..``MESSAGES``."""
+VIEW_ANGLE = math.radians(60)  # The camera's field of view
+MESSAGES = 20  # V is computed for distances 0..``MESSAGES``
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,9 @@ from bufgym.papers.afr_theorems import extremes, gaps_of
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
 from bufgym.papers.rows import FigureRows
 
-ROUNDING = 1e-9
-"""Relative tolerance; the expectations are sums of some ten thousand products."""
-COUNTEREXAMPLE = (1, 4, 2)
-"""L, T and D at which AFR falls short of Random's expectation."""
-DRAWN_L, DRAWN_D = 8, (2, 5, 20)
-"""L and D of the picture's left panel."""
+ROUNDING = 1e-9  # Relative tolerance; the expectations are sums of some ten thousand products
+COUNTEREXAMPLE = (1, 4, 2)  # L, T and D at which AFR falls short of Random's expectation
+DRAWN_L, DRAWN_D = 8, (2, 5, 20)  # L and D of the picture's left panel
 
 
 def expected_gaps(capacity: int, last_T: int) -> NDArray[np.float64]:

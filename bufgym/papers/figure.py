@@ -41,8 +41,7 @@ COLOURS = {
 
 UNDECIDED = "undecided"
 VERDICTS = {True: "holds", False: "DIFFERS", None: "not tested here", UNDECIDED: UNDECIDED}
-WIDTH = 120
-"""Width of the printed text in letters."""
+WIDTH = 120  # Width of the printed text in letters
 
 
 Rule = Callable[[str, Any], Any]

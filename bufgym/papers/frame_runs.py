@@ -50,8 +50,7 @@ POLICIES = {
     "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"]),
 }
 """Policy -> label, colour. The clairvoyant plans for motion QoI."""
-RESAMPLES, CONFIDENCE = 1000, 0.95
-"""Bootstrap of a rank correlation."""
+RESAMPLES, CONFIDENCE = 1000, 0.95  # Bootstrap of a rank correlation
 
 
 class FrameRun(NamedTuple):

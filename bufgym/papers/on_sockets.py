@@ -18,8 +18,7 @@ from bufgym.robot.sender import Leaves
 from bufgym.robot.validate import play
 from bufgym.sim import Senders
 
-UNITS = ("_s", "_ms", "_hz")
-"""Suffixes of the columns that are compared."""
+UNITS = ("_s", "_ms", "_hz")  # Suffixes of the columns that are compared
 
 
 def received_s(

@@ -28,8 +28,7 @@ from bufgym.papers.rows import FigureRows
 from bufgym.scenario import Client, Stream
 from bufgym.traces import Trace
 
-POINTS = 10_000
-"""Points of a PointCloud2, each of ``POINT_BYTES``; the paper gives no size."""
+POINTS = 10_000  # Points of a PointCloud2, each of ``POINT_BYTES``; the paper gives no size
 POINT_BYTES = 16
 BYTES = {
     "LaserScan": (7_260, 7_328, 28_000),
@@ -45,10 +44,8 @@ _CLOUD_JSON = 562_376 / POINTS
 JITTER = 0.1
 ROUND_TRIP_MS = 10.0
 """Round trip, our choice. With n_T = 1 it limits throughput to one message per transmission plus round trip."""
-QUEUE_SIZE = 10
-"""Queue of a native ROS publisher in messages, our choice after ROS's own tutorials."""
-MBIT = 125_000
-"""Bytes/s in a Mbit/s."""
+QUEUE_SIZE = 10  # Queue of a native ROS publisher in messages, our choice after ROS's own tutorials
+MBIT = 125_000  # Bytes/s in a Mbit/s
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,9 @@ from bufgym.traces.generate import steady
 
 SENDERS = ("robofleet", "no-drop", "no-drop-released", "rosbridge", "ros-native")
 TRIO = ("robofleet", "rosbridge", "ros-native")
-LOW = 2.0
-"""Ratio to the latency at the lowest rate up to which a latency is called low."""
-EQUAL = 0.02
-"""Relative difference up to which latencies count as equal."""
-GROWN = 10.0
-"""Ratio to the latency at the lowest rate beyond which a latency is called grown."""
+LOW = 2.0  # Ratio to the latency at the lowest rate up to which a latency is called low
+EQUAL = 0.02  # Relative difference up to which latencies count as equal
+GROWN = 10.0  # Ratio to the latency at the lowest rate beyond which a latency is called grown
 
 
 @dataclass(frozen=True)

@@ -28,18 +28,14 @@ SENDERS = ("robofleet", "rosbridge", "ros-native")
 RATES_HZ = {"PointCloud2": 5.0, "CompressedImage": 2.0, "LaserScan": 10.0}
 KIND_COLOURS = dict(zip(RATES_HZ, (COLOURS["afr"], COLOURS["drop-oldest"], COLOURS["random"]), strict=True))
 PAPER_RATIO = 5.0
-ABOUT = (4.0, 6.0)
-"""Range of ratios that we accept as "about 5 times"."""
-FACTOR = 2.0
-"""Ratio to the nominal latency up to which a latency counts as nominal."""
+ABOUT = (4.0, 6.0)  # Range of ratios that we accept as "about 5 times"
+FACTOR = 2.0  # Ratio to the nominal latency up to which a latency counts as nominal
 BEFORE_S = 10.0
-WATCHED = 12.0
-"""Time watched after the link's return, in dropout lengths; at least ``LEAST_WATCHED_S``."""
+WATCHED = 12.0  # Time watched after the link's return, in dropout lengths; at least ``LEAST_WATCHED_S``
 LEAST_WATCHED_S = 30.0
 
 
-SIMILAR, SIMILAR_TIMES = 0.9, 2.0
-"""Share of the cells in which Robofleet's recovery must be similar to native ROS's."""
+SIMILAR, SIMILAR_TIMES = 0.9, 2.0  # Share of the cells in which Robofleet's recovery must be similar to native ROS's
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,9 @@ from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, ClientFigure, clo
 from bufgym.papers.rows import FigureRows, average, listed
 from bufgym.traces.generate import steady
 
-COMPARABLE = 2.0
-"""Latencies within this factor of each other count as comparable."""
+COMPARABLE = 2.0  # Latencies within this factor of each other count as comparable
 NAMES = ("rosbridge", "ros-native", "robofleet")
-STRAIGHT = 0.98
-"""Least correlation of native ROS's mean latency with the number of consumers that counts as linear."""
+STRAIGHT = 0.98  # Least correlation of native ROS's mean latency with the number of consumers that counts as linear
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,7 @@ SHOWN = {
     "json-numbers": ("JSON, bytes as numbers", COLOURS["orange"]),
 }
 """Encoding -> label and colour of its bars."""
-MAX_FRAME_ID = 64
-"""Longest frame_id, in letters, that we consider likely."""
+MAX_FRAME_ID = 64  # Longest frame_id, in letters, that we consider likely
 
 
 @dataclass(frozen=True)

@@ -30,12 +30,10 @@ from bufgym.papers.figure import COLOURS, Figure, finish, whole
 from bufgym.papers.robofleet_evaluation import POINTS
 from bufgym.papers.rows import FigureRows
 
-PROGRAMS = {"robofleet": "Robofleet", "rosbridge": "RosLibPy"}
-"""Program -> its label."""
+PROGRAMS = {"robofleet": "Robofleet", "rosbridge": "RosLibPy"}  # Program -> its label
 PAPER = {"robofleet": ((1.3, 452.5), (15.1, 425.6)), "rosbridge": ((16.6, 1_339.6), (155.9, 732.9))}
 """Program -> (CPU of a core in %, virtual memory in MB) on the desktop's i7 and on the Jetson TX2."""
-START_S = 120.0
-"""Time for a program to connect; the first one compiles its policy."""
+START_S = 120.0  # Time for a program to connect; the first one compiles its policy
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from typing import Final
 
 FIRST_S: Final = 0.25
 MOST_S: Final = 8.0
-HELD_S: Final = 5.0
-"""Time after which a connection has held."""
+HELD_S: Final = 5.0  # Time after which a connection has held
 
 
 class Backoff:

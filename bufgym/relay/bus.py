@@ -20,15 +20,11 @@ from bufgym.robot.extra import needs
 
 MESSAGE: Final = "bufgym.relay.message"
 HOLD: Final = "bufgym.relay.hold"
-NAME: Final = "bufgym.relay.name"
-"""Subject under which a relay answers for its name."""
+NAME: Final = "bufgym.relay.name"  # Subject under which a relay answers for its name
 STREAM: Final = "bufgym-relay"
-ANSWER_S: Final = 3.0
-"""Time for the server to answer."""
-ASK_S: Final = 5.0
-"""Time between two questions whether the server still knows this relay."""
-TRIES: Final = 30
-"""Times that a message is tried for which this relay has no room, once a second."""
+ANSWER_S: Final = 3.0  # Time for the server to answer
+ASK_S: Final = 5.0  # Time between two questions whether the server still knows this relay
+TRIES: Final = 30  # Times that a message is tried for which this relay has no room, once a second
 _TWIN_S: Final = 1.0  # time for another relay of this name to answer
 _TAKE_S: Final = 10.0  # time after which a message is given again that was neither taken nor put back
 _HEADER_BYTES: Final = 256

@@ -19,8 +19,7 @@ from bufgym.relay.patterns import pattern
 
 PORT: Final = 7420
 NO_DROP: Final = ("/robots/[^/]+/command",)
-SKIP_PENDING: Final = "skip-pending"
-"""Robofleet's server rule, a policy of the relay alone."""
+SKIP_PENDING: Final = "skip-pending"  # Robofleet's server rule, a policy of the relay alone
 POLICIES: Final = ("robofleet", SKIP_PENDING, "drop-oldest", "drop-newest", "afr", "min-motion-gap", "ros-native")
 """Policies that a viewer may choose; each is compiled at its first use."""
 DEFAULT_CAPACITY: Final = 32

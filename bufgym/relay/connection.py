@@ -21,8 +21,7 @@ from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError
 
-HELLO_BYTES: Final = 2**16
-"""Size limit of a frame from a client that has not yet said hello."""
+HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello
 
 
 class Connection:

@@ -18,8 +18,7 @@ from bufgym.relay.rules import FOXGLOVE, Permissions
 from bufgym.relay.session import Session
 from bufgym.robot.extra import needs
 
-MAX_CHANNELS: Final = 10_000
-"""Limit on channels, which clients open by topic and type; further channels are not shown."""
+MAX_CHANNELS: Final = 10_000  # Limit on channels, which clients open by topic and type; further channels are not shown
 _TRANSFORMS: Final = ("/tf", "", "")
 _PICTURES: Final = ("jpeg", "png")
 _ROBOT: Final = re.compile(r"/robots/([^/]+)/")

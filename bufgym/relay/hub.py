@@ -25,14 +25,12 @@ if TYPE_CHECKING:
     from bufgym.relay.foxglove import Window
     from bufgym.relay.peers import Peers
 
-OWN: Final = "relay"
-"""The relay's name as a sender, and the prefix of its topics."""
+OWN: Final = "relay"  # The relay's name as a sender, and the prefix of its topics
 STATUS: Final = f"/{OWN}/status"
 ROBOFLEET: Final = "robofleet"
 """Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
-MAX_JSON_BYTES: Final = 2**20
-"""Size limit of a text frame and of a JSON payload, which take time to read."""
+MAX_JSON_BYTES: Final = 2**20  # Size limit of a text frame and of a JSON payload, which take time to read
 
 
 @dataclass(eq=False)

@@ -18,10 +18,8 @@ from bufgym.relay.wire import RefusedError
 
 MAX_KEYS_BYTES: Final = 2**20
 MAX_TOKEN_CHARACTERS: Final = 2**14
-KEYS_AGE_S: Final = 300.0
-"""Longest time for which a key is still trusted after the issuer withdrew it."""
-AGAIN_S: Final = 1.0
-"""Shortest time between two requests to the issuer because of tokens with unknown keys."""
+KEYS_AGE_S: Final = 300.0  # Longest time for which a key is still trusted after the issuer withdrew it
+AGAIN_S: Final = 1.0  # Shortest time between two requests to the issuer because of tokens with unknown keys
 _FETCH_S: Final = 5.0
 
 

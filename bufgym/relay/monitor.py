@@ -10,10 +10,8 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.robot.log import Record
 
-RATE_S: Final = 1.0
-"""Time before now over which rates are computed."""
-QOI_S: Final = 30.0
-"""Time before now whose messages count for QoI."""
+RATE_S: Final = 1.0  # Time before now over which rates are computed
+QOI_S: Final = 30.0  # Time before now whose messages count for QoI
 _MOST: Final = 10_000  # messages of a topic that are remembered for its QoI
 
 

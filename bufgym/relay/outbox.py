@@ -15,8 +15,7 @@ from bufgym.relay.hub import Member, Outgoing
 from bufgym.relay.subscriber import next_lane
 from bufgym.relay.wire import WireError
 
-MAX_ANSWERS: Final = 4_096
-"""Limit on unsent answers; a client that asks on without reading is closed."""
+MAX_ANSWERS: Final = 4_096  # Limit on unsent answers; a client that asks on without reading is closed
 
 
 class Outbox:

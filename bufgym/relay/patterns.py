@@ -10,8 +10,7 @@ from typing import Any, Final, NamedTuple
 from bufgym.ground.errors import BufgymError
 
 MAX_CHARACTERS: Final = 512
-MAX_MEMORY_BYTES: Final = 2**18
-"""Memory limit of one expression's automaton."""
+MAX_MEMORY_BYTES: Final = 2**18  # Memory limit of one expression's automaton
 _KEPT: Final = 1024  # expressions kept compiled; viewers with the same expression share it
 
 

@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from bufgym.policies.registry import Policy
     from bufgym.robot import PolicyQueue
 
-PLACES: Final = 32
-"""Topics that share a queue, where the policy knows topics."""
-ROOM: Final = 64
-"""Messages between two cleanups of a queue's bookkeeping; few, because there are many queues."""
+PLACES: Final = 32  # Topics that share a queue, where the policy knows topics
+ROOM: Final = 64  # Messages between two cleanups of a queue's bookkeeping; few, because there are many queues
 _COMPILING: Final = threading.Lock()
 
 

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from bufgym.policies.registry import Policy
 
 MAX_PRIORITY: Final = 1e6
-MAX_CAPACITY: Final = 1_000
-"""Largest L of a subscriber's queue."""
+MAX_CAPACITY: Final = 1_000  # Largest L of a subscriber's queue
 ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "recordings", "replay")
 _SESSION: Final = re.compile(r"[\w.-]{1,64}", re.ASCII)
 

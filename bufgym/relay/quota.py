@@ -60,8 +60,7 @@ class Quota:
             raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
 
 
-KEPT_S = 60.0
-"""Time for which a quota outlives its last connection, so that reconnecting does not reset it."""
+KEPT_S = 60.0  # Time for which a quota outlives its last connection, so that reconnecting does not reset it
 MAX_QUOTAS = 100_000
 
 

@@ -20,8 +20,7 @@ from mcap.stream_reader import StreamReader
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import wire
 
-MOST_BYTES: Final = 4 * 2**20
-"""Limit on the payloads of a piece."""
+MOST_BYTES: Final = 4 * 2**20  # Limit on the payloads of a piece
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _STEP_BYTES: Final = 2**18  # distance between two indexed places of a file
 

@@ -135,5 +135,4 @@ class Ros1(_RosSource):
         return take
 
 
-SOURCES: Final = {"1": Ros1, "2": Ros2}
-"""Version of ROS -> its source."""
+SOURCES: Final = {"1": Ros1, "2": Ros2}  # Version of ROS -> its source

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 
 _PING_S: Final = 20.0
 _PONG_S: Final = 60.0  # time for a pong, which on a slow link waits long behind the message being sent
-TICK_S: Final = 1.0
-"""Time between two ticks, which publish the relay's state and forget what has expired."""
+TICK_S: Final = 1.0  # Time between two ticks, which publish the relay's state and forget what has expired
 _QUIET: Final = logging.getLogger("bufgym.relay.websockets")
 """Silenced logger; clients' faults go to the audit log, not to tracebacks."""
 _QUIET.setLevel(logging.CRITICAL + 1)

@@ -26,8 +26,7 @@ from bufgym.robot.sockets import connected, unacked_bytes
 from bufgym.robot.tasks import Tasks, until_one_ends
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
-PATIENCE_S: Final = 5.0
-"""Time to wait for a connection, and for the relay's welcome."""
+PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
 _MAX_TOKEN_BYTES: Final = 2**16
 _MAX_FRAME_BYTES: Final = 2**26
 

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from bufgym.policies.registry import Policy
     from bufgym.robot import Item, PolicyQueue
 
-MAX_QUEUES: Final = 64
-"""Limit on the queues of a subscription; further topics share queues."""
+MAX_QUEUES: Final = 64  # Limit on the queues of a subscription; further topics share queues
 
 
 class Lane:

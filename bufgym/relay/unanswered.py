@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import wire
 
-AGAIN = "out_of_order"
-"""Code with which a message behind a refused one is refused too; it is sent again."""
+AGAIN = "out_of_order"  # Code with which a message behind a refused one is refused too; it is sent again
 
 
 @dataclass

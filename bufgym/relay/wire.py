@@ -21,14 +21,10 @@ from bufgym.ground.errors import BufgymError
 PATH: Final = "/relay"
 SUBPROTOCOL: Final = "bufgym.relay.v1"
 VERSION: Final = 1
-MESSAGE: Final = 1
-"""The one kind of binary frame."""
-NO_DROP: Final = 1
-"""A flag."""
-MAX_NAME_BYTES: Final = 255
-"""Of a topic, a type, an encoding, a sender."""
-MAX_SEQ: Final = 2**53
-"""Numbers are exact in JavaScript up to this."""
+MESSAGE: Final = 1  # The one kind of binary frame
+NO_DROP: Final = 1  # A flag
+MAX_NAME_BYTES: Final = 255  # Of a topic, a type, an encoding, a sender
+MAX_SEQ: Final = 2**53  # Numbers are exact in JavaScript up to this
 MAX_STAMP_US: Final = 2**53
 
 _HEADER: Final = struct.Struct("!2s7B3sIQq")

@@ -20,10 +20,8 @@ from bufgym.robot.extra import needs
 from bufgym.robot.sockets import DEAD_AFTER_S, small_buffers
 
 ROOT: Final = "bufgym"
-MQTT_PORT: Final = 1883
-"""Standard port of an MQTT broker."""
-CONNECT_S: Final = 1.0
-"""Time for a Zenoh receiver to answer."""
+MQTT_PORT: Final = 1883  # Standard port of an MQTT broker
+CONNECT_S: Final = 1.0  # Time for a Zenoh receiver to answer
 
 
 class ZenohBus:
@@ -143,5 +141,4 @@ def _prompt(connection: Any) -> None:
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-BUSES: Final[dict[str, Open]] = {"zenoh": ZenohBus, "mqtt": MqttBus}
-"""Name of a library -> class that opens either end."""
+BUSES: Final[dict[str, Open]] = {"zenoh": ZenohBus, "mqtt": MqttBus}  # Name of a library -> class that opens either end

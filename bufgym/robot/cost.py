@@ -14,12 +14,9 @@ from bufgym.cli.options import Positive
 from bufgym.robot.queue import PolicyQueue
 
 POLICIES = ("drop-oldest", "afr", "learned")
-RATE_HZ, SIZE_BYTES, CAPACITY = 30.0, 230_000, 16
-"""Frames that the camera puts, and the queue's L."""
-LINK_HZ = 12.0
-"""Frames a second that the link carries."""
-WITHOUT_PAUSE = 1000
-"""Frames."""
+RATE_HZ, SIZE_BYTES, CAPACITY = 30.0, 230_000, 16  # Frames that the camera puts, and the queue's L
+LINK_HZ = 12.0  # Frames a second that the link carries
+WITHOUT_PAUSE = 1000  # Frames
 
 
 def measure(policy: str, seconds: float) -> list[str]:

@@ -16,8 +16,7 @@ _HEADER: Final = struct.Struct("!2sBxIQQqdI")
 HEADER_BYTES: Final = _HEADER.size
 _MAGIC: Final = b"bG"
 MAX_BODY_BYTES: Final = 2**26
-STREAM_BYTES: Final = 16
-"""Length of a stream's name, which is random."""
+STREAM_BYTES: Final = 16  # Length of a stream's name, which is random
 
 
 class FrameError(ConnectionError):

@@ -8,10 +8,8 @@ from typing import Any, Final, Self
 
 from bufgym.robot.extra import needs
 
-MAX_CHANNELS: Final = 30_000
-"""Channels of a file. MCAP itself numbers at most 65,535."""
-MAX_FORMS: Final = 16
-"""Channels of one topic, which differ in encoding or schema."""
+MAX_CHANNELS: Final = 30_000  # Channels of a file. MCAP itself numbers at most 65,535.
+MAX_FORMS: Final = 16  # Channels of one topic, which differ in encoding or schema
 _MOST_NS: Final = 2**64 - 1
 _FLUSH_S: Final = 0.5  # time between flushes; a killed program loses what it has written since the last one
 

@@ -26,12 +26,9 @@ from bufgym.traces import MotionSettings
 
 CAMERA, ODOMETRY = "/camera", "/odom"
 """The topics: ``CompressedImage``, whose ``format`` is the frame's number, and ``PoseStamped``."""
-SILENCE_S: Final = 120.0
-"""Longest wait for anything."""
-LEAD_S: Final = 0.01
-"""Time by which a pose is sent before its frame, because the two use different sockets."""
-START_S: Final = 0.3
-"""Time from the command to begin to the beginning."""
+SILENCE_S: Final = 120.0  # Longest wait for anything
+LEAD_S: Final = 0.01  # Time by which a pose is sent before its frame, because the two use different sockets
+START_S: Final = 0.3  # Time from the command to begin to the beginning
 _POLL_S: Final = 0.02
 
 

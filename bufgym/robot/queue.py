@@ -35,10 +35,8 @@ from bufgym.policies.registry import Policy, get
 from bufgym.robot.log import LogFile, Record, settings
 from bufgym.robot.row import ROOM, LiveRow
 
-FIRST_US: Final = 2
-"""Earliest time of a call; the two first knots of a link lie before it."""
-MAX_SIZE_BYTES: Final = 2**40
-"""Size limit of a message; sums over months then stay within 64 bits."""
+FIRST_US: Final = 2  # Earliest time of a call; the two first knots of a link lie before it
+MAX_SIZE_BYTES: Final = 2**40  # Size limit of a message; sums over months then stay within 64 bits
 
 
 @dataclass(frozen=True)

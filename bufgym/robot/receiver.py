@@ -19,10 +19,8 @@ from bufgym.robot.mcap_file import McapFile
 from bufgym.robot.sockets import free_port
 from bufgym.robot.tasks import Tasks
 
-MAX_STREAMS: Final = 64
-"""Number of latest senders that are remembered."""
-MAX_PEERS: Final = 2 * MAX_STREAMS
-"""Connections at a time, with those that senders have given up."""
+MAX_STREAMS: Final = 64  # Number of latest senders that are remembered
+MAX_PEERS: Final = 2 * MAX_STREAMS  # Connections at a time, with those that senders have given up
 MAX_ARRIVING_BYTES: Final = 2**28
 """Bodies that arrive at the same time over TCP; a sender beyond is hung up on, and tries again."""
 IDLE_S: Final = 600.0

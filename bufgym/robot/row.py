@@ -29,8 +29,7 @@ from bufgym.sim.rollout import compiled_rollout, python_rollout
 from bufgym.sim.state import CARRIES, NOT_YET, Batch
 from bufgym.traces import Trace
 
-ROOM = 2**16
-"""Columns of a new row, 7 MB. After this many messages the settled ones are forgotten."""
+ROOM = 2**16  # Columns of a new row, 7 MB. After this many messages the settled ones are forgotten.
 
 
 class LiveRow:

@@ -13,8 +13,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.oracle.measure import regret
 
-DIFFER: Final = 0.01
-"""Relative difference in simulated H beyond which two policies should rank alike live."""
+DIFFER: Final = 0.01  # Relative difference in simulated H beyond which two policies should rank alike live
 
 
 @dataclass(frozen=True)

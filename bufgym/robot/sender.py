@@ -17,8 +17,7 @@ Leaves = Literal["acked", "sent", "written"]
 system. "written" hides a queue in the system's buffers; it serves to measure the cost of that."""
 
 RETRY_S: Final = 0.5
-PATIENCE_S: Final = 20.0
-"""Time for the receiver's answer to the greeting."""
+PATIENCE_S: Final = 20.0  # Time for the receiver's answer to the greeting
 _POLL_S: Final = 0.001
 _MOST_UNACKED: Final = 256  # limit on messages that await the receiver's ack, where they count as left before it
 

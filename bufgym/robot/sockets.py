@@ -12,10 +12,8 @@ import sys
 from typing import Final
 
 SEND_BUFFER_BYTES: Final = 32_768
-UNSENT_BYTES: Final = 16_384
-"""TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel."""
-DEAD_AFTER_S: Final = 20.0
-"""Time without acks after which a connection is given up, where the system can tell."""
+UNSENT_BYTES: Final = 16_384  # TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel
+DEAD_AFTER_S: Final = 20.0  # Time without acks after which a connection is given up, where the system can tell
 
 
 def unacked_bytes(connection: socket.socket) -> int | None:

@@ -6,8 +6,7 @@ from typing import Final
 
 from bufgym.robot.log import Record, value_of
 
-RATE_US: Final = 1_000_000
-"""Time before now over which rates are computed."""
+RATE_US: Final = 1_000_000  # Time before now over which rates are computed
 HISTORY_S: Final = 60
 _BARS: Final = " ▁▂▃▄▅▆▇█"
 

@@ -24,10 +24,8 @@ Depth = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 """uint8[height, width], or [height, width, 3] in the order blue, green, red."""
 
-SENT_WIDTH: Final = 640
-"""Frames are sent at the size at which a Kinect takes them, 640x480."""
-JPEG_QUALITY: Final = 50
-"""The paper sends "a low-quality JPEG" beside the depth."""
+SENT_WIDTH: Final = 640  # Frames are sent at the size at which a Kinect takes them, 640x480
+JPEG_QUALITY: Final = 50  # The paper sends "a low-quality JPEG" beside the depth
 
 
 @dataclass(frozen=True)

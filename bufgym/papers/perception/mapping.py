@@ -20,16 +20,11 @@ from bufgym.papers.perception import tsdf
 from bufgym.papers.perception.frames import Camera, Sequence
 from bufgym.traces.trace import Float64Array
 
-VOXEL_M: Final = 0.04
-"""Edge of a voxel by default, m: at 160x120 pixels are 1.4 cm apart on a wall at 2 m."""
-TRUNCATION_VOXELS: Final = 3.0
-"""Distance from the surface up to which the function is kept, in voxels."""
-FAR_M: Final = 4.5
-"""Largest depth used, m; a Kinect's depth there is off by 6 cm already."""
-COVERED_M: Final = 0.05
-"""A part of the reference is uncovered if the map has no point within this distance, m."""
-MOST_VOXELS: Final = 2**25
-"""A larger grid would take more than 256 MB."""
+VOXEL_M: Final = 0.04  # Edge of a voxel by default, m: at 160x120 pixels are 1.4 cm apart on a wall at 2 m
+TRUNCATION_VOXELS: Final = 3.0  # Distance from the surface up to which the function is kept, in voxels
+FAR_M: Final = 4.5  # Largest depth used, m; a Kinect's depth there is off by 6 cm already
+COVERED_M: Final = 0.05  # A part of the reference is uncovered if the map has no point within this distance, m
+MOST_VOXELS: Final = 2**25  # A larger grid would take more than 256 MB
 
 _BOX_STRIDE: Final = 8  # step between the frames and pixels that measure the box
 

@@ -21,8 +21,7 @@ from bufgym.papers.perception.frames import Image, Sequence
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode
 
-FEATURES: Final = 500
-"""Features of an image at most, as OpenCV has it by default."""
+FEATURES: Final = 500  # Features of an image at most, as OpenCV has it by default
 NEAR_BITS: Final = 64
 """Descriptors of 256 bits match where at most so many differ (ORB-SLAM2's TH_LOW is 50, its TH_HIGH 100)."""
 
@@ -77,8 +76,7 @@ def orbbuf_by(similar: Callable[[int, int], float], episode: Episode) -> Policy:
     return Policy("orbbuf-images", on_arrival, about=about, source=source, built_in=True)
 
 
-COMPARED: Final = 3
-"""Further images that the last of so many decisions compares."""
+COMPARED: Final = 3  # Further images that the last of so many decisions compares
 
 
 def decision_ms(sequence: Sequence, decisions: int) -> NDArray[np.float64]:

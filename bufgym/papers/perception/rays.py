@@ -17,23 +17,15 @@ import numpy as np
 from bufgym.ground.kernel import kernel
 from bufgym.traces.trace import Float64Array as Array
 
-BASELINE_M = 0.075
-"""Distance from the camera to the projector along x, m."""
-STEPS_PER_PIXEL = 8.0
-"""Steps of the disparity."""
-NOISE_STEPS = 0.5
-"""Standard deviation of the disparity, in such steps."""
-WINDOW = 5
-"""Pixels that are matched together, and share their error."""
-NEAREST_M, FARTHEST_M = 0.4, 5.0
-"""What can be measured, m."""
-GRAZING = 0.12
-"""Cosine of the angle to the surface's normal below which the dots are too stretched."""
-SLACK = 1e-3
-"""Margin around the bounds of things, in pixels and m, so that rounding hides none."""
+BASELINE_M = 0.075  # Distance from the camera to the projector along x, m
+STEPS_PER_PIXEL = 8.0  # Steps of the disparity
+NOISE_STEPS = 0.5  # Standard deviation of the disparity, in such steps
+WINDOW = 5  # Pixels that are matched together, and share their error
+NEAREST_M, FARTHEST_M = 0.4, 5.0  # What can be measured, m
+GRAZING = 0.12  # Cosine of the angle to the surface's normal below which the dots are too stretched
+SLACK = 1e-3  # Margin around the bounds of things, in pixels and m, so that rounding hides none
 
-ANYWHERE = (-math.inf, math.inf, -math.inf, math.inf, -math.inf)
-"""Bounds of a thing that may be seen in every pixel."""
+ANYWHERE = (-math.inf, math.inf, -math.inf, math.inf, -math.inf)  # Bounds of a thing that may be seen in every pixel
 
 _MASK = 0xFFFFFFFF
 

@@ -36,8 +36,7 @@ SEVEN_SCENES_CAMERA: Final = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 TUM_UNITS_PER_M: Final = 5000.0
 MM_PER_M: Final = 1000.0
 SEVEN_SCENES_HZ: Final = 30.0
-SAME_MOMENT_S: Final = 0.02
-"""Most time between a depth and its picture, as in the publishers' associate.py, s."""
+SAME_MOMENT_S: Final = 0.02  # Most time between a depth and its picture, as in the publishers' associate.py, s
 POSE_GAP_S: Final = 0.1
 """Longest gap in the ground truth across which poses are interpolated, s; frames in longer gaps are left out."""
 

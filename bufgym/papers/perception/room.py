@@ -21,18 +21,13 @@ from bufgym.traces.poses import Poses, quaternions
 from bufgym.traces.shipped import load_motion
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
-SIZE_M: Final = (5.0, 4.2, 2.6)
-"""Length, width and height of the room, m."""
-EYE_M: Final = 1.3
-"""Mean height of the camera, m."""
-FREE_M: Final = 0.45
-"""Least distance of things from the camera's path, m."""
+SIZE_M: Final = (5.0, 4.2, 2.6)  # Length, width and height of the room, m
+EYE_M: Final = 1.3  # Mean height of the camera, m
+FREE_M: Final = 0.45  # Least distance of things from the camera's path, m
 BOXES: Final = 80
 BALLS: Final = 8
-MOTION: Final = "drive-0"
-"""Shipped recording whose motion the camera follows."""
-PACE: Final = 0.5
-"""Its speed. The view then changes as fast as in 7-Scenes, 11.6 fields of view in 1000 frames."""
+MOTION: Final = "drive-0"  # Shipped recording whose motion the camera follows
+PACE: Final = 0.5  # Its speed. The view then changes as fast as in 7-Scenes, 11.6 fields of view in 1000 frames.
 
 _LAP_POINTS: Final = 4000
 _TRIES: Final = 60

@@ -17,8 +17,7 @@ from bufgym.traces import Trace
 WIDTH, VIEW_WIDTH = 160, 80
 """Image widths: frames are mapped and tracked at 160 x 120, and views are compared at 80 x 60. Tracking at 80 x 60
 would take two thirds of the time, but it loses runs that are tracked at 160 x 120."""
-OFFSETS: Final = 10
-"""Number of fade offsets; each shifts the fade earlier by a tenth of the stream."""
+OFFSETS: Final = 10  # Number of fade offsets; each shifts the fade earlier by a tenth of the stream
 IMAGES: Final = "orbbuf-images"
 """ORBBuf that compares images; the policy is made for each episode and is not registered."""
 

@@ -18,8 +18,7 @@ from bufgym.scenario.suites import motion_value
 from bufgym.sim import metrics
 from bufgym.traces import Trace
 
-SIZED_EVERY = 10
-"""Distance between frames that are encoded; sizes between them are interpolated."""
+SIZED_EVERY = 10  # Distance between frames that are encoded; sizes between them are interpolated
 
 
 @lru_cache(maxsize=8)

@@ -31,24 +31,15 @@ the same, a millisecond faster."""
 MODEL_WIDTH: Final = 80
 """About the pixels per row through which the model is seen: every second of 160. They are 2.7 cm apart at 2 m, finer
 than voxels."""
-SMALL_STEP: Final = 3e-4
-"""Step below which a level ends early, rad and m."""
-SAME_SURFACE: Final = 0.05
-"""Largest relative difference of neighbouring pixels' distances on one surface."""
-SMOOTH_RADIUS: Final = 2
-"""Depths are smoothed over 5x5 pixels, within one surface, before normals are taken."""
-MOST_WEIGHT: Final = 64.0
-"""Limit on frames in the model's running mean, which forgets as in KinectFusion."""
-APART_M: Final = 0.1
-"""Pairs farther apart than this are none, m."""
-APART_DEG: Final = 30.0
-"""Nor are pairs whose normals differ by more, degrees."""
-LEAST_PAIRS: Final = 0.3
-"""Lost if fewer of the frame's points than this share have a pair."""
-MOST_ERROR_M: Final = 0.1
-"""Lost if one step is off by more, m."""
-MOST_ERROR_DEG: Final = 5.0
-"""Lost if the turn of one step is off by more, degrees."""
+SMALL_STEP: Final = 3e-4  # Step below which a level ends early, rad and m
+SAME_SURFACE: Final = 0.05  # Largest relative difference of neighbouring pixels' distances on one surface
+SMOOTH_RADIUS: Final = 2  # Depths are smoothed over 5x5 pixels, within one surface, before normals are taken
+MOST_WEIGHT: Final = 64.0  # Limit on frames in the model's running mean, which forgets as in KinectFusion
+APART_M: Final = 0.1  # Pairs farther apart than this are none, m
+APART_DEG: Final = 30.0  # Nor are pairs whose normals differ by more, degrees
+LEAST_PAIRS: Final = 0.3  # Lost if fewer of the frame's points than this share have a pair
+MOST_ERROR_M: Final = 0.1  # Lost if one step is off by more, m
+MOST_ERROR_DEG: Final = 5.0  # Lost if the turn of one step is off by more, degrees
 
 
 @dataclass(frozen=True, eq=False)

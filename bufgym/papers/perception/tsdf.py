@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 
-NEAR_M = 0.3
-"""Least depth used, m; a Kinect measures from 0.4 m on."""
+NEAR_M = 0.3  # Least depth used, m; a Kinect measures from 0.4 m on
 
 
 @kernel

@@ -20,12 +20,9 @@ from bufgym.ground.kernel import kernel
 from bufgym.papers.perception.frames import Sequence
 from bufgym.papers.perception.mapping import points_of
 
-AGREE: Final = 0.05
-"""Largest relative difference of agreeing depths, ten times a Kinect's noise at 3 m."""
-POINTS_ACROSS: Final = 20
-"""Pixels per row that are looked for; few are enough, because views overlap in large pieces."""
-CELL_M: Final = 0.1
-"""Side of the cells in which coverage is counted, m."""
+AGREE: Final = 0.05  # Largest relative difference of agreeing depths, ten times a Kinect's noise at 3 m
+POINTS_ACROSS: Final = 20  # Pixels per row that are looked for; few are enough, because views overlap in large pieces
+CELL_M: Final = 0.1  # Side of the cells in which coverage is counted, m
 LEAST_VIEWS: Final = 3
 """Frames that must have seen a cell for it to count; cells seen by fewer are mostly noise at edges."""
 

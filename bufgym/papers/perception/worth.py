@@ -28,8 +28,7 @@ from bufgym.scenario.suites import motion_value
 from bufgym.traces.workload import Workload
 
 SEED: Final = 0
-FRAMES: Final = 240
-"""Frames of the recording, 8 s."""
+FRAMES: Final = 240  # Frames of the recording, 8 s
 SIZES: Final = (
     *(188_078, 188_294, 189_843, 195_316, 199_698, 205_064, 210_528, 215_847, 222_067, 224_835, 224_970, 228_515),
     *(221_105, 219_960, 220_765, 218_843, 216_128, 215_568, 215_483, 216_212, 214_161, 210_834, 207_500, 205_819),
@@ -37,8 +36,7 @@ SIZES: Final = (
 )
 """Bytes of every tenth frame and the last, measured once and checked by a test. So episodes begin at once and do not
 depend on the JPEG library installed."""
-SCALE: Final = 0.25
-"""Scale of the shipped links, which then carry about half of the frames."""
+SCALE: Final = 0.25  # Scale of the shipped links, which then carry about half of the frames
 
 
 @functools.cache

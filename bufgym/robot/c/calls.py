@@ -21,8 +21,7 @@ from bufgym.sim.transition import next_event
 from bufgym.sim.view import arrival_of, view
 from bufgym.traces import Trace
 
-INIT, ARRIVAL, DEQUEUE, SENT, ENDS = range(5)
-"""Kinds of calls, as in ``parts/parity.h``."""
+INIT, ARRIVAL, DEQUEUE, SENT, ENDS = range(5)  # Kinds of calls, as in ``parts/parity.h``
 
 CALL = np.dtype(
     [

@@ -34,8 +34,7 @@ _HELPERS = {
     "bufgym_thin(": "thin.h",
 }
 """Parts that rules share, each before its callers."""
-_LEARNED = ("features.h", "scorer.h")
-"""Parts of a learned agent."""
+_LEARNED = ("features.h", "scorer.h")  # Parts of a learned agent
 _CONSTANTS = {
     thinning: "WAITING SOON_US STEADY",
     target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
@@ -45,8 +44,7 @@ _CONSTANTS = {
 }
 """Constants that the parts name, by the module that has them."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
-_SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40
-"""Seed, episodes and messages of the calls in the header."""
+_SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40  # Seed, episodes and messages of the calls in the header
 
 
 def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_bytes: int | None = None) -> Path:

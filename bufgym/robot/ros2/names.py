@@ -14,8 +14,7 @@ from typing import Any, Final
 from bufgym.ground.errors import BufgymError, install
 from bufgym.robot.frames import FrameError
 
-DEPTH: Final = 10
-"""Default history depth, because DDS does not announce a publisher's own."""
+DEPTH: Final = 10  # Default history depth, because DDS does not announce a publisher's own
 _MAX_NAME_BYTES: Final = 255
 _HEAD: Final = struct.Struct("!BBBH")  # bytes of name and type, flags, depth
 _RELIABLE, _TRANSIENT_LOCAL = 1, 2

@@ -27,8 +27,7 @@ from bufgym.scenario import Client
 
 SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 """Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
-LOOK_S: Final = 0.2
-"""Time between two searches for publishers."""
+LOOK_S: Final = 0.2  # Time between two searches for publishers
 _MATCH_S: Final = 1.0  # longest wait of a new publisher's first message for a subscriber
 
 
