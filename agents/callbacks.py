@@ -86,7 +86,7 @@ class Validation(BetweenUpdates):
         home: the seed's folder.
         validations: the seed's validations so far.
         measure: model -> the measures in ``validations``' columns.
-        message: format of the last measure in words.
+        message: format of the measures in words.
         curve: has the seconds of training.
     """
 
@@ -104,7 +104,7 @@ class Validation(BetweenUpdates):
     def latest(self) -> str:
         """The latest validation in words."""
         rows = self.validations.rows
-        return self.message.format(rows[-1][-1]) if rows else ""
+        return self.message.format(*rows[-1][2:]) if rows else ""
 
     def _on_rollout_start(self) -> None:
         self.validate(self.model)

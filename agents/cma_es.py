@@ -162,7 +162,7 @@ def train(settings: Evolve, folder: Path, seed: int, line: int = 0) -> Run:
                         "algo": settings.algo,
                     }
                     weights.save(home / MODEL, state.agent, notes)
-                report = objective.message.format(measures[-1])
+                report = objective.message.format(*measures)
                 bar.set_postfix_str(report, refresh=False)
                 if not sys.stderr.isatty():
                     print(f"seed {seed}: {state.steps:,} of {settings.steps:,} steps, {report}", flush=True)

@@ -25,7 +25,7 @@ from bufgym.benchmark import summary
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
-from bufgym.benchmark.table import aligned, apart, same, told_once
+from bufgym.benchmark.table import NONE, aligned, apart, same, told_once
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
 from bufgym.oracle import BASELINE
@@ -116,12 +116,23 @@ def report(trained: Trained) -> None:
     write_notes(folder, trained.settings, seeds, notes)
     seconds = ", ".join(f"{run.seconds:.0f}" for run in (*trained.runs, *trained.beside))
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
+    print("\n".join(["next:", *NEXT.get(best.model.suffix, ())]).format(model=folder / best.model.name))
 
 
 def agent_name(run: Run) -> str:
     """Name of one seed's agent in tables."""
     return f"agent (seed {run.seed})"
 
+
+NEXT = {
+    ".safetensors": (
+        "  bufgym play --policies {model}                # watch it decide",
+        "  bufgym bench --policies {model},learned,afr   # compare it on other episodes, links and L",
+        "  bufgym export {model} mine.safetensors --name mine",
+    ),
+    ".zip": ("  bufgym export {model} mine.safetensors --name mine   # a file that decides without torch",),
+}
+"""What to do with a model, by its kind of file."""
 
 RIVALS: dict[str, Callable[[], list[Policy]]] = {"topics": topics.rivals, "fleet": fleet.rivals}
 """Kind -> the fixed policies for comparison."""
@@ -158,12 +169,12 @@ def report_environment(trained: Trained) -> Report:
             outcomes[name] = test.play(training.load(settings, run), settings.environment)
     rows = test.rows(outcomes)
     entries, alike = summarise(outcomes, rows, best), same(rows)
-    print(table(entries, best, alike))
-    print(verdict(entries, best))
+    unranked = apart(map(registry.get, registry.names()))
+    print(table(entries, best, alike, unranked))
+    print(verdict(entries, best, trained.best.seconds))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = trained.save(trained.folder, held_out=held_out, scores=entries)
-    unranked = apart(map(registry.get, registry.names()))
     bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in unranked}
     bars, twins = _drawn(bars, alike)
     draw(
@@ -178,19 +189,29 @@ def report_environment(trained: Trained) -> Report:
     return [trained.best.seed], notes, "model, figure and numbers"
 
 
-def verdict(entries: Sequence[dict[str, Any]], agent: str) -> str:
-    """One sentence: whether the agent beats the best rule written by hand, and PPO's agent, and by how much."""
+def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float) -> str:
+    """One sentence: how far the agent's score lies above those of AFR, the best rules and other agents, or below.
+
+    It is level with a policy where the 95 % interval of the difference in QoI has 0 in it.
+    """
     known, rules = {entry["policy"]: entry for entry in entries}, by_hand()
-    best = next(entry for entry in entries if entry["policy"] in rules)
-    rivals = {f"the best rule, {best['policy']}": best}
-    by_ppo = [name for name in known if name.startswith("agent by PPO")]  # best first, as all entries are
-    rivals |= {name: known[name] for name in by_ppo[:1]}
+    best = next(name for name in known if name in rules)  # the best first, as all entries are
+    by_ppo = [name for name in known if name.startswith("agent by PPO")][:1]
+    rivals = {
+        "afr": "AFR",
+        best: f"the best rule written by hand, {best},",
+        "target-gap": "target-gap",
+        "learned": "learned",
+    }
     told = []
-    for name, entry in rivals.items():
-        low, high = sorted(-bound for bound in entry["minus_agent_95"])
-        won = "beats" if low > 0 else "loses to" if high < 0 else "cannot be told from"
-        told.append(f"{won} {name}: QoI {-entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]")
-    return f"{agent} {', and '.join(told)}"
+    for name, label in {**rivals, **{name: name for name in by_ppo}}.items():
+        if name not in known:
+            continue
+        low, high = known[name]["minus_agent_95"]
+        ahead = known[agent]["score"] - known[name]["score"]
+        where = "above" if high < 0 else "below" if low > 0 else "level with"
+        told.append(f"{where} {label}" + (f" by {abs(ahead):.3f}" if where != "level with" else f" ({ahead:+.3f})"))
+    return f"after {seconds:.0f} s {agent} scores {known[agent]['score']:.3f}: {', '.join(told)}"
 
 
 def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:
@@ -204,19 +225,30 @@ def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> 
     return drawn, [f"{first}: also {', '.join(names)}" for first, names in alike.items() if first in drawn]
 
 
-def table(entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Sequence[str]]) -> str:
-    """A table, best first, with the difference to the agent and its 95 % interval; ``alike`` policies share a line."""
-    lines = [["policy", "score [95 %]", *(heading for heading, *_ in COLUMNS), "QoI - agent's [95 %]"]]
+def table(
+    entries: Sequence[dict[str, Any]], agent: str, alike: Mapping[str, Sequence[str]], unranked: Mapping[str, str]
+) -> str:
+    """A table, best first, with the difference to the agent and its 95 % interval; ``alike`` policies share a line.
+
+    The agent is marked, and those that do not compete stand below a rule.
+    """
+    head = ["policy", "score [95 %]", *(heading for heading, *_ in COLUMNS), "QoI - agent's [95 %]"]
     others = {name for names in alike.values() for name in names}
+    blocks: tuple[list[list[str]], list[list[str]]] = [], []
     for entry in entries:
-        if entry["policy"] in others:
+        name = entry["policy"]
+        if name in others:
             continue
         low, high = entry["minus_agent_95"]
-        difference = "" if entry["policy"] == agent else f"{entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
+        difference = "" if name == agent else f"{entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
         score = written(Interval(entry["score"], *entry["score_95"]), ".3f")
-        numbers = [format(entry[name] * factor, spec) for _, name, factor, spec in COLUMNS]
-        lines.append([entry["policy"], score, *numbers, difference])
-    return "\n".join([*aligned(lines), "score: 0 is Drop Oldest, 1 the clairvoyant", *told_once(alike)])
+        numbers = [format(entry[column] * factor, spec).replace("nan", NONE) for _, column, factor, spec in COLUMNS]
+        label = f"> {name}" if name == agent else name
+        blocks[name in unranked].append([label, score, *numbers, difference])
+    lines = aligned([head, *blocks[0], *blocks[1]])
+    lines.insert(1 + len(blocks[0]), "-" * max(map(len, lines)))
+    notes = [f"note: {name} does not compete: {unranked[name]}" for name in unranked if name not in others]
+    return "\n".join([*lines, "score: 0 is Drop Oldest, 1 the clairvoyant", *notes, *told_once(alike)])
 
 
 def report_suites(trained: Trained) -> Report:

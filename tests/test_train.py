@@ -15,6 +15,7 @@ from agents import held_out, runs, training
 from agents.callbacks import Curve, checkpoints
 from agents.held_out import FixedEpisodes
 from agents.objectives import guided
+from agents.report import verdict
 from agents.settings import (
     DQN,
     PPO,
@@ -99,7 +100,7 @@ def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, cap
     told = {row["policy"]: row["qoi"] for row in rows}
     assert told["agent (seed 0)"] == np.mean([o.qoi for o in test.run(agent)])
     assert told["agent by PPO (seed 0)"] == np.mean([o.qoi for o in test.run(found)])
-    assert "the best rule, " in capsys.readouterr().out
+    assert "the best rule written by hand, " in capsys.readouterr().out
 
 
 def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: Patch) -> None:
@@ -315,3 +316,17 @@ def test_without_words_evolve_runs_and_ppo_beside_it(monkeypatch: pytest.MonkeyP
     with pytest.raises(SystemExit):
         train.typed([])
     assert asked == [(Evolve(), True)]
+
+
+def test_the_verdict_says_how_far_above_whom() -> None:
+    def entry(policy: str, score: float, low: float, high: float) -> dict[str, Any]:
+        return {"policy": policy, "score": score, "minus_agent_95": [low, high]}
+
+    entries = [
+        *(entry("learned", 0.75, 0.1, 0.3), entry("a", 0.7, 0.0, 0.0), entry("min-gap", 0.69, -0.2, 0.1)),
+        *(entry("agent by PPO (seed 1)", 0.6, -2.0, -1.0), entry("afr", 0.4, -5.0, -4.0)),
+    ]
+    assert verdict(entries, "a", 61.4) == (
+        "after 61 s a scores 0.700: above AFR by 0.300, level with the best rule written by hand, min-gap, (+0.010), "
+        "below learned by 0.050, above agent by PPO (seed 1) by 0.100"
+    )

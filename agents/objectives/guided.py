@@ -45,7 +45,7 @@ class GuidedObjective(Objective):
     name = "guided"
     columns = ("score", "qoi")
     best = max
-    message = "mean QoI {:.3f} on validation"
+    message = "score {0:.3f}, mean QoI {1:.3f} on validation"
 
     @functools.cached_property
     def training(self) -> list[list[Played]]:

@@ -35,7 +35,7 @@ class Objective(ABC):
     best: Callable[..., Any]
     """``min`` or ``max``, the better direction of that last measure."""
     message: str
-    """Format of that measure in words."""
+    """Format of the measures in words."""
     sigma = 0.02
     """First step size; 0.1 diverges."""
     training: Any

@@ -23,7 +23,7 @@ class SuitesObjective(Objective):
     name = "guided"
     columns = Verdict._fields
     best = min
-    message = "{:.3f} of AFR's regret on validation"
+    message = "{2:.3f} of AFR's regret on validation"
 
     @functools.cached_property
     def training(self) -> list[list[Family]]:
