@@ -133,6 +133,7 @@ class Connection:
         name = said.get("policy", config.policies[0])
         try:
             self._quota.message(0, self._hub.clock())
+            self.permissions.check_subscription(said["topic"])
             # A policy that nobody has asked for yet is compiled, while others are served.
             policy = await asyncio.to_thread(policies.warm, name) if name in config.policies else None
             self._quota.subscribe(said["id"], self.subscriptions)

@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 
 from bufgym.relay.config import Rule
 from bufgym.relay.patterns import pattern
+from bufgym.relay.wire import RefusedError
 
 Verb = Literal["send", "receive"]
 _REMEMBERED: Final = 4_096  # answers cached for one identity
@@ -74,3 +75,17 @@ class Permissions:
                 self._answers.clear()
             self._answers[verb, topic] = answer
         return answer
+
+    def check_subscription(self, text: str) -> None:
+        """Ask the rules before a subscription (Algorithm 3, line 9); each message is asked for again.
+
+        A pattern of one whole topic, ``^/a/b$``, needs a rule for it. Others need a rule that lets receive anything.
+
+        Raises RefusedError: there is none.
+        """
+        topic = text[1:-1]
+        if text == f"^{topic}$" and not set(topic) & set(r".^$*+?{}[]\|()"):
+            if not self.allow("receive", topic):
+                raise RefusedError("unauthorized", f"topic {topic}: no rule allows to receive it")
+        elif not any(rule.receive for rule in self.rules):
+            raise RefusedError("unauthorized", "no rule allows to receive anything")

@@ -3,6 +3,7 @@
 A hundred configurations in a commit; ten thousand in the night.
 """
 
+import contextlib
 import ipaddress
 import itertools
 import random
@@ -19,7 +20,7 @@ from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
 from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription
-from bufgym.relay.wire import Message
+from bufgym.relay.wire import Message, RefusedError
 
 VERBS = ("send", "receive")
 
@@ -44,6 +45,19 @@ def test_each_kind_of_rule(known: dict[str, object], who: Identity, other: Ident
         assert Permissions(rules, who).allow(verb, topic) == (verb == allowed and topic == "/a/b")  # type: ignore[arg-type]
         assert not Permissions(rules, other).allow(verb, topic)  # type: ignore[arg-type]
         assert not Permissions([], who).allow(verb, topic)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("text", "allowed"),
+    [("^/a/b$", True), ("^/a/c$", False), ("^/a/.$", True), ("/a/c", True), ("^/a/c", True), ("^", True), ("", True)],
+)
+def test_rules_are_asked_before_a_subscription(text: str, allowed: bool) -> None:
+    """Patterns of one whole topic like a message on it; others pass where anything at all may be received."""
+    mine, sender = Rule(address="10.0.0.7", receive=True, topic="/a/b"), Rule(address="10.0.0.7", send=True)
+    with contextlib.nullcontext() if allowed else pytest.raises(RefusedError, match="topic /a/c: no rule allows"):
+        Permissions([mine], Identity("10.0.0.7")).check_subscription(text)
+    with pytest.raises(RefusedError, match="no rule allows to receive"):
+        Permissions([sender], Identity("10.0.0.7")).check_subscription(text)
 
 
 def test_addresses_are_taken_as_they_are_meant() -> None:
