@@ -190,7 +190,7 @@ def report_environment(trained: Trained) -> Report:
 
 
 def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float) -> str:
-    """One sentence: how far the agent's score lies above those of AFR, the best rules and other agents, or below.
+    """One sentence: the distance of the agent's score from AFR, the best rules and other agents.
 
     It is level with a policy where the 95 % interval of the difference in QoI has 0 in it.
     """
@@ -230,7 +230,7 @@ def table(
 ) -> str:
     """A table, best first, with the difference to the agent and its 95 % interval; ``alike`` policies share a line.
 
-    The agent is marked, and those that do not compete stand below a rule.
+    The agent is marked. Policies that do not compete stand below a rule.
     """
     head = ["policy", "score [95 %]", *(heading for heading, *_ in COLUMNS), "QoI - agent's [95 %]"]
     others = {name for names in alike.values() for name in names}

@@ -49,7 +49,7 @@ class CameraMotion:
 
 
 def _passing(width: float, step: float) -> tuple[Callable[[float], tuple[float, float]], int, Value]:
-    """View, dimensions and V of a motion by ``step`` a message past what is seen ``width`` wide."""
+    """View, dimensions and V of a motion past a wall: ``step`` a message, a view ``width`` wide."""
     return lambda k: (k * step - width / 2, k * step + width / 2), 1, qoi.saturating(width / step)
 
 

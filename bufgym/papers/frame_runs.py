@@ -104,7 +104,7 @@ class FrameFigure(Figure):
         return whole.motion().at(whole.time_us)
 
     def of_each(self, told: Iterable[str]) -> str:
-        """Join what is told of each recording, in order."""
+        """Join the sentences about each recording, in order."""
         return "; ".join(map(" ".join, zip(self.recordings, told, strict=True)))
 
     def settings(self) -> list[FrameRun]:

@@ -66,7 +66,7 @@ class Reproduction(Figure):
         return rows
 
     async def _run(self, program: str, port: int, cloud: bytes) -> dict[str, float]:
-        """Play the clouds to a program; return what it says of its costs."""
+        """Play the clouds to a program; return its costs."""
         words = [sys.executable, table2_programs.__file__, program, str(port)]
         here = {**os.environ, "PYTHONPATH": str(Path(bufgym.__file__).parent.parent)}
         pipe = asyncio.subprocess.PIPE
@@ -131,7 +131,7 @@ class Reproduction(Figure):
 
 @contextlib.asynccontextmanager
 async def _receiver() -> AsyncIterator[tuple[int, list[Any]]]:
-    """The other end of our sender; gives its port and a list of what it has received."""
+    """The other end of our sender; gives its port and the list of received messages."""
     from bufgym.robot.receiver import Receiver
 
     came: list[Any] = []

@@ -1,8 +1,8 @@
-"""The two programs of Robofleet's Table II; each sends to a server what it reads, and says what that cost.
+"""The two programs of Robofleet's Table II. Each sends the messages that it reads to a server, and says its costs.
 
 ``python table2_programs.py PROGRAM PORT`` says "ready", then reads messages from its standard input, ROS binary behind
 its length as ROS's own sockets have it, until there are no more. Then it writes its share of a core and its virtual
-memory, as JSON. It is run as a file, so that each program has loaded what it needs itself, and no more.
+memory, as JSON. It is run as a file, so that each program loads its own libraries and no more.
 """
 
 import asyncio

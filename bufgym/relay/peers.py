@@ -36,7 +36,7 @@ _MAX_FRAME_BYTES: Final = 2**26
 
 
 class Delays:
-    """Delays of another relay's messages beyond the least of the last minutes, as no clock is that of another."""
+    """Delays of another relay's messages beyond the least of the last minutes. Two clocks never agree."""
 
     def __init__(self) -> None:
         self._since_s, self._before_s, self._least_s = -math.inf, math.inf, math.inf

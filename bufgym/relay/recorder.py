@@ -78,7 +78,7 @@ class Recorder:
         return McapFile(self.folder / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now_s))}-{now_ns:09}.mcap", "xb")
 
     def flush(self) -> None:
-        """Hand what was written to the system."""
+        """Flush the file."""
         try:
             if self._file is not None:
                 self._file.flush()
@@ -86,7 +86,7 @@ class Recorder:
             self._failed(error)
 
     def _failed(self, error: OSError) -> None:
-        """Give the file up, with what it holds, and pause."""
+        """Give the file up with its messages, and pause."""
         if not self._again_s:
             self._audit("recording_failed", why=error.strerror or str(error), pause_s=PAUSE_S)
         self._again_s = time.monotonic() + PAUSE_S

@@ -63,7 +63,7 @@ class McapFile:
         return True
 
     def flush(self) -> None:
-        """Hand what was written to the system."""
+        """Flush the file."""
         self.file.flush()
         self._flushed_s = time.monotonic()
 
