@@ -86,15 +86,15 @@ class Ros2(_RosSource):
 
                 return publish
 
-            def subscribe(topic: Published) -> None:
+            def subscribe(topic: Published) -> list[Any]:
                 def take(payload: bytes) -> None:
                     self._take(robot, topic.name, payload, "cdr", topic.type)
 
-                here.create_subscription(topic.message_class, topic.name, take, topic.qos, raw=True)
+                return [here.create_subscription(topic.message_class, topic.name, take, topic.qos, raw=True)]
 
             self._listen(robot, advertise)
             async with spinning(here):
-                await look(here, self._wanted, subscribe, NODE)
+                await look(here, self._wanted, subscribe, NODE, robot.client.note)
 
 
 class Ros1(_RosSource):

@@ -1,10 +1,14 @@
 """ROS 2: the relay and the publisher. Nodes run where rclpy is; what the relay says of a topic everywhere."""
 
+import asyncio
 import importlib.util
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from cli_cases import fails
@@ -18,6 +22,7 @@ from bufgym.ground.kernel import JIT
 from bufgym.robot import replay
 from bufgym.robot.frames import FrameError
 from bufgym.robot.log import of, read_log
+from bufgym.robot.ros2 import relay
 from bufgym.robot.ros2.names import Published, parse
 from bufgym.robot.ros2.relay import RosSender
 from bufgym.scenario import read_client
@@ -87,6 +92,42 @@ def test_topics_that_cannot_be_relayed() -> None:
         _ = Published("/a", "no_such_msgs/msg/B").message_class
     with pytest.raises(BufgymError, match=r"topic 'pointcloud': moves, which needs a topic with odometry"):
         RosSender(read_client(REPO / "examples" / "client.toml"), "127.0.0.1", 1)
+
+
+async def test_a_topic_is_subscribed_again_when_its_publisher_comes_back_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A camera goes, comes back best effort, and stays; a topic of a type that is not here stops no other."""
+    camera, odd = Published("/camera", "a/msg/B"), Published("/odd", "no_such_msgs/msg/B")
+    seen = iter([None, camera, None, replace(camera, reliable=False), replace(camera, reliable=False)])
+    made: list[Published] = []
+    gone: list[Published] = []
+    told: list[str] = []
+    ended = asyncio.Event()
+
+    def published(node: Any, name: str, but_not: str) -> Published | None:
+        if name == "/odd":
+            return odd
+        try:
+            return next(seen)
+        except StopIteration:
+            ended.set()
+            return None
+
+    def found(topic: Published) -> list[Published]:
+        if topic is odd:
+            _ = topic.message_class
+        made.append(topic)
+        return [topic]
+
+    monkeypatch.setattr(relay, "published", published)
+    monkeypatch.setattr(relay, "LOOK_S", 0.0)
+    node = SimpleNamespace(destroy_subscription=gone.append)
+    looking = asyncio.create_task(relay.look(node, ["/odd", "/camera"], found, "me", told.append))
+    await asyncio.wait_for(ended.wait(), 10)
+    looking.cancel()
+    assert [topic.reliable for topic in made] == [True, False] and gone == [camera]
+    assert told == ["/odd: left out: topic /odd: messages of no_such_msgs/msg/B, which is not installed here"]
 
 
 def test_the_command_names_what_is_wrong(

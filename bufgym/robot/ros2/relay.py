@@ -8,7 +8,7 @@ way through a second pair with ``no_drop`` topics.
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import partial
 from typing import Any, Final
@@ -71,17 +71,29 @@ async def spinning(node: Any) -> AsyncIterator[None]:
         await asyncio.gather(thread, return_exceptions=True)
 
 
-async def look(node: Any, names: Iterable[str], found: Callable[[Published], None], but_not: str) -> None:
-    """Call ``found`` once for each of these topics that has a publisher not named ``but_not``; never return."""
-    wanted = set(names)
-    while wanted:
-        for name in list(wanted):
+async def look(
+    node: Any, names: Sequence[str], found: Callable[[Published], list[Any]], but_not: str, say: Callable[[str], None]
+) -> None:
+    """Call ``found`` for each of these topics that has a publisher not named ``but_not``; never return.
+
+    ``found`` returns its subscriptions. Where publishers come back with another type or quality of service, these are
+    destroyed and it is called again. A topic whose messages are not installed here is left out, and told once.
+    """
+    known: dict[str, Published] = {}
+    made: dict[str, list[Any]] = {}
+    while True:
+        for name in names:
             topic = published(node, name, but_not)
-            if topic is not None:
-                wanted.discard(name)
-                found(topic)
+            if topic is None or topic == known.get(name):
+                continue
+            known[name] = topic
+            for subscription in made.pop(name, []):
+                node.destroy_subscription(subscription)
+            try:
+                made[name] = found(topic)
+            except BufgymError as error:
+                say(f"{name}: left out: {error}")
         await asyncio.sleep(LOOK_S)
-    await asyncio.Event().wait()
 
 
 class RosSender:
@@ -128,9 +140,11 @@ class RosSender:
             names = [*self._numbers, *([] if self._odometry_topic is None else [self._odometry_topic])]
             async with spinning(node):
                 found = partial(self._subscribe, node)
-                await until_one_ends(self.sender.run(), look(node, names, found, RECEIVER))
+                await until_one_ends(self.sender.run(), look(node, names, found, RECEIVER, self._say))
 
-    def _subscribe(self, node: Any, topic: Published) -> None:
+    def _subscribe(self, node: Any, topic: Published) -> list[Any]:
+        subscribe = partial(node.create_subscription, topic.message_class, topic.name)
+        made = []
         self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
         number = self._numbers.get(topic.name)
         if number is not None:
@@ -140,9 +154,10 @@ class RosSender:
                 x = self._odometry.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
                 self.queue.put(head + message, len(head) + len(message), x, number)
 
-            node.create_subscription(topic.message_class, topic.name, put, topic.qos, raw=True)
+            made.append(subscribe(put, topic.qos, raw=True))
         if topic.name == self._odometry_topic:
-            node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos)
+            made.append(subscribe(self._odometry.take, topic.qos))
+        return made
 
 
 async def receive(
