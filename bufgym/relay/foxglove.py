@@ -70,10 +70,8 @@ class Screen:
             from foxglove.channels import CompressedImageChannel
 
             return CompressedImageChannel(message.topic, context=self._context)
-        definition = b""
-        if message.encoding == "cdr":
-            definition = (ros_messages.definition(message.type) or "").encode()
-        elif message.encoding == "json":
+        definition = ros_messages.definition(message.type, message.encoding)
+        if message.encoding == "json":
             definition = b'{"type": "object"}'
         schema = self._foxglove.Schema(
             name=message.type or "object", encoding=SCHEMAS.get(message.encoding, ""), data=definition

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.relay import wire
+from bufgym.relay import ros_messages, wire
 from bufgym.relay.audit import Audit
 from bufgym.relay.config import Config, Rotation
 from bufgym.relay.rules import RECORDER, Permissions
@@ -64,6 +64,7 @@ class Recorder:
         times_ns, encoding = (time.time_ns(), max(0, message.stamp_us) * 1000), message.encoding
         schema = message.type or ("object" if encoding == "json" else "")
         form: dict[str, Any] = {"encoding": encoding, "schema": schema, "schema_encoding": SCHEMAS.get(encoding, "")}
+        form["definition"] = ros_messages.definition(schema, encoding)
         written = self._file.write(message.topic, bytes(message.payload), *times_ns, seq=message.seq, **form)
         if not (written or self._full):
             self._full = True

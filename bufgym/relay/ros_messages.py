@@ -81,8 +81,10 @@ def as_ros1(payload: bytes, type: str) -> bytes:
         raise BufgymError(f"message of {len(payload)} bytes: no {type}: {error}") from None
 
 
-def definition(type: str) -> str | None:
-    """Write the type's definition with all types that it uses, as in recordings; None for an unknown type."""
-    if type not in store().types:
-        return None
-    return str(store().generate_msgdef(type, ros_version=2)[0])
+@functools.lru_cache(1_000)
+def definition(type: str, encoding: str = "cdr") -> bytes:
+    """Write the type's definition with all types that it uses, as in recordings; empty for an unknown type."""
+    version, known = (1, _store_1()) if encoding == "ros1" else (2, store())
+    if encoding not in ("cdr", "ros1") or type not in known.types:
+        return b""
+    return str(known.generate_msgdef(type, ros_version=version)[0]).encode()

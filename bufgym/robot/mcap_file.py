@@ -40,9 +40,10 @@ class McapFile:
         encoding: str = "json",
         schema: str = "",
         schema_encoding: str = "jsonschema",
+        definition: bytes = b"",
         seq: int = 0,
     ) -> bool:
-        """Add a message; ``schema`` is the name of its type, empty for none.
+        """Add a message; ``schema`` is the name of its type, empty for none, ``definition`` its text.
 
         Return False and add nothing if it needs one channel more than ``MAX_CHANNELS`` or ``MAX_FORMS``.
         """
@@ -52,7 +53,7 @@ class McapFile:
                 return False
             self._forms[topic] += 1
             if schema and kind not in self._schemas:
-                text = b'{"type": "object"}' if schema_encoding == "jsonschema" else b""
+                text = b'{"type": "object"}' if schema_encoding == "jsonschema" else definition
                 self._schemas[kind] = self._writer.register_schema(schema, schema_encoding, text)
             self._channels[key] = self._writer.register_channel(topic, encoding, self._schemas.get(kind, 0))
         times = {"log_time": min(log_ns, _MOST_NS), "publish_time": min(publish_ns, _MOST_NS)}

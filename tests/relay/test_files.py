@@ -35,6 +35,23 @@ async def test_what_a_rule_allows_is_recorded(tmp_path: Path) -> None:
     assert bag.size_bytes.tolist() == [*range(1_000, 1_040), 2]
 
 
+def test_types_of_ros_are_recorded_with_all_that_they_depend_on(tmp_path: Path) -> None:
+    """As ``rosbags`` and Foxglove want them; a type that nobody knows has a name alone."""
+    from mcap.reader import make_reader
+
+    one, pose = recorder(tmp_path, []), "geometry_msgs/msg/PoseStamped"
+    for k, (encoding, type) in enumerate([("cdr", pose), ("ros1", pose), ("cdr", "my_msgs/msg/Own"), ("cdr", "Odd")]):
+        one(Message(f"/robots/a/{k}", b"12", encoding, type))
+    one.close()
+    (path,) = (tmp_path / FOLDER).glob("*.mcap")
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    cdr, ros1, own, odd = (summary.schemas[channel.schema_id] for _, channel in sorted(summary.channels.items()))
+    assert [each.encoding for each in (cdr, ros1)] == ["ros2msg", "ros1msg"] and not own.data and not odd.data
+    assert b"MSG: geometry_msgs/Quaternion\nfloat64 x" in cdr.data and b"uint32 seq" in ros1.data
+
+
 def recorder(folder: Path, payloads: list[bytes], file_bytes: int = 10**6) -> Recorder:
     """One that has written these, of encoding json and jpeg in turn, and has not been closed."""
     config = settings(folder=folder, rules=(RECORD,), recording=Rotation(bytes=file_bytes, files=3))

@@ -97,7 +97,7 @@ def test_messages_read_as_they_were_made() -> None:
     old = ros_messages.as_ros1(made, ODOMETRY)
     assert ros_messages.modern(old, ODOMETRY, "ros1") == ("cdr", made)
     assert ros_messages.modern(b"?", "my_msgs/msg/Own", "ros1") == ("ros1", b"?")
-    assert "float32[] ranges" in (ros_messages.definition(SCAN) or "")
+    assert b"float32[] ranges" in ros_messages.definition(SCAN)
 
 
 Came = dict[str, list[wire.Message]]
