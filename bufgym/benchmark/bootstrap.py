@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from bufgym.benchmark.episodes import Episode, Numbers
 from bufgym.benchmark.table import NONE
 
-RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0
-"""Resamples, confidence of the intervals and seed of the draws."""
+RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0  # Resamples, confidence of the intervals and seed of the draws
 
 
 class Interval(NamedTuple):

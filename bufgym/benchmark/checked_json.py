@@ -9,8 +9,7 @@ from typing import Any, NoReturn
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8
 
-MAX_JSON_BYTES = 64 * 2**20
-"""Size limit; a timeline of 100,000 messages has some 20 MB."""
+MAX_JSON_BYTES = 64 * 2**20  # Size limit; a timeline of 100,000 messages has some 20 MB
 
 
 def read_object(path: Path) -> dict[str, Any]:

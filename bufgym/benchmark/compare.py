@@ -26,8 +26,7 @@ from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
 
 KEYWORDS = ("capacity", "seeds", "progress", "about", "against")
-QUEUE = ("max_bytes", "decide_at")
-"""Settings of a queue."""
+QUEUE = ("max_bytes", "decide_at")  # Settings of a queue
 PolicyLike = Policy | str | Path | OnArrival
 
 

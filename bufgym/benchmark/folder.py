@@ -17,8 +17,7 @@ from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import replaced
 
-FORMAT = 2
-"""Version of the folder's layout, raised when manifest, rows or timeline change their meaning."""
+FORMAT = 2  # Version of the folder's layout, raised when manifest, rows or timeline change their meaning
 
 _MANIFEST = {
     **dict.fromkeys(("task", "suite", "split", "about", "episodes", "bufgym", "command"), str),

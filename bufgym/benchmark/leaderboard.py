@@ -28,8 +28,7 @@ COLUMNS: Layout = {
 }
 """Columns of the file, which has one line for each quantity of an entry."""
 
-MAX_BYTES = 16 * 2**20
-"""Size limit of the file; each line has some 200 bytes."""
+MAX_BYTES = 16 * 2**20  # Size limit of the file; each line has some 200 bytes
 
 _ROUNDING = 1e-9
 

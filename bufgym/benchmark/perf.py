@@ -39,8 +39,7 @@ TOPICS = "bufgym/Topics-v0"
 POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")
 NATIVE = "vector_entry_point"
 SEED = 1
-FELL, BEFORE = 0.15, 5
-"""A ratio fell if it is lower by more than this share than the median of so many runs before."""
+FELL, BEFORE = 0.15, 5  # A ratio fell if it is lower by more than this share than the median of so many runs before
 
 
 class Measurement(NamedTuple):

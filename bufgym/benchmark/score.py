@@ -44,14 +44,11 @@ from bufgym.benchmark.episodes import Arrays, Cell, Numbers
 from bufgym.benchmark.table import NOBODY, RunRows, Unranked
 from bufgym.oracle.measure import BASELINE, TIE, normalised_score
 
-REFERENCE = "afr"
-"""Policy that improvements and differences compare with; without its rows they are NaN."""
+REFERENCE = "afr"  # Policy that improvements and differences compare with; without its rows they are NaN
 
-DISCRIMINATIVE = 0.01
-"""A cell is discriminative, and counts, where the baseline's regret is at least this."""
+DISCRIMINATIVE = 0.01  # A cell is discriminative, and counts, where the baseline's regret is at least this
 
-NEGLIGIBLE = 1e-9
-"""Mean regret up to which a ratio to it says nothing."""
+NEGLIGIBLE = 1e-9  # Mean regret up to which a ratio to it says nothing
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ RunRows = Sequence[Mapping[str, Any]]
 Unranked = Mapping[str, str]
 """Policies that do not compete, with the reasons, see ``apart``."""
 NOBODY: Unranked = MappingProxyType({})
-NONE = "–"
-"""No number."""
+NONE = "–"  # No number
 
 
 def decimal(number: float, digits: int, unit: str = "") -> str:
@@ -139,8 +138,7 @@ SCORE = (
     " regret = 1 - QoI / the clairvoyant's"
 )
 """The line below a table with scores."""
-REGRET_AT_MOST = "regret, at most"
-"""Title of regrets if some rest on an uncertified bound."""
+REGRET_AT_MOST = "regret, at most"  # Title of regrets if some rest on an uncertified bound
 UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exact here: it is at most this"
 """The note below them."""
 

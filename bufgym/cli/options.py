@@ -13,8 +13,7 @@ from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, install, printable
 from bufgym.ground.units import bytes_of, rate_or_number
 
-MAX_EPISODES = 100_000
-"""Limit on episodes of each trace; memory holds a row for each, times policies and capacities."""
+MAX_EPISODES = 100_000  # Limit on episodes of each trace; memory holds a row for each, times policies and capacities
 
 OPTIONS = Parameter(
     consume_multiple=(1, None),

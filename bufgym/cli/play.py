@@ -12,8 +12,7 @@ from bufgym.cli.options import Count, Least0, Natural, PolicyFile, one_policy
 from bufgym.ground.errors import BufgymError, install, unknown
 from bufgym.ground.files import replaced
 
-FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}
-"""Suffix of a film -> Pillow's name of the format."""
+FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}  # Suffix of a film -> Pillow's name of the format
 
 
 def play(

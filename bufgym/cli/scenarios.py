@@ -26,8 +26,7 @@ there."""
 _MESSAGES = ("fps", "bytes", "size_cv", "sizes", "seconds", "jitter")
 """Options of a made stream, which a recording has itself."""
 
-_OF_A_CLIENT = ("trace", "motion", "scale")
-"""Options that a client of one's own takes too."""
+_OF_A_CLIENT = ("trace", "motion", "scale")  # Options that a client of one's own takes too
 
 
 @Parameter(name="*")

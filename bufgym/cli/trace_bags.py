@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from bufgym.traces.formats.bags import Bag
     from bufgym.traces.workload import TopicSummary
 
-MOTION = ("fov_deg", "scene_scale_m", "max_gap_s")
-"""Options of ``MotionOptions``."""
+MOTION = ("fov_deg", "scene_scale_m", "max_gap_s")  # Options of ``MotionOptions``
 
 
 @Parameter(name="*")

@@ -20,8 +20,7 @@ from bufgym.sim.state import Batch
 from bufgym.sim.view import arrival_of, view
 
 GUIDED = "guided"
-ACTIONS = ("slots", GUIDED)
-"""What an action is: the slot that goes, or numbers of the rule."""
+ACTIONS = ("slots", GUIDED)  # What an action is: the slot that goes, or numbers of the rule
 INPUT_FIELDS = tuple(
     Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
 )

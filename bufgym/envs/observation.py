@@ -15,8 +15,7 @@ from bufgym.model.observe import OWN_FIELDS, Field, own_field
 Observation = Any
 """A dict of arrays; for "flat", one array."""
 
-FORMS = ("dict", "flat", "slots")
-"""Names of the forms, which ``ObservationForm`` explains."""
+FORMS = ("dict", "flat", "slots")  # Names of the forms, which ``ObservationForm`` explains
 
 
 class Place(NamedTuple):
@@ -150,8 +149,7 @@ class Reused(Generic[Thing]):
         return thing
 
 
-_KEPT = 4
-"""Most things to keep."""
+_KEPT = 4  # Most things to keep
 
 
 class Handed:

@@ -16,10 +16,8 @@ FREELY_UNPACKED_BYTES = 64 * 2**20
 MOST_UNPACKED = 100
 """Largest ratio of unpacked to packed bytes. No recording or text data set packs so well; a bomb packs 1,000:1."""
 
-MAX_TOML_BYTES = 2**18
-"""Limit for a TOML file: a client of a thousand topics needs less."""
-MAX_DOTS = 100
-"""Most dots in one line of a TOML file."""
+MAX_TOML_BYTES = 2**18  # Limit for a TOML file: a client of a thousand topics needs less
+MAX_DOTS = 100  # Most dots in one line of a TOML file
 
 
 def read_whole(path: str | os.PathLike[str], most_bytes: int) -> bytes:

@@ -8,8 +8,7 @@ import threading
 import time
 from typing import Final
 
-PATIENCE_S: Final = 1.0
-"""Time between a worker's checks that its parent process is alive."""
+PATIENCE_S: Final = 1.0  # Time between a worker's checks that its parent process is alive
 COMPILES: Final = "BUFGYM_COMPILES"
 """Environment variable of a process that compiles: it starts no other, whatever program it turns out to be."""
 _CALL = "import sys; sys.path[:] = {path!r}; from {module} import {name}; {name}({arguments})"

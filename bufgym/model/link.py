@@ -19,11 +19,9 @@ from bufgym.ground.kernel import item, kernel
 from bufgym.model.checks import whole
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Trace
 
-FOREVER = 2**62
-"""A time that never comes, us."""
+FOREVER = 2**62  # A time that never comes, us
 
-MAX_TIME_US = MAX_DURATION_S * US_PER_S
-"""The latest arrival of a message, and the longest delay, us."""
+MAX_TIME_US = MAX_DURATION_S * US_PER_S  # The latest arrival of a message, and the longest delay, us
 
 LOOP, HOLD, STOP = 0, 1, 2
 _AFTER = {"loop": LOOP, "hold": HOLD, "stop": STOP}
@@ -95,8 +93,7 @@ class Link:
         return int(carried[-1]) if ends else FOREVER
 
 
-KEPT_KNOTS = 2**20
-"""Knots to store (16 MB) before traces that no sender uses make room for others."""
+KEPT_KNOTS = 2**20  # Knots to store (16 MB) before traces that no sender uses make room for others
 
 
 @dataclass(eq=False)

@@ -175,8 +175,7 @@ def of_function(v: Callable[[float], float], name: str = "") -> Value:
     return _checked(name, [TABULATED, POINTS, *distances, *map(at, distances)], np.append(distances, 2 * until))
 
 
-POINTS = 65
-"""Points of a table made from a function."""
+POINTS = 65  # Points of a table made from a function
 _SMALLEST, _LARGEST, _FLAT = 1e-3, 1e9, 1e-3
 """Where the search for a table's end starts and stops, and the relative growth of V that still counts as flat."""
 

@@ -19,8 +19,7 @@ from bufgym.model.checks import is_number, whole
 from bufgym.model.qoi import Value
 
 MAX_TOPICS = 256
-MAX_NUMBER = 1e12
-"""The largest priority, weight, rate limit (Hz) and deadline (s)."""
+MAX_NUMBER = 1e12  # The largest priority, weight, rate limit (Hz) and deadline (s)
 NO_DEADLINE_US = 2**62
 MAX_ACK_DELAY_US = NO_DEADLINE_US // 2 - 1
 

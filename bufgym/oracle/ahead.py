@@ -15,14 +15,11 @@ from bufgym.ground.kernel import Floats, Ints, at, kernel
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 
-ALWAYS = 2**62
-"""A byte beyond every message's end."""
+ALWAYS = 2**62  # A byte beyond every message's end
 
-NO_ROOM, NO_WORK_SPACE = -1, -2
-"""Results of ``find_steps`` that ran out of room or of work space."""
+NO_ROOM, NO_WORK_SPACE = -1, -2  # Results of ``find_steps`` that ran out of room or of work space
 
-TIE = 1e-12
-"""Least difference by which a gain must be better to replace another."""
+TIE = 1e-12  # Least difference by which a gain must be better to replace another
 
 
 class Ahead(NamedTuple):

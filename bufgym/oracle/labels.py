@@ -27,14 +27,12 @@ from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.programme import Messages, Problem, find_future, new_problem
 
-GRID = 16
-"""Grid steps to a message."""
+GRID = 16  # Grid steps to a message
 
 SHARES = (1 / 16, 1 / 4, 1.0)
 """Distances below the upper bound at which to look for the optimum, as shares of the way down to a known plan."""
 
-LABELS = 1 << 14
-"""Initial room for labels; it doubles whenever it runs out."""
+LABELS = 1 << 14  # Initial room for labels; it doubles whenever it runs out
 
 _ROUNDING = 1e-9  # tolerance: the bounds add the same numbers in another order
 

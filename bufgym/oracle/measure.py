@@ -13,11 +13,9 @@ from bufgym.sim.metrics import outcome
 BASELINE = "drop-oldest"
 """The policy of score 0: the drop rule of ROS."""
 
-TIE = 1e-9
-"""Relative difference up to which two H are equal: they sum the same gaps in another order."""
+TIE = 1e-9  # Relative difference up to which two H are equal: they sum the same gaps in another order
 
-MEASURED = ("clairvoyant", "regret", "score")
-"""The entries of ``measured``."""
+MEASURED = ("clairvoyant", "regret", "score")  # The entries of ``measured``
 
 
 def regret(h: float, most: float) -> float:

@@ -13,11 +13,9 @@ from bufgym.model.qoi import value
 NEVER = -1
 """A limit that leaves no room for the message."""
 
-MAX_CELLS = 1 << 23
-"""Most entries of ``future``, 8 bytes each; longer episodes take a coarser grid."""
+MAX_CELLS = 1 << 23  # Most entries of ``future``, 8 bytes each; longer episodes take a coarser grid
 
-BLOCK = 32
-"""Grid positions that share the range of successors to look at."""
+BLOCK = 32  # Grid positions that share the range of successors to look at
 
 
 class Messages(NamedTuple):

@@ -28,16 +28,11 @@ from bufgym.model.qoi import value
 from bufgym.oracle import beam
 from bufgym.oracle.programme import Messages, Problem, Room, find_priced_future, new_problem
 
-ROUNDS = 40
-"""Most price updates."""
-ENOUGH = 1e-4
-"""Gap between bound and plan, as a fraction of the bound, at which updates end."""
-PATIENCE = 3
-"""Rounds without progress after which the step is halved."""
-GRID, FINE_GRID = 12, 96
-"""Grid steps to a mean message: in the search for prices, and for the last bound."""
-WIDTH, LAST_WIDTH = 8, 64
-"""States per message in the beam, likewise."""
+ROUNDS = 40  # Most price updates
+ENOUGH = 1e-4  # Gap between bound and plan, as a fraction of the bound, at which updates end
+PATIENCE = 3  # Rounds without progress after which the step is halved
+GRID, FINE_GRID = 12, 96  # Grid steps to a mean message: in the search for prices, and for the last bound
+WIDTH, LAST_WIDTH = 8, 64  # States per message in the beam, likewise
 
 
 def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tuple[Ints, float]:

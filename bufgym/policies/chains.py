@@ -19,8 +19,7 @@ from bufgym.ground.kernel import item, kernel
 from bufgym.model.buffer import Buffer
 from bufgym.model.qoi import value
 
-SPAN = 24
-"""Messages that a step leads on, at most."""
+SPAN = 24  # Messages that a step leads on, at most
 COLUMNS = 3 + SPAN
 """Numbers of scratch for each place of a chain: the best chain from it, to it and without it, then its steps."""
 FROM, TO, WITHOUT = range(3)

@@ -19,8 +19,7 @@ from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
 from bufgym.policies.registry import Arrival, Memory, built_in
 
-UNKNOWN = 1e6
-"""Rate of a link that has not been measured, bytes/us: 1 TB/s."""
+UNKNOWN = 1e6  # Rate of a link that has not been measured, bytes/us: 1 TB/s
 AHEAD, SINCE, OWN, RATE, SEEN = range(5)  # indices of a pipe's account in the memory
 PIPE = {"ahead_bytes": 0.0, "since_us": 0.0, "own_bytes": 0.0, "bytes_per_us": UNKNOWN, "seen_us": 0.0}
 """Account of a pipe: bytes not yet transmitted, with lost fragments, and the time of that count; those of whole

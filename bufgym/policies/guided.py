@@ -82,23 +82,19 @@ INPUTS = {
     "plain": "1 on a measured steady link, and until the link has carried anything; otherwise 0",
 }
 """Names and meanings of the inputs, in their order."""
-MOST = 3.0
-"""Largest input and output, either way."""
-SPREAD_US = 10e6
-"""Time over which the spread of the link's rate is measured, us."""
+MOST = 3.0  # Largest input and output, either way
+SPREAD_US = 10e6  # Time over which the spread of the link's rate is measured, us
 SLOW_US = 20e6
 """Time over which the mean rate says how heavy the load is, us. A shorter one opens the gate in every outage."""
 HEAVY, HEAVIER = 0.7, 1.5
 """Logarithm of messages that come for one that the link carries: where h begins to rise, and how much more makes it
 1."""
 
-LOG_RATE, LOG_RATE_VARIANCE, SLOW_RATE, RULE = range(4)
-"""Own entries of the memory, before those of the rule."""
+LOG_RATE, LOG_RATE_VARIANCE, SLOW_RATE, RULE = range(4)  # Own entries of the memory, before those of the rule
 REMEMBERED = {"log_rate": 0.0, "log_rate_variance": 0.0, "slow_rate": 0.0, **price_dp.REMEMBERED}
 """Memory: mean and variance of the logarithm of the link's rate, bytes/s; its mean over ``SLOW_US``; and what the rule
 remembers."""
-BASE = np.array(list(price_dp.PARAMETERS.values()))
-"""The rule's numbers as they stand."""
+BASE = np.array(list(price_dp.PARAMETERS.values()))  # The rule's numbers as they stand
 NUMBERS, N_INPUTS, N_OUTPUTS = len(BASE), len(INPUTS), len(OUTPUTS)
 WORK = (chains.SCRATCH[0] + N_INPUTS + N_OUTPUTS + NUMBERS, chains.SCRATCH[1])
 """``Policy.work``: the rule's own, then inputs, outputs and numbers, at the memory's end."""

@@ -25,8 +25,7 @@ HEADER = 5
 """Numbers before the fields: fields read, the context's share of them, widths of both layers, size of one network."""
 DROP, KEEP = range(2)
 """Networks of a scorer, in the order of its parameters: they score dropping and accepting a candidate."""
-OF_INPUTS = {"skip", "0.weight"}
-"""Tensors of a network whose first axis is the inputs."""
+OF_INPUTS = {"skip", "0.weight"}  # Tensors of a network whose first axis is the inputs
 
 
 class Scorer(NamedTuple):

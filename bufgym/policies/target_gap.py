@@ -79,16 +79,13 @@ LEAST = 4
 SHORT_QUEUE, SHORT_RUN_US = 5, 10e6
 """Largest L with a last chance for its head, and how long a stream must have run for it to follow the target, us.
 Structural: the last chance was found on the laws of ``switching-v1``, which has L up to 5 and streams of 10 s."""
-TOLD = 4.0
-"""How many times sooner a stream follows the target if the robot knows when it ends."""
-SLOWEST = 16.0
-"""Most arrivals in S and M. Structural: a link that stands still would make both infinite."""
+TOLD = 4.0  # How many times sooner a stream follows the target if the robot knows when it ends
+SLOWEST = 16.0  # Most arrivals in S and M. Structural: a link that stands still would make both infinite.
 BURSTY, LATE = 1.5, 1 / 32
 """Arrivals are bursty if the mean square of the time between them exceeds ``BURSTY`` times the square of its mean. The
 ratio is 2 for a Poisson process and 10 for bursts of ten. The newest time has weight ``LATE`` in both means, so that
 a whole burst does not look like an even stream. Structural: a camera's jitter keeps the ratio near 1."""
-WITHIN = 1.001
-"""Factor by which a gap may exceed g through rounding. Structural."""
+WITHIN = 1.001  # Factor by which a gap may exceed g through rounding. Structural.
 
 Numbers = NDArray[Any]
 """float64[parameters]: ``PARAMETERS``, and perhaps more behind them."""

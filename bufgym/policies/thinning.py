@@ -21,8 +21,7 @@ WAITING = 3
 SOON_US = 4e6
 """Longest time in which all L messages would be sent, us, for a queue to be thinned. A slower queue would give up too
 many messages that are sent after the stream's end. Structural: a queue of some seconds at most."""
-HORIZON_US = 60e6
-"""40 and 80 s were best of 20, 40, 80 s and no end at all, on the train links of ``sustained-v1``."""
+HORIZON_US = 60e6  # 40 and 80 s were best of 20, 40, 80 s and no end at all, on the train links of ``sustained-v1``
 STEADY = 0.01
 """Tolerance of a steady link: its rate over 0.5 s differs from its rate over 2 s by at most this fraction, its rate
 over 0.1 s by at most twice as much. Structural: above rounding, below what a radio link ever holds."""

@@ -15,20 +15,15 @@ from bufgym.policies.classic import keep_first
 from bufgym.policies.fragments import PIPE, RATE, UNKNOWN, account, ahead_of_newcomer
 from bufgym.policies.registry import Arrival, Memory, built_in
 
-BUCKET_S = 0.5
-"""Size of the bucket, s of the target rate: above it frames are dropped."""
-MOST_S = 3.0
-"""Most seconds of the target rate in the bucket."""
-MOST_DROPS_S = 4.0
-"""Longest run of dropped frames, s."""
-LARGE = 3.0
-"""A frame larger than the average by this factor is large."""
+BUCKET_S = 0.5  # Size of the bucket, s of the target rate: above it frames are dropped
+MOST_S = 3.0  # Most seconds of the target rate in the bucket
+MOST_DROPS_S = 4.0  # Longest run of dropped frames, s
+LARGE = 3.0  # A frame larger than the average by this factor is large
 SIZE_ALPHA, RATIO_ALPHA, FAST_RATIO_ALPHA = 0.9, 0.9, 0.8
 """Shares of the old value that the filters keep: of frame size, of drop ratio, and of drop ratio while the bucket runs
 far over."""
 MOST_RATIO = 0.96
-FORGETS_S = 1e6
-"""Time for which an old target holds until a message has shown another."""
+FORGETS_S = 1e6  # Time for which an old target holds until a message has shown another
 
 STATE = ("level_bytes", "target", "average_bytes", "ratio", "count", "large_left", "large_part", "above")
 LEVEL, TARGET, AVERAGE, RATIO, COUNT, LARGE_LEFT, LARGE_PART, ABOVE = range(len(PIPE), len(PIPE) + len(STATE))

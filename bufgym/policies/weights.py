@@ -46,14 +46,10 @@ AnyWeights = Weights | GuidedWeights
 Kind = type[Weights] | type[GuidedWeights]
 
 FORMAT = 1
-MAX_BYTES = 1 << 20
-"""Largest file accepted, bytes: a slot scorer has a few kilobytes."""
-MAX_WIDTH = 256
-"""Most units of a hidden layer."""
-KEY = "bufgym"
-"""The entry of the header's metadata that holds the JSON text."""
-WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")
-"""Metadata that ``save`` itself writes."""
+MAX_BYTES = 1 << 20  # Largest file accepted, bytes: a slot scorer has a few kilobytes
+MAX_WIDTH = 256  # Most units of a hidden layer
+KEY = "bufgym"  # The entry of the header's metadata that holds the JSON text
+WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")  # Metadata that ``save`` itself writes
 
 
 def observation_hash(names: Sequence[str] = ()) -> str:

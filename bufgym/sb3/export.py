@@ -19,8 +19,7 @@ from bufgym.policies.weights import StrPath
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 from bufgym.scenario import suites
 
-CHECKED = (4, 8, 16, 32)
-"""Values of L for the regrets noted in the file."""
+CHECKED = (4, 8, 16, 32)  # Values of L for the regrets noted in the file
 
 
 def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:

@@ -22,8 +22,7 @@ from torch import Tensor, nn
 
 from bufgym.ground.errors import BufgymError
 
-ACCEPT_BIAS = 2.0
-"""Initial logit of accepting: exploration that drops messages where there is room learns little."""
+ACCEPT_BIAS = 2.0  # Initial logit of accepting: exploration that drops messages where there is room learns little
 
 
 def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:

@@ -15,8 +15,7 @@ from bufgym.traces import Trace, read_trace
 RATE_HZ = 30.0
 PAPER_FRAMES = 794
 FRAME_BYTES = 160_000
-LINK = "belgium_4g/csv/report_car_0002.csv"
-"""The log, in a folder of recordings."""
+LINK = "belgium_4g/csv/report_car_0002.csv"  # The log, in a folder of recordings
 FOLDER = "BUFGYM_DATA"
 """Environment variable that names the folder for the scenario ``afr-evaluation``."""
 

@@ -17,8 +17,7 @@ from bufgym.traces.generate.sizes import EQUAL, parsed
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
-MAX_RATE_HZ = 100_000
-"""Highest arrival rate: times are whole microseconds, at least ten to a period."""
+MAX_RATE_HZ = 100_000  # Highest arrival rate: times are whole microseconds, at least ten to a period
 
 
 def rate(rate_hz: Any) -> None:
@@ -92,8 +91,7 @@ def as_tuple(
     object.__setattr__(scenario, name, tuple(items))
 
 
-GENERATED = 8
-"""Links that a generator makes without given seeds."""
+GENERATED = 8  # Links that a generator makes without given seeds
 _GENERATOR = re.compile(r"([A-Za-z_][\w.]*:[A-Za-z_]\w*)(?::(\d+)-(\d+))?")
 
 

@@ -31,8 +31,7 @@ from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
-ENCODINGS = ("ros", "json")
-"""Encodings of rivals, in place of Robofleet's flatbuffers (``Policy.client.encoding``)."""
+ENCODINGS = ("ros", "json")  # Encodings of rivals, in place of Robofleet's flatbuffers (``Policy.client.encoding``)
 
 
 @dataclass(frozen=True)

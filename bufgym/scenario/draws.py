@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from bufgym import traces
 from bufgym.traces import Motion, Trace
 
-SIZES = 1
-"""Number of the generator ``beside`` a stream that draws sizes; of robot or stream r: r more."""
+SIZES = 1  # Number of the generator ``beside`` a stream that draws sizes; of robot or stream r: r more
 
 
 def beside(rng: np.random.Generator, number: int) -> np.random.Generator:

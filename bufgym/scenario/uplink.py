@@ -28,8 +28,7 @@ from bufgym.traces.workload import Workload
 _JITTER_HZ = 30.0
 """Reference rate. At any rate an episode leaves its stream where the jitter of so many messages a second does. So
 motion and all later draws are the same for every ``rate_hz``, ``jitter``, ``sizes`` and ``size_cv``."""
-_TIMES = 0
-"""Number of the generator ``beside`` the stream that draws the jitter of other rates."""
+_TIMES = 0  # Number of the generator ``beside`` the stream that draws the jitter of other rates
 
 
 @dataclass(frozen=True)

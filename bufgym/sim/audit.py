@@ -22,8 +22,7 @@ QOI = "H is not that of the messages that were received"
 
 _FAULTS = ("", ARRIVAL, QUEUED, BYTES, LOG, TOPIC, QOI)
 _ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC, _QOI = range(1, len(_FAULTS))
-_ROUNDING = 1e-9
-"""Tolerance: H is added up in another order here."""
+_ROUNDING = 1e-9  # Tolerance: H is added up in another order here
 
 
 def touched(batch: Batch, i: int, episode: Episode, topic_table: NDArray[Any]) -> str:

@@ -24,8 +24,7 @@ from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, N
 from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
 
-_SHORT = 200_000
-"""Arrivals times numbers read at each, for a rollout that takes at most some milliseconds."""
+_SHORT = 200_000  # Arrivals times numbers read at each, for a rollout that takes at most some milliseconds
 
 
 def rollout(

@@ -15,8 +15,7 @@ from bufgym.model.qoi import exponential
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
 """Events of a sender (see the package's text)."""
-NOTHING = -1
-"""No event: time moves on without a question or a departure."""
+NOTHING = -1  # No event: time moves on without a question or a departure
 
 NOTHING_WAITS, ARRIVAL_WAITS, SOCKET_WAITS = range(3)
 """What a sender may be ``waiting`` for: nothing, a decision on its arrival, or the choice of a message to send."""
@@ -130,8 +129,7 @@ LOG_ENTRY = np.dtype(
 NEVER = -1
 """A time in LOG_ENTRY for an event that has not happened."""
 
-NOT_YET = FOREVER - 1
-"""Arrival time of a message that a live row still waits for: the row stops there."""
+NOT_YET = FOREVER - 1  # Arrival time of a message that a live row still waits for: the row stops there
 
 
 @documented

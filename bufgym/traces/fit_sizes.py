@@ -22,10 +22,8 @@ from bufgym.traces.motion import Motion
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 LAGS: Final = 30
-LEAST: Final = 100
-"""Fewer messages say too little."""
-MOST_EVERY: Final = 300
-"""Longest group of pictures that is looked for."""
+LEAST: Final = 100  # Fewer messages say too little
+MOST_EVERY: Final = 300  # Longest group of pictures that is looked for
 _RHOS: Final = np.round(np.arange(0, 1, 0.005), 3)
 _SHARE: Final = 0.95  # part of the groups, or of the pairs, that must be alike to be taken as such
 

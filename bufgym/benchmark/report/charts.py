@@ -29,8 +29,7 @@ so that a chart is light or dark with the page."""
 FIXED = {"afr": "blue", "drop-oldest": "vermillion", "clairvoyant": "ink"}
 """Policies that look the same in every report."""
 
-SPARE = ("green", "orange", "purple", "sky")
-"""Colours of the best other policies, in order."""
+SPARE = ("green", "orange", "purple", "sky")  # Colours of the best other policies, in order
 
 STYLE: dict[Any, Any] = {
     **{"svg.fonttype": "none", "svg.hashsalt": "bufgym", "text.parse_math": False, "font.size": 9},
@@ -259,8 +258,7 @@ def _log_axis(axes: Any, side: str, low: float, high: float, title: str, write: 
     axes.tick_params(axis=side, which="minor", length=0, labelbottom=False, labelleft=False)
 
 
-LONG = 8.0
-"""Ratio of largest to smallest value from which an axis is logarithmic."""
+LONG = 8.0  # Ratio of largest to smallest value from which an axis is logarithmic
 
 
 def delays(context: Context) -> Chart | None:

@@ -26,8 +26,7 @@ from bufgym.sim import NEVER, Senders, run
 from bufgym.sim.metrics import outcome
 from bufgym.sim.senders import padded
 
-SHARE = f"regret / {REFERENCE}'s"
-"""Title of the share of AFR's regret, see ``score``."""
+SHARE = f"regret / {REFERENCE}'s"  # Title of the share of AFR's regret, see ``score``
 
 
 def best(

@@ -18,8 +18,7 @@ from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
 
-LEAST_REGRET = 0.001
-"""Least regret of the better yardstick for a cell to count; below it a ratio means nothing."""
+LEAST_REGRET = 0.001  # Least regret of the better yardstick for a cell to count; below it a ratio means nothing
 
 
 class Ratios(NamedTuple):

@@ -13,8 +13,7 @@ from bufgym.oracle.from_queue import find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.sim.state import ARRIVAL_WAITS
 
-_TIE = 1e-9
-"""Values closer than this are equal: they sum the same gaps in another order."""
+_TIE = 1e-9  # Values closer than this are equal: they sum the same gaps in another order
 
 _ROOM = 1 << 16
 """Initial room, in steps of 20 bytes each; it grows as needed."""

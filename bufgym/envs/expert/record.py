@@ -15,8 +15,7 @@ from bufgym.ground.errors import BufgymError
 KINDS = ("expert", "medium", "mixed", "random")
 """Who plays: the clairvoyant, a fixed policy, a mixture of all (an episode each in turn), or random valid actions."""
 
-ROWS = 256
-"""Most episodes played side by side."""
+ROWS = 256  # Most episodes played side by side
 
 
 class Recorded(NamedTuple):

@@ -10,10 +10,8 @@ from bufgym.envs.render.scene import DELIVERED, DROPPED, QUEUED, SENDING
 from bufgym.envs.rows import Rows
 
 _QUEUED, _FREE = "■", "·"
-_WIDEST = 32
-"""Largest L for which the text has a character for every slot; above it, two numbers."""
-_MOST_LABELS = 32
-"""Most robots that have room for a label in the image."""
+_WIDEST = 32  # Largest L for which the text has a character for every slot; above it, two numbers
+_MOST_LABELS = 32  # Most robots that have room for a label in the image
 
 
 def cell_ansi(rows: Rows, names: list[str]) -> str:

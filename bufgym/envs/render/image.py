@@ -15,14 +15,10 @@ COLOURS = ("#2a9d5c", "#2f6fde", "#e0a100", "#d1495b", "#8e3bb8")
 """The colour of each state."""
 _GREY, _EMPTY, _RED = "#999999", "#f4f4f4", COLOURS[DROPPED]
 _WIDTH_PX, _HEIGHT_PX, _DPI = 800, 400, 100
-_WINDOW_S = 10.0
-"""Length of the time axis, s; it grows while an older message is still held."""
-_BINS = 150
-"""Points of the capacity curve."""
-_MOST_BOXES = 64
-"""Largest L for which every slot is drawn as a box; above it, one bar."""
-_MOST_NAMES = 24
-"""Most lanes with room for their topics' names."""
+_WINDOW_S = 10.0  # Length of the time axis, s; it grows while an older message is still held
+_BINS = 150  # Points of the capacity curve
+_MOST_BOXES = 64  # Largest L for which every slot is drawn as a box; above it, one bar
+_MOST_NAMES = 24  # Most lanes with room for their topics' names
 
 
 def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:

@@ -11,8 +11,7 @@ from bufgym.envs.output import delivered_qoi
 from bufgym.sim import Senders
 from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 
-DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)
-"""States of a message."""
+DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)  # States of a message
 STATES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
 
 

@@ -9,17 +9,13 @@ import numpy as np
 from bufgym.envs.render.scene import NEWCOMER, QUEUED, STATES, Scene, letter, link_rates, scene_of
 from bufgym.sim import Senders
 
-_MARKS = "●▶■·?"
-"""The character of each state."""
+_MARKS = "●▶■·?"  # The character of each state
 _GREEN, _BLUE, _YELLOW, _RED, _MAGENTA, _CYAN, _PLAIN = "32", "34", "33", "31", "1;35", "36", ""
 """ANSI colours; plain text gets no codes."""
-_COLOURS = (_GREEN, _BLUE, _YELLOW, _RED, _MAGENTA)
-"""The colour of each state."""
+_COLOURS = (_GREEN, _BLUE, _YELLOW, _RED, _MAGENTA)  # The colour of each state
 _LEVELS = "_▁▂▃▄▅▆▇█"
-_LABEL, _TOPIC_LABEL = 10, 16
-"""Columns of a line's label, and of a label that is a topic's name."""
-_WIDTH = 100
-"""Columns of the picture."""
+_LABEL, _TOPIC_LABEL = 10, 16  # Columns of a line's label, and of a label that is a topic's name
+_WIDTH = 100  # Columns of the picture
 
 
 def ansi(senders: Senders, i: int) -> str:

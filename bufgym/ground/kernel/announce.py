@@ -6,8 +6,7 @@ from typing import Any, cast
 
 from numba.core import event
 
-PATIENCE_S = 1.0
-"""Compiling time of one kernel after which the notice appears, s."""
+PATIENCE_S = 1.0  # Compiling time of one kernel after which the notice appears, s
 NOTICE = "bufgym: compiling, once (about 10 s; bufgym warmup does it beforehand)"
 
 

@@ -163,8 +163,7 @@ def located(signature: Any, compiled: Any) -> Any:
     return _Located(compiled, signature)
 
 
-TRIED = (0, 68)
-"""The newest Numba that passed all tests; a later one is tried out."""
+TRIED = (0, 68)  # The newest Numba that passed all tests; a later one is tried out
 
 
 def try_out() -> None:

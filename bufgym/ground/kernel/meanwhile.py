@@ -25,8 +25,7 @@ from bufgym.ground.kernel.arrays import named
 from bufgym.ground.kernel.cache import FOLDER
 from bufgym.ground.processes import COMPILES, compiling
 
-FEW = 8
-"""Rows of a batch that plain Python is fast enough for."""
+FEW = 8  # Rows of a batch that plain Python is fast enough for
 
 
 class Meanwhile:

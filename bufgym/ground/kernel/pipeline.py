@@ -18,8 +18,7 @@ from numba.core import codegen, compiler, datamodel
 
 from bufgym.ground.kernel.none_fields import with_none_fields
 
-PART = "part"
-"""Marks a part among the code that is kept on disk."""
+PART = "part"  # Marks a part among the code that is kept on disk
 
 # Numba has no types.
 _Library: Any = codegen.JITCodeLibrary

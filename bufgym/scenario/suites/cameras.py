@@ -13,10 +13,8 @@ from bufgym.scenario.suites.synthetic import FIRST_SEED, SIZE_BYTES, camera, lte
 LAWS = ("jpeg", "gop", "depth-colour", "motion", "equal")
 MEANS = {"heavy": (0.4e6, 0.5e6, 0.6e6), "light": (0.9e6, 1.2e6, 1.6e6, 2e6)}
 """Mean rates of the links, bytes/s, in turn; the demand is 6.9 MB/s."""
-LINKS = {"train": 12, "validation": 6, "test": 24}
-"""Links of a split at each of the two loads."""
-PLACES, MANY = 8, 31
-"""Mean messages that the byte limit has room for, and L there."""
+LINKS = {"train": 12, "validation": 6, "test": 24}  # Links of a split at each of the two loads
+PLACES, MANY = 8, 31  # Mean messages that the byte limit has room for, and L there
 
 
 def _cameras(split: str, data: Path) -> dict[str, Setting]:

@@ -18,8 +18,7 @@ from bufgym.traces.generate.lte import LTE_MODES
 
 RATE_HZ = 30.0
 """Messages a second of the camera."""
-SIZE_BYTES = 230_000
-"""AFR's RGB-D frames: about 200 kB of depth and a JPEG."""
+SIZE_BYTES = 230_000  # AFR's RGB-D frames: about 200 kB of depth and a JPEG
 DEMAND_BYTES_PER_S = RATE_HZ * SIZE_BYTES
 EPISODE_S = 60.0
 camera = functools.partial(Uplink, rate_hz=RATE_HZ, size_bytes=SIZE_BYTES, duration_s=EPISODE_S)
@@ -46,8 +45,7 @@ FIRST_SEED = {"train": 1000, "validation": 2000, "test": 3000}
 
 TRACES = {"train": 24, "validation": 6, "test": 12}
 """Links in a split; some suites have a half or a third as many for each of their scenarios."""
-MORE_TRACES = {"train": 48, "validation": 48, "test": 48}
-"""The same of suites that resolve smaller differences."""
+MORE_TRACES = {"train": 48, "validation": 48, "test": 48}  # The same of suites that resolve smaller differences
 
 
 def motions_of(split: str, count: int = 4) -> tuple[Motion, ...]:

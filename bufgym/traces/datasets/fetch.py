@@ -23,12 +23,9 @@ from bufgym.traces.datasets.table import Dataset, Remote, datasets
 from bufgym.traces.datasets.unpack import ending, unpack
 from bufgym.traces.formats.faults import StrPath, os_errors
 
-MAX_BYTES: Final = 64 * 2**30
-"""No file may be longer."""
-SILENCE_S: Final = 30.0
-"""An attempt fails when the server sends nothing for so long, s."""
-RETRIES: Final = 2
-"""Further attempts after the first has failed."""
+MAX_BYTES: Final = 64 * 2**30  # No file may be longer
+SILENCE_S: Final = 30.0  # An attempt fails when the server sends nothing for so long, s
+RETRIES: Final = 2  # Further attempts after the first has failed
 
 Origin = Literal["downloaded", "there already", "copied"]
 

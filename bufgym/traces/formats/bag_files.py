@@ -298,5 +298,4 @@ def _limited(decompress: Callable[[bytes], bytes], unpacked: _Unpacked) -> Calla
     return limited
 
 
-SOURCES: Final = {"mcap": mcap, "ros1": ros1, "rosbag2": rosbag2}
-"""Reader of each kind of recording."""
+SOURCES: Final = {"mcap": mcap, "ros1": ros1, "rosbag2": rosbag2}  # Reader of each kind of recording

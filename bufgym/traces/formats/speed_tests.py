@@ -17,8 +17,7 @@ from bufgym.traces.formats.tables import MAX_MBIT_PER_S
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 
-MAX_INTERVAL_S: Final = 3600
-"""Longest interval of a speed test, s; a longer one does not measure a changing link."""
+MAX_INTERVAL_S: Final = 3600  # Longest interval of a speed test, s; a longer one does not measure a changing link
 
 _STAMP: Final = r"(?:\[[0-9T:.+ -]+\] *)?"
 INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%)(.*)")
@@ -91,11 +90,9 @@ def read_iperf3(path: StrPath) -> Knots:
 
 
 MAX_RUNS: Final = 16
-RUNS: Final = tuple(f"run {number}" for number in range(1, MAX_RUNS + 1))
-"""Values of `column`."""
+RUNS: Final = tuple(f"run {number}" for number in range(1, MAX_RUNS + 1))  # Values of `column`
 
-RUN_STEP_S: Final = 0.1
-"""Time between the samples of a run without times, s; runs with times have this step."""
+RUN_STEP_S: Final = 0.1  # Time between the samples of a run without times, s; runs with times have this step
 
 RUN: Final = re.compile(r"Run ([0-9]{1,3})")
 RULER: Final = re.compile(r"#{3,}")

@@ -32,8 +32,7 @@ _ZIP_MAGIC = b"PK\x03\x04"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 # int() and float() accept more than a data file should hold: "1_000", "infinity", digits of other scripts.
 _WHOLE = re.compile(r"[0-9]+")
-NUMBER: Final = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-"""Pattern of a plain finite decimal number."""
+NUMBER: Final = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"  # Pattern of a plain finite decimal number
 _NUMBER = re.compile(NUMBER)
 _MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
 

@@ -32,12 +32,9 @@ from bufgym.traces.trace import Float64Array, Int64Array
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
 
 EQUAL: Final = "equal"
-FLOOR: Final = 0.1
-"""What a camera at rest sends, in `motion`, as if it moved at this part of its mean speed."""
-WINDOW_US: Final = 100_000
-"""Time over which speed is taken, us: three frames at 30 Hz."""
-IN_TURN: Final = {"rvl-jpeg": ("rvl", "jpeg90")}
-"""Recorded sequences that alternate between columns of the table."""
+FLOOR: Final = 0.1  # What a camera at rest sends, in `motion`, as if it moved at this part of its mean speed
+WINDOW_US: Final = 100_000  # Time over which speed is taken, us: three frames at 30 Hz
+IN_TURN: Final = {"rvl-jpeg": ("rvl", "jpeg90")}  # Recorded sequences that alternate between columns of the table
 
 
 class Moving(NamedTuple):
