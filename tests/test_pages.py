@@ -131,8 +131,7 @@ def _is_public(module: str, name: str) -> bool:
 
 
 def test_links_and_pictures_lead_somewhere() -> None:
-    """A page is a file or one that the site makes; an anchor is a title of some page."""
-    menu = re.findall(r"[\w/-]+\.md", (REPO / "mkdocs.yml").read_text(encoding="utf-8"))
+    """To a file of the repository, as it is read without the site; an anchor is a title of some page."""
     titles = [title for text in texts().values() for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE)]
     anchors = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
     for page, text in texts().items():
@@ -141,9 +140,7 @@ def test_links_and_pictures_lead_somewhere() -> None:
         for target in re.findall(r"\]\(([^)]+)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL)):
             path, _, anchor = target.partition("#")
             if not target.startswith("http"):
-                there = ((REPO / page).parent / path).resolve()
-                made = there in [REPO / "docs" / name for name in menu] or there.with_suffix(".py") in TUTORIALS
-                assert not path or there.exists() or made, (page, target)
+                assert not path or ((REPO / page).parent / path).exists(), (page, target)
                 assert not anchor or anchor in anchors or 'id="' in text, (page, target)
 
 

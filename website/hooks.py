@@ -41,12 +41,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Point links to files outside docs/ at their copies on the site."""
+    """Point links to files outside docs/ at their copies on the site, and tutorials' files at their pages."""
     for up in ("", "../"):  # from docs/ and from a folder in docs/
         for name, page in FROM_ROOT.items():
             markdown = markdown.replace(f"]({up}../{name}", f"]({up}{page}")
         markdown = markdown.replace(f"]({up}../examples/", f"]({up}examples/")
-    return markdown
+    return re.sub(r"\]\((tutorials/)?([\w-]+)\.py\)", r"](\1\2.md)", markdown)
 
 
 def _of_root(text: str) -> str:
