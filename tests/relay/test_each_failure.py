@@ -1,0 +1,146 @@
+"""A relay's day, again and again: each time another write, send, accept or reading of the clock fails once.
+
+A robot streams and takes commands, an operator sends them, a viewer watches, all is recorded. Whatever failed, the relay
+goes on, each acked command arrives once and in order, and the recording opens.
+"""
+
+import asyncio
+import contextlib
+import errno
+import os
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loop_cases import beside, compiled
+from relay_cases import ALL, Server, settings, until, wait
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosedError
+
+from bufgym.ground.errors import BufgymError
+from bufgym.model.topics import Topic
+from bufgym.relay import audit, backoff, server
+from bufgym.relay.client import RobotClient
+from bufgym.relay.config import Rule
+from bufgym.relay.hub import Hub
+from bufgym.relay.recorder import FOLDER
+from bufgym.relay.session import Session
+from bufgym.relay.store import Store
+from bufgym.robot.mcap_file import McapFile
+from bufgym.traces.formats import bags
+
+pytest.importorskip("mcap", reason="no mcap here: the extra relay")
+RULES = (ALL, Rule(recorder=True, receive=True, topic="/robots/.*"))
+CAMERA, COMMAND = "/robots/a/camera", "/robots/a/command"
+COMMANDS = 4
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+class Fails:
+    """Counts what may fail; the n-th does."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.counts = n, Counter[str]()
+        self.failed = ""
+
+    def due(self, what: str) -> bool:
+        self.counts[what] += 1
+        due = self.counts.total() == self.n
+        self.failed = what if due else self.failed
+        return due
+
+    def wrapped(self, what: str, function: Callable[..., Any], error: Exception) -> Callable[..., Any]:
+        def call(*words: Any, **named: Any) -> Any:
+            if self.due(what):
+                raise error
+            return function(*words, **named)
+
+        return call
+
+
+class Database:
+    """A connection of SQLite of which each statement may fail."""
+
+    def __init__(self, real: Any, fails: Fails) -> None:
+        self._real = real
+        self.execute = fails.wrapped("statement", real.execute, sqlite3.OperationalError("disk I/O error"))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._real, name)
+
+
+@contextlib.contextmanager
+def failing(fails: Fails) -> Iterator[None]:
+    """Within the block the n-th of these fails."""
+    began, made, clock = Store.__init__, server.Accepted.connection_made, Hub.__init__
+
+    def store(self: Store, *words: Any, **named: Any) -> None:
+        began(self, *words, **named)
+        self._db = Database(self._db, fails)
+
+    def accepted(self: Any, transport: Any) -> None:
+        if fails.due("accept"):
+            transport.abort()  # the peer has gone already
+        made(self, transport)
+
+    def hub(self: Hub, *words: Any, **named: Any) -> None:
+        clock(self, *words, **named)
+        real = self.clock
+        self.clock = lambda: real() + 3_600 * fails.due("clock")
+
+    gone = ConnectionClosedError(None, None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Store, "__init__", store)
+        patch.setattr(Hub, "__init__", hub)
+        patch.setattr(server.Accepted, "connection_made", accepted)
+        patch.setattr(ServerConnection, "send", fails.wrapped("send", ServerConnection.send, gone))
+        for name in ("write", "flush"):
+            patch.setattr(McapFile, name, fails.wrapped(f"recording's {name}", getattr(McapFile, name), FULL))
+        patch.setattr(audit._Lines, "write", fails.wrapped("audit", audit._Lines.write, FULL))
+        yield
+
+
+async def day(folder: Path, fails: Fails) -> None:
+    came: list[int] = []
+    seen: list[int] = []
+    acked: list[int] = []
+    with failing(fails):
+        one = Server(settings(folder=folder, rules=RULES))
+        url = f"ws://127.0.0.1:{await wait('a start', one.start())}"
+        robot = RobotClient(url, "a", topics=(Topic(CAMERA),), policy="drop-oldest", capacity=8)
+        robot.subscribe(f"^{COMMAND}$", lambda message: came.append(int(bytes(message.payload))), durable=True)
+        viewer, operator = Session(url, "v"), Session(url, "o")
+        viewer.subscribe(f"^{CAMERA}$", lambda message: seen.append(message.seq))
+        async with beside(robot.run(), viewer.run(), operator.run()):
+            for k in range(COMMANDS):
+                await until("all to be ready", lambda: robot.ready.is_set() and viewer.ready.is_set())
+                robot.publish(CAMERA, b"picture", "jpeg")
+                with contextlib.suppress(BufgymError):
+                    await wait("an answer", operator.command(COMMAND, k))
+                    acked.append(k)
+            await until("the commands", lambda: len(came) >= len(acked))
+            before = len(seen)
+            while len(seen) == before:  # the relay still forwards
+                robot.publish(CAMERA, b"picture", "jpeg")
+                await asyncio.sleep(0.005)
+            one.hub.tick()
+        await wait("an end", one.close())
+    assert [k for k in came if k in acked] == acked and len(acked) >= COMMANDS - 1, fails.failed
+    assert sorted(set(came)) == sorted(came), fails.failed
+    recorded = sum(len(bags.read_bag(path).time_ns) for path in sorted((folder / FOLDER).glob("*.mcap")))
+    assert recorded >= len(came) + len(seen) - 2, fails.failed
+
+
+@compiled
+async def test_whatever_fails_once_the_relay_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every tenth point in a commit; all of them in the night, as ``HYPOTHESIS_PROFILE`` says."""
+    monkeypatch.setattr(backoff, "MOST_S", 0.01)
+    calm = Fails(0)
+    await day(tmp_path / "calm", calm)
+    assert set(calm.counts) == {"statement", "accept", "clock", "send", "recording's write", "recording's flush", "audit"}
+    step = 1 if os.environ.get("HYPOTHESIS_PROFILE") == "nightly" else 10
+    for n in range(1, calm.counts.total() + 1, step):
+        await day(tmp_path / str(n), Fails(n))
