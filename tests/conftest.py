@@ -64,10 +64,8 @@ def ros(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     from ros1_cases import environment
 
     where = environment(tmp_path_factory.mktemp("ros"))
-    names = "rospy, rosmaster, sensor_msgs.msg, nav_msgs.msg"
-    done = subprocess.run(
-        [sys.executable, "-c", f"import {names}"], env=where, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", "import rospy, rosmaster, sensor_msgs.msg, nav_msgs.msg"]
+    done = subprocess.run(command, env=where, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         pytest.skip(f"ROS 1 (python3-rospy and others) is not here: {done.stderr.strip().splitlines()[-1]}")
     return where

@@ -141,9 +141,8 @@ BENCH = ["bench", *W.split(), "--capacity", "1"]
 
 def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
     text = shown([*BENCH, "--policies", "drop-oldest,drop-newest,clairvoyant", "--drops", "drops.csv"], capsys)
-    lines = text.splitlines()
     # By topic: two messages each, 1 s between the two, 2 s apart.
-    assert ["/camera", "2", "0.500", "2,000", "1,000", "50.0%"] in [line.split() for line in lines]
+    assert ["/camera", "2", "0.500", "2,000", "1,000", "50.0%"] in [line.split() for line in text.splitlines()]
     # H: messages 0 and 3 give 1 + V(2) = 1.865; 0 and 1 give 1 + V(0) = 1.
     first, _, second = text.partition("dropped of")
     table = {line.split()[0]: line.split() for line in first.splitlines() if line}

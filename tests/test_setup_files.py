@@ -68,8 +68,7 @@ def test_workflows_run_rules_and_scripts_that_there_are(name: str) -> None:
 
 
 def test_every_supported_python_is_tried() -> None:
-    matrix = read_yaml(".github/workflows/test.yml")["jobs"]["test"]["strategy"]["matrix"]["python"]
-    assert matrix == PYTHONS
+    assert read_yaml(".github/workflows/test.yml")["jobs"]["test"]["strategy"]["matrix"]["python"] == PYTHONS
     for name in ("nightly.yml", "release.yml"):
         assert set(PYTHONS) <= set(re.findall(r"^ +(3\.\d+)$", (REPO / ".github/workflows" / name).read_text(), re.M))
     assert set(PYTHONS) <= set(stages.PYTHONS)
@@ -123,8 +122,7 @@ def test_a_stage_beyond_its_limit_is_killed_with_all_that_it_started(tmp_path: P
     child = f"open({str(held)!r}, 'w'); import time; time.sleep(60)"
     text = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
     assert run(program(text, limit_s=0.5), tmp_path / "log") == ("TOO SLOW", "killed after 0.5 s")
-    alive = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
-    assert str(held) not in alive
+    assert str(held) not in subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
 
 
 def test_pytest_stages_name_the_failed_test_and_the_slowest(tmp_path: Path) -> None:
@@ -187,6 +185,5 @@ def test_functions_that_are_compiled_are_found() -> None:
 
 
 def test_the_oldest_dependencies_are_those_of_this_python() -> None:
-    oldest = script("installed").oldest(str(REPO / "pyproject.toml"))
-    names = [line.partition("==")[0] for line in oldest]
+    names = [line.partition("==")[0] for line in script("installed").oldest(str(REPO / "pyproject.toml"))]
     assert sorted(set(names)) == sorted(names) and {"numpy", "numba", "gymnasium"} < set(names)

@@ -57,8 +57,7 @@ def test_devices_and_fifos_are_refused(tmp_path: Path, command: str, capsys: Cap
 
 def test_a_row_is_not_believed_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     """A forged value needs a wide interval; what counts is the interval that is computed now."""
-    now = leaderboard.Interval(0.5, 0.4, 0.6)
-    entry = leaderboard.Entry("lte-v1", "afr", 1, 3, {"score": now}, "0.1.0")
+    entry = leaderboard.Entry("lte-v1", "afr", 1, 3, {"score": leaderboard.Interval(0.5, 0.4, 0.6)}, "0.1.0")
     monkeypatch.setattr(leaderboard, "_run", lambda *a, **k: [entry])
     assert leaderboard.validate(entry) is entry
     for value, low, high in ((0.9, -9, 9), (0.5, -9, 9), (0.9, 0.85, 0.95), (0.61, 0.4, 0.6), (float("nan"), 0.4, 0.6)):

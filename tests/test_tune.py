@@ -218,8 +218,7 @@ def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(set(specs)) == len(specs)
         for policy, entry in entries.items():
             assert entry["setting"] in tune.settings(policy) and entry["split"] == "validation"
-            assert entry["command"].startswith(f"python -m agents.tune {suite}") and entry["command"].endswith(
-                "--write"
-            )
+            command = entry["command"]
+            assert command.startswith(f"python -m agents.tune {suite}") and command.endswith("--write")
             assert (entry["setting"] == policy) == (entry["setting"] not in tuned.tuned(suite))
     assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tuned.FILE.read_text(encoding="utf-8")

@@ -21,17 +21,11 @@ def test_links_are_drawn_jointly_by_hand() -> None:
     assert drawn["time"].shape == (2001, 4) and (drawn["time"][0] == 1).all()
     assert (drawn["time"][:, 0] == drawn["time"][:, 1]).all() and (drawn["time"].sum(axis=1) == 4).all()
     assert (drawn["time"] == drawn["motion"]).all() and (drawn["time"] == drawn["reverse"][:, ::-1]).all()
-    jointly = (drawn["time"] @ won + drawn["motion"] @ won) / 8
-    assert percentile_interval(jointly, 0.8) == (0.5, 0, 1)
+    assert percentile_interval((drawn["time"] @ won + drawn["motion"] @ won) / 8, 0.8) == (0.5, 0, 1)
     apart = sum(times_drawn(2, 2000, stream(0, name))[:, 0] / 4 for name in ("time", "motion"))
     assert percentile_interval(np.asarray(apart), 0.8) == (0.5, 0.25, 0.75)
-    rows = [
-        row
-        for scenario in ("time", "motion")
-        for row in rows_of(
-            {"drop-oldest": [0] * 4, "mine": 10 * won}, [10] * 4, traces=["a", "a", "b", "b"], scenario=scenario
-        )
-    ]
+    h = {"drop-oldest": [0] * 4, "mine": 10 * won}
+    rows = [row for s in ("time", "motion") for row in rows_of(h, [10] * 4, traces=["a", "a", "b", "b"], scenario=s)]
     made = score.scores(rows)
     assert standing_of(made, "mine")["score"] == (0.5, 0, 1)
     assert cell_of(made, "mine", "time").qoi == (5, 0, 10)

@@ -27,9 +27,7 @@ from bufgym.sim.metrics import outcome
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.traces import Trace
 
-PLAYABLE = [
-    name for name in policies.names() if not (policies.get(name).drops_at_dequeue or policies.get(name).unbounded)
-]
+PLAYABLE = [p.name for p in map(policies.get, policies.names()) if not (p.drops_at_dequeue or p.unbounded)]
 
 TINY = perf.Sizes(3, (2, 1), 24, 10, 1, 1)
 

@@ -38,8 +38,7 @@ def spy(name: str, log: list[Any]) -> Policy:
 def test_every_policy_and_capacity_meets_the_same_episodes() -> None:
     first: list[Any] = []
     second: list[Any] = []
-    scenario = replace(UPLINK, size_cv=0.5)
-    run.run([spy("one", first), spy("two", second)], scenario, [2, 5], 3)
+    run.run([spy("one", first), spy("two", second)], replace(UPLINK, size_cv=0.5), [2, 5], 3)
     assert first == second
     half = len(first) // 2
     assert half == 2 * 3 * 20  # traces x seeds x messages
@@ -202,8 +201,7 @@ def test_rows_come_back_to_the_last_bit(tmp_path: Path, ending: str) -> None:
     # repr tells None from NaN, 3 from 3.0, 0.0 from -0.0, and shows every bit of a float.
     assert [repr(same) for same in read_rows(path)] == [repr(given) for given in HARD]
     assert list(tmp_path.iterdir()) == [path]  # nothing temporary stays
-    again = write_rows(read_rows(path), tmp_path / f"again.{ending}")
-    assert again.read_bytes() == path.read_bytes()
+    assert write_rows(read_rows(path), tmp_path / f"again.{ending}").read_bytes() == path.read_bytes()
     assert read_rows(write_rows([], path)) == []
     with pytest.raises(FileNotFoundError):
         read_rows(tmp_path / f"none.{ending}")

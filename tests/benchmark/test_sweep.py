@@ -198,8 +198,7 @@ def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: P
         trace = Trace.steps([(1.0, float((data / "rate").read_text()))], name="link")
         return {"link": suites.Setting(Uplink(traces=(trace,), rate_hz=5, duration_s=2), "a link")}
 
-    found = suites.Suite("found-v1", "found", build, (2,), 1, needs="rate")
-    monkeypatch.setitem(suites.SUITES, "found-v1", found)
+    monkeypatch.setitem(suites.SUITES, "found-v1", suites.Suite("found-v1", "found", build, (2,), 1, needs="rate"))
     for name, rate in (("a", "500000"), ("b", "600000"), ("c", "500000")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "rate").write_text(rate)

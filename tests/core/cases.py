@@ -101,9 +101,7 @@ def trace(knots: list[tuple[int, int]], after: str) -> Trace:
     return Trace("random", np.array(us, np.int64), np.array(size, np.int64), after=after)
 
 
-def drawn_messages(
-    rng: np.random.Generator, n: int, largest: int, arrival_us: NDArray[np.int64] | None = None
-) -> NDArray[Any]:
+def drawn_messages(rng: np.random.Generator, n: int, largest: int, arrival_us: Any = None) -> NDArray[Any]:
     """n messages of less than ``largest`` bytes, several at the same time among them; x in eighths: exact sums."""
     step_us = rng.choice([0, 1, 700, 5_000], n) + rng.integers(0, 3_000, n) * rng.integers(0, 2, n)
     arrivals = messages(

@@ -60,9 +60,8 @@ def test_x_of_a_stream_that_moves_is_the_robots_motion() -> None:
     assert episode.arrivals["x"] == pytest.approx(expected - expected[0])
     # All that move see one motion at one time.
     both = client(moving, replace(moving, topic=Topic("cloud")), motion=motion).draw(Streams.seeded(4)).arrivals
-    steps = np.interp(
-        both["arrival_us"][both["topic"] == 1], *(both[both["topic"] == 0][c] for c in ("arrival_us", "x"))
-    )
+    first, second = (both[both["topic"] == k] for k in (0, 1))
+    steps = np.interp(second["arrival_us"], first["arrival_us"], first["x"])
     assert np.abs(np.diff(steps) - np.diff(both["x"][both["topic"] == 1])).max() < 0.05
 
 

@@ -116,8 +116,7 @@ def start(fields, seen):
 @given(case=cases(max_bytes=False), v=VALUES, capacity=st.integers(1, 20))
 def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, v, capacity):
     case = replace(case, capacity=capacity)  # one set of weights serves every L
-    linear = start(("rank", field, "service_ratio"), field)
-    assert same(case.run(linear, v), case.run(policies.get(fixed), v))
+    assert same(case.run(start(("rank", field, "service_ratio"), field), v), case.run(policies.get(fixed), v))
 
 
 @kernels

@@ -117,9 +117,7 @@ def test_a_policy_of_your_own():
 
 def test_own_departures():
     heard = []
-    register("listener", on_departure=lambda buffer, memory: heard.append(len(buffer.slots)))(
-        lambda buffer, arrival, memory: ACCEPT
-    )
+    register("listener", on_departure=lambda buffer, memory: heard.append(len(buffer.slots)))(lambda b, a, m: ACCEPT)
     interruption("listener", 3, 3)
     # Message 0 leaves an empty buffer; after the outage 3 are left, then 2, 1; message 4 meets an empty buffer.
     assert heard == [0, 2, 1, 0, 0]

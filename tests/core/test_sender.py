@@ -124,8 +124,7 @@ def test_the_bytes_after_a_dropped_head_follow_without_a_pause():
     # Where nothing follows, the link rests, and the next message begins when it arrives: 2 at 2 us, byte 1400.
     fast = Link(trace([(0, 0), (10, 7_000)], "loop"))
     for third_us, crossed_us in ((0, 3), (2, 4)):
-        episode = Episode(messages(np.array([0, 0, third_us]), 1_000), fast)
-        senders = run(head_dropper(every_second), [episode], 5, V)
+        senders = run(head_dropper(every_second), [Episode(messages(np.array([0, 0, third_us]), 1_000), fast)], 5, V)
         assert log(senders)["transmitted_us"] == {0: 2, 2: crossed_us}
         assert log(senders)["dropped_us"] == {1: 2}
 
@@ -213,9 +212,7 @@ def test_a_no_drop_message_drives_out_as_many_as_it_needs():
         assert order(senders) == [0, 4]
 
 
-RANKED = [
-    policy for policy in map(policies.get, policies.names(for_topics=False)) if policy.ranked and not policy.weights
-]
+RANKED = [p for p in map(policies.get, policies.names(for_topics=False)) if p.ranked and not p.weights]
 
 
 # steady has as many sites as L says.
@@ -240,5 +237,4 @@ def test_each_victim_is_a_draw_of_its_own():
     gone = Counter(tuple(sorted(log(senders, i)["dropped_us"])) for i in range(n))
     assert gone[(6,)] / n == pytest.approx(1 / 6, abs=0.03)
     assert [len(pair) for pair in gone if 6 in pair] == [1]
-    double = [count / n for pair, count in gone.items() if 6 not in pair]
-    assert double == pytest.approx([1 / 12] * 10, abs=0.02)
+    assert [count / n for pair, count in gone.items() if 6 not in pair] == pytest.approx([1 / 12] * 10, abs=0.02)

@@ -174,8 +174,7 @@ def hold(case, senders):
     topic = np.asarray(case.case.episode.arrivals)["topic"] * bool(case.topics)
     x = np.asarray(case.case.episode.arrivals)["x"]
     slots = np.asarray(batch.slots[0])[first : first + queued]
-    times = ("dropped_us", "transmitted_us", "dequeued_us")
-    dropped, transmitted, dequeued = (rows[name] != NEVER for name in times)
+    dropped, transmitted, dequeued = (rows[name] != NEVER for name in ("dropped_us", "transmitted_us", "dequeued_us"))
     assert (transmitted <= dequeued).all() and not (dropped & dequeued).any()
     assert not (dropped | dequeued)[slots["seq"]].any()
     assert (dequeued & ~transmitted).sum() == sender["busy"]

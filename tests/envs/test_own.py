@@ -136,8 +136,7 @@ def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
         _, info = env.reset(seed=seed)
         total, ended = dict.fromkeys(info["reward_terms"], 0.0), False
         while not ended:
-            action = valid_action(info["action_mask"], rng)
-            seen, reward, ended, _, info = env.step(action)
+            seen, reward, ended, _, info = env.step(valid_action(info["action_mask"], rng))
             assert env.observation_space.contains(seen)
             assert list(seen) == ["loss", "wait", "wait_py", "occupancy", "megabytes", "megabytes_py"]
             for name in ("wait", "megabytes"):

@@ -98,8 +98,7 @@ def test_an_episode_of_three_topics_by_hand() -> None:
     seen, info = env.reset(options={"episode": three_topics()})
     totals = dict.fromkeys(TERMS, 0.0)
     for k, (who, ms, mask, action, retained, delivered) in enumerate(script):
-        now_us = int(env.rows.senders.batch.senders["now_us"][0])
-        assert (waiting(env), now_us) == (who, 1_000 * ms)
+        assert (waiting(env), int(env.rows.senders.batch.senders["now_us"][0])) == (who, 1_000 * ms)
         assert info["action_mask"].tolist() == [bool(each) for each in mask]
         assert seen["socket_asks"] == [who == SOCKET_WAITS]
         assert seen["occupied"].tolist()[-1] == (who == ARRIVAL_WAITS)
@@ -219,6 +218,5 @@ def test_pictures_of_any_size(topics: int, capacity: int) -> None:
     frame = env.render()
     assert (frame.shape, frame.dtype) == ((400, 800, 3), np.uint8)
     shown = {tuple(pixel) for pixel in frame.reshape(-1, 3).tolist()}
-    queued = tuple(int(render.image.COLOURS[scene.QUEUED][k : k + 2], 16) for k in (1, 3, 5))
-    assert queued in shown
+    assert tuple(int(render.image.COLOURS[scene.QUEUED][k : k + 2], 16) for k in (1, 3, 5)) in shown
     assert tuple(frame[2, 2]) == (255, 255, 255)

@@ -43,8 +43,7 @@ def test_a_kinects_depth_has_steps_and_shadows() -> None:
     assert {115, 116, 117, 118, 119} >= set(np.rint(steps).astype(int).ravel()) >= {116, 117, 118}
     assert middle.std() == pytest.approx(0.5 * 3.0 / 117, rel=0.5)
     # Behind a box at 1.5 m a wall at 3 m has a shadow of f b (1/1.5 - 1/3) = 14.6 px on the camera's left.
-    thing = [4.55, 2, 1, 0.05, 0.3, 0.3, 1, 0]
-    row = scene(thing, stride=1).depth(0)[240]
+    row = scene([4.55, 2, 1, 0.05, 0.3, 0.3, 1, 0], stride=1).depth(0)[240]
     missing = np.flatnonzero(row == 0)
     # The box's left edge is at 320 - 585 * 0.3 / 1.5 = 203.
     assert [missing.min(), missing.max()] == pytest.approx([203 - 14.6, 202], abs=1.1)

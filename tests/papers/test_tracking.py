@@ -80,8 +80,7 @@ def test_a_known_movement_is_found_again() -> None:
     poses = np.stack([still.poses[0], still.poses[0] @ moved])
     sequence = MadeUpRoom("moved", still.scene, still.time_us, poses, 0, stride=4)
     depths = [sequence.rendered(k, noisy=False)[0] for k in range(2)]
-    grid = VoxelGrid((-0.2, -0.2, -0.2), (136, 116, 76))
-    tracker = Tracker(sequence.camera, grid)
+    tracker = Tracker(sequence.camera, VoxelGrid((-0.2, -0.2, -0.2), (136, 116, 76)))
     tracker.add(depths[0], poses[0])
     pose = tracker.follow(depths[1])
     assert pose is not None

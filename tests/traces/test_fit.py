@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_cases import Capsys, fails, shown
+from cli_cases import Capsys, Patch, fails, shown
 
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import suites
@@ -140,9 +140,7 @@ def test_the_command_writes_parameters_and_a_page(tmp_path: Path, capsys: Capsys
     assert list(read_links(out)) == ["walk"]
 
 
-def test_the_command_fits_what_a_suite_trains_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_command_fits_what_a_suite_trains_on(monkeypatch: Patch, tmp_path: Path, capsys: Capsys) -> None:
     """The links of the train split alone, each once though it carries several scenarios."""
 
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
@@ -157,9 +155,7 @@ def test_the_command_fits_what_a_suite_trains_on(
 
 
 @pytest.mark.nightly
-def test_the_committed_parameters_are_the_fit_of_the_recordings(
-    shared_data: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_committed_parameters_fit_the_recordings(shared_data: Path, tmp_path: Path, capsys: Capsys) -> None:
     rows: dict[str, list[Float64Array]] = {}
     for file in sorted([*shared_data.glob("belgium_4g/csv/*.csv"), *shared_data.glob("solis_wifi/wifi_*.txt")]):
         rows.setdefault(mode_of(file), []).append(rates_of(file))

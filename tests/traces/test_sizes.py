@@ -22,8 +22,7 @@ LAWS = ["jpeg", "gop", "depth-colour", "motion", "recorded:7scenes-rvl", "record
 
 
 def sample(law: str, n: int = 60_000, seed: int = 3) -> np.ndarray:
-    times = np.arange(n, dtype=np.int64) * 33_333
-    return drawn(law, n, MEAN, np.random.default_rng(seed), Moving(DRIVE, times))
+    return drawn(law, n, MEAN, np.random.default_rng(seed), Moving(DRIVE, np.arange(n, dtype=np.int64) * 33_333))
 
 
 @pytest.mark.parametrize("law", ["jpeg:rho=0.5", "gop:rho=0.5", "depth-colour:rho=0.5", "motion", *LAWS[4:]])

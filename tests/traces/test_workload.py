@@ -59,9 +59,7 @@ MESSAGES = st.tuples(st.integers(0, 10**9), st.integers(1, 10**10), st.integers(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(MESSAGES, min_size=1), names=st.booleans(), moves=st.booleans())
-def test_round_trip_is_exact(
-    tmp_path: Path, messages: list[tuple[int, int, int, float]], names: bool, moves: bool
-) -> None:
+def test_a_round_trip(tmp_path: Path, messages: list[tuple[int, int, int, float]], names: bool, moves: bool) -> None:
     steps_us, sizes, topics, steps = (np.array(column) for column in zip(*messages, strict=True))
     moved, time_us = np.cumsum(steps), np.cumsum(steps_us)
     topic, called = (topics, ("/a", "/b c", "/ü")) if names else (None, ("",))
