@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_cases import Capsys, Patch
+from refusal_cases import refuse
 from train_cases import DropOldest, KilledError, columns, in_a_folder_of_its_own  # noqa: F401
 
 import train
@@ -126,12 +127,10 @@ def test_a_run_is_not_overwritten_or_mixed_with_another() -> None:
     assert runs.prepare(unnamed) == Path("runs/train-2")
     assert runs.prepare(dataclasses.replace(unnamed, resume=True)) == Path("runs/train-2")
     runs.prepare(TINY)
-    with pytest.raises(BufgymError, match="exists"):
-        runs.prepare(TINY)
+    refuse("exists", runs.prepare, TINY)
     with pytest.raises(BufgymError, match="capacity was 3, now 4"):
         runs.prepare(dataclasses.replace(TINY, resume=True, environment=dataclasses.replace(ON, capacity=4)))
-    with pytest.raises(BufgymError, match="no run"):
-        runs.prepare(dataclasses.replace(TINY, resume=True, name="other"))
+    refuse("no run", runs.prepare, dataclasses.replace(TINY, resume=True, name="other"))
 
 
 def test_held_out_traces_are_never_trained_on() -> None:
@@ -228,8 +227,7 @@ def test_batches_divide_the_experience() -> None:
     assert training.even_batch(32_768, 4_096) == 4_096
     assert training.even_batch(34_560, 4_096) == 3_840  # nine of them: eight would be too large
     assert training.even_batch(100, 4_096) == 100
-    with pytest.raises(BufgymError, match="batch_size = 4: num_envs x n_steps = 7 decisions"):
-        training.even_batch(7, 4)
+    refuse("batch_size = 4: num_envs x n_steps = 7 decisions", training.even_batch, 7, 4)
 
 
 POSITIVE = (

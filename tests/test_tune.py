@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from cyclopts import App
+from refusal_cases import refuse
 
 from agents import tune
 from agents.tune import Choice
@@ -93,8 +94,7 @@ def test_test_episodes_are_refused_before_any_is_drawn(splits: list[str]) -> Non
     ],
 )
 def test_what_cannot_be_tuned(suite: str, names: list[str], more: dict[str, Any], message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        tune.tune(suite, names, jobs=1, **more)
+    refuse(message, tune.tune, suite, names, jobs=1, **more)
 
 
 def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> None:
@@ -180,8 +180,7 @@ def test_where_no_cell_is_discriminative_regrets_are_compared() -> None:
 def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[str]) -> None:
     text = cli("tiny-twelve --policies decimate,lifespan --seeds 3", capsys)
     assert "best, chosen" in text and "default, best, chosen" in text and not tuned.FILE.exists()
-    with pytest.raises(BufgymError, match="never chosen on test episodes"):
-        cli("tiny-twelve --split test --write", capsys)
+    refuse("never chosen on test episodes", cli, "tiny-twelve --split test --write", capsys)
     assert not tuned.FILE.exists()
     cli("tiny-twelve --policies decimate,lifespan --seeds 3 --write", capsys)
     entry = tuned.read()["tiny-twelve"]["decimate"]
@@ -205,8 +204,7 @@ def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[
 )
 def test_a_broken_file_is_named(text: bytes, message: str) -> None:
     tuned.FILE.write_bytes(text)
-    with pytest.raises(BufgymError, match=f"{tuned.FILE.name}.*{message}"):
-        default_policies("lte-v1")
+    refuse(f"{tuned.FILE.name}.*{message}", default_policies, "lte-v1")
 
 
 def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:

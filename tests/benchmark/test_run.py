@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from refusal_cases import refused
+from refusal_cases import refuse, refused
 
 from bufgym import oracle, policies
 from bufgym.benchmark import run
@@ -219,11 +219,9 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_other_endings_and_parquet_without_pyarrow_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(BufgymError, match=r"rows\.txt: rows are written to \.csv or \.parquet"):
-        write_rows([], tmp_path / "rows.txt")
+    refuse(r"rows\.txt: rows are written to \.csv or \.parquet", write_rows, [], tmp_path / "rows.txt")
     monkeypatch.setitem(sys.modules, "pyarrow", None)  # importing it now fails
-    with pytest.raises(BufgymError, match=r"unlike \.csv, needs pyarrow: .*bufgym\[bench\]"):
-        write_rows(HARD, tmp_path / "rows.parquet")
+    refuse(r"unlike \.csv, needs pyarrow: .*bufgym\[bench\]", write_rows, HARD, tmp_path / "rows.parquet")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -258,8 +256,7 @@ def test_a_file_that_is_none_or_cut_short_is_named(tmp_path: Path, content: byte
         path = write_rows(HARD, tmp_path / "rows.parquet")
         content = path.read_bytes()[: round(content * path.stat().st_size)]
     path.write_bytes(content)
-    with pytest.raises(BufgymError, match=rf"{path.name}: no rows that can be read"):
-        read_rows(path)
+    refuse(rf"{path.name}: no rows that can be read", read_rows, path)
 
 
 def test_one_wrong_bit_in_a_parquet_page_is_noticed(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 
 from bufgym import scenario, traces
 from bufgym.ground.errors import BufgymError
@@ -190,7 +191,5 @@ def test_bad_files_are_one_line_that_names_the_file(tmp_path: Path, text: Any, r
 )
 def test_bad_clients(parameters: dict[str, Any], rule: str) -> None:
     assert set(parameters) <= {f.name for f in fields(Client)}
-    with pytest.raises(BufgymError, match=rule):
-        replace(client(), **parameters)
-    with pytest.raises(BufgymError, match=r"stream: 'a' is not a bufgym\.model\.topics\.Topic"):
-        Stream("a", 1, 1)
+    refuse(rule, replace, client(), **parameters)
+    refuse(r"stream: 'a' is not a bufgym\.model\.topics\.Topic", Stream, "a", 1, 1)

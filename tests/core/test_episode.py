@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusal_cases import refused
+from refusal_cases import refuse, refused
 
 from bufgym import policies, scenario
 from bufgym.ground.errors import BufgymError
@@ -50,10 +50,8 @@ def changed(**fields: Any) -> Any:
     ],
 )
 def test_a_message_that_breaks_a_rule(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(BufgymError, match=f"^message 1: {message}"):
-        Episode(changed(**fields), STEADY)
-    with pytest.raises(BufgymError, match=f"^arrivals of robot 1: message 1: {message}"):
-        FleetEpisode((THREE, changed(**fields)), STEADY)
+    refuse(f"^message 1: {message}", Episode, changed(**fields), STEADY)
+    refuse(f"^arrivals of robot 1: message 1: {message}", FleetEpisode, (THREE, changed(**fields)), STEADY)
 
 
 @pytest.mark.parametrize(
@@ -73,8 +71,7 @@ def test_a_message_that_breaks_a_rule(fields: dict[str, Any], message: str) -> N
     ],
 )
 def test_other_parameters(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        replace(Episode(THREE, STEADY), **changes)
+    refuse(message, replace, Episode(THREE, STEADY), **changes)
 
 
 def test_what_the_robot_was_told_survives() -> None:
@@ -83,14 +80,12 @@ def test_what_the_robot_was_told_survives() -> None:
     others = told.with_uniforms(rng), told.encoded("json"), told.copied(2), told.valued(V)
     for episode in (*others, fleet.episode(1), fleet.with_uniforms(rng).episode(0)):
         assert episode.ends_us == 7
-    with pytest.raises(BufgymError, match="ends_us = -7"):
-        FleetEpisode((THREE, THREE), STEADY, -7)
+    refuse("ends_us = -7", FleetEpisode, (THREE, THREE), STEADY, -7)
 
 
 def test_another_encoding_keeps_the_rules_too() -> None:
     episode = Episode(THREE, STEADY, encodings={"json": np.array([5, 0, 5])})
-    with pytest.raises(BufgymError, match="message 1: size_bytes = 0"):
-        episode.encoded("json")
+    refuse("message 1: size_bytes = 0", episode.encoded, "json")
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -121,14 +116,12 @@ def test_x_of_topics_falls_only_where_topics_are_used() -> None:
     Senders(1, 2, V, max_messages=4, topics=[Topic("a"), Topic("b")]).load(0, episode)
     one_queue = Senders(1, 2, V, max_messages=4)
     for load in (lambda: one_queue.load(0, episode), lambda: clairvoyant(episode, 2, V)):
-        with pytest.raises(BufgymError, match="x falls from one message to the next"):
-            load()
+        refuse("x falls from one message to the next", load)
 
 
 @pytest.mark.parametrize("what", [None, 5, FleetEpisode((THREE,), STEADY)])
 def test_senders_load_episodes_only(what: Any) -> None:
-    with pytest.raises(BufgymError, match=r"is not a bufgym\.scenario Episode"):
-        Senders(1, 2, V, max_messages=4).load(0, what)
+    refuse(r"is not a bufgym\.scenario Episode", Senders(1, 2, V, max_messages=4).load, 0, what)
 
 
 def slow(after: str, carried: int = 1) -> Link:
@@ -144,8 +137,7 @@ def test_a_link_that_would_take_longer_than_64_bits_can_count() -> None:
             Episode(messages(np.array([0]), 231_000), slow(after))
     Episode(messages(np.array([0]), 10**10), slow("stop"))  # carries one byte and ends
     # Two robots of a cell share it, and so do their bytes.
-    with pytest.raises(BufgymError, match=r"link on slow: may need 3e\+18 us"):
-        FleetEpisode((messages(np.array([0]), 150_000),) * 2, slow("loop"))
+    refuse(r"link on slow: may need 3e\+18 us", FleetEpisode, (messages(np.array([0]), 150_000),) * 2, slow("loop"))
 
 
 def test_a_link_that_would_carry_more_than_64_bits_can_count() -> None:
@@ -157,8 +149,7 @@ def test_a_link_that_would_carry_more_than_64_bits_can_count() -> None:
 
 def test_pauses_for_acks_count_too() -> None:
     """3 messages and an ack delay of 2^60 us: the last ack comes after 3 x 2^60 us."""
-    with pytest.raises(BufgymError, match=r"may need 3.46e\+18 us"):
-        Episode(THREE, STEADY, ack_delay_us=2**60)
+    refuse(r"may need 3.46e\+18 us", Episode, THREE, STEADY, ack_delay_us=2**60)
 
 
 def test_a_fleet_of_one_meets_the_episodes_of_its_uplink() -> None:

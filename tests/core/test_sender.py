@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import log, order, same, trace, watched
+from refusal_cases import refuse
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
@@ -154,14 +154,12 @@ def test_peak_backlog():
     ],
 )
 def test_errors(given_, rule):
-    with pytest.raises(BufgymError, match=rule):
-        Senders(1, **{"capacity": 2, "v": V, "max_messages": 3, **given_})
+    refuse(rule, Senders, 1, **{"capacity": 2, "v": V, "max_messages": 3, **given_})
 
 
 @kernels
 def test_no_episode():
-    with pytest.raises(BufgymError, match="no episode to run"):
-        run(policies.get("afr"), [], 2, V)
+    refuse("no episode to run", run, policies.get("afr"), [], 2, V)
 
 
 SLOW = Link(trace([(0, 0), (1_000_000, 100), (2_000_000, 10_000_000)], "hold"))

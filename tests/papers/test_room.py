@@ -3,8 +3,8 @@
 import frame_cases  # noqa: F401  skips where the extra is absent
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
-from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import rays
 from bufgym.papers.perception.rays import BASELINE_M
 from bufgym.papers.perception.room import FREE_M, Furniture, MadeUpRoom, made_up_room
@@ -84,7 +84,5 @@ def test_no_thing_stands_in_the_cameras_way() -> None:
 
 
 def test_what_is_not_there_is_refused() -> None:
-    with pytest.raises(BufgymError, match="frames = 1: must be at least 2"):
-        made_up_room(0, frames=1)
-    with pytest.raises(BufgymError, match="frame 2: must be from 0 to 1"):
-        made_up_room(0, frames=2).reduced(SMALL).depth(2)
+    refuse("frames = 1: must be at least 2", made_up_room, 0, frames=1)
+    refuse("frame 2: must be from 0 to 1", made_up_room(0, frames=2).reduced(SMALL).depth, 2)

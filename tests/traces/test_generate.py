@@ -10,9 +10,10 @@ import pytest
 from cli_cases import Capsys, fails, shown
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 
 from bufgym import traces
-from bufgym.ground.errors import BufgymError, TraceError
+from bufgym.ground.errors import TraceError
 from bufgym.traces import describe, load, load_motion, read_motion, read_trace, synthetic_lte
 from bufgym.traces.generate.driving import drive_motion
 from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates, markov_link
@@ -134,8 +135,7 @@ def test_broken_arguments_and_parameter_files(tmp_path: Path) -> None:
         (lambda: steady(0), "bytes_per_s = 0: must be a number from 1"),
         (lambda: replace(FLAT, place_share=0.7, level_share=0.7), "level_share = 0.7: must be a number from 0 to 0.3"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            make()
+        refuse(says, make)
     file, shipped = tmp_path / "links.json", LINKS.read_text(encoding="ascii")
     stay = f'"level_stay_s": {json.loads(shipped)["modes"]["bus"]["level_stay_s"]}'
     stays = [shipped.replace(stay, f'"level_stay_s": {s}') for s in ("null", "true", '"5"', "NaN", "-1", "1e400")]
@@ -147,8 +147,7 @@ def test_broken_arguments_and_parameter_files(tmp_path: Path) -> None:
         *((text, "mode '.*': level_stay_s = |is not a finite number") for text in stays),
     ):
         file.write_text(text, encoding="utf-8")
-        with pytest.raises(TraceError, match=f"links.json.*({says})"):
-            read_links(file)
+        refuse(f"links.json.*({says})", read_links, file, kind=TraceError)
 
 
 # --- files that come with bufgym, and the command ``generate`` -------------------------------------------------------
@@ -178,12 +177,9 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
     own = tmp_path / "own.csv"
     traces.write_csv(tunnel(), own)
     assert load(own) == load(str(own)) == read_trace(own) and load(own, after="stop").after == "stop"
-    with pytest.raises(TraceError, match=r"lte-nowhere: no such file, .*known: .*drive-0.*lte-synthetic-7"):
-        load("lte-nowhere")
-    with pytest.raises(TraceError, match="must fit a known format"):
-        load("drive-0")
-    with pytest.raises(TraceError, match="must have 8 columns"):
-        read_motion(names["lte-synthetic-0"])
+    refuse(r"lte-nowhere: no such file, .*known: .*drive-0.*lte-synthetic-7", load, "lte-nowhere", kind=TraceError)
+    refuse("must fit a known format", load, "drive-0", kind=TraceError)
+    refuse("must have 8 columns", read_motion, names["lte-synthetic-0"], kind=TraceError)
 
 
 GENERATE = ["trace", "generate"]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cli_cases import Capsys, fails, shown
 from link_files import HEADER, SAMPLES, UCC_HEADER, knots, written
+from refusal_cases import refuse
 
 from bufgym.cli import main
 from bufgym.ground.errors import BufgymError
@@ -103,8 +104,7 @@ def test_ucc_columns(tmp_path: Path) -> None:
     assert trace.source.endswith("(format ucc, detected, column DL_bitrate, 1 s a line, 4 s by its clock)")
     assert read_trace(path, column="DL_bitrate") == trace
     assert read_trace(path, column="UL_bitrate").cumulative_bytes.tolist() == [0, 2_500, 3_500, 3_500]
-    with pytest.raises(BufgymError, match="column = 'Speed': must be one of DL_bitrate, UL_bitrate"):
-        read_trace(path, column="Speed")
+    refuse("column = 'Speed': must be one of DL_bitrate, UL_bitrate", read_trace, path, column="Speed")
     with pytest.raises(BufgymError, match="column = 'DL_bitrate': format mahimahi has no columns"):
         read_trace(written(tmp_path, "1\n"), column="DL_bitrate")
 
@@ -124,8 +124,7 @@ def test_runs_of_a_list_with_and_without_times(tmp_path: Path) -> None:
     assert knots(third) == [(0, 0), (S, S), (2 * S, 1_500_000)]
     assert third.source.endswith("run 3 of 3, times as stated, the first of 2 pairs)")
     assert read_trace(path, column="run 2").total_bytes == 2_000_000
-    with pytest.raises(BufgymError, match="has no run 4: must be one of run 1, run 3, run 2"):
-        read_trace(path, column="run 4")
+    refuse("has no run 4: must be one of run 1, run 3, run 2", read_trace, path, column="run 4")
 
 
 def test_what_convert_refuses(tmp_path: Path, capsys: Capsys) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_files import written
-from refusal_cases import refused
+from refusal_cases import refuse, refused
 
 from bufgym.ground.errors import TraceError, where
 from bufgym.traces import Trace, describe, difference, read_trace, write_csv, write_mahimahi
@@ -161,12 +161,9 @@ def test_mahimahi_never_runs_ahead_but_at_the_end(tmp_path: Path, rows: list[tup
 def test_unwritable_traces(tmp_path: Path) -> None:
     for write in (write_csv, write_mahimahi):
         for path, why in ((tmp_path, "Is a directory"), (tmp_path / "nowhere" / "link", "No such file")):
-            with pytest.raises(TraceError, match=f"cannot be written: {why}"):
-                write(Trace.constant(1, 1), path)
-    with pytest.raises(TraceError, match="at most 1000000000000 bytes"):
-        write_csv(Trace.constant(2e12, 1), tmp_path / "fast.csv")
-    with pytest.raises(TraceError, match="at most 10000000 packets"):
-        write_mahimahi(Trace.constant(4.6e11, 1), tmp_path / "fast.up")
+            refuse(f"cannot be written: {why}", write, Trace.constant(1, 1), path, kind=TraceError)
+    refuse("at most 1000000000000 bytes", write_csv, Trace.constant(2e12, 1), tmp_path / "fast.csv", kind=TraceError)
+    refuse("at most 10000000 packets", write_mahimahi, Trace.constant(4.6e11, 1), tmp_path / "fast.up", kind=TraceError)
     assert list(tmp_path.iterdir()) == []
     trace = Trace.from_intervals([1, 999_999, 1_234_567, 2_000_000], [0, 10**12, 7, 0], name="odd")
     write_csv(trace, tmp_path / "odd.csv")
