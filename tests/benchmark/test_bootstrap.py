@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from refusal_cases import refuse
 from test_score import TWO_CELLS, cell_of, noisy, rows_of, standing_of, width
 
 from bufgym.benchmark import score
 from bufgym.benchmark.bootstrap import links_drawn, percentile_interval, stream, times_drawn
-from bufgym.ground.errors import BufgymError
 
 
 def test_links_are_drawn_jointly_by_hand() -> None:
@@ -53,8 +53,7 @@ def test_share_of_afrs_regret_and_its_paired_difference_by_hand() -> None:
     assert less.value == pytest.approx((oldest - mine) / afr) and less.low <= less.value <= less.high
     plain = score.scores(TWO_CELLS)
     assert "against" not in standing_of(plain, "mine").values and plain.cells == made.cells
-    with pytest.raises(BufgymError, match="no row of min-gap, with which the others are to be compared"):
-        score.scores(TWO_CELLS, against="min-gap")
+    refuse("no row of min-gap, with which the others are to be compared", score.scores, TWO_CELLS, against="min-gap")
 
 
 def test_a_difference_is_paired() -> None:

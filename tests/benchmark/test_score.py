@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 from bufgym.benchmark import score, table
 from bufgym.benchmark.score import CellScore, Interval, Scores, Standing
-from bufgym.ground.errors import BufgymError
 
 
 def rows_of(
@@ -262,8 +262,7 @@ def test_without_a_reference_there_is_no_improvement() -> None:
     ],
 )
 def test_rows_that_do_not_fit_together(rows: list[dict[str, Any]], message: str) -> None:
-    with pytest.raises(BufgymError, match=re.escape(message)):
-        score.scores(rows)
+    refuse(re.escape(message), score.scores, rows)
 
 
 def row(policy: str, capacity: int, qoi: float, **more: Any) -> dict[str, Any]:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
+from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.benchmark import sources
 from bufgym.benchmark.rows import read_rows
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 
 MODULE = """
@@ -132,5 +132,4 @@ def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: Capsys
 @pytest.mark.parametrize("word", ["os:system", "mine.zip", "mine.safetensors"])
 def test_a_name_from_elsewhere_loads_nothing(word: str) -> None:
     """``policies.get`` also gets names from leaderboards and results of strangers."""
-    with pytest.raises(BufgymError, match=r"unknown policy"):
-        policies.get(word)
+    refuse(r"unknown policy", policies.get, word)

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from naive_cell import Cell
+from refusal_cases import refuse
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.model.link import Link
@@ -175,8 +175,7 @@ def test_an_answer_must_be_a_whole_number(hook, given):
     odd = policies.Policy("odd", **{"on_arrival": accept, hook: lambda *_: given})
     one = episodes[0].episode(0)
     for play in (lambda: run_fleet(odd, episodes, 4, made.value), lambda: run(odd, [one], 4, made.value)):
-        with pytest.raises(BufgymError, match=rf"policy odd: {hook} returned {given!r}: must be a whole number"):
-            play()
+        refuse(rf"policy odd: {hook} returned {given!r}: must be a whole number", play)
 
 
 def test_cells_of_a_batch_know_nothing_of_each_other():

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from env_cases import same, valid_action
 from gymnasium.vector import AutoresetMode
-from refusal_cases import refused
+from refusal_cases import refuse, refused
 
 from bufgym import policies
 from bufgym.envs import FleetVecEnv, SenderEnv
-from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
@@ -203,8 +202,7 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
         if name == "bufgym.envs.fleet" or name.split(".")[0] == "pettingzoo":
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
-    with pytest.raises(BufgymError, match=r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"'):
-        bufgym.envs.__getattr__("FleetEnv")
+    refuse(r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"', bufgym.envs.__getattr__, "FleetEnv")
     with pytest.raises(AttributeError, match="no_such_thing"):
         bufgym.envs.__getattr__("no_such_thing")
     assert bufgym.envs.FleetVecEnv is FleetVecEnv

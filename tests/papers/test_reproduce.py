@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 from cli_cases import Patch, fails
+from refusal_cases import refuse
 
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.papers import FIGURES, afr_fig5, page, run
 from bufgym.papers.figure import statements
@@ -142,5 +142,4 @@ def test_unknown_names_and_unusable_options_are_refused() -> None:
         ("robofleet-fig4", {"kinds": ("Laser",)}, "must be some of PointCloud2, CompressedImage, LaserScan"),
         ("robofleet-fig6", {"queue_sizes": (1.5,)}, "queue_sizes = 1.5: must be a whole number >= 1"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            run(name, **options)
+        refuse(says, run, name, **options)
