@@ -26,21 +26,10 @@ REPO = Path(__file__).resolve().parent.parent
 COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
 
 # A busy machine draws examples slowly; that is no failure.
-settings.register_profile(
-    "commit",
-    max_examples=25 if COMPILED else 8,
-    derandomize=True,
-    database=None,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-settings.register_profile(
-    "nightly",
-    max_examples=200 if COMPILED else 30,
-    deadline=None,
-    print_blob=True,
-    suppress_health_check=[HealthCheck.too_slow],
-)
+patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+few, many = (25, 200) if COMPILED else (8, 30)
+settings.register_profile("commit", patient, max_examples=few, derandomize=True, database=None)
+settings.register_profile("nightly", patient, max_examples=many, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "commit"))
 
 

@@ -37,11 +37,8 @@ TINY = Evolve(suites=ON, name="tiny", steps=4_000, validate_every=1_500)
 def client(**more: Any) -> Client:
     """Two topics of which half can cross; every second the link stands still for one."""
     link = Trace.steps([(1.0, 20_000), (1.0, 0)])
-    streams = (
-        Stream(Topic("first", priority=5, weight=2), 10, 500),
-        Stream(Topic("second", weight=1), 10, 1_500),
-        Stream(Topic("command", no_drop=True), 2, 100),
-    )
+    first, second = Topic("first", priority=5, weight=2), Topic("second", weight=1)
+    streams = (Stream(first, 10, 500), Stream(second, 10, 1_500), Stream(Topic("command", no_drop=True), 2, 100))
     given: dict[str, Any] = {"duration_s": 4.0, "value": qoi.exponential(0.5)}
     return Client(streams, (link,), **(given | more))
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import Patch
 
 from bufgym import cli
 
@@ -131,16 +132,12 @@ def test_pytest_stages_name_the_failed_test_and_the_slowest(tmp_path: Path) -> N
     result = stages.carry_out(stage, tmp_path / "log")
     assert (result.outcome, result.remark) == ("FAILED", "2 tests, 0 skipped, 1 failed: test_tale.py::test_bad")
     rows = stages.table([result]).splitlines()
-    assert rows[0].startswith("tale          FAILED") and {row.split()[-1] for row in rows[-2:]} == {
-        "test_tale.py::test_good",
-        "test_tale.py::test_bad",
-    }
+    assert rows[0].startswith("tale          FAILED")
+    assert {row.split()[-1] for row in rows[-2:]} == {f"test_tale.py::test_{name}" for name in ("good", "bad")}
 
 
 @pytest.mark.parametrize("tier, ran", [("test", ["one"]), ("nightly", ["one", "two"])])
-def test_the_night_goes_on_after_a_failure_and_a_commit_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tier: str, ran: list[str]
-) -> None:
+def test_a_failure_ends_a_commit_but_no_night(tmp_path: Path, monkeypatch: Patch, tier: str, ran: list[str]) -> None:
     monkeypatch.setattr(stages, "REPO", tmp_path)
     two = [stages.Stage(name, [sys.executable, "-c", f"exit({code})"]) for name, code in (("one", 1), ("two", 0))]
     monkeypatch.setattr(stages, tier, lambda arguments: two)
@@ -149,7 +146,7 @@ def test_the_night_goes_on_after_a_failure_and_a_commit_does_not(
     assert [line.split()[0] for line in summary] == ran
 
 
-def test_a_night_ends_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_night_ends_in_time(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(stages, "REPO", tmp_path)
     monkeypatch.setattr(stages, "NIGHT_S", 0.0)
     monkeypatch.setattr(stages, "nightly", lambda arguments: [program("import time; time.sleep(60)")])

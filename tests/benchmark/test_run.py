@@ -125,12 +125,8 @@ def test_functions_and_names_are_policies_too() -> None:
 
 
 CHOSEN = [policies.get(spec) for spec in ("drop-oldest", "afr", "random", "codel", "clairvoyant", "rosbridge")]
-GAPPY = Uplink(
-    traces=(Trace.steps([(1.0, 600_000), (2.0, 0), (1.0, 250_000)], name="gappy"),),
-    rate_hz=10,
-    duration_s=6,
-    size_bytes=50_000,
-)
+GAPS = Trace.steps([(1.0, 600_000), (2.0, 0), (1.0, 250_000)], name="gappy")
+GAPPY = Uplink(traces=(GAPS,), rate_hz=10, duration_s=6, size_bytes=50_000)
 STOPS = replace(GAPPY, traces=(Trace.steps([(2.0, 300_000), (2.0, 20_000)], name="stops", after="stop"),))
 """Here the link ends for good: a message hangs in transmission and others stay queued."""
 

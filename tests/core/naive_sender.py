@@ -303,12 +303,8 @@ class Sender:
 
     def late(self, until):
         """Sum of the weights of messages older than their deadline when they reached the server."""
-        return sum(
-            rules.weight
-            for lane, rules in enumerate(self.rules)
-            for us, m in self.received(lane, until)
-            if us - m["us"] > rules.deadline_us
-        )
+        ages = [(r, us - m["us"]) for lane, r in enumerate(self.rules) for us, m in self.received(lane, until)]
+        return sum(rules.weight for rules, age_us in ages if age_us > rules.deadline_us)
 
     def left_bytes(self):
         """Bytes that the socket took and that have not crossed yet."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_cases import Capsys, Patch
 from refusal_cases import refuse
 
 from bufgym.cli import main
@@ -40,9 +41,7 @@ def test_recordings_that_are_missing_are_named(tmp_path: Path) -> None:
         refuse(r"report_car_0002.csv: no such file", run, name, data=tmp_path)
 
 
-def test_all_leaves_them_out_without_data_which_is_passed_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_all_leaves_them_out_without_data(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     data, out = tmp_path / "data", str(tmp_path / "out")
     (data / "belgium_4g" / "csv").mkdir(parents=True)
     trace = Trace.steps([(1, 9e6), (40, 0.4e6)], name="report_car_0002")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import Patch, fails
+from cli_cases import Capsys, Patch, fails
 from refusal_cases import refuse
 
 from bufgym.cli import main
@@ -96,9 +96,7 @@ def test_every_claim_has_its_place_or_is_ours_and_a_row_on_the_page(name: str) -
         assert set(claim_rows(name)) <= set(text_of_page.splitlines())  # what comes out now
 
 
-def test_the_rows_of_one_figure_are_renewed(
-    tmp_path: Path, monkeypatch: Patch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_rows_of_one_figure_are_renewed(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     """Fig. 4's row is made again, and those of figures that are not named stay, however old."""
     file, old = tmp_path / "claims.md", "| place | an old sentence | `{}` | ours | not checked | |"
     file.write_text("\n".join(["# Head", "", old.format("afr-fig4").replace("4`", "4` †"), old.format("afr-fig5")]))
