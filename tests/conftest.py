@@ -26,21 +26,10 @@ REPO = Path(__file__).resolve().parent.parent
 COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
 
 # A busy machine draws examples slowly; that is no failure.
-settings.register_profile(
-    "commit",
-    max_examples=25 if COMPILED else 8,
-    derandomize=True,
-    database=None,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-settings.register_profile(
-    "nightly",
-    max_examples=200 if COMPILED else 30,
-    deadline=None,
-    print_blob=True,
-    suppress_health_check=[HealthCheck.too_slow],
-)
+patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+few, many = (25, 200) if COMPILED else (8, 30)
+settings.register_profile("commit", patient, max_examples=few, derandomize=True, database=None)
+settings.register_profile("nightly", patient, max_examples=many, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "commit"))
 
 
@@ -64,10 +53,8 @@ def ros(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     from ros1_cases import environment
 
     where = environment(tmp_path_factory.mktemp("ros"))
-    names = "rospy, rosmaster, sensor_msgs.msg, nav_msgs.msg"
-    done = subprocess.run(
-        [sys.executable, "-c", f"import {names}"], env=where, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", "import rospy, rosmaster, sensor_msgs.msg, nav_msgs.msg"]
+    done = subprocess.run(command, env=where, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         pytest.skip(f"ROS 1 (python3-rospy and others) is not here: {done.stderr.strip().splitlines()[-1]}")
     return where

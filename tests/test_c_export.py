@@ -70,8 +70,7 @@ def compiled(folder, compiler, standard, source, text, *flags):
 
 def assert_equal(text, expected):
     """Without pytest's own search for what differs, which takes minutes."""
-    lines = zip(text.splitlines(), expected.splitlines(), strict=True)
-    assert [pair for pair in lines if pair[0] != pair[1]] == []
+    assert [pair for pair in zip(text.splitlines(), expected.splitlines(), strict=True) if pair[0] != pair[1]] == []
 
 
 def output(program, *words, text=""):
@@ -102,8 +101,7 @@ def every_field() -> Policy:
 
 def every_output() -> Policy:
     """A random agent that changes every number of the rule it guides."""
-    W = np.random.default_rng(4).normal(size=guided.GuidedWeights.SHAPE)
-    return guided.linear("every-output", 0.4 * W)
+    return guided.linear("every-output", 0.4 * np.random.default_rng(4).normal(size=guided.GuidedWeights.SHAPE))
 
 
 AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
@@ -164,8 +162,7 @@ def test_parity_finds_another_number(name, number, other, tmp_path):
 def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
     """8 MB/s but for a standstill from second 4 to 8; 230 kB frames at 30 Hz."""
     policy = policies.get(name)
-    text = header(policy, 8, EXPONENTIAL)
-    robot = compiled(tmp_path, "g++", "c++17", REPO / "examples" / "robot.cpp", text)
+    robot = compiled(tmp_path, "g++", "c++17", REPO / "examples" / "robot.cpp", header(policy, 8, EXPONENTIAL))
     frames = 360 if JIT else 150
     at_us = 33_333 * np.arange(frames)
     arrivals = "".join(f"{us} 230000 {k}\n" for k, us in enumerate(at_us))

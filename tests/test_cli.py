@@ -47,33 +47,6 @@ def test_the_module_runs_as_a_command_and_opens_no_heavy_module() -> None:
     assert done.stdout == f"bufgym {__version__}\n"
 
 
-@pytest.mark.parametrize(
-    ("command", "naming"),
-    [
-        ("benc", 'Did you mean "bench"?'),
-        ("trace inf", 'Did you mean "info"?'),
-        ("trace info missing.csv", "missing.csv"),
-        ("trace plot lte-synthetic-0 --out x.doc", "x.doc"),
-        ("play --env Moon-v0", "'Moon-v0'"),
-        ("play --out film.mp4", "film.mp4: must end in .gif"),
-        ("bench --policies decimate:every=0", "every = 0"),
-        ("bench --policies mine.py", "--policy-file mine.py registers its policies"),
-        ("bench --policies afr --against no-such", "no-such"),
-        ("bench --capacity 0", "0: must be"),
-        ("bench --fps nan", "nan: must be"),
-        ("bench --bytes 1.5", "1.5"),
-        ("bench --seconds 1e9", "duration_s = 1000000000.0: must be at most"),
-        ("bench --jitter 2", "jitter = 2"),
-        ("bench --t-max 5", "--t-max needs --interruption"),
-        ("bench --interruption --trace x.csv", "--trace cannot go with --interruption"),
-        ("bench --nonsense", "--nonsense"),
-        ("bench --size 3", "--size. Did you mean --sizes?"),
-    ],
-)
-def test_bad_commands(command: str, naming: str, capsys: Capsys) -> None:
-    fails(command.split(), naming, capsys)
-
-
 def test_ctrl_c_and_a_reader_that_left(monkeypatch: Patch, capsys: Capsys, tmp_path: Path) -> None:
     def interrupt(*_: Any, **__: Any) -> str:
         raise KeyboardInterrupt
@@ -169,30 +142,6 @@ def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) 
         action = 9 if info["action_mask"][9] else 0  # accept, else evict the oldest
         _, _, ended, _, info = env.step(action)
     assert info["qoi"] == row["qoi"] and info["regret"] == pytest.approx(row["regret"]) and info["score"] == 0
-
-
-BOOM = """
-from bufgym.policies import register
-@register('boom'{})
-def boom(buffer, arrival, memory):
-    return {}
-"""
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("def broken(:\n", "line 1"),
-        ("import a_module_that_is_not_there\n", "line 1: ModuleNotFoundError"),
-        (BOOM.format("", "1 // 0"), "line 5: ZeroDivisionError"),
-        (BOOM.format(", compile=True", "buffer.nothing"), "compile" if JIT else "line 5: AttributeError"),
-    ],
-)
-def test_a_users_mistake_is_shown_where_it_is(trace: str, tmp_path: Path, text: str, line: str, capsys: Capsys) -> None:
-    mine = tmp_path / "mine.py"
-    mine.write_text(text)
-    only = ["--policies", "boom"] if "boom" in text else []
-    fails(["bench", "--trace", trace, *QUICK, "--policy-file", mine, *only], line, capsys)
 
 
 def test_an_output_folder_that_cannot_be_written(trace: str, tmp_path: Path, capsys: Capsys) -> None:

@@ -86,28 +86,6 @@ def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Caps
     assert "1 episode of 2 s" in told and "1.000 [–]" in told and "1.000 [1.000" not in told
 
 
-@pytest.mark.parametrize(
-    ("options", "naming"),
-    [
-        ("topics --consumers 0", "consumers = 0"),
-        ("topics --suite fleet-v1", "suite fleet-v1 is not one of topics: bufgym bench --suite fleet-v1"),
-        ("topics --policies clairvoyant", "policy clairvoyant: it plans with a queue of its own"),
-        *((f"topics --{name} 2", f"--{name} needs --config") for name in ("trace", "motion", "scale")),
-        ("topics --by-topic afr", "--by-topic afr: not among the policies that run"),
-        ("topics --out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
-        ("topics --config no-such.toml", "error: no-such.toml: no such file\n"),
-        ("topics --config x.toml --suite topics-v1", "--suite cannot go with --config"),
-        ("bench --by-topic afr", "--by-topic needs several topics"),
-        ("bench --window 2", "--window needs --suite, --scenario or --config"),
-        ("bench --scenario topics --max-bytes 9", "--max-bytes is for one queue"),
-        ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
-        ("fleet --robots 257", "robots = 257: must be a whole number from 1 to 256"),
-    ],
-)
-def test_bad_options(options: str, naming: str, capsys: Capsys) -> None:
-    fails(options.split(), naming, capsys)
-
-
 def test_a_mistake_typed_is_not_the_files_fault(config: str, capsys: Capsys, monkeypatch: Patch) -> None:
     fails(["topics", "--config", config, "--trace", "lte-synthetic-0", "--window", 0], "error: window = 0", capsys)
     fails(["topics", "--config", config, "--trace", "none.csv"], "none.csv", capsys)
@@ -141,9 +119,8 @@ BENCH = ["bench", *W.split(), "--capacity", "1"]
 
 def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
     text = shown([*BENCH, "--policies", "drop-oldest,drop-newest,clairvoyant", "--drops", "drops.csv"], capsys)
-    lines = text.splitlines()
     # By topic: two messages each, 1 s between the two, 2 s apart.
-    assert ["/camera", "2", "0.500", "2,000", "1,000", "50.0%"] in [line.split() for line in lines]
+    assert ["/camera", "2", "0.500", "2,000", "1,000", "50.0%"] in [line.split() for line in text.splitlines()]
     # H: messages 0 and 3 give 1 + V(2) = 1.865; 0 and 1 give 1 + V(0) = 1.
     first, _, second = text.partition("dropped of")
     table = {line.split()[0]: line.split() for line in first.splitlines() if line}

@@ -51,8 +51,7 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     robots = by_trace(fleet.fleet_of(ON, "validation"))[0][1]
     robots = dataclasses.replace(robots, uplink=dataclasses.replace(robots.uplink, duration_s=2.0))
     cell = fleet.FleetEpisodes(robots, [draw(robots, seed) for seed in (0, 1)], 4)
-    rows = run([policies.get(name) for name in ("afr", "min-gap")], robots, [4], 2)
-    mean = TASK.summary(rows).standings
+    mean = TASK.summary(run([policies.get(name) for name in ("afr", "min-gap")], robots, [4], 2)).standings
     assert cell.rival == pytest.approx(mean["afr"]["team"].value)
     assert cell.team_qoi(policies.get("min-gap")) == pytest.approx(mean["min-gap"]["team"].value)
     gain = fleet.mean_gain(policies.get("min-gap"), [cell])

@@ -22,8 +22,7 @@ def test_an_interruption_second_by_second() -> None:
     assert run.received.tolist() == [0, 3, 4, 5]
     assert picture.states_at(run, 250_000).tolist() == [SENDING, QUEUED, QUEUED, -1, -1, -1]
     assert picture.states_at(run, 300_000).tolist() == [SENDING, DROPPED, QUEUED, QUEUED, -1, -1]
-    after = [DELIVERED, DROPPED, DROPPED, DELIVERED, DELIVERED, DELIVERED]
-    assert picture.states_at(run, 900_000).tolist() == after
+    assert picture.states_at(run, 900_000).tolist() == [DELIVERED, DROPPED, DROPPED, DELIVERED, DELIVERED, DELIVERED]
     assert run.longest_gap_s == pytest.approx(0.3)
     # Gaps of 3, 1 and 1 with V = 1 - 0.618^d.
     assert run.h == pytest.approx(1 + (1 - 0.618**3) + 2 * (1 - 0.618))

@@ -17,10 +17,9 @@ from bufgym.traces import Trace
 
 def runs() -> list[families.Run]:
     """Two links that carry a third of 30 messages a second."""
-    links = (Trace.steps([(1.0, 4e6), (1.0, 5e5)], name="a"), Trace.steps([(2.0, 3e6), (1.0, 1e6)], name="b"))
     return [
         run_of(link.name, Uplink(traces=(link,), duration_s=6.0), seed, L, max_bytes)
-        for link in links
+        for link in (Trace.steps([(1.0, 4e6), (1.0, 5e5)], name="a"), Trace.steps([(2.0, 3e6), (1.0, 1e6)], name="b"))
         for seed in range(2)
         for L, max_bytes in ((4, None), (8, 8 * 230_000))
     ]
@@ -55,14 +54,9 @@ def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeyp
     joint.main(file, out=tmp_path / "page.md")
     page = (tmp_path / "page.md").read_text().splitlines()
     own, rule = (family.share(each) for each in (policies.load(file), policies.get("gap-price")))
-    assert next(line for line in page if line.startswith("| task |")).split(" | ")[3:] == [
-        f"{rule:.3f}",
-        f"{own:.3f} |",
-    ]
-    assert [line.split(" |")[0] for line in page if line.startswith("| default")] == [
-        "| default-frames, L = 4",
-        "| default-frames, L = 8",
-    ] * 2
+    assert next(row for row in page if row.startswith("| task |")).split(" | ")[3:] == [f"{rule:.3f}", f"{own:.3f} |"]
+    frames = [row.split(" |")[0] for row in page if row.startswith("| default")]
+    assert frames == [f"| default-frames, L = {L}" for L in (4, 8)] * 2
 
 
 def test_every_family_is_drawn_anew_for_each_split(tmp_path: Path, monkeypatch: Patch) -> None:

@@ -19,8 +19,7 @@ def test_frames_arrive_as_they_do_one_episode_at_a_time() -> None:
     arrived = side_by_side.arrived(policies.get("afr"))
     for episode, frames in zip(side_by_side.episodes, arrived, strict=True):
         assert frames.tolist() == list(streams.received("afr", episode, 4))
-        senders = sim.run(policies.get("afr"), [episode], 4, worth.mapping().value)
-        sender = senders.batch.senders[0]
+        sender = sim.run(policies.get("afr"), [episode], 4, worth.mapping().value).batch.senders[0]
         assert on_task.information(frames) == pytest.approx(float(sender["delivered_gain"]) + 1)
     assert arrived[0].tolist() != arrived[1].tolist()
 

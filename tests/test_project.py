@@ -96,6 +96,5 @@ def test_every_hint_names_an_extra_that_there_is() -> None:
     extras = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     named = set()
     for path in sorted((REPO / "bufgym").rglob("*.py")):
-        text = path.read_text(encoding="utf-8")
-        named |= set(re.findall(r"""install\(['"](\w+)['"]\)""", text))
+        named |= set(re.findall(r"""install\(['"](\w+)['"]\)""", path.read_text(encoding="utf-8")))
     assert {"plot", "train", "fleet", "ros"} <= named <= set(extras)

@@ -30,23 +30,21 @@ from bufgym.sim.metrics import topic_outcomes
 from bufgym.traces import Trace
 
 ON = Suites(("topics-v1",), test_seeds=1)
+ZERO = SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32))
 TINY = Evolve(suites=ON, name="tiny", steps=4_000, validate_every=1_500)
 
 
 def client(**more: Any) -> Client:
     """Two topics of which half can cross; every second the link stands still for one."""
     link = Trace.steps([(1.0, 20_000), (1.0, 0)])
-    streams = (
-        Stream(Topic("first", priority=5, weight=2), 10, 500),
-        Stream(Topic("second", weight=1), 10, 1_500),
-        Stream(Topic("command", no_drop=True), 2, 100),
-    )
+    first, second = Topic("first", priority=5, weight=2), Topic("second", weight=1)
+    streams = (Stream(first, 10, 500), Stream(second, 10, 1_500), Stream(Topic("command", no_drop=True), 2, 100))
     given: dict[str, Any] = {"duration_s": 4.0, "value": qoi.exponential(0.5)}
     return Client(streams, (link,), **(given | more))
 
 
 def test_weights_are_a_vector_and_back() -> None:
-    search = Evolution.around(SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32)), 0.1, 0)
+    search = Evolution.around(ZERO, 0.1, 0)
     vector = np.arange(len(search.average), dtype=float)
     found = search.weights(vector)
     assert isinstance(found, SchedulerWeights) and (found.weight.reshape(-1) == vector).all()
@@ -60,8 +58,7 @@ def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[floa
     for i, episode in enumerate(of.episodes):
         for k, (topic, made) in enumerate(zip(topics, topic_outcomes(senders, i), strict=True)):
             times = episode.arrivals["arrival_us"]
-            begin_us = times[episode.arrivals["topic"] == k][0]
-            area = made.mean_age_s * (times[-1] - begin_us) / 1e6
+            area = made.mean_age_s * (times[-1] - times[episode.arrivals["topic"] == k][0]) / 1e6
             qoi_ += topic.share * made.qoi
             first, others = first + area * (k == 0), others + area * (k > 0)
             lost += made.lost * topic.no_drop
@@ -69,10 +66,7 @@ def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[floa
 
 
 def test_reached_is_what_the_metrics_say() -> None:
-    for policy in (
-        policies.get("fifo"),
-        SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32)).policy("plain"),
-    ):
+    for policy in (policies.get("fifo"), ZERO.policy("plain")):
         of = topics.ClientEpisodes(client(), 6, 2, np.random.default_rng(1))
         assert of.reached(policy) == pytest.approx(by_metrics(policy, of), rel=1e-9)
         assert of.reached(policy) == of.reached(policy)
@@ -106,8 +100,7 @@ def short_episodes(monkeypatch: Patch) -> None:
     def client_episodes(
         chosen: Suites, split: str, seed: int, episodes: int, episode_s: float | None = None, *, scale: float = 1.0
     ) -> Any:
-        rng = np.random.default_rng([seed, split == "train"])
-        return [topics.ClientEpisodes(client(duration_s=2.0), 6, 1, rng)]
+        return [topics.ClientEpisodes(client(duration_s=2.0), 6, 1, np.random.default_rng([seed, split == "train"]))]
 
     monkeypatch.setattr(topics, "client_episodes", client_episodes)
 

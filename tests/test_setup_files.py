@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import Patch
 
 from bufgym import cli
 
@@ -68,8 +69,7 @@ def test_workflows_run_rules_and_scripts_that_there_are(name: str) -> None:
 
 
 def test_every_supported_python_is_tried() -> None:
-    matrix = read_yaml(".github/workflows/test.yml")["jobs"]["test"]["strategy"]["matrix"]["python"]
-    assert matrix == PYTHONS
+    assert read_yaml(".github/workflows/test.yml")["jobs"]["test"]["strategy"]["matrix"]["python"] == PYTHONS
     for name in ("nightly.yml", "release.yml"):
         assert set(PYTHONS) <= set(re.findall(r"^ +(3\.\d+)$", (REPO / ".github/workflows" / name).read_text(), re.M))
     assert set(PYTHONS) <= set(stages.PYTHONS)
@@ -123,8 +123,7 @@ def test_a_stage_beyond_its_limit_is_killed_with_all_that_it_started(tmp_path: P
     child = f"open({str(held)!r}, 'w'); import time; time.sleep(60)"
     text = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
     assert run(program(text, limit_s=0.5), tmp_path / "log") == ("TOO SLOW", "killed after 0.5 s")
-    alive = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
-    assert str(held) not in alive
+    assert str(held) not in subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
 
 
 def test_pytest_stages_name_the_failed_test_and_the_slowest(tmp_path: Path) -> None:
@@ -133,16 +132,12 @@ def test_pytest_stages_name_the_failed_test_and_the_slowest(tmp_path: Path) -> N
     result = stages.carry_out(stage, tmp_path / "log")
     assert (result.outcome, result.remark) == ("FAILED", "2 tests, 0 skipped, 1 failed: test_tale.py::test_bad")
     rows = stages.table([result]).splitlines()
-    assert rows[0].startswith("tale          FAILED") and {row.split()[-1] for row in rows[-2:]} == {
-        "test_tale.py::test_good",
-        "test_tale.py::test_bad",
-    }
+    assert rows[0].startswith("tale          FAILED")
+    assert {row.split()[-1] for row in rows[-2:]} == {f"test_tale.py::test_{name}" for name in ("good", "bad")}
 
 
 @pytest.mark.parametrize("tier, ran", [("test", ["one"]), ("nightly", ["one", "two"])])
-def test_the_night_goes_on_after_a_failure_and_a_commit_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tier: str, ran: list[str]
-) -> None:
+def test_a_failure_ends_a_commit_but_no_night(tmp_path: Path, monkeypatch: Patch, tier: str, ran: list[str]) -> None:
     monkeypatch.setattr(stages, "REPO", tmp_path)
     two = [stages.Stage(name, [sys.executable, "-c", f"exit({code})"]) for name, code in (("one", 1), ("two", 0))]
     monkeypatch.setattr(stages, tier, lambda arguments: two)
@@ -151,7 +146,7 @@ def test_the_night_goes_on_after_a_failure_and_a_commit_does_not(
     assert [line.split()[0] for line in summary] == ran
 
 
-def test_a_night_ends_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_night_ends_in_time(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(stages, "REPO", tmp_path)
     monkeypatch.setattr(stages, "NIGHT_S", 0.0)
     monkeypatch.setattr(stages, "nightly", lambda arguments: [program("import time; time.sleep(60)")])
@@ -187,6 +182,5 @@ def test_functions_that_are_compiled_are_found() -> None:
 
 
 def test_the_oldest_dependencies_are_those_of_this_python() -> None:
-    oldest = script("installed").oldest(str(REPO / "pyproject.toml"))
-    names = [line.partition("==")[0] for line in oldest]
+    names = [line.partition("==")[0] for line in script("installed").oldest(str(REPO / "pyproject.toml"))]
     assert sorted(set(names)) == sorted(names) and {"numpy", "numba", "gymnasium"} < set(names)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from cli_cases import Capsys, fails, shown
+from refusal_cases import refuse
 
 from agents import tune
 from bufgym.benchmark import leaderboard, tuned
@@ -44,8 +45,7 @@ def test_numbers_of_any_size_are_read_or_refused(tmp_path: Path, key: str, numbe
     own = f"{key} = {number}\n" if key in ("window", "duration_s") else ""
     topic = {"name": '"t"', "rate_hz": "1", "size_bytes": "1", **({} if own else {key: number})}
     path.write_text(own + "[[topic]]\n" + "".join(f"{k} = {v}\n" for k, v in topic.items()))
-    with pytest.raises(BufgymError, match=r"client\.toml"):
-        read_client(path)
+    refuse(r"client\.toml", read_client, path)
 
 
 @pytest.mark.parametrize("command", ["topics --config", "trace info", "trace from-bag", "report", "bench --workload"])
@@ -57,14 +57,12 @@ def test_devices_and_fifos_are_refused(tmp_path: Path, command: str, capsys: Cap
 
 def test_a_row_is_not_believed_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     """A forged value needs a wide interval; what counts is the interval that is computed now."""
-    now = leaderboard.Interval(0.5, 0.4, 0.6)
-    entry = leaderboard.Entry("lte-v1", "afr", 1, 3, {"score": now}, "0.1.0")
+    entry = leaderboard.Entry("lte-v1", "afr", 1, 3, {"score": leaderboard.Interval(0.5, 0.4, 0.6)}, "0.1.0")
     monkeypatch.setattr(leaderboard, "_run", lambda *a, **k: [entry])
     assert leaderboard.validate(entry) is entry
     for value, low, high in ((0.9, -9, 9), (0.5, -9, 9), (0.9, 0.85, 0.95), (0.61, 0.4, 0.6), (float("nan"), 0.4, 0.6)):
         forged = leaderboard.replace(entry, values={"score": leaderboard.Interval(value, low, high)})
-        with pytest.raises(BufgymError, match=r"score is 0.500000 \[0.400000, 0.600000\], but the file states"):
-            leaderboard.validate(forged)
+        refuse(r"score is 0.500000 \[0.400000, 0.600000\], but the file states", leaderboard.validate, forged)
 
 
 CELLS = ["lte-v1", "afr", "1", "3", "score", "0.5", "0.4", "0.6", "0.1", "x"]

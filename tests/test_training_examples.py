@@ -41,8 +41,7 @@ def test_ppos_parts_by_hand() -> None:
     """gamma = lambda = 1/2. Last: 1 + 3/2 - 2 = 0.5; first: 1 + 2/2 - 1 + 0.5/4 = 1.125, or 1 - 1 where it ended."""
     ppo = example("ppo.py")
     values = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
-    ended = torch.tensor([[0.0, 1.0], [0.0, 0.0]])
-    advantages = ppo["advantages_of"](torch.ones(2, 2), values, ended, 0.5, 0.5)
+    advantages = ppo["advantages_of"](torch.ones(2, 2), values, torch.tensor([[0.0, 1.0], [0.0, 0.0]]), 0.5, 0.5)
     assert advantages.tolist() == [[1.125, 0.0], [0.5, 0.5]]
     # An invalid action is never drawn, whatever its logit.
     logits = ppo["masked"](torch.tensor([[50.0, 0.0, 1.0]]), torch.tensor([[0, 1, 1]], dtype=torch.int8))

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cli_cases import Capsys, Patch
 from cyclopts import App
+from refusal_cases import refuse
 
 from agents import tune
 from agents.tune import Choice
@@ -28,7 +30,7 @@ T = 9: every=3, the default, keeps 4 and 7, with gaps of 4, 3, 3."""
 
 
 @pytest.fixture(autouse=True)
-def splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def splits(tmp_path: Path, monkeypatch: Patch) -> Iterator[list[str]]:
     """The splits asked for, of two tiny suites; results go to a file of the test's own."""
     asked: list[str] = []
 
@@ -48,7 +50,7 @@ def splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str
 default_policies = TASKS["queue"].default_policies
 
 
-def cli(words: str, capsys: pytest.CaptureFixture[str]) -> str:
+def cli(words: str, capsys: Capsys) -> str:
     app = App(default_command=tune.main, default_parameter=OPTIONS, result_action="return_value")
     app([*words.split(), "--jobs", "1"])
     return capsys.readouterr().out
@@ -93,8 +95,7 @@ def test_test_episodes_are_refused_before_any_is_drawn(splits: list[str]) -> Non
     ],
 )
 def test_what_cannot_be_tuned(suite: str, names: list[str], more: dict[str, Any], message: str) -> None:
-    with pytest.raises(BufgymError, match=message):
-        tune.tune(suite, names, jobs=1, **more)
+    refuse(message, tune.tune, suite, names, jobs=1, **more)
 
 
 def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> None:
@@ -120,9 +121,7 @@ def test_one_parameter_at_a_time_around_the_default() -> None:
 
 
 @pytest.mark.parametrize("sizes", ["equal", "jpeg"])
-def test_rules_of_our_own_are_tuned_for_equal_and_for_unequal_sizes(
-    sizes: str, monkeypatch: pytest.MonkeyPatch, splits: list[str]
-) -> None:
+def test_our_own_rules_are_tuned_for_equal_and_unequal_sizes(sizes: str, monkeypatch: Patch, splits: list[str]) -> None:
     """The price of bytes changes what gap-price does only where sizes differ; price-dp reads each of its numbers."""
     link = Trace.steps([(2, 2e6), (1, 0), (3, 1e6), (2, 4e6)], name="fading")
     scenario = Uplink((link,), sizes=sizes, duration_s=20.0, value=qoi.exponential(0.5))
@@ -177,11 +176,10 @@ def test_where_no_cell_is_discriminative_regrets_are_compared() -> None:
     assert compared([199, 199], [190, 190], [180, 180], 200).chosen.spec == "p"
 
 
-def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_what_bench_then_reads(capsys: Capsys) -> None:
     text = cli("tiny-twelve --policies decimate,lifespan --seeds 3", capsys)
     assert "best, chosen" in text and "default, best, chosen" in text and not tuned.FILE.exists()
-    with pytest.raises(BufgymError, match="never chosen on test episodes"):
-        cli("tiny-twelve --split test --write", capsys)
+    refuse("never chosen on test episodes", cli, "tiny-twelve --split test --write", capsys)
     assert not tuned.FILE.exists()
     cli("tiny-twelve --policies decimate,lifespan --seeds 3 --write", capsys)
     entry = tuned.read()["tiny-twelve"]["decimate"]
@@ -205,11 +203,10 @@ def test_the_command_writes_what_bench_then_reads(capsys: pytest.CaptureFixture[
 )
 def test_a_broken_file_is_named(text: bytes, message: str) -> None:
     tuned.FILE.write_bytes(text)
-    with pytest.raises(BufgymError, match=f"{tuned.FILE.name}.*{message}"):
-        default_policies("lte-v1")
+    refuse(f"{tuned.FILE.name}.*{message}", default_policies, "lte-v1")
 
 
-def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_shipped(monkeypatch: Patch) -> None:
     monkeypatch.setattr(tuned, "FILE", Path(tuned.__file__).with_name("tuned.json"))
     shipped = tuned.read()
     assert shipped and set(shipped) <= set(suites.SUITES)
@@ -218,8 +215,7 @@ def test_what_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(set(specs)) == len(specs)
         for policy, entry in entries.items():
             assert entry["setting"] in tune.settings(policy) and entry["split"] == "validation"
-            assert entry["command"].startswith(f"python -m agents.tune {suite}") and entry["command"].endswith(
-                "--write"
-            )
+            command = entry["command"]
+            assert command.startswith(f"python -m agents.tune {suite}") and command.endswith("--write")
             assert (entry["setting"] == policy) == (entry["setting"] not in tuned.tuned(suite))
     assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tuned.FILE.read_text(encoding="utf-8")

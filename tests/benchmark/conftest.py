@@ -14,10 +14,8 @@ from bufgym.traces import Trace
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> Sweep:
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
-        traces = tuple(
-            Trace.steps([(1.0, 500_000), (2.0, 0), (1.0, 300_000)], name=f"{split}-{k}").scaled(1 + k / 2)
-            for k in range(2)
-        )
+        steps = [(1.0, 500_000), (2.0, 0), (1.0, 300_000)]
+        traces = tuple(Trace.steps(steps, name=f"{split}-{k}").scaled(1 + k / 2) for k in range(2))
         uplink = Uplink(traces=traces, rate_hz=5, duration_s=5, size_bytes=100_000)
         return {label: suites.Setting(uplink, f"{label} here", outage_s=2.0) for label in ("one", "two")}
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from refusal_cases import refuse
 from test_score import TWO_CELLS, cell_of, noisy, rows_of, standing_of, width
 
 from bufgym.benchmark import score
 from bufgym.benchmark.bootstrap import links_drawn, percentile_interval, stream, times_drawn
-from bufgym.ground.errors import BufgymError
 
 
 def test_links_are_drawn_jointly_by_hand() -> None:
@@ -21,17 +21,11 @@ def test_links_are_drawn_jointly_by_hand() -> None:
     assert drawn["time"].shape == (2001, 4) and (drawn["time"][0] == 1).all()
     assert (drawn["time"][:, 0] == drawn["time"][:, 1]).all() and (drawn["time"].sum(axis=1) == 4).all()
     assert (drawn["time"] == drawn["motion"]).all() and (drawn["time"] == drawn["reverse"][:, ::-1]).all()
-    jointly = (drawn["time"] @ won + drawn["motion"] @ won) / 8
-    assert percentile_interval(jointly, 0.8) == (0.5, 0, 1)
+    assert percentile_interval((drawn["time"] @ won + drawn["motion"] @ won) / 8, 0.8) == (0.5, 0, 1)
     apart = sum(times_drawn(2, 2000, stream(0, name))[:, 0] / 4 for name in ("time", "motion"))
     assert percentile_interval(np.asarray(apart), 0.8) == (0.5, 0.25, 0.75)
-    rows = [
-        row
-        for scenario in ("time", "motion")
-        for row in rows_of(
-            {"drop-oldest": [0] * 4, "mine": 10 * won}, [10] * 4, traces=["a", "a", "b", "b"], scenario=scenario
-        )
-    ]
+    h = {"drop-oldest": [0] * 4, "mine": 10 * won}
+    rows = [row for s in ("time", "motion") for row in rows_of(h, [10] * 4, traces=["a", "a", "b", "b"], scenario=s)]
     made = score.scores(rows)
     assert standing_of(made, "mine")["score"] == (0.5, 0, 1)
     assert cell_of(made, "mine", "time").qoi == (5, 0, 10)
@@ -59,8 +53,7 @@ def test_share_of_afrs_regret_and_its_paired_difference_by_hand() -> None:
     assert less.value == pytest.approx((oldest - mine) / afr) and less.low <= less.value <= less.high
     plain = score.scores(TWO_CELLS)
     assert "against" not in standing_of(plain, "mine").values and plain.cells == made.cells
-    with pytest.raises(BufgymError, match="no row of min-gap, with which the others are to be compared"):
-        score.scores(TWO_CELLS, against="min-gap")
+    refuse("no row of min-gap, with which the others are to be compared", score.scores, TWO_CELLS, against="min-gap")
 
 
 def test_a_difference_is_paired() -> None:

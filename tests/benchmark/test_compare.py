@@ -48,10 +48,8 @@ def test_the_paired_difference_to_a_policy() -> None:
     assert "| min-gap |" in done.table("markdown").split("\n\n")[-2] and done.html.count("<table>") == 2
     suite = bufgym.compare("afr", "interruption-v1", against="afr", capacity=4, seeds=3, progress=False)
     assert "minus afr's" in suite.table()
-    fleet = bufgym.compare(
-        "min-gap", FleetScenario(robots=2, uplink=scenario.get("lte", duration_s=5.0)), against="afr", seeds=1
-    )
-    assert "minus afr's" in fleet.table()
+    fleet = FleetScenario(robots=2, uplink=scenario.get("lte", duration_s=5.0))
+    assert "minus afr's" in bufgym.compare("min-gap", fleet, against="afr", seeds=1).table()
 
 
 def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
@@ -79,16 +77,14 @@ def test_a_suite_takes_files_and_named_policies_and_those_registered_here(
 
 def test_a_picture() -> None:
     pytest.importorskip("matplotlib", reason="a picture needs the extra [plot]")
-    done = bufgym.compare(["afr", "min-gap"], "interruption", capacity=[2, 4], seeds=2, progress=False)
-    axes = done.plot()
+    axes = bufgym.compare(["afr", "min-gap"], "interruption", capacity=[2, 4], seeds=2, progress=False).plot()
     assert {label.get_text() for label in axes.get_yticklabels()} == {"min-gap", "afr"}
     assert len(axes.patches) == 4 and axes.get_xlabel().startswith("regret")
 
 
 def test_a_frame() -> None:
     frame = pytest.importorskip("pandas", reason="a frame needs pandas")
-    done = bufgym.compare(["afr"], "interruption", seeds=2, progress=False)
-    found = done.to_pandas()
+    found = bufgym.compare(["afr"], "interruption", seeds=2, progress=False).to_pandas()
     assert isinstance(found, frame.DataFrame) and found["policy"].tolist() == ["afr", "afr"]
     assert found["scenario"].tolist() == ["interruption", "interruption"]
 

@@ -36,9 +36,7 @@ def test_rows_of_a_cell_worked_by_hand() -> None:
     rows = met(2, replace(ONE, scale=0.5))
     assert [list(row) for row in rows] == [list(ROWS)] * 2
     key = {"scenario": "hand", "trace": "1 kB/s", "seed": 0, "robots": 2, "policy": "drop-newest", "capacity": 1}
-    assert [key | {"robot": robot} for robot in (0, 1)] == [
-        {name: row[name] for name in list(ROWS)[:7]} for row in rows
-    ]
+    assert [key | {"robot": i} for i in (0, 1)] == [{name: row[name] for name in list(ROWS)[:7]} for row in rows]
     for row in rows:
         assert (row["arrived"], row["delivered"], row["dropped"], row["buffered"]) == (3, 3, 0, 0)
         assert row["qoi"] == pytest.approx(1 + 2 * 0.5)
@@ -84,8 +82,7 @@ def test_intervals_are_over_episodes_not_robots() -> None:
 
 
 def test_rounding_is_no_gain_and_nothing_is_fair() -> None:
-    nothing = (0.0, 0.0)
-    teams = {"afr": (0.1 + 0.2, 0.0), "mine": (0.3, 0.0), "none": nothing}
+    teams = {"afr": (0.1 + 0.2, 0.0), "mine": (0.3, 0.0), "none": (0.0, 0.0)}
     found = TASK.summary([row for policy, team in teams.items() for row in made(policy, team, team)]).standings
     assert found["mine"]["above"] == found["mine"]["below"] == exactly(0.0)
     assert found["none"]["fairness"] == exactly(1.0) and found["none"]["below"] == exactly(0.5)

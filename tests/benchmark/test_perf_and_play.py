@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
@@ -27,9 +28,7 @@ from bufgym.sim.metrics import outcome
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.traces import Trace
 
-PLAYABLE = [
-    name for name in policies.names() if not (policies.get(name).drops_at_dequeue or policies.get(name).unbounded)
-]
+PLAYABLE = [p.name for p in map(policies.get, policies.names()) if not (p.drops_at_dequeue or p.unbounded)]
 
 TINY = perf.Sizes(3, (2, 1), 24, 10, 1, 1)
 
@@ -60,8 +59,7 @@ def test_a_history_says_what_fell_below_the_median_of_the_last_five(tmp_path: Pa
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert len(lines) == 9 and lines[3]["ratios"] == {"batch": 9.0}
     file.write_text("nothing\n")
-    with pytest.raises(BufgymError, match="not a history"):
-        told(1.0)
+    refuse("not a history", told, 1.0)
 
 
 def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:
@@ -100,8 +98,7 @@ def played(env: Any, player: Player, episode: Any) -> dict[str, Any]:
     ended, info = False, {}
     while not ended:
         _, _, ended, _, info = env.step(player.action(env.rows.senders))
-    with pytest.raises(BufgymError, match="no decision is due"):
-        player.action(env.rows.senders)
+    refuse("no decision is due", player.action, env.rows.senders)
     return info
 
 
@@ -138,8 +135,7 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
         odd = Policy("odd", policies.get("fifo").on_arrival, on_send=lambda buffer, memory: 3)
         Player(odd).action(env.rows.senders)
     for name, why in (("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")):
-        with pytest.raises(BufgymError, match=f"policy {name} {why}"):
-            Player(policies.get(name))
+        refuse(f"policy {name} {why}", Player, policies.get(name))
 
 
 @pytest.mark.nightly

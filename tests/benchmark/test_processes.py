@@ -31,8 +31,7 @@ def {name}(buffer, arrival, memory):
 
 
 def words(policy: Path, out: Path) -> list[object]:
-    name = policy.stem
-    sweep = ["bench", "--suite", "interruption-v1", "--policies", name, "--capacity", 2, "--seeds", 1]
+    sweep = ["bench", "--suite", "interruption-v1", "--policies", policy.stem, "--capacity", 2, "--seeds", 1]
     return [*sweep, "--policy-file", policy, "--format", "csv", "--jobs", 2, "--out", out]
 
 
@@ -96,9 +95,8 @@ def test_a_worker_that_dies_is_one_line_and_a_retry(tmp_path: Path) -> None:
 @pytest.mark.nightly
 def test_one_that_always_dies_is_an_error(tmp_path: Path) -> None:
     code, _, err = ended(*words(policy_file(tmp_path, "doomed", "os.kill(os.getpid(), 9)"), tmp_path / "out"))
-    assert code == 2 and any(
-        line.startswith("bufgym: error: a worker process ended before") for line in err.splitlines()
-    ), err
+    told = "bufgym: error: a worker process ended before"
+    assert code == 2 and any(line.startswith(told) for line in err.splitlines()), err
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

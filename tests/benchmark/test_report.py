@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from browser_cases import opened
+from cli_cases import Patch
 from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
@@ -89,12 +90,10 @@ def test_names_are_shown_as_they_are_written(folder: Path) -> None:
     ],
 )
 def test_topics_and_fleets_have_a_page_too(
-    suite: str, changes: dict[str, int], heading: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    suite: str, changes: dict[str, int], heading: str, tmp_path: Path, monkeypatch: Patch
 ) -> None:
-    short = {
-        label: dataclasses.replace(setting, scenario=shortened(setting.scenario))
-        for label, setting in suites.get(suite).settings("validation").items()
-    }
+    settings = suites.get(suite).settings("validation")
+    short = {k: dataclasses.replace(setting, scenario=shortened(setting.scenario)) for k, setting in settings.items()}
     monkeypatch.setitem(suites.SUITES, suite, dataclasses.replace(suites.get(suite), build=lambda *_: short))
     sweep = Sweep(suite, ("drop-oldest", "rosbridge"), "validation", (3, 6), seeds=2, changes=changes)
     run_sweep(sweep, tmp_path, jobs=1, command="the command", form="csv")
@@ -131,7 +130,7 @@ def refusal(folder: Path) -> str:
     return str(caught.value)
 
 
-def test_the_page_needs_an_extra_and_the_tables_do_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_needs_an_extra_and_the_tables_do_not(folder: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
     assert "bufgym[report]" in refusal(folder)
     assert "afr" in report.markdown(folder)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from refusal_cases import refused
+from refusal_cases import refuse, refused
 
 from bufgym import oracle, policies
 from bufgym.benchmark import run
@@ -38,8 +38,7 @@ def spy(name: str, log: list[Any]) -> Policy:
 def test_every_policy_and_capacity_meets_the_same_episodes() -> None:
     first: list[Any] = []
     second: list[Any] = []
-    scenario = replace(UPLINK, size_cv=0.5)
-    run.run([spy("one", first), spy("two", second)], scenario, [2, 5], 3)
+    run.run([spy("one", first), spy("two", second)], replace(UPLINK, size_cv=0.5), [2, 5], 3)
     assert first == second
     half = len(first) // 2
     assert half == 2 * 3 * 20  # traces x seeds x messages
@@ -126,12 +125,8 @@ def test_functions_and_names_are_policies_too() -> None:
 
 
 CHOSEN = [policies.get(spec) for spec in ("drop-oldest", "afr", "random", "codel", "clairvoyant", "rosbridge")]
-GAPPY = Uplink(
-    traces=(Trace.steps([(1.0, 600_000), (2.0, 0), (1.0, 250_000)], name="gappy"),),
-    rate_hz=10,
-    duration_s=6,
-    size_bytes=50_000,
-)
+GAPS = Trace.steps([(1.0, 600_000), (2.0, 0), (1.0, 250_000)], name="gappy")
+GAPPY = Uplink(traces=(GAPS,), rate_hz=10, duration_s=6, size_bytes=50_000)
 STOPS = replace(GAPPY, traces=(Trace.steps([(2.0, 300_000), (2.0, 20_000)], name="stops", after="stop"),))
 """Here the link ends for good: a message hangs in transmission and others stay queued."""
 
@@ -202,8 +197,7 @@ def test_rows_come_back_to_the_last_bit(tmp_path: Path, ending: str) -> None:
     # repr tells None from NaN, 3 from 3.0, 0.0 from -0.0, and shows every bit of a float.
     assert [repr(same) for same in read_rows(path)] == [repr(given) for given in HARD]
     assert list(tmp_path.iterdir()) == [path]  # nothing temporary stays
-    again = write_rows(read_rows(path), tmp_path / f"again.{ending}")
-    assert again.read_bytes() == path.read_bytes()
+    assert write_rows(read_rows(path), tmp_path / f"again.{ending}").read_bytes() == path.read_bytes()
     assert read_rows(write_rows([], path)) == []
     with pytest.raises(FileNotFoundError):
         read_rows(tmp_path / f"none.{ending}")
@@ -221,11 +215,9 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_other_endings_and_parquet_without_pyarrow_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(BufgymError, match=r"rows\.txt: rows are written to \.csv or \.parquet"):
-        write_rows([], tmp_path / "rows.txt")
+    refuse(r"rows\.txt: rows are written to \.csv or \.parquet", write_rows, [], tmp_path / "rows.txt")
     monkeypatch.setitem(sys.modules, "pyarrow", None)  # importing it now fails
-    with pytest.raises(BufgymError, match=r"unlike \.csv, needs pyarrow: .*bufgym\[bench\]"):
-        write_rows(HARD, tmp_path / "rows.parquet")
+    refuse(r"unlike \.csv, needs pyarrow: .*bufgym\[bench\]", write_rows, HARD, tmp_path / "rows.parquet")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -260,8 +252,7 @@ def test_a_file_that_is_none_or_cut_short_is_named(tmp_path: Path, content: byte
         path = write_rows(HARD, tmp_path / "rows.parquet")
         content = path.read_bytes()[: round(content * path.stat().st_size)]
     path.write_bytes(content)
-    with pytest.raises(BufgymError, match=rf"{path.name}: no rows that can be read"):
-        read_rows(path)
+    refuse(rf"{path.name}: no rows that can be read", read_rows, path)
 
 
 def test_one_wrong_bit_in_a_parquet_page_is_noticed(tmp_path: Path) -> None:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 from bufgym.benchmark import score, table
 from bufgym.benchmark.score import CellScore, Interval, Scores, Standing
-from bufgym.ground.errors import BufgymError
 
 
 def rows_of(
@@ -129,8 +129,7 @@ def test_the_interquartile_mean_of_traces_by_hand() -> None:
     c's two episodes count as one task: (3 + 5) / 20 = 0.4. The middle half: (0.2 + 0.4) / 2.
     """
     h = {"drop-oldest": [0, 0, 0, 0, 0, 7], "mine": [1, 2, 3, 5, 9, 7]}
-    rows = rows_of(h, [10, 10, 10, 10, 10, 7], traces=["a", "b", "c", "c", "d", "e"])
-    made = score.scores(rows)
+    made = score.scores(rows_of(h, [10, 10, 10, 10, 10, 7], traces=["a", "b", "c", "c", "d", "e"]))
     assert standing_of(made, "mine")["iqm"].value == pytest.approx(0.3)
     assert standing_of(made, "mine")["score"].value == pytest.approx(20 / 50)
 
@@ -200,10 +199,8 @@ def test_all_capacities_of_a_scenario_share_their_draws() -> None:
     assert standing_of(score.scores(twice), "afr")["score"] == pytest.approx(once)
     same = [*rows_of(**cell), *rows_of(**cell, scenario="other")]
     assert standing_of(score.scores(same), "afr")["score"] == pytest.approx(once)
-    apart = [*rows_of(**cell), *rows_of(**noisy(600, seed=1), scenario="other")]
-    assert width(standing_of(score.scores(apart), "afr")["score"]) == pytest.approx(
-        width(once) / math.sqrt(2), rel=0.15
-    )
+    two = [*rows_of(**cell), *rows_of(**noisy(600, seed=1), scenario="other")]
+    assert width(standing_of(score.scores(two), "afr")["score"]) == pytest.approx(width(once) / math.sqrt(2), rel=0.15)
 
 
 def test_neither_order_nor_company_matters(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,8 +262,7 @@ def test_without_a_reference_there_is_no_improvement() -> None:
     ],
 )
 def test_rows_that_do_not_fit_together(rows: list[dict[str, Any]], message: str) -> None:
-    with pytest.raises(BufgymError, match=re.escape(message)):
-        score.scores(rows)
+    refuse(re.escape(message), score.scores, rows)
 
 
 def row(policy: str, capacity: int, qoi: float, **more: Any) -> dict[str, Any]:

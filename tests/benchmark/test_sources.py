@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
+from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.benchmark import sources
 from bufgym.benchmark.rows import read_rows
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 
 MODULE = """
@@ -62,8 +62,7 @@ def module(tmp_path: Path, monkeypatch: Patch) -> str:
 
 def rows_of(text: str) -> dict[str, str]:
     """The table's lines by policy, without the name; those that a note calls the same have the same line."""
-    lines = text.split("\n")
-    table = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines if len(line.split()) > 5}
+    table = {line.split()[0]: line.split(maxsplit=1)[1] for line in text.split("\n") if len(line.split()) > 5}
     for names, first in re.findall(r"^note: (.*): the same rows here as (.*)$", text, re.MULTILINE):
         table |= dict.fromkeys(names.split(", "), table[first])
     return table
@@ -71,8 +70,7 @@ def rows_of(text: str) -> dict[str, str]:
 
 def test_functions_makers_and_policies_of_a_module(module: str, capsys: Capsys) -> None:
     words = [f"{module}:{name}" for name in ("newest", "made", "whole", "every_other")]
-    chosen = ",".join([*words, "every:every=3", "drop-oldest"])
-    table = rows_of(shown(["bench", *ONE, "--policies", chosen], capsys))
+    table = rows_of(shown(["bench", *ONE, "--policies", ",".join([*words, "every:every=3", "drop-oldest"])], capsys))
     assert table["newest"] == table["made-here"] == table["whole"] == table["drop-oldest"]
     assert table["every"] != table["every:every=3"]
     assert sources.load(f"{module}:makes_a_function") == "newest"  # as there is already
@@ -134,5 +132,4 @@ def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: Capsys
 @pytest.mark.parametrize("word", ["os:system", "mine.zip", "mine.safetensors"])
 def test_a_name_from_elsewhere_loads_nothing(word: str) -> None:
     """``policies.get`` also gets names from leaderboards and results of strangers."""
-    with pytest.raises(BufgymError, match=r"unknown policy"):
-        policies.get(word)
+    refuse(r"unknown policy", policies.get, word)

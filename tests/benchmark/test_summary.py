@@ -148,8 +148,7 @@ def test_a_byte_limit_of_a_setting_holds(monkeypatch: pytest.MonkeyPatch, tmp_pa
         uplink = Uplink((Trace.constant(100_000.0, 60.0),), rate_hz=5, duration_s=10, size_bytes=100_000)
         return {"free": suites.Setting(uplink, "free"), "tight": suites.Setting(uplink, "tight", max_bytes=250_000)}
 
-    tight = suites.Suite("tight-v1", "tight", build, (2, 9), 1, kind="stress")
-    monkeypatch.setitem(suites.SUITES, "tight-v1", tight)
+    monkeypatch.setitem(suites.SUITES, "tight-v1", suites.Suite("tight-v1", "tight", build, (2, 9), 1, kind="stress"))
     rows = run_sweep(Sweep("tight-v1", ("afr", "drop-oldest", "min-gap")), tmp_path / "run", jobs=1, progress=False)
     h = {(row["scenario"], row["capacity"]): row["qoi"] for row in rows if row["policy"] == "min-gap"}
     best = {(row["scenario"], row["capacity"]): row["clairvoyant"] for row in rows}

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from cli_cases import Capsys, Patch, shown
+from refusal_cases import refuse
 from sweep_cases import THREE, TINY, contents, ended, interrupt
 
 from bufgym import policies
@@ -183,12 +184,10 @@ def test_so_does_another_version_or_policy_file(tmp_path: Path, small: Sweep, mi
     before = contents(tmp_path / "out")
     text = mine.read_text()
     mine.write_text(text.replace("% 2", "% 3"))
-    with pytest.raises(BufgymError, match="policy_file is"):
-        sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
+    refuse("policy_file is", sweep.run_sweep, plan, tmp_path / "out", backend="sequential")
     mine.write_text(text)
     monkeypatch.setattr(sweep, "__version__", "0.0.0")
-    with pytest.raises(BufgymError, match=r'bufgym is ".*", but this run has "0\.0\.0"'):
-        sweep.run_sweep(plan, tmp_path / "out", backend="sequential")
+    refuse(r'bufgym is ".*", but this run has "0\.0\.0"', sweep.run_sweep, plan, tmp_path / "out", backend="sequential")
     assert contents(tmp_path / "out") == before
 
 
@@ -198,15 +197,13 @@ def test_so_do_other_recordings_of_the_same_names(tmp_path: Path, monkeypatch: P
         trace = Trace.steps([(1.0, float((data / "rate").read_text()))], name="link")
         return {"link": suites.Setting(Uplink(traces=(trace,), rate_hz=5, duration_s=2), "a link")}
 
-    found = suites.Suite("found-v1", "found", build, (2,), 1, needs="rate")
-    monkeypatch.setitem(suites.SUITES, "found-v1", found)
+    monkeypatch.setitem(suites.SUITES, "found-v1", suites.Suite("found-v1", "found", build, (2,), 1, needs="rate"))
     for name, rate in (("a", "500000"), ("b", "600000"), ("c", "500000")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "rate").write_text(rate)
     first, other, same = (Sweep("found-v1", ("afr",), data=str(tmp_path / name)) for name in "abc")
     rows = sweep.run_sweep(first, tmp_path / "out", backend="sequential")
-    with pytest.raises(BufgymError, match="scenarios is"):
-        sweep.run_sweep(other, tmp_path / "out", backend="sequential")
+    refuse("scenarios is", sweep.run_sweep, other, tmp_path / "out", backend="sequential")
     assert repr(sweep.run_sweep(same, tmp_path / "out", backend="sequential")) == repr(rows)
 
 
@@ -256,8 +253,7 @@ def test_a_broken_part_is_named_and_made_anew(tmp_path: Path, small: Sweep, form
 )
 def test_a_bad_sweep_writes_nothing(tmp_path: Path, small: Sweep, change: dict[str, Any], told: str) -> None:
     where = {name: change.pop(name) for name in ("jobs", "backend") if name in change}
-    with pytest.raises(BufgymError, match=told):
-        sweep.run_sweep(Sweep(**{**vars(small), **change}), tmp_path / "out", **where)
+    refuse(told, sweep.run_sweep, Sweep(**{**vars(small), **change}), tmp_path / "out", **where)
     assert not (tmp_path / "out").exists()
 
 

@@ -23,14 +23,9 @@ TASK = TASKS["topics"]
 
 POSE = Stream(Topic("pose", priority=3, deadline_s=0.5), rate_hz=2, size_bytes=100, jitter=0)
 MAP = Stream(Topic("map", no_drop=True), rate_hz=1, size_bytes=1000, jitter=0)
-CLIENT = Client(
-    (POSE, MAP),
-    (Trace.constant(1000.0, 60.0, name="1 kB/s"),),
-    duration_s=2.0,
-    random_offset=False,
-    propagation_us=0,
-    value=qoi.exponential(0.618),
-)
+LINK = Trace.constant(1000.0, 60.0, name="1 kB/s")
+NUMBERS = {"duration_s": 2.0, "random_offset": False, "propagation_us": 0}
+CLIENT = Client((POSE, MAP), (LINK,), value=qoi.exponential(0.618), **NUMBERS)
 """Poses at 0, 0.5, 1 and 1.5 s that take 0.1 s each, maps at 0 and 1 s that take 1 s each."""
 
 

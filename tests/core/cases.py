@@ -101,16 +101,11 @@ def trace(knots: list[tuple[int, int]], after: str) -> Trace:
     return Trace("random", np.array(us, np.int64), np.array(size, np.int64), after=after)
 
 
-def drawn_messages(
-    rng: np.random.Generator, n: int, largest: int, arrival_us: NDArray[np.int64] | None = None
-) -> NDArray[Any]:
+def drawn_messages(rng: np.random.Generator, n: int, largest: int, arrival_us: Any = None) -> NDArray[Any]:
     """n messages of less than ``largest`` bytes, several at the same time among them; x in eighths: exact sums."""
     step_us = rng.choice([0, 1, 700, 5_000], n) + rng.integers(0, 3_000, n) * rng.integers(0, 2, n)
-    arrivals = messages(
-        np.cumsum(step_us) if arrival_us is None else arrival_us,
-        rng.integers(1, largest, n),
-        np.cumsum(rng.integers(0, 5, n)) / 8,
-    )
+    arrival_us = np.cumsum(step_us) if arrival_us is None else arrival_us
+    arrivals = messages(arrival_us, rng.integers(1, largest, n), np.cumsum(rng.integers(0, 5, n)) / 8)
     arrivals["uniform"] = rng.random(n)
     return arrivals
 
@@ -157,10 +152,8 @@ VALUES = st.one_of(
 def log(senders: Senders, i: int = 0) -> dict[str, dict[int, int]]:
     """{"dequeued_us": {sequence number: time}, ...}, of what happened at all."""
     rows = np.asarray(senders.batch.log[i])[: int(senders.batch.senders[i]["arrivals"])]
-    return {
-        name: {k: int(us) for k, us in enumerate(rows[name]) if us != NEVER}
-        for name in ("dequeued_us", "transmitted_us", "dropped_us")
-    }
+    names = ("dequeued_us", "transmitted_us", "dropped_us")
+    return {name: {k: int(us) for k, us in enumerate(rows[name]) if us != NEVER} for name in names}
 
 
 def twin_log(twin: Any) -> dict[str, dict[int, int]]:

@@ -137,8 +137,7 @@ class Seen:
         sooner = 4 if buffer.remaining_us < FOREVER else 1
         if sooner * r * self.seen_us < L or (L <= 5 and self.seen_us < 10e6):
             return None
-        last = buffer.dequeued_x
-        m = 0.6 * float(arrival["x"] - last) / elapsed_us + 0.4 * pace
+        m = 0.6 * float(arrival["x"] - buffer.dequeued_x) / elapsed_us + 0.4 * pace
         T = near(5e6, buffer)
         g = m * T / (r * T + L - s)
         return g if g > 0 else None
@@ -171,8 +170,7 @@ def approached(buffer, arrival, g):
     left = gaps_left(buffer, arrival)
     free_soon = buffer.left_bytes * 1e6 < 1.5 * buffer.period_us * buffer.short_rate_bytes_per_s
     if s and free_soon:
-        last = buffer.dequeued_x
-        if abs(left[0] - g) < abs(float(buffer.slots[0]["x"] - last) - g):
+        if abs(left[0] - g) < abs(float(buffer.slots[0]["x"] - buffer.dequeued_x) - g):
             return 0
     victim = least_gap(buffer, arrival, discount=0.165)
     if room and left[s if victim == REJECT else victim] > 1.001 * g:

@@ -119,8 +119,7 @@ class Sender(naive_sender.Sender):
         for name, w in RATES_US.items():
             mean = last[name]
             if made["drained_us"] > 0:
-                weight = made["drained_us"] + min(w, last["us"])
-                mean += (made["drained"] - mean * made["drained_us"]) / weight
+                mean += (made["drained"] - mean * made["drained_us"]) / (made["drained_us"] + min(w, last["us"]))
             made[name] = mean
         return made
 

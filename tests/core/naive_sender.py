@@ -166,8 +166,7 @@ class Sender:
         self.dequeued[message["seq"]] = self.now
 
     def window_open(self, message):
-        flushed = self.flush_no_drop and self.rules[self.lane(message)].no_drop
-        return len(self.in_flight) < self.window or flushed
+        return len(self.in_flight) < self.window or (self.flush_no_drop and self.rules[self.lane(message)].no_drop)
 
     def sendable(self, message):
         """The oldest of its topic, by n_T and, where rate limits hold back at the socket, by its own."""
@@ -220,8 +219,7 @@ class Sender:
         return [m for m in may_go if self.within_limit(message) or self.lane(m) == self.lane(message)]
 
     def must_keep(self, message):
-        no_drop = self.rules[self.lane(message)].no_drop
-        return no_drop and (self.fits(message) or bool(self.evictable(message)))
+        return self.rules[self.lane(message)].no_drop and (self.fits(message) or bool(self.evictable(message)))
 
     def carry_out(self, decision, message):
         """Whether the message has been enqueued or dropped; if not, the policy is asked again."""
@@ -277,11 +275,8 @@ class Sender:
 
     def received(self, lane, until):
         """(when, message) of what reached the server by then."""
-        at = [
-            (self.transmitted[m["seq"]] + self.propagation_us, m)
-            for m in self.sent[lane]
-            if m["seq"] in self.transmitted
-        ]
+        crossed = [m for m in self.sent[lane] if m["seq"] in self.transmitted]
+        at = [(self.transmitted[m["seq"]] + self.propagation_us, m) for m in crossed]
         return [(us, m) for us, m in at if us <= until]
 
     def delivered_gain(self, until):
@@ -308,12 +303,8 @@ class Sender:
 
     def late(self, until):
         """Sum of the weights of messages older than their deadline when they reached the server."""
-        return sum(
-            rules.weight
-            for lane, rules in enumerate(self.rules)
-            for us, m in self.received(lane, until)
-            if us - m["us"] > rules.deadline_us
-        )
+        ages = [(r, us - m["us"]) for lane, r in enumerate(self.rules) for us, m in self.received(lane, until)]
+        return sum(rules.weight for rules, age_us in ages if age_us > rules.deadline_us)
 
     def left_bytes(self):
         """Bytes that the socket took and that have not crossed yet."""

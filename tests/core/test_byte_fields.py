@@ -58,8 +58,7 @@ def test_spread_of_sizes():
     # Logarithms l and l + log 4 differ from their mean by log 2.
     assert seen([1_000, 4_000])["size_spread"] == pytest.approx(math.log(2))
     # Logarithms l, l and l + 0.6 (their mean l + 0.2) have the variance (0.04 + 0.04 + 0.16) / 3.
-    sizes = [10**9, 10**9, round(10**9 * math.exp(0.6))]
-    assert seen(sizes)["size_spread"] == pytest.approx(math.sqrt(0.08))
+    assert seen([10**9, 10**9, round(10**9 * math.exp(0.6))])["size_spread"] == pytest.approx(math.sqrt(0.08))
     assert seen([1, 10_000_000])["size_spread"] == 1
 
 
@@ -91,8 +90,7 @@ def test_environments_observe_them_where_they_are_named(id):
     env = gym.make(id, fields=["rank", *BYTE_FIELDS], capacity=4)
     _, info = env.reset(seed=1)
     for _ in range(60):
-        action = int(np.flatnonzero(info["action_mask"])[0])
-        observation, _, ended, _, info = env.step(action)
+        observation, _, ended, _, info = env.step(int(np.flatnonzero(info["action_mask"])[0]))
         assert env.observation_space.contains(observation)
         if ended:
             _, info = env.reset()

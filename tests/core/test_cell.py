@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from naive_cell import Cell
+from refusal_cases import refuse
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.model.link import Link
@@ -48,8 +48,7 @@ def test_one_robot_is_a_sender_bit_for_bit(case, v, policy):
     episode = FleetEpisode((case.episode.arrivals,), case.episode.link)
     limits = {"max_bytes": case.max_bytes, "decide_at": case.decide_at}
     fleet = run_fleet(policy, [episode], case.capacity, v, **limits)
-    alone = run(policy, [episode.episode(0)], case.capacity, v, **limits)
-    assert cases.same(fleet.senders, alone)
+    assert cases.same(fleet.senders, run(policy, [episode.episode(0)], case.capacity, v, **limits))
 
 
 @kernels
@@ -83,8 +82,7 @@ def cells(draw):
     robots, n = [], draw(st.integers(1, 15))
     largest = draw(st.sampled_from([2, 40, 4_000]))
     for _ in range(draw(st.integers(1, 4))):
-        arrivals = cases.drawn_messages(rng, n, largest, robots[0]["arrival_us"] if together and robots else None)
-        robots.append(arrivals)
+        robots.append(cases.drawn_messages(rng, n, largest, robots[0]["arrival_us"] if together and robots else None))
         n = n if together else int(rng.integers(1, 16))
     max_bytes = draw(st.one_of(st.none(), st.integers(1_000, 15_000)))
     return FleetEpisode(tuple(robots), link), knots, draw(st.integers(1, 6)), max_bytes
@@ -125,8 +123,7 @@ def test_the_whole_byte_twin_agrees_exactly(drawn, decide_at):
     limits = {"max_bytes": max_bytes, "decide_at": decide_at}
     memory = np.arange(episode.robots, dtype=np.float64)[:, None]
     fleet = run_fleet(policies.Policy("test-look", look), [episode], capacity, V, memory=memory, **limits)
-    slow = twin(episode, knots, TwinLook, capacity, max_bytes, decide_at)
-    for i, robot in enumerate(slow.robots):
+    for i, robot in enumerate(twin(episode, knots, TwinLook, capacity, max_bytes, decide_at).robots):
         assert cases.log(fleet.senders, i) == cases.twin_log(robot)
         assert cases.order(fleet.senders, i) == robot.order
         told = outcome(fleet.senders, i)
@@ -176,12 +173,9 @@ def test_a_python_policy_does_what_the_compiled_one_does(name):
 def test_an_answer_must_be_a_whole_number(hook, given):
     made, episodes = drawn_episodes(2)
     odd = policies.Policy("odd", **{"on_arrival": accept, hook: lambda *_: given})
-    for play in (
-        lambda: run_fleet(odd, episodes, 4, made.value),
-        lambda: run(odd, [episodes[0].episode(0)], 4, made.value),
-    ):
-        with pytest.raises(BufgymError, match=rf"policy odd: {hook} returned {given!r}: must be a whole number"):
-            play()
+    one = episodes[0].episode(0)
+    for play in (lambda: run_fleet(odd, episodes, 4, made.value), lambda: run(odd, [one], 4, made.value)):
+        refuse(rf"policy odd: {hook} returned {given!r}: must be a whole number", play)
 
 
 def test_cells_of_a_batch_know_nothing_of_each_other():

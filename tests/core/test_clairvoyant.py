@@ -8,10 +8,10 @@ import pytest
 from cases import VALUES, Case, cases, trace, traces, twin_messages
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 
 from bufgym import policies, scenario
 from bufgym.benchmark.run import draw
-from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
@@ -56,8 +56,7 @@ def test_a_message_larger_than_the_buffer_takes_nobodys_place():
     [(0, None, "capacity = 0: L must be"), (-1, None, "capacity = -1: L must be"), (2, 0, "max_bytes = 0: B must be")],
 )
 def test_errors(capacity, max_bytes, message):
-    with pytest.raises(BufgymError, match=message):
-        clairvoyant(line([0]), capacity, V, max_bytes=max_bytes)
+    refuse(message, clairvoyant, line([0]), capacity, V, max_bytes=max_bytes)
 
 
 @st.composite
@@ -107,8 +106,7 @@ def test_is_the_best_of_all_decisions_or_an_upper_bound(kind, data, v):
     assert plan.certified or kind != "equal sizes"
     if plan.certified and case.decide_at == "arrival":
         assert plan.qoi == pytest.approx(best, abs=EXACT)
-        played = outcome(case.run(policies.get("clairvoyant"), v), 0)
-        assert played.qoi == pytest.approx(plan.qoi, abs=EXACT)
+        assert outcome(case.run(policies.get("clairvoyant"), v), 0).qoi == pytest.approx(plan.qoi, abs=EXACT)
 
 
 @kernels
@@ -143,8 +141,7 @@ def test_labels_are_those_that_no_other_beats(offered):
 def test_unequal_sizes_by_hand():
     """L = 1, messages of 10, 30 and 10 us at 0, 5 and 6: of the two that wait only one has room, and the small one
     lets the fourth, at 25, find an idle link."""
-    episode = line([0, 5, 6, 25], sizes=np.array([10, 30, 10, 10]))
-    plan = clairvoyant(episode, 1, V)
+    plan = clairvoyant(line([0, 5, 6, 25], sizes=np.array([10, 30, 10, 10])), 1, V)
     assert plan.kept.tolist() == [True, False, True, True] and plan.certified
     assert plan.qoi == pytest.approx(V.information(np.array([0.0, 2.0, 3.0])), abs=EXACT)
 
@@ -221,10 +218,9 @@ def test_it_is_exact_to_the_byte(seed, equal, v):
     limit = np.full(n, unit * rng.integers(1, 4)) if equal else rng.choice([programme.NEVER, 0, 1, 3, 9], n)
     x = np.cumsum(rng.integers(0, 9, n) / 8)
     ends = int(rng.choice([2**62, c[-1] + rng.integers(-3, 4 * unit)]))
-    problem = [part.tolist() for part in (c, size, limit, x)]
     # Where sizes differ, the bound on a grid of one byte is the answer itself.
     assert labels.best(programme.Messages(c, size, limit, x, v.array, ends))[1] == pytest.approx(
-        naive_oracle.best_by_bytes(*problem, v, ends), abs=EXACT
+        naive_oracle.best_by_bytes(*[part.tolist() for part in (c, size, limit, x)], v, ends), abs=EXACT
     )
 
 
@@ -274,9 +270,8 @@ def test_bounds_coarse_grids_and_little_room_lose_nothing(module, setting, numbe
 def test_a_beam_keeps_to_the_room(capacity, max_bytes, width, plan):
     """Three messages of 10 bytes arrive at bytes 0, 1 and 2 of the link."""
     c, size, far = np.arange(3), np.full(3, 10), np.full(3, 100)
-    p = programme.new_problem(
-        programme.Messages(c, size, far, np.arange(3.0), V.array, 2**62), np.zeros(3, np.int64), 1
-    )
+    three = programme.Messages(c, size, far, np.arange(3.0), V.array, 2**62)
+    p = programme.new_problem(three, np.zeros(3, np.int64), 1)
     room = programme.Room(capacity, max_bytes, np.zeros((2, 200)), np.zeros((2, 4)), p.future)
     work = np.empty(3, np.int64)
     length, gain = beam.search(p, room, beam.new_states(3, width), work)

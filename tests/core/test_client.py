@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 
 from bufgym import scenario, traces
 from bufgym.ground.errors import BufgymError
@@ -60,9 +61,8 @@ def test_x_of_a_stream_that_moves_is_the_robots_motion() -> None:
     assert episode.arrivals["x"] == pytest.approx(expected - expected[0])
     # All that move see one motion at one time.
     both = client(moving, replace(moving, topic=Topic("cloud")), motion=motion).draw(Streams.seeded(4)).arrivals
-    steps = np.interp(
-        both["arrival_us"][both["topic"] == 1], *(both[both["topic"] == 0][c] for c in ("arrival_us", "x"))
-    )
+    first, second = (both[both["topic"] == k] for k in (0, 1))
+    steps = np.interp(second["arrival_us"], first["arrival_us"], first["x"])
     assert np.abs(np.diff(steps) - np.diff(both["x"][both["topic"] == 1])).max() < 0.05
 
 
@@ -191,7 +191,5 @@ def test_bad_files_are_one_line_that_names_the_file(tmp_path: Path, text: Any, r
 )
 def test_bad_clients(parameters: dict[str, Any], rule: str) -> None:
     assert set(parameters) <= {f.name for f in fields(Client)}
-    with pytest.raises(BufgymError, match=rule):
-        replace(client(), **parameters)
-    with pytest.raises(BufgymError, match=r"stream: 'a' is not a bufgym\.model\.topics\.Topic"):
-        Stream("a", 1, 1)
+    refuse(rule, replace, client(), **parameters)
+    refuse(r"stream: 'a' is not a bufgym\.model\.topics\.Topic", Stream, "a", 1, 1)

@@ -116,9 +116,8 @@ def test_types_are_told_by_the_names_of_their_fields() -> None:
 
     whole = numba.types.int64
     tuples = [ModuleType(str(k)) for k in range(2)]
-    for module, source in zip(
-        tuples, (TALE, TALE.replace("a: int\n    b: int = 1", "b: int\n    a: int = 1")), strict=True
-    ):
+    renamed = TALE.replace("a: int\n    b: int = 1", "b: int\n    a: int = 1")
+    for module, source in zip(tuples, (TALE, renamed), strict=True):
         exec(source, module.__dict__)
     one, other = ((numba.types.NamedTuple((whole, whole), module.Pair),) for module in tuples)
     assert repr(one) == repr(other) and told_types(one) != told_types(other)

@@ -22,9 +22,8 @@ SMALL = "batch_size=100,queue_size=1,so_sndbuf=50"
 def delivered(spec, times_ms, size_bytes, bytes_per_ms, capacity=8):
     """What arrives of messages at these times, ms, over a steady link."""
     arrivals = messages((np.asarray(times_ms) * MS).astype(np.int64), size_bytes)
-    return order(
-        run(policies.get(spec), [Episode(arrivals, Link(Trace.constant(1e3 * bytes_per_ms, 1_000)))], capacity, V)
-    )
+    link = Link(Trace.constant(1e3 * bytes_per_ms, 1_000))
+    return order(run(policies.get(spec), [Episode(arrivals, link)], capacity, V))
 
 
 def camera(spec, megabytes_per_s, count=300):
@@ -71,9 +70,8 @@ def test_zenoh_is_near_the_real_one(megabytes_per_s, sent, real):
 
     Drop tail, which loses no fragment, delivers 112 of 240 over 3 MB/s.
     """
-    ours = camera("zenoh-drop", megabytes_per_s, sent)
     # Besides, one a second measures the link.
-    assert abs(ours - real) <= 0.05 * sent + sent / 30
+    assert abs(camera("zenoh-drop", megabytes_per_s, sent) - real) <= 0.05 * sent + sent / 30
 
 
 @kernels

@@ -7,10 +7,10 @@ import pytest
 from cases import VALUES, cases, same
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 from test_price_dp import equal, queue
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import guided, price_dp, target_gap
 from bufgym.policies.guided import INPUTS, OUTPUTS
 
@@ -44,8 +44,7 @@ def test_the_smallest_outputs_change_next_to_nothing(case, v, equals):
         rule, numbers = memory[guided.RULE :], guided.BASE
         if price_dp.share(rule, numbers) == 0 and buffer.evictions == 0:
             plain = target_gap.decide(buffer, arrival, rule, numbers)
-            general = guided.follow(buffer, arrival, memory, numbers, np.full(len(OUTPUTS), 1e-12))
-            buffers.append((plain, general))
+            buffers.append((plain, guided.follow(buffer, arrival, memory, numbers, np.full(len(OUTPUTS), 1e-12))))
         return guided.follow(buffer, arrival, memory, guided.BASE, np.zeros(len(OUTPUTS)))
 
     case.run(replace(guided.linear("watched", ZERO), on_arrival=watched, compile=False), v)
@@ -59,8 +58,7 @@ def test_outputs_set_the_numbers_of_the_rule():
 
     def changed(**outputs):
         given = np.array([outputs.get(output.name, 0.0) for output in OUTPUTS])
-        told = guided.set_numbers(given, guided.BASE, numbers)
-        assert told == (numbers != guided.BASE).any() == bool(outputs)
+        assert guided.set_numbers(given, guided.BASE, numbers) == (numbers != guided.BASE).any() == bool(outputs)
         return {names[k]: numbers[k] for k in np.flatnonzero(numbers != guided.BASE)}
 
     e = np.exp(0.5)
@@ -90,7 +88,6 @@ def test_inputs_are_what_the_rule_knows():
     seen = np.zeros(len(INPUTS))
     guided.inputs(buffer, arrival, memory, guided.BASE, seen)
     size, s, r, g = 200.0, 1, (0.25 * 100 + 0.25 * 50 + 0.5 * 50) / 1e6, 3.0 / 2
-    a = 1 / (1 + np.exp(5 - 6))
     by_hand = {
         "short": np.log(2),
         "medium": -np.log(2),
@@ -106,7 +103,7 @@ def test_inputs_are_what_the_rule_knows():
         "unknown": 1.0,
         "one": 1.0,
         "head_gap": np.log(3.0 / g),
-        "share": a,
+        "share": 1 / (1 + np.exp(5 - 6)),
         "plain": 0.0,
     }
     assert dict(zip(INPUTS, seen, strict=True)) == pytest.approx(by_hand)
@@ -120,5 +117,4 @@ def test_a_ratio_is_never_endless(a, b, ratio):
 
 def test_weights_of_another_shape_are_refused():
     for weights in (np.zeros((16, 10)), np.full(ZERO.shape, np.nan)):
-        with pytest.raises(BufgymError, match=r"policy 'mine': weights of shape \[.*: must be 20 x 16 finite numbers"):
-            guided.linear("mine", weights)
+        refuse(r"policy 'mine': weights of shape \[.*: must be 20 x 16 finite numbers", guided.linear, "mine", weights)

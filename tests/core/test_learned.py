@@ -9,12 +9,12 @@ from cases import VALUES, cases, log, same
 from gap_cases import fits
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 from weight_cases import network, score
 
 from bufgym import cli, policies
 from bufgym import scenario as scenarios
 from bufgym.ground import files
-from bufgym.ground.errors import BufgymError
 from bufgym.model import observe, qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.policies import learned
@@ -116,8 +116,7 @@ def start(fields, seen):
 @given(case=cases(max_bytes=False), v=VALUES, capacity=st.integers(1, 20))
 def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, v, capacity):
     case = replace(case, capacity=capacity)  # one set of weights serves every L
-    linear = start(("rank", field, "service_ratio"), field)
-    assert same(case.run(linear, v), case.run(policies.get(fixed), v))
+    assert same(case.run(start(("rank", field, "service_ratio"), field), v), case.run(policies.get(fixed), v))
 
 
 @kernels
@@ -176,8 +175,7 @@ def test_export_takes_over_what_the_run_noted(tmp_path):
     assert (policy.name, policy.summary) == ("one", "Random.")
     assert weights.widths == (8, 8) and set(weights.fields) == {field.name for field in observe.FIELDS}
     notes.write_text("{", encoding="utf-8")
-    with pytest.raises(BufgymError, match=r"notes\.json: cannot be read"):
-        exported(model, tmp_path / "two.safetensors", "--name", "two")
+    refuse(r"notes\.json: cannot be read", exported, model, tmp_path / "two.safetensors", "--name", "two")
 
 
 def test_what_is_no_slot_scorer_is_not_exported(tmp_path):
@@ -188,6 +186,5 @@ def test_what_is_no_slot_scorer_is_not_exported(tmp_path):
         ("other.zip", "no such file"),
         ("text.zip", r"text\.zip: no model of stable-baselines3"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            exported(tmp_path / name, tmp_path / "out.safetensors", "--name", "none")
+        refuse(says, exported, tmp_path / name, tmp_path / "out.safetensors", "--name", "none")
     assert not (tmp_path / "out.safetensors").exists()

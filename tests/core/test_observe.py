@@ -94,7 +94,6 @@ class Twin:
             lost = 0.0  # the first message of all has no gap before it yet
         age = s.now - m["us"]
         gains = [self.gain(each) / self.top / each["bytes"] for each in messages]
-        of_newcomer = self.newcomer is not None and lane == s.lane(self.newcomer)
         return {
             "occupied": 1.0,
             "rank": 1.0 if m is self.newcomer else (k + 1) / (len(s.slots()) + 1),
@@ -109,7 +108,7 @@ class Twin:
             "weight": topic.share / self.top,
             "no_drop": float(topic.no_drop),
             "oldest": float(bool(queue) and m is queue[0]),
-            "own": float(of_newcomer),
+            "own": float(self.newcomer is not None and lane == s.lane(self.newcomer)),
             "waited": per(age, 1e6),
             "silence": per(s.now - (s.sent[lane][-1]["us"] if s.sent[lane] else 0), 1e6),
             "lateness": 0.0 if topic.deadline_s is None else per(age, round(topic.deadline_s * 1e6)),

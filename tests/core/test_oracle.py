@@ -35,9 +35,8 @@ def test_by_hand():
 def test_one_run_tells_of_every_shorter_interruption():
     """Messages 1, 2, 3 arrive, L = 1: the second evicts the first, the third is rejected; message 4 follows."""
     v = qoi.exponential(0.5)
-    h = by_length(np.array([9, 2, 9, 3, 9]), v)
     # T = 0: 0, 1. T = 1: 0, 1, 2. T = 2: 0, 2, 3. T = 3: 0, 2, 4.
-    assert h.tolist() == [1 + v(1), 1 + 2 * v(1), 1 + v(2) + v(1), 1 + 2 * v(2)]
+    assert by_length(np.array([9, 2, 9, 3, 9]), v).tolist() == [1 + v(1), 1 + 2 * v(1), 1 + v(2) + v(1), 1 + 2 * v(2)]
 
 
 @kernels

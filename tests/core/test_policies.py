@@ -48,8 +48,7 @@ def test_one_place_keeps_powers_of_two(T):
 def ask(on_arrival, L, s, r, c, p):
     """The decision with s of L messages queued, and the memory after it."""
     memory = np.array([r, c, p], np.float64)
-    decision = on_arrival(queue_of(s, L), newcomer(), memory)
-    return decision, *memory
+    return on_arrival(queue_of(s, L), newcomer(), memory), *memory
 
 
 @kernels
@@ -190,8 +189,7 @@ def test_foxglove_backlog():
 def test_codel_drops_ever_faster():
     # Two messages arrive for each that leaves: the one taken at k ms is k/2 ms old. At 10 ms that is the target of 5;
     # an interval later, at 110 ms, the first is dropped; from there on the gaps are 100 ms / sqrt(count).
-    senders = stream("codel", 600, 500, 1_000)
-    times_ms = sorted(us / MS for us in log(senders)["dropped_us"].values())[:3]
+    times_ms = sorted(us / MS for us in log(stream("codel", 600, 500, 1_000))["dropped_us"].values())[:3]
     exact = 110 + np.cumsum([0, *(100 / np.sqrt(np.arange(1, 3)))])
     assert exact == pytest.approx([110, 210, 280.7], abs=0.05)
     assert times_ms == np.ceil(exact).tolist()  # the socket takes a message each ms
@@ -203,8 +201,7 @@ KEYS = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "docs/references.bib").read_text
 
 def test_keys_in_brackets_are_references():
     for path in sorted((ROOT / "bufgym").rglob("*.py")):
-        cited = set(re.findall(r"\[([a-z]+(?:19|20)\d\d[a-z0-9]*)\]", path.read_text(encoding="utf-8")))
-        assert cited <= KEYS, path
+        assert set(re.findall(r"\[([a-z]+(?:19|20)\d\d[a-z0-9]*)\]", path.read_text(encoding="utf-8"))) <= KEYS, path
 
 
 @pytest.mark.parametrize("name", [*policies.names()])

@@ -8,6 +8,7 @@ from cases import ANYTHING, VALUES, cases, log, order, same, twin_log
 from hypothesis import given
 from naive_policies import twins
 from policy_cases import interruption, kept
+from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
@@ -117,9 +118,7 @@ def test_a_policy_of_your_own():
 
 def test_own_departures():
     heard = []
-    register("listener", on_departure=lambda buffer, memory: heard.append(len(buffer.slots)))(
-        lambda buffer, arrival, memory: ACCEPT
-    )
+    register("listener", on_departure=lambda buffer, memory: heard.append(len(buffer.slots)))(lambda b, a, m: ACCEPT)
     interruption("listener", 3, 3)
     # Message 0 leaves an empty buffer; after the outage 3 are left, then 2, 1; message 4 meets an empty buffer.
     assert heard == [0, 2, 1, 0, 0]
@@ -144,24 +143,19 @@ def test_parameters():
     ],
 )
 def test_bad_specs(spec, rule):
-    with pytest.raises(BufgymError, match=rule):
-        policies.get(spec)
+    refuse(rule, policies.get, spec)
 
 
 def test_bad_registrations():
     for name in policies.names():
-        with pytest.raises(BufgymError, match=f"policy '{name}': a built-in policy has this name"):
-            register(name)(keep_even)
+        refuse(f"policy '{name}': a built-in policy has this name", register, name)
     register("test-mine")(keep_even)
     register("test-mine")(keep_even)  # a notebook's cell runs again
     with pytest.raises(BufgymError, match=r"policy 'test-mine': the function .*\.keep_even has this name"):
         register("test-mine")(lambda buffer, arrival, memory: REJECT)
     registry._REGISTRY.pop("test-mine")
     for name in ("", "a b", "a:b", "a,b", "a=b"):
-        with pytest.raises(BufgymError, match="a name must be non-empty"):
-            register(name)(keep_even)
+        refuse("a name must be non-empty", register, name)
     for what in ("parameters", "memory"):
-        with pytest.raises(BufgymError, match=rf"{what} = \('speed',\): must map names to numbers"):
-            register("mine", **{what: ("speed",)})(keep_even)
-    with pytest.raises(BufgymError, match="3 is not a function"):
-        register("mine")(3)
+        refuse(rf"{what} = \('speed',\): must map names to numbers", register("mine", **{what: ("speed",)}), keep_even)
+    refuse("3 is not a function", register("mine"), 3)

@@ -41,10 +41,7 @@ def advantages(buffer, arrival, price, end_x):
 def by_hand(buffer, arrival, price, end_x):
     """Every chain, one by one."""
     v = qoi.exponential(0.5)
-    places = [
-        *((float(m["x"]), int(m["size_bytes"])) for m in buffer.slots),
-        (float(arrival["x"]), int(arrival["size_bytes"])),
-    ]
+    places = [(float(m["x"]), int(m["size_bytes"])) for m in (*buffer.slots, arrival)]
     best = {True: [-np.inf] * len(places), False: [-np.inf] * len(places)}
     for length in range(len(places) + 1):
         for chosen in combinations(range(len(places)), length):

@@ -89,8 +89,7 @@ def test_the_common_drop_rule(name):
     # One of equal rank goes: 2, the oldest of B, for 4 of C.
     assert dropped(played(name, "0 A, 1 C, 2 B, 3 B, 4 A", topics(2, 2, 3), capacity=3)) == [2]
     # A limit is met by the topic alone, though there is room.
-    limited = topics(1.0, {"limit": 2})
-    assert dropped(played(name, "0 A, 1 B, 2 B, 3 A, 4 B", limited)) == [1]
+    assert dropped(played(name, "0 A, 1 B, 2 B, 3 A, 4 B", topics(1.0, {"limit": 2}))) == [1]
 
 
 ROBOFLEET = "0 A, 10 B, 20 A, 30 B, 40 N, 50 N"
@@ -144,10 +143,7 @@ def test_clients():
 
     assert [name for name in ALL if client(name).limit_at_send or client(name).flush_no_drop] == ["robofleet-released"]
     assert [name for name in ALL if not client(name).awaits_acks] == ["rosbridge", "ros-native"]
-    assert {name: client(name).encoding for name in ALL if client(name).encoding} == {
-        "rosbridge": "json",
-        "ros-native": "ros",
-    }
+    assert {n: client(n).encoding for n in ALL if client(n).encoding} == {"rosbridge": "json", "ros-native": "ros"}
     assert [name for name in ALL if client(name).copies] == ["ros-native"]
 
 

@@ -84,8 +84,7 @@ def test_near_the_end_of_the_stream_the_target_is_what_comes_until_then():
     assert left(0) == left(5_000_000)  # past an end that was told wrong
     # Just before it: what has room goes in, and a full queue keeps to the link's gap.
     assert 0 < left(1) < 1e-4
-    full = fast(0, 1, 2, 3, 4, 5, 6, 7, remaining_us=1)
-    assert target(*full, remembered()) == pytest.approx(2 * 4.0, rel=1e-3)
+    assert target(*fast(0, 1, 2, 3, 4, 5, 6, 7, remaining_us=1), remembered()) == pytest.approx(2 * 4.0, rel=1e-3)
 
 
 @kernels
@@ -322,8 +321,7 @@ def test_on_a_steady_link_the_server_gets_an_even_stream(share):
     one = episode(share, frames)
     streams = []
     for name in ("target-gap", "min-motion-gap"):
-        senders = run(policies.get(name), [one], 20, V)
-        x = received(senders, 0)["x"]
+        x = received(run(policies.get(name), [one], 20, V), 0)["x"]
         streams.append(x[(x > 0.05 * frames) & (x < 0.9 * frames)])
     thinned, full = streams
     assert np.diff(thinned).max() <= np.floor(1 / share) + 1  # the queue fills meanwhile, in a minute and more

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from cases import log, order, trace, watched
+from refusal_cases import refused
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT
 from bufgym.model.checks import check_window
@@ -78,8 +78,7 @@ def test_10_hz_of_a_30_hz_stream_is_every_third():
     camera = (Topic("camera", rate_limit_hz=10),)
     policy, asked = watched(lambda buffer, arrival: int(arrival.seq))
     # 0, 33.333, 66.667, 100, ... ms: those kept are exactly 1 / rate apart. Of the others nobody is asked.
-    played = episode([round(k * 1e6 / 30) / MS for k in range(10)])
-    senders = after_run(played, camera, on_arrival=policy.on_arrival)
+    senders = after_run(episode([round(k * 1e6 / 30) / MS for k in range(10)]), camera, on_arrival=policy.on_arrival)
     assert order(senders) == asked == [0, 3, 6, 9]
     assert log(senders)["dropped_us"].keys() == {1, 2, 4, 5, 7, 8}
     assert np.asarray(senders.batch.log[0])["limited"].tolist() == [0, 1, 1] * 3 + [0]
@@ -138,35 +137,25 @@ def test_a_rate_limit_comes_before_no_drop():
 A_B = (Topic("a"), Topic("b"))
 
 
-@pytest.mark.parametrize(
-    ("build", "complaint"),
-    [
-        (lambda: Topic(""), "topic '': a name must be a non-empty text"),
-        *(
-            (lambda p=p: Topic("a", priority=p), "must be a number >= 0")
-            for p in (-1, None, True, float("inf"), 10**400)
-        ),
-        *((lambda hz=hz: Topic("a", rate_limit_hz=hz), "must be a number > 0") for hz in (0, "10")),
-        (lambda: Topic("a", weight=float("nan")), "weight = nan: must be a number >= 0"),
-        *((lambda s=s: Topic("a", deadline_s=s), r"deadline_s = .*: must be a number > 0") for s in (0, 1e300)),
-        (lambda: Topic("a", no_drop=1), "no_drop = 1: must be true or false"),
-        *((lambda n=n: Topic("a", limit=n), "must be a whole number from 1") for n in (0, 1.5)),
-        (lambda: Topic("a", value=0.618), "value = 0.618: must be a V of bufgym.model.qoi"),
-        (lambda: Topic("a", no_drop=True, limit=3), "limit = 3: a no_drop topic can't have a limit"),
-        (lambda: Senders(1, 2, V, max_messages=1, topics=[*A_B, Topic("a")]), "topic 'a': two topics have this name"),
-        (lambda: check_topics(["a"]), "'a' is not a bufgym"),
-        (lambda: check_topics([Topic(str(k)) for k in range(257)]), "257 topics: must be at most 256"),
-        (lambda: after_run(episode([0, 1], [0, 2]), A_B), "episode: unknown topic 2; the senders know 2, from 0 on"),
-        (lambda: after_run(episode([0, 1], [0, -1]), A_B), "message 1: topic = -1: must be >= 0"),
-        *((lambda n=n: check_window(n), "n_T must be a whole number from 1") for n in (0, 1.0, True, "2", 10**6 + 1)),
-        (lambda: after_run(episode([0], window=0)), "n_T must be a whole number from 1"),
-        *((lambda us=us: episode([0], ack_delay_us=us), "must be a whole number from 0 to") for us in (-1, 0.5, None)),
-    ],
+test_what_is_refused = refused(
+    (lambda: Topic(""), "topic '': a name must be a non-empty text"),
+    *((lambda p=p: Topic("a", priority=p), "must be a number >= 0") for p in (-1, None, True, np.inf, 10**400)),
+    *((lambda hz=hz: Topic("a", rate_limit_hz=hz), "must be a number > 0") for hz in (0, "10")),
+    (lambda: Topic("a", weight=float("nan")), "weight = nan: must be a number >= 0"),
+    *((lambda s=s: Topic("a", deadline_s=s), r"deadline_s = .*: must be a number > 0") for s in (0, 1e300)),
+    (lambda: Topic("a", no_drop=1), "no_drop = 1: must be true or false"),
+    *((lambda n=n: Topic("a", limit=n), "must be a whole number from 1") for n in (0, 1.5)),
+    (lambda: Topic("a", value=0.618), "value = 0.618: must be a V of bufgym.model.qoi"),
+    (lambda: Topic("a", no_drop=True, limit=3), "limit = 3: a no_drop topic can't have a limit"),
+    (lambda: Senders(1, 2, V, max_messages=1, topics=[*A_B, Topic("a")]), "topic 'a': two topics have this name"),
+    (lambda: check_topics(["a"]), "'a' is not a bufgym"),
+    (lambda: check_topics([Topic(str(k)) for k in range(257)]), "257 topics: must be at most 256"),
+    (lambda: after_run(episode([0, 1], [0, 2]), A_B), "episode: unknown topic 2; the senders know 2, from 0 on"),
+    (lambda: after_run(episode([0, 1], [0, -1]), A_B), "message 1: topic = -1: must be >= 0"),
+    *((lambda n=n: check_window(n), "n_T must be a whole number from 1") for n in (0, 1.0, True, "2", 10**6 + 1)),
+    (lambda: after_run(episode([0], window=0)), "n_T must be a whole number from 1"),
+    *((lambda us=us: episode([0], ack_delay_us=us), "must be a whole number from 0 to") for us in (-1, 0.5, None)),
 )
-def test_what_is_refused(build, complaint):
-    with pytest.raises(BufgymError, match=complaint) as caught:
-        build()
-    assert "\n" not in str(caught.value)
 
 
 def test_the_slowest_rate_limit():

@@ -174,8 +174,7 @@ def hold(case, senders):
     topic = np.asarray(case.case.episode.arrivals)["topic"] * bool(case.topics)
     x = np.asarray(case.case.episode.arrivals)["x"]
     slots = np.asarray(batch.slots[0])[first : first + queued]
-    times = ("dropped_us", "transmitted_us", "dequeued_us")
-    dropped, transmitted, dequeued = (rows[name] != NEVER for name in times)
+    dropped, transmitted, dequeued = (rows[name] != NEVER for name in ("dropped_us", "transmitted_us", "dequeued_us"))
     assert (transmitted <= dequeued).all() and not (dropped & dequeued).any()
     assert not (dropped | dequeued)[slots["seq"]].any()
     assert (dequeued & ~transmitted).sum() == sender["busy"]
@@ -215,6 +214,7 @@ def holds_sometimes(buffer, memory):
     return int(buffer.now_us % 3 > 0) - 1
 
 
+SCHEDULERS, ACKS_US = (None, head, holds_sometimes), st.sampled_from([0, 0, 1, 3_000])
 PLAIN = [
     p
     for p in (*map(policies.get, policies.names()), ANYTHING)
@@ -229,14 +229,7 @@ PLAIN = [
 
 
 @kernels
-@given(
-    cases(max_messages=25),
-    VALUES,
-    st.sampled_from([None, head, holds_sometimes]),
-    st.sampled_from(PLAIN),
-    st.integers(1, 4),
-    st.sampled_from([0, 0, 1, 3_000]),
-)
+@given(cases(max_messages=25), VALUES, st.sampled_from(SCHEDULERS), st.sampled_from(PLAIN), st.integers(1, 4), ACKS_US)
 def test_one_topic_without_rules_is_a_plain_sender(case, v, on_send, policy, window, ack_delay_us):
     episode = replace(case.episode, window=window, ack_delay_us=ack_delay_us)
     arrivals = case.episode.arrivals.copy()

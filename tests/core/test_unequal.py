@@ -116,8 +116,7 @@ def test_nothing_is_lost_by_looking_only_at_successors_that_can_still_be_best(se
     room = unequal._priced(p, rng.choice([0.0, 0.0, 0.02, 0.2], (2, n)) * [[1.0], [0.02]], n, 10**6)
     for i in np.flatnonzero((limit >= 0) & (c + size <= p.ends)):
         for step in range((c[i] + size[i]) // p.grid, min(c[i] + limit[i] + size[i], p.ends) // p.grid + 1):
-            found = p.future[i, step - c[i] // p.grid]
-            assert found == pytest.approx(every_successor(p, room, i, step), abs=1e-12)
+            assert p.future[i, step - c[i] // p.grid] == pytest.approx(every_successor(p, room, i, step), abs=1e-12)
 
 
 @given(st.integers(0, 2**32), VALUES)
@@ -136,8 +135,7 @@ def test_leaving_messages_out_while_the_link_is_idle_is_never_worth_it(seed, v):
 
 def test_a_fast_link_costs_no_work_where_no_message_reaches():
     """Three bursts, 10**8 bytes apart, of which the last comes when the link has ended: plan and bound stay."""
-    rng = np.random.default_rng(7)
-    size, limit, x = rng.integers(100, 900, 30), np.full(30, 2_000), np.arange(30) / 4
+    size, limit, x = np.random.default_rng(7).integers(100, 900, 30), np.full(30, 2_000), np.arange(30) / 4
     c = np.repeat([500, 10**8, 2 * 10**8], 10) + np.tile(np.arange(10) * 90, 3)
     sent = Messages(c, size, limit, x, qoi.exponential(0.5).array, 10**8 + 5_000)
     short, *_, ends = unequal.without_idle(sent)

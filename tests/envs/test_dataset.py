@@ -18,8 +18,7 @@ SHORT = {"duration_s": 2.0, "size_bytes": 500_000}
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_recorded_can_be_played_again(kind: str) -> None:
     """Row 0's episodes, in the single environment with its seed: the same observations, rewards and masks."""
-    envs = SenderVectorEnv(2, "lte", 4, observation="flat", **SHORT)
-    episodes = list(record(envs, kind, 6, seed=3))
+    episodes = list(record(SenderVectorEnv(2, "lte", 4, observation="flat", **SHORT), kind, 6, seed=3))
     assert len(episodes) == 6
     turns = ("expert", "medium", "random") if kind == "mixed" else (kind,) * 3
     env = SenderEnv("lte", 4, observation="flat", **SHORT)

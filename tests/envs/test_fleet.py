@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from env_cases import same, valid_action
 from gymnasium.vector import AutoresetMode
-from refusal_cases import refused
+from refusal_cases import refuse, refused
 
 from bufgym import policies
 from bufgym.envs import FleetVecEnv, SenderEnv
-from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
@@ -95,8 +94,7 @@ def test_an_episode_is_the_rollout_of_the_same_policy(reward):
     for agent in env.possible_agents:
         assert infos[agent]["qoi"] == pytest.approx(1 + own[agent])
         assert infos[agent]["arrived"] == infos[agent]["delivered"] + infos[agent]["dropped"]
-        mean = np.mean(list(own.values()))
-        assert sums[agent] == pytest.approx(mean if reward == "team" else own[agent])
+        assert sums[agent] == pytest.approx(np.mean(list(own.values())) if reward == "team" else own[agent])
     assert len({round(total, 6) for total in own.values()}) > 1  # they moved differently
     with pytest.raises(gym.error.ResetNeeded):
         env.step({})
@@ -107,9 +105,7 @@ def test_left_is_what_is_left_of_the_share():
     # 1 byte/us. A alone from 0; at 500 it has 500 of its 1000 bytes left, and B joins. At 750 A has 375 left, B 875.
     link = Link(Trace("even", np.array([0, 1_000_000]), np.array([0, 1_000_000])))
     ticks = np.array([0, 500, 750])
-    episode = FleetEpisode(
-        (messages(ticks, np.array([1_000, 10, 10])), messages(ticks, np.array([1_000, 10, 10]))), link
-    )
+    episode = FleetEpisode((messages(ticks, np.array([1_000, 10, 10])),) * 2, link)
     env = FleetEnv(2, FleetScenario.of(2, "lte"), 2)
     env.reset(options={"episode": episode})
     seen, *_ = env.step({"robot_0": 3, "robot_1": 2})  # robot 1 rejects its first
@@ -206,8 +202,7 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
         if name == "bufgym.envs.fleet" or name.split(".")[0] == "pettingzoo":
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
-    with pytest.raises(BufgymError, match=r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"'):
-        bufgym.envs.__getattr__("FleetEnv")
+    refuse(r'FleetEnv needs pettingzoo: pip install "bufgym\[fleet\]"', bufgym.envs.__getattr__, "FleetEnv")
     with pytest.raises(AttributeError, match="no_such_thing"):
         bufgym.envs.__getattr__("no_such_thing")
     assert bufgym.envs.FleetVecEnv is FleetVecEnv
@@ -249,14 +244,12 @@ def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
 
 def test_cells_can_be_given_and_begun_one_by_one():
     envs = FleetVecEnv(2, 2, "lte", L, autoreset_mode=AutoresetMode.DISABLED, parameters=PARAMETERS)
-    scenario = FleetScenario.of(2, "lte", **PARAMETERS)
-    given = scenario.draw(Streams.seeded(4))
+    given = FleetScenario.of(2, "lte", **PARAMETERS).draw(Streams.seeded(4))
     envs.reset(seed=0, options={"episodes": [None, given]})
     assert envs.rows.senders.episodes[3].arrivals is given.arrivals[1]
     for _ in range(10):
         envs.step(np.full(4, L + 1))
-    mask = np.array([False, False, True, True])
-    envs.reset(options={"reset_mask": mask, "episodes": [None, given]})
+    envs.reset(options={"reset_mask": np.array([False, False, True, True]), "episodes": [None, given]})
     assert envs.rows.senders.batch.senders["next"].tolist() == [10, 10, 0, 0]
 
 
@@ -264,9 +257,7 @@ def test_cells_can_be_given_and_begun_one_by_one():
 def test_a_robot_that_is_asked_again_holds_the_others_up():
     # B = 2500. Robot 0: 1000, 1000 and 500 are queued behind its first message, then 2000 comes: both of the oldest go.
     # Robot 1's last message, 3000, is larger than B: it is dropped unasked.
-    arrivals = [
-        messages(np.arange(5), np.array(sizes)) for sizes in ([100, 1_000, 1_000, 500, 2_000], [100] * 4 + [3_000])
-    ]
+    arrivals = [messages(np.arange(5), np.array(s)) for s in ([100, 1_000, 1_000, 500, 2_000], [100] * 4 + [3_000])]
     link = Link(Trace("slow", np.array([0, 1_000_000, 2_000_000]), np.array([0, 10, 1_000_000]), "hold"))
     episode = FleetEpisode((arrivals[0], arrivals[1]), link)
     env = FleetEnv(2, FleetScenario.of(2, "lte"), 8, max_bytes=2_500)

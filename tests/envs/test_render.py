@@ -92,8 +92,7 @@ def test_lines_keep_to_the_width(capacity: int) -> None:
 @pytest.mark.parametrize("arrivals_us", [[0], [0, 0, 0], [5, 10**9]])
 def test_odd_episodes(arrivals_us: list[int]) -> None:
     """A single message, all at one moment, and a quarter of an hour of nothing; on a link that dies."""
-    link = Link(Trace.steps([(1.0, 300.0)], after="stop"))
-    episode = Episode(messages(np.array(arrivals_us), 200), link)
+    episode = Episode(messages(np.array(arrivals_us), 200), Link(Trace.steps([(1.0, 300.0)], after="stop")))
     env = SenderEnv(Interruption(t_max=20), 2)
     env.reset(options={"episode": episode})
     ended = False

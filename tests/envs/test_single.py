@@ -110,15 +110,12 @@ def test_a_copy_plays_on_and_begins_anew_as_the_original(copied: Any) -> None:
 
     env = begun()
     env.step(4)
-    other = copied(env)
-    assert str(rest(other)) == str(rest(env))
+    assert str(rest(copied(env))) == str(rest(env))
 
 
 @pytest.mark.skipif(not COMPILED, reason="all runs as plain Python")
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
-def test_while_the_kernel_is_compiled_elsewhere_the_steps_are_the_same(
-    env_id: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_while_the_kernel_is_compiled_elsewhere_steps_are_equal(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled = played(env_id, 5)
     monkeypatch.setattr(Meanwhile, "_compile", lambda self: None)
     for step in (step_rows, step_cells):
@@ -153,8 +150,7 @@ def test_rewards_worked_by_hand() -> None:
             assert reward == info["reward_terms"]["retained"]
             assert not truncated
         assert ended
-        expected = [(v1, 0), (v1, 0), (v2 - v1, 0), (v2, v1 + v2 + v2)]
-        np.testing.assert_allclose(rewarded, expected, atol=1e-15)
+        np.testing.assert_allclose(rewarded, [(v1, 0), (v1, 0), (v2 - v1, 0), (v2, v1 + v2 + v2)], atol=1e-15)
         assert info["qoi"] == pytest.approx(1 + v1 + 2 * v2)
         assert (info["arrived"], info["delivered"], info["dropped"], info["invalid"]) == (6, 4, 2, 0)
 
@@ -224,8 +220,7 @@ def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None
 @kernels
 def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> None:
     """Arrivals at one moment, x that stands still: every reference length is 0."""
-    arrivals = messages(np.zeros(9, np.int64), 1000, np.zeros(9))
-    episode = Episode(arrivals, Link(Trace.steps([(1.0, 0), (1.0, 1e6)])))
+    episode = Episode(messages(np.zeros(9, np.int64), 1000, np.zeros(9)), Link(Trace.steps([(1.0, 0), (1.0, 1e6)])))
     env = SenderEnv(Interruption(t_max=25), 3)
     observation, _ = env.reset(seed=0, options={"episode": episode})
     ended = False
@@ -262,10 +257,7 @@ test_wrong_use_is_named = refused(
     (lambda: SenderEnv(decide_at="noon"), "decide_at = 'noon'"),
     (lambda: SenderEnv(max_bytes=0), "max_bytes = 0"),
     (lambda: SenderEnv(render_mode="human"), "render_mode = 'human'"),
-    *(
-        (lambda action=action: begun().step(action), rf"action = .*: {WHOLE}")
-        for action in (1.7, np.array([1]), "1", None)
-    ),
+    *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}") for a in (1.7, np.array([1]), "1", None)),
     (lambda: begun().step(6), r"action = 6: must lie in 0\.\.5"),
     (lambda: make("interruption").reset(options={"episode": Interruption(t_max=30).episode(30)}), "room for 27"),
 )

@@ -171,8 +171,7 @@ def test_threads_change_nothing(case: str) -> None:
 def test_the_forms_hold_the_same_numbers(case: str) -> None:
     """flat is what ``FlattenObservation`` makes of the dict; slots are its slot fields side by side."""
     several = {form: vector(case, observation=form) for form in ("dict", "flat", "slots")}
-    flattened = FlattenObservation(several["dict"])
-    assert several["flat"].single_observation_space == flattened.single_observation_space
+    assert several["flat"].single_observation_space == FlattenObservation(several["dict"]).single_observation_space
     seen: dict[str, Any] = {form: envs.reset(seed=4)[0] for form, envs in several.items()}
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -194,8 +193,7 @@ def test_seeds_are_told_as_gymnasium_tells_them() -> None:
     envs.reset(seed=[None, 2, None]), sync.reset(seed=[None, 2, None])
     assert envs.np_random_seed == sync.np_random_seed == (4, 2, 9)
     assert [rng.random() for rng in envs.np_random] == [rng.random() for rng in sync.np_random]
-    unseeded = vector("interruption")
-    assert len(set(unseeded.np_random_seed)) == N
+    assert len(set(vector("interruption").np_random_seed)) == N
 
 
 def test_autoreset_by_hand() -> None:

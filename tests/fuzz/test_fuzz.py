@@ -210,9 +210,7 @@ POLICIES = [name for name in policies.names(for_topics=False) if name != "clairv
     limit=st.sampled_from([None, None, 2 * 10**6]),
     first=st.integers(0, 2**31),
 )
-def test_random_episodes_keep_the_invariants(
-    met: Uplink, name: str, capacity: int, limit: int | None, first: int
-) -> None:
+def test_random_episodes_keep_invariants(met: Uplink, name: str, capacity: int, limit: int | None, first: int) -> None:
     """Each message ends somewhere, once; no more than L wait; H is within its bounds."""
     policy, episodes = policies.get(name), []
     for i in range(8):

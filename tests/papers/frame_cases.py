@@ -72,8 +72,7 @@ def packed(folder: Path) -> Path:
             archive.writestr(f"{k:04d}.png", png(1000 + 500 * k, shape=(240, 320)))
     with zipfile.ZipFile(folder / "gray_320x240.zip", "w") as archive:
         for k in range(2):
-            picture = cv2.imencode(".jpg", np.full((240, 320), 77, np.uint8))[1].tobytes()
-            archive.writestr(f"{k:04d}.jpg", picture)
+            archive.writestr(f"{k:04d}.jpg", cv2.imencode(".jpg", np.full((240, 320), 77, np.uint8))[1].tobytes())
     lines = [" ".join(str(x) for x in pose.ravel()) for pose in (np.eye(4), TURNED)]
     (folder / "poses_camera_to_world.txt").write_text("\n".join(lines))
     return folder

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_cases import Capsys, Patch
+from refusal_cases import refuse
 
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
 from bufgym.papers import NEEDS_DATA, figure, run
 from bufgym.papers.afr_frame_size import full
 from bufgym.sim import NEVER
@@ -36,15 +37,11 @@ def test_fig6_names_the_seconds_under_500_KB_per_s(tmp_path: Path) -> None:
 
 def test_recordings_that_are_missing_are_named(tmp_path: Path) -> None:
     for name in NEEDS_DATA:
-        with pytest.raises(BufgymError, match=r"\(--data DIR\) with belgium_4g/csv/report_car_0002.csv"):
-            run(name)
-        with pytest.raises(BufgymError, match=r"report_car_0002.csv: no such file"):
-            run(name, data=tmp_path)
+        refuse(r"\(--data DIR\) with belgium_4g/csv/report_car_0002.csv", run, name)
+        refuse(r"report_car_0002.csv: no such file", run, name, data=tmp_path)
 
 
-def test_all_leaves_them_out_without_data_which_is_passed_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_all_leaves_them_out_without_data(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     data, out = tmp_path / "data", str(tmp_path / "out")
     (data / "belgium_4g" / "csv").mkdir(parents=True)
     trace = Trace.steps([(1, 9e6), (40, 0.4e6)], name="report_car_0002")

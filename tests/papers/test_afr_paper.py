@@ -131,5 +131,4 @@ def test_the_timed_loop_makes_the_policys_own_decisions(name: str) -> None:
     start, memory = policy.new_memory(2)
     looped = afr_fig9.compiled_loop()(buffer, arrivals, memory, start, policy.compiled[0], 2)
     memory = policy.new_memory()[0]
-    called = sum(policy.compiled[0](buffer, arrivals[k], memory) for k in range(30))
-    assert looped == 2 * called
+    assert looped == 2 * sum(policy.compiled[0](buffer, arrivals[k], memory) for k in range(30))

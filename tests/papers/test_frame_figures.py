@@ -58,15 +58,13 @@ def fig8_claims(broken: dict[tuple[str, str, int], int], data: Path | None, *cap
         for L in capacities
         for k in range(10)
     )
-    fig8 = afr_fig8.Reproduction(policies=policies, capacities=capacities, data=data)
-    return fig8.claims(rows)
+    return afr_fig8.Reproduction(policies=policies, capacities=capacities, data=data).claims(rows)
 
 
 def test_the_claims_of_fig8_count_failures(tmp_path: Path) -> None:
     """Of ten runs at each of two L Drop Oldest breaks 6 and AFR 2, at L = 5 alone."""
-    facts = fig8_claims(
-        {("room", "drop-oldest", 5): 4, ("room", "drop-oldest", 15): 2, ("room", "afr", 5): 2}, None, 5, 15
-    )
+    broken = {("room", "drop-oldest", 5): 4, ("room", "drop-oldest", 15): 2, ("room", "afr", 5): 2}
+    facts = fig8_claims(broken, None, 5, 15)
     assert facts["counts"] == "room: Drop Oldest 6, AFR 2"
     assert facts["oldest_rate"].startswith("room 30% [") and facts["afr_rate"].startswith("room 10% [")
     assert facts["third_count"] == "room 2 against 6"

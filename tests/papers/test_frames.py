@@ -8,6 +8,7 @@ from typing import Any
 import frame_cases
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
@@ -88,17 +89,14 @@ def test_missing_measurements_poses_that_drifted_and_reduced_frames(tmp_path: Pa
     whole = frame_cases.Held(Camera(4, 2, 8.0, 8.0, 2.0, 1.0), [depth], [np.eye(4)])
     half = whole.reduced(2).loaded()
     assert half.depth(0).tolist() == [[0.0, 2.0]] and half.camera == Camera(2, 1, 4.0, 4.0, 1.0, 0.5)
-    with pytest.raises(BufgymError, match="stride = 3: must divide 4 x 2"):
-        whole.reduced(3)
+    refuse("stride = 3: must divide 4 x 2", whole.reduced, 3)
 
 
 def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for folder, says in ((tmp_path, r"depth\.txt \(TUM\)"), (tmp_path / "desk", "no such folder")):
-        with pytest.raises(BufgymError, match=says):
-            open_sequence(folder)
+        refuse(says, open_sequence, folder)
     monkeypatch.setitem(sys.modules, "rvl", None)
-    with pytest.raises(BufgymError, match=r"bufgym needs rvl: pip install .*perception"):
-        library("rvl")
+    refuse(r"bufgym needs rvl: pip install .*perception", library, "rvl")
 
 
 def test_the_size_of_a_frame() -> None:

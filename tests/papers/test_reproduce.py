@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_cases import fails
+from cli_cases import Capsys, Patch, fails
+from refusal_cases import refuse
 
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.papers import FIGURES, afr_fig5, page, run
 from bufgym.papers.figure import statements
@@ -55,7 +55,7 @@ SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9", "robofleet-table2"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in SLOW)) for n in FIGURES])
-def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch: Patch) -> None:
     for library in ("matplotlib", *NEEDS_LIBRARIES.get(name, ())):
         pytest.importorskip(library)
     if not JIT and name in OF_FRAMES:
@@ -72,9 +72,7 @@ def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch
     assert figure.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
 
-def test_without_a_folder_nothing_is_saved_and_without_matplotlib_numbers_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_folder_nothing_is_saved_without_matplotlib_numbers_are(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)
     assert "Fig. 4" in run("afr-fig4") and list(tmp_path.iterdir()) == []
     for name in ("matplotlib.figure", "matplotlib.backends.backend_agg"):
@@ -98,9 +96,7 @@ def test_every_claim_has_its_place_or_is_ours_and_a_row_on_the_page(name: str) -
         assert set(claim_rows(name)) <= set(text_of_page.splitlines())  # what comes out now
 
 
-def test_the_rows_of_one_figure_are_renewed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_rows_of_one_figure_are_renewed(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     """Fig. 4's row is made again, and those of figures that are not named stay, however old."""
     file, old = tmp_path / "claims.md", "| place | an old sentence | `{}` | ours | not checked | |"
     file.write_text("\n".join(["# Head", "", old.format("afr-fig4").replace("4`", "4` †"), old.format("afr-fig5")]))
@@ -144,5 +140,4 @@ def test_unknown_names_and_unusable_options_are_refused() -> None:
         ("robofleet-fig4", {"kinds": ("Laser",)}, "must be some of PointCloud2, CompressedImage, LaserScan"),
         ("robofleet-fig6", {"queue_sizes": (1.5,)}, "queue_sizes = 1.5: must be a whole number >= 1"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            run(name, **options)
+        refuse(says, run, name, **options)

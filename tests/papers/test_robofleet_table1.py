@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 pytest.importorskip("rosbags", reason="extra ros")
 pytest.importorskip("flatbuffers", reason="extra robofleet")
@@ -17,7 +18,7 @@ from flatbuffers.number_types import Float32Flags
 from flatbuffers.table import Table
 from rosbags.typesys import get_types_from_msg
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import install
 from bufgym.papers import encodings
 from bufgym.papers.encodings import KINDS, Kind, content, encode, stores
 from bufgym.papers.robofleet_table1 import PAPER, Reproduction, fitted
@@ -118,15 +119,12 @@ def test_the_fitted_messages_have_the_papers_bytes_as_ros_binary() -> None:
 
 
 def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(BufgymError, match="unknown encoding 'xml'; known: ros1, cdr, robofleet"):
-        encode("PoseStamped", content("PoseStamped"), "xml")
+    refuse("unknown encoding 'xml'; known: ros1, cdr, robofleet", encode, "PoseStamped", content("PoseStamped"), "xml")
     for beams in (1785, 1803):
-        with pytest.raises(BufgymError, match=f"beams = {beams}: 7260 bytes would need a frame_id of"):
-            Reproduction(beams=beams).simulate()
+        refuse(f"beams = {beams}: 7260 bytes would need a frame_id of", Reproduction(beams=beams).simulate)
     stores.cache_clear()
     for library, encoding, extra in (("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")):
         monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
-        with pytest.raises(BufgymError, match=re.escape(f"needs {library}: {install(extra)}")):
-            encode("PoseStamped", content("PoseStamped"), encoding)
+        refuse(re.escape(f"needs {library}: {install(extra)}"), encode, "PoseStamped", content("PoseStamped"), encoding)
         assert len(encode("PoseStamped", content("PoseStamped"), "json")) > 0  # which needs neither
     assert "flatbuffers" not in vars(encodings) and "rosbags" not in vars(encodings)

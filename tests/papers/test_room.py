@@ -3,8 +3,8 @@
 import frame_cases  # noqa: F401  skips where the extra is absent
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
-from bufgym.ground.errors import BufgymError
 from bufgym.papers.perception import rays
 from bufgym.papers.perception.rays import BASELINE_M
 from bufgym.papers.perception.room import FREE_M, Furniture, MadeUpRoom, made_up_room
@@ -43,8 +43,7 @@ def test_a_kinects_depth_has_steps_and_shadows() -> None:
     assert {115, 116, 117, 118, 119} >= set(np.rint(steps).astype(int).ravel()) >= {116, 117, 118}
     assert middle.std() == pytest.approx(0.5 * 3.0 / 117, rel=0.5)
     # Behind a box at 1.5 m a wall at 3 m has a shadow of f b (1/1.5 - 1/3) = 14.6 px on the camera's left.
-    thing = [4.55, 2, 1, 0.05, 0.3, 0.3, 1, 0]
-    row = scene(thing, stride=1).depth(0)[240]
+    row = scene([4.55, 2, 1, 0.05, 0.3, 0.3, 1, 0], stride=1).depth(0)[240]
     missing = np.flatnonzero(row == 0)
     # The box's left edge is at 320 - 585 * 0.3 / 1.5 = 203.
     assert [missing.min(), missing.max()] == pytest.approx([203 - 14.6, 202], abs=1.1)
@@ -85,7 +84,5 @@ def test_no_thing_stands_in_the_cameras_way() -> None:
 
 
 def test_what_is_not_there_is_refused() -> None:
-    with pytest.raises(BufgymError, match="frames = 1: must be at least 2"):
-        made_up_room(0, frames=1)
-    with pytest.raises(BufgymError, match="frame 2: must be from 0 to 1"):
-        made_up_room(0, frames=2).reduced(SMALL).depth(2)
+    refuse("frames = 1: must be at least 2", made_up_room, 0, frames=1)
+    refuse("frame 2: must be from 0 to 1", made_up_room(0, frames=2).reduced(SMALL).depth, 2)

@@ -140,7 +140,15 @@ async def test_whatever_fails_once_the_relay_goes_on(tmp_path: Path, monkeypatch
     monkeypatch.setattr(backoff, "MOST_S", 0.01)
     calm = Fails(0)
     await day(tmp_path / "calm", calm)
-    assert set(calm.counts) == {"statement", "accept", "clock", "send", "recording's write", "recording's flush", "audit"}
+    assert set(calm.counts) == {
+        "statement",
+        "accept",
+        "clock",
+        "send",
+        "recording's write",
+        "recording's flush",
+        "audit",
+    }
     step = 1 if os.environ.get("HYPOTHESIS_PROFILE") == "nightly" else 10
     for n in range(1, calm.counts.total() + 1, step):
         await day(tmp_path / str(n), Fails(n))

@@ -30,8 +30,7 @@ def odometry(x_m: float, yaw_deg: float, store: Any = ROS2, scale: float = 1.0) 
     t, half = store.types, math.radians(yaw_deg) / 2
     vector, seq = t["geometry_msgs/msg/Vector3"], {"seq": 0} if store is ROS1 else {}
     turn = t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=scale * math.sin(half), w=scale * math.cos(half))
-    place = t["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0)
-    pose = t["geometry_msgs/msg/Pose"](position=place, orientation=turn)
+    pose = t["geometry_msgs/msg/Pose"](position=t["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0), orientation=turn)
     twist = t["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
     stamp = t["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     message = t["nav_msgs/msg/Odometry"](

@@ -64,8 +64,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
 def serving() -> Iterator[Site]:
     """A site on a free port of this machine."""
     site = Site()
-    handler = type("SiteHandler", (Handler,), {"site": site})
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), type("SiteHandler", (Handler,), {"site": site})) as server:
         server.daemon_threads = True
         site.address = f"http://127.0.0.1:{server.server_port}"
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from http_server import DATA, SHA256, Site, get, left
+from refusal_cases import refuse
 from requests import PreparedRequest, Response
 
 from bufgym.ground.errors import BufgymError
@@ -33,8 +34,7 @@ def test_a_whole_file(site: Site, tmp_path: Path) -> None:
     (tmp_path / ".mine.part").mkdir()
     (tmp_path / ".mine.part" / "tmpabc").write_text("of a process that was killed")
     done.path.unlink()
-    with pytest.raises(BufgymError, match=f"data.bin: SHA256 hash .* expected {'0' * 64} but got {SHA256}; not kept"):
-        get(site, tmp_path, "0" * 64)
+    refuse(f"data.bin: SHA256 hash .* expected {'0' * 64} but got {SHA256}; not kept", get, site, tmp_path, "0" * 64)
     assert left(tmp_path) == [] and not (tmp_path / ".mine.part").exists()
 
 
@@ -67,8 +67,7 @@ def test_what_does_not(
     monkeypatch.setattr(fetch, "SILENCE_S", 0.3 if "stall" in settings else 30)
     address = settings.pop("address", "/data.bin")
     vars(site).update(settings)
-    with pytest.raises(BufgymError, match=says):
-        get(site, tmp_path, None, address=address if address.startswith("http") else site.address + address)
+    refuse(says, get, site, tmp_path, None, address=address if address.startswith("http") else site.address + address)
     assert left(tmp_path) == []
 
 
@@ -77,8 +76,7 @@ def test_redirections_and_names(site: Site, tmp_path: Path, monkeypatch: pytest.
     response = Response()
     response.status_code, response.url, response.request = 302, "https://a/", PreparedRequest()
     response.headers["Location"] = "http://b/"
-    with pytest.raises(BufgymError, match="https://a/: redirects to http://b/, which is not allowed"):
-        fetch._refuse_plain(response)
+    refuse("https://a/: redirects to http://b/, which is not allowed", fetch._refuse_plain, response)
 
     def unresolved(*arguments: object, **options: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
@@ -92,13 +90,11 @@ def test_redirections_and_names(site: Site, tmp_path: Path, monkeypatch: pytest.
 def test_a_full_disk_and_a_file_without_end(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(fetch, "MAX_BYTES", 200_000)
-        with pytest.raises(BufgymError, match="sends more than 200000 bytes: must be less"):
-            get(site, tmp_path)
+        refuse("sends more than 200000 bytes: must be less", get, site, tmp_path)
 
     def full(*arguments: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(shutil, "move", full)
-    with pytest.raises(BufgymError, match="cannot be written to the disk: No space left on device"):
-        get(site, tmp_path)
+    refuse("cannot be written to the disk: No space left on device", get, site, tmp_path)
     assert left(tmp_path) == []

@@ -92,8 +92,7 @@ def test_the_table_says_what_is_known() -> None:
 
 @pytest.mark.nightly
 def test_the_sums_are_those_of_the_recorded_files(shared_data: Path, tmp_path: Path) -> None:
-    recorded = [shared_data / "ucc_5g" / "5G-production-dataset.zip"]
-    assert fetch_dataset("ucc-5g", tmp_path, recorded)[0].known
+    assert fetch_dataset("ucc-5g", tmp_path, [shared_data / "ucc_5g" / "5G-production-dataset.zip"])[0].known
     logs = sorted((tmp_path / "ucc-5g").rglob("Download/**/*.csv"))
     assert len(logs) > 0 and b"DL_bitrate" in logs[0].read_bytes()[:400]
     for name, folder in (("perama-wifi", "uplink_wifi"), ("mmwave-uplink", "uplink_mmwave")):
@@ -103,9 +102,7 @@ def test_the_sums_are_those_of_the_recorded_files(shared_data: Path, tmp_path: P
         assert not known
 
 
-def test_the_command_lists_and_fetches_and_says_what_is_wrong(
-    site: Site, tmp_path: Path, monkeypatch: Patch, capsys: Capsys
-) -> None:
+def test_the_command_lists_fetches_and_refuses(site: Site, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert cache_folder().parts[-3:] == ("cache", "bufgym", "datasets")
     out = shown(["trace", "fetch", "--list"], capsys)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_cases import Capsys, fails, shown
+from cli_cases import Capsys, Patch, fails, shown
+from refusal_cases import refuse
 
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
 from bufgym.traces import write_csv
@@ -95,12 +95,10 @@ def test_what_the_fit_refuses(tmp_path: Path, capsys: Capsys) -> None:
         ({"nan": [np.full(100, np.nan)]}, "mode nan: rates must be finite"),
         ({"negative": [np.full(100, -1.0)]}, "mode negative: rates must be finite and >= 0"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            fit_links(wrong)
+        refuse(says, fit_links, wrong)
     names = ("report_car_0002.csv", "logs/wifi_office_231114-151821.txt", "Tram.csv", "report_bus_0001.csv.gz")
     assert [mode_of(name) for name in names] == ["car", "wifi-office", "tram", "bus"]
-    with pytest.raises(BufgymError, match=r"0001.csv: its name does not say the mode: give --mode"):
-        mode_of("0001.csv")
+    refuse(r"0001.csv: its name does not say the mode: give --mode", mode_of, "0001.csv")
     for words, says in (
         ("", "needs recordings, FILE ... or --suite NAME"),
         ("a.csv --suite lte-v1", "--suite: cannot go with FILE or --mode"),
@@ -140,9 +138,7 @@ def test_the_command_writes_parameters_and_a_page(tmp_path: Path, capsys: Capsys
     assert list(read_links(out)) == ["walk"]
 
 
-def test_the_command_fits_what_a_suite_trains_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_command_fits_what_a_suite_trains_on(monkeypatch: Patch, tmp_path: Path, capsys: Capsys) -> None:
     """The links of the train split alone, each once though it carries several scenarios."""
 
     def build(split: str, data: Path | None) -> dict[str, suites.Setting]:
@@ -157,9 +153,7 @@ def test_the_command_fits_what_a_suite_trains_on(
 
 
 @pytest.mark.nightly
-def test_the_committed_parameters_are_the_fit_of_the_recordings(
-    shared_data: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_committed_parameters_fit_the_recordings(shared_data: Path, tmp_path: Path, capsys: Capsys) -> None:
     rows: dict[str, list[Float64Array]] = {}
     for file in sorted([*shared_data.glob("belgium_4g/csv/*.csv"), *shared_data.glob("solis_wifi/wifi_*.txt")]):
         rows.setdefault(mode_of(file), []).append(rates_of(file))

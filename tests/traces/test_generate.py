@@ -1,7 +1,6 @@
 """Links and motions from a seed: rules by hand, chance by its laws, shipped files, `trace generate`."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,22 +10,19 @@ import pytest
 from cli_cases import Capsys, fails, shown
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 
 from bufgym import traces
-from bufgym.ground.errors import BufgymError, TraceError
+from bufgym.ground.errors import TraceError
 from bufgym.traces import describe, load, load_motion, read_motion, read_trace, synthetic_lte
 from bufgym.traces.generate.driving import drive_motion
 from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates, markov_link
 from bufgym.traces.generate.parameters import LINKS, LinkParameters, OutageParameters, fitted_links, read_links
 from bufgym.traces.generate.rules import ramp, steady, tunnel
 from bufgym.traces.generate.shipped import shipped_calls, write_shipped
-from bufgym.traces.trace import Trace
 
 MODES = ("bicycle", "bus", "car", "foot", "train", "tram")
-SEEDED: tuple[Callable[[int], Trace], ...] = (
-    lambda seed: markov_link("tram", seed, 120),
-    lambda seed: synthetic_lte(seed, 120),
-)
+SEEDED: Any = (lambda seed: markov_link("tram", seed, 120), lambda seed: synthetic_lte(seed, 120))
 
 # 8 Mbit/s = 1 MB/s everywhere outside outages, nothing inside.
 FLAT = LinkParameters(1, 1000, (1e6,) * 11, 0.0, 0.0, 10.0, 0.0, None)
@@ -55,8 +51,7 @@ def test_links_never_run_backwards_and_a_longer_one_begins_as_the_shorter(seed: 
     assert (bytes_per_s >= 0).all() and bytes_per_s.max() <= fitted_links()[mode].quantiles_bytes_per_s[-1]
     longer = markov_link(mode, seed, seconds + 50).cumulative_bytes[: seconds + 1]
     assert longer.tolist() == trace.cumulative_bytes.tolist()
-    asked = markov_link(mode, seed, seconds, mean_bytes_per_s=7.5e6)
-    assert abs(asked.total_bytes - seconds * 7.5e6) <= seconds / 2
+    assert abs(markov_link(mode, seed, seconds, mean_bytes_per_s=7.5e6).total_bytes - seconds * 7.5e6) <= seconds / 2
 
 
 def test_a_link_without_outages_keeps_its_quantiles() -> None:
@@ -82,8 +77,7 @@ def test_outages_are_as_long_and_as_far_apart_as_stated() -> None:
     assert [(lengths > 1).mean(), (lengths > 2).mean()] == pytest.approx([4 / 9, 1 / 4], abs=0.03)
     assert abs(gaps.mean() - 32) < 2 and lengths.max() <= MAX_OUTAGE_S
     # Rates beside outages are lowered by half within 5 s; never below the least rate outside of one.
-    quantiles = (0.3e6, *(1e6,) * 10)
-    lowered = replace(FLAT, quantiles_bytes_per_s=quantiles, outages=replace(OUTAGES, shoulder=0.5))
+    lowered = replace(FLAT, quantiles_bytes_per_s=(0.3e6, *(1e6,) * 10), outages=replace(OUTAGES, shoulder=0.5))
     rates = link_rates(lowered, 1, 2000)
     start = int(np.argmax(rates == 0))
     assert rates[start - 6 : start].tolist() == [1e6, 5e5, 5e5, 5e5, 5e5, 5e5]
@@ -141,13 +135,10 @@ def test_broken_arguments_and_parameter_files(tmp_path: Path) -> None:
         (lambda: steady(0), "bytes_per_s = 0: must be a number from 1"),
         (lambda: replace(FLAT, place_share=0.7, level_share=0.7), "level_share = 0.7: must be a number from 0 to 0.3"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            make()
+        refuse(says, make)
     file, shipped = tmp_path / "links.json", LINKS.read_text(encoding="ascii")
     stay = f'"level_stay_s": {json.loads(shipped)["modes"]["bus"]["level_stay_s"]}'
-    stays = [
-        shipped.replace(stay, f'"level_stay_s": {value}') for value in ("null", "true", '"5"', "NaN", "-1", "1e400")
-    ]
+    stays = [shipped.replace(stay, f'"level_stay_s": {s}') for s in ("null", "true", '"5"', "NaN", "-1", "1e400")]
     for text, says in (
         ("{", "must be JSON"),
         ("[]", 'must be an object with "modes"'),
@@ -156,8 +147,7 @@ def test_broken_arguments_and_parameter_files(tmp_path: Path) -> None:
         *((text, "mode '.*': level_stay_s = |is not a finite number") for text in stays),
     ):
         file.write_text(text, encoding="utf-8")
-        with pytest.raises(TraceError, match=f"links.json.*({says})"):
-            read_links(file)
+        refuse(f"links.json.*({says})", read_links, file, kind=TraceError)
 
 
 # --- files that come with bufgym, and the command ``generate`` -------------------------------------------------------
@@ -187,12 +177,9 @@ def test_shipped_names_and_loading(tmp_path: Path) -> None:
     own = tmp_path / "own.csv"
     traces.write_csv(tunnel(), own)
     assert load(own) == load(str(own)) == read_trace(own) and load(own, after="stop").after == "stop"
-    with pytest.raises(TraceError, match=r"lte-nowhere: no such file, .*known: .*drive-0.*lte-synthetic-7"):
-        load("lte-nowhere")
-    with pytest.raises(TraceError, match="must fit a known format"):
-        load("drive-0")
-    with pytest.raises(TraceError, match="must have 8 columns"):
-        read_motion(names["lte-synthetic-0"])
+    refuse(r"lte-nowhere: no such file, .*known: .*drive-0.*lte-synthetic-7", load, "lte-nowhere", kind=TraceError)
+    refuse("must fit a known format", load, "drive-0", kind=TraceError)
+    refuse("must have 8 columns", read_motion, names["lte-synthetic-0"], kind=TraceError)
 
 
 GENERATE = ["trace", "generate"]

@@ -5,11 +5,11 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 import bufgym.envs  # noqa: F401  (registers the environments)
 from bufgym import scenario, traces
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, FleetScenario, Interruption, Stream, Streams
 from bufgym.traces.fit_sizes import fits, laws
@@ -22,8 +22,7 @@ LAWS = ["jpeg", "gop", "depth-colour", "motion", "recorded:7scenes-rvl", "record
 
 
 def sample(law: str, n: int = 60_000, seed: int = 3) -> np.ndarray:
-    times = np.arange(n, dtype=np.int64) * 33_333
-    return drawn(law, n, MEAN, np.random.default_rng(seed), Moving(DRIVE, times))
+    return drawn(law, n, MEAN, np.random.default_rng(seed), Moving(DRIVE, np.arange(n, dtype=np.int64) * 33_333))
 
 
 @pytest.mark.parametrize("law", ["jpeg:rho=0.5", "gop:rho=0.5", "depth-colour:rho=0.5", "motion", *LAWS[4:]])
@@ -91,17 +90,14 @@ def test_bad_text_and_what_does_not_go_together_are_refused_in_one_sentence() ->
         ("recorded", "known: 7scenes-rvl"),
         (3, "must be text"),
     ):
-        with pytest.raises(BufgymError, match=re.escape(says)):
-            scenario.get("lte", sizes=text)
-    with pytest.raises(BufgymError, match="must not both be given"):
-        scenario.get("lte", sizes="jpeg", size_cv=0.5)
+        refuse(re.escape(says), scenario.get, "lte", sizes=text)
+    refuse("must not both be given", scenario.get, "lte", sizes="jpeg", size_cv=0.5)
     for made in (
         lambda: scenario.get("lte", sizes="motion", motion="none"),
         lambda: Interruption(sizes="motion"),
         lambda: Stream(Topic("a"), 5, 100, sizes="motion"),
     ):
-        with pytest.raises(BufgymError, match="needs a motion recording"):
-            made()
+        refuse("needs a motion recording", made)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -179,8 +175,7 @@ def test_fit_reads_tables_workloads_and_names(tmp_path, capsys) -> None:
     assert "gop:every=30,ratio=5.32" in capsys.readouterr().out
     workload = tmp_path / "w.csv"
     workload.write_text("time_s,bytes\n" + "".join(f"{k},{100 + k % 5}\n" for k in range(50)))
-    with pytest.raises(BufgymError, match="no topic has the 100 messages"):
-        fits(workload)
+    refuse("no topic has the 100 messages", fits, workload)
     assert main(["trace", "fit", "--sizes"]) == 2 and "needs recordings" in capsys.readouterr().err
 
 
