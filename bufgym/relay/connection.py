@@ -48,7 +48,7 @@ class Connection:
     async def run(self, greeted: Callable[[], None]) -> None:
         """Serve the client to the end; call ``greeted`` after its welcome."""
         hub, caller, admitted = self._hub, self._caller, self._admitted
-        hub.settled(hub.store.acked(self.session, admitted.received))
+        hub.store.acked(self.session, admitted.received)
         hub.join(self)
         self._socket.protocol.max_message_size = hub.config.limits.message_bytes
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
@@ -84,7 +84,7 @@ class Connection:
                     self._hub.unsubscribe(self, id)
                 case {"op": "ack", "seq": number}:
                     self._outbox.acked(number)
-                    self._hub.settled(self._hub.store.acked(self.session, number))
+                    self._hub.store.acked(self.session, number)
                 case {"op": "recordings"}:
                     self.tell("recordings", files=await asyncio.to_thread(replay.recordings, self._recordings))
                 case said:
