@@ -54,11 +54,9 @@ class Rule(Section, frozen=True, kw_only=True):
     topic: str = ".*"
 
     def __post_init__(self) -> None:
-        known = [self.address != "", self.email != "", self.recorder, self.foxglove, self.nats]
-        if sum(known) != 1:
-            raise BufgymError(
-                "rule: needs one identity: an address, an email, recorder = true, foxglove = true, or nats = true"
-            )
+        if sum(map(bool, (self.address, self.email, self.recorder, self.foxglove, self.nats))) != 1:
+            who = "an address, an email, recorder = true, foxglove = true, or nats = true"
+            raise BufgymError(f"rule: needs one identity: {who}")
         if not (self.send or self.receive):
             raise BufgymError("rule: must allow send or receive")
         if self.address:

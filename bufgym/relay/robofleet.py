@@ -122,6 +122,7 @@ class RobofleetConnection(Connection):
             self._hub.unsubscribe(self, flat.pattern)
             return
         try:
+            self._quota.message(0, self._hub.clock())
             chosen = pattern(flat.pattern)
             warmed = await asyncio.to_thread(policies.warm, SKIP_PENDING)
             self._quota.subscribe(flat.pattern, self.subscriptions)

@@ -22,7 +22,7 @@ from bufgym.relay import ros_messages, wire
 from bufgym.relay.client import RobotClient
 from bufgym.relay.monitor import Monitor
 from bufgym.robot.odometry import Odometry
-from bufgym.robot.tasks import Tasks, until_one_ends
+from bufgym.robot.tasks import until_one_ends
 from bufgym.scenario import Stream
 
 STATUS_S: Final = 1.0
@@ -80,7 +80,6 @@ class Robot:
         self._odometry = Odometry()
         self._location: dict[str, float] | None = None
         self._began_s = time.monotonic()
-        self._pings = Tasks()
         settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
         self.client = RobotClient(url, name, **settings)
         self.client.subscribe(f"^{self.topic('command')}$", self._command)
@@ -127,11 +126,16 @@ class Robot:
 
     async def run(self) -> None:
         """Run until the source has no more, or until cancelled."""
-        own = [self.client.run(), self._every(STATUS_S, self._say_status), self._every(QUEUE_S, self._say_queue)]
-        try:
-            await until_one_ends(self.source.run(self), *own)
-        finally:
-            await self._pings.end()
+
+        async def status() -> None:
+            self.say("status", self.status())
+
+        async def queue() -> None:
+            self.say("queue", self.monitor.state())
+
+        own = [(STATUS_S, status), (STATUS_S, self.client.ping), (QUEUE_S, queue)]
+        every = [self._every(period_s, work) for period_s, work in own]
+        await until_one_ends(self.source.run(self), self.client.run(), *every)
 
     async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         await self.client.connected.wait()
@@ -141,13 +145,6 @@ class Robot:
             await work()
             next_s = max(next_s + period_s, loop.time())
             await asyncio.sleep(next_s - loop.time())
-
-    async def _say_status(self) -> None:
-        self.say("status", self.status())
-        self._pings.begin(self.client.ping())
-
-    async def _say_queue(self) -> None:
-        self.say("queue", self.monitor.state())
 
     async def _command(self, message: wire.Message) -> None:
         try:

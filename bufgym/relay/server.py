@@ -113,20 +113,20 @@ class Accepted(ServerConnection):
     def __init__(self, door: Door, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
         self._door = door
-        self._address = ""
+        self.address = ""
         self._inside = False
         self._waits = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         try:
-            self._address = plain_address(transport.get_extra_info("peername")[0])
-            self._door.enter(self._address)
+            self.address = plain_address(transport.get_extra_info("peername")[0])
+            self._door.enter(self.address)
         except (TypeError, IndexError):  # the peer has gone already
             self.transport.abort()
             return
         except RefusedError as refused:
-            self._refused(refused.code, str(refused))
+            self.refused(refused.code, refused)
             self.transport.abort()
             return
         self._inside = self._waits = True
@@ -140,20 +140,21 @@ class Accepted(ServerConnection):
         """Note that the client has said hello, or has gone."""
         if self._waits:
             self._waits = False
-            self._door.greeted(self._address)
+            self._door.greeted(self.address)
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._inside:
             self._inside = False
             self._door.open -= 1
             if self.response is None:
-                why = self.protocol.handshake_exc or "no whole request in time"
-                self._refused("wrong", f"{type(why).__name__}: {why}" if isinstance(why, Exception) else why)
+                fault = self.protocol.handshake_exc
+                self.refused("wrong", f"{type(fault).__name__}: {fault}" if fault else "no whole request in time")
             self.greeted()
         super().connection_lost(exc)
 
-    def _refused(self, code: str, why: str) -> None:
-        self._door.hub.audit.repeated(what="connection", code=code, address=self._address, why=why)
+    def refused(self, code: str, why: object) -> None:
+        """Log why it was not let in."""
+        self._door.hub.audit.repeated(what="connection", code=code, address=self.address, why=str(why))
 
 
 class Server:
@@ -261,30 +262,25 @@ class Server:
 
     def _request(self, socket: ServerConnection, request: Request) -> Response | None:
         """Deny a request, answer it with a page, or let it become a WebSocket."""
-        try:
-            address = plain_address(socket.remote_address[0])
-        except (TypeError, IndexError):
-            return pages.response(HTTPStatus.BAD_REQUEST, "gone\n")
-        refused = self._door.refusal(address, request)
+        assert isinstance(socket, Accepted)
+        refused = self._door.refusal(socket.address, request)
         if refused is not None:
-            self.hub.audit.repeated(what="connection", code=refused.code, address=address, why=str(refused))
+            socket.refused(refused.code, refused)
             return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")
         if _is_ours(request) or (self.config.robofleet and "Upgrade" in request.headers):
             return None
         match request.path.partition("?")[0]:
             case "/healthz":
-                runs = self._ticking is not None and not self._ticking.done()
-                return pages.response(
-                    *((HTTPStatus.OK, "ok\n") if runs else (HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n"))
-                )
+                if self._ticking is None or self._ticking.done():
+                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n")
+                return pages.response(HTTPStatus.OK, "ok\n")
             case "/metrics":
-                return self._metrics(address)
+                return self._metrics(socket.address)
         return pages.answer(request.path)
 
     def _metrics(self, address: str) -> Response:
         if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):
-            why = f"no rule lets this address receive {STATUS}\n"
-            return pages.response(HTTPStatus.FORBIDDEN, why)
+            return pages.response(HTTPStatus.FORBIDDEN, f"no rule lets this address receive {STATUS}\n")
         with needs("prometheus_client", "relay"):
             from bufgym.relay import metrics  # not at start-up: few need it
 
@@ -311,17 +307,14 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     told = asyncio.Event()
     with contextlib.suppress(
         NotImplementedError, RuntimeError, ValueError
-    ):  # Windows; a thread that is not the main one
+    ):  # Windows; a thread other than the main one
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
-
-    async def ends() -> None:
-        await told.wait()
 
     async def works() -> None:
         await server.warm()
-        await ends()
+        await told.wait()
 
     try:
-        await until_one_ends(works(), ends())
+        await until_one_ends(works(), told.wait())
     finally:
         await server.close()

@@ -119,18 +119,9 @@ def check_topic(topic: str) -> None:
 
 
 def check_name(what: str, name: str) -> None:
-    """A name is short, and prints as it stands."""
-    if not name.isprintable() or (not name.isascii() and _utf8_bytes(what, name) > MAX_NAME_BYTES):
+    """A name is short, and prints as it stands: so it is UTF-8."""
+    if not name.isprintable() or len(name.encode()) > MAX_NAME_BYTES:
         raise WireError(f"{what} {name!r}: must be printable, at most {MAX_NAME_BYTES} bytes")
-    if len(name) > MAX_NAME_BYTES:
-        raise WireError(f"{what} {name!r}: must be at most {MAX_NAME_BYTES} bytes")
-
-
-def _utf8_bytes(what: str, name: str) -> int:
-    try:
-        return len(name.encode())
-    except UnicodeEncodeError:
-        raise WireError(f"{what} {name!r}: must be UTF-8") from None
 
 
 Number = Annotated[int, Meta(ge=0, le=MAX_SEQ)]
