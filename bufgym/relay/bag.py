@@ -33,9 +33,7 @@ class BagSource:
             streams = tuple(
                 Stream(Topic(name.lstrip("/")), count / seconds, 1000) for name, count in counts.items() if count
             )
-        self.path = path
-        self.streams = streams
-        self._loops = loops
+        self.path, self.streams, self._loops = path, streams, loops
         self._names = {f"/{stream.topic.name.lstrip('/')}": stream.topic.name for stream in streams}
         for name in self._names:
             if not counts.get(name):

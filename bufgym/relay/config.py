@@ -234,13 +234,12 @@ def load(path: str | Path) -> Config:
         config,
         tls=_beside(folder, config.tls, "certificate", "key", "clients"),
         nats=_beside(folder, config.nats, "credentials", "authority"),
-        tokens=config.tokens
-        if config.tokens and "://" in config.tokens.keys
-        else _beside(folder, config.tokens, "keys"),
+        tokens=_beside(folder, config.tokens, "keys"),
     )
 
 
 def _beside(folder: Path, table: Any, *names: str) -> Any:
-    """Resolve the table's file names in this folder."""
+    """Resolve the table's file names in this folder; a URL stays as it is."""
     files = {name: getattr(table, name, "") for name in names}
-    return table and replace(table, **{name: str(folder / file) for name, file in files.items() if file})
+    own = {name: str(folder / file) for name, file in files.items() if file and "://" not in file}
+    return table and replace(table, **own)

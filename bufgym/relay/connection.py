@@ -10,7 +10,7 @@ from typing import Any, Final
 from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import policies, protocol, replay, wire
+from bufgym.relay import outbox, policies, protocol, replay, wire
 from bufgym.relay.caller import POLICY_VIOLATION, Caller
 from bufgym.relay.hub import Outgoing
 from bufgym.relay.outbox import Outbox
@@ -159,7 +159,7 @@ class Connection:
 
     def _told(self) -> None:
         self._outbox.wake()
-        if self._outbox.full:
+        if len(self._caller.answers) > outbox.MAX_ANSWERS:
             self.end("reads none of the answers")
 
     def end(self, why: str) -> None:

@@ -43,9 +43,7 @@ class Monitor:
     def __init__(
         self, topics: Sequence[Topic], value: Value | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._topics = tuple(topics)
-        self._value = value or qoi.exponential()
-        self._clock = clock
+        self._topics, self._value, self._clock = tuple(topics), value or qoi.exponential(), clock
         self._counts = [_Counts() for _ in topics]
         self._left: deque[tuple[float, int]] = deque()
         self._queued: dict[tuple[int, int], _Put] = {}

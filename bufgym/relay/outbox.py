@@ -29,11 +29,6 @@ class Outbox:
         self._sent_number = received
         self._in_flight: deque[int] = deque()
 
-    @property
-    def full(self) -> bool:
-        """Whether the client reads too few answers."""
-        return len(self._caller.answers) > MAX_ANSWERS
-
     def wake(self) -> None:
         """Look for something to send."""
         self._awake.set()

@@ -139,8 +139,11 @@ class Peers:
                 if item is not None:
                     frame, put_us = item.message
                     headers = {"Relay": self._settings.name, "Put": str(put_us)}
-                    await bus.publish(frame.message.topic, frame.binary, headers)
-                    self.sent += 1
+                    try:
+                        await bus.publish(frame.message.topic, frame.binary, headers)
+                        self.sent += 1
+                    except wire.RefusedError as refused:
+                        self._note(refused)
                 lane.gone()
 
     async def _heard(self, heard: Any) -> None:

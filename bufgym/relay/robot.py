@@ -68,8 +68,7 @@ class Robot:
         """Arguments as for ``RobotClient``; a command may choose one of ``policies``."""
         if not name or "/" in name:
             raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
-        self.name = name
-        self.source = source
+        self.name, self.source = name, source
         streams = [*source.streams]
         streams += [own for own in _OWN if own.topic.name not in {stream.topic.name for stream in streams}]
         self._streams = {stream.topic.name: stream for stream in streams}

@@ -224,7 +224,8 @@ class Server:
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     def _warm(self) -> None:
-        policies.check(self.config.policies)
+        for name in self.config.policies:
+            policies.policy(name)  # raises an error if there is none
         policies.warm(self.config.policies[0])
 
     async def warm(self) -> None:
