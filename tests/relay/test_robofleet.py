@@ -78,9 +78,8 @@ async def released(port: int) -> AsyncIterator[ClientConnection]:
 
 async def wanted(server: Server, patterns: int) -> None:
     """Return once clients have so many subscriptions in all: released ones are not told."""
-    await until(
-        "subscriptions", lambda: sum(len(member.subscriptions) for member in server.hub.members.values()) == patterns
-    )
+    members = server.hub.members
+    await until("subscriptions", lambda: sum(len(one.subscriptions) for one in members.values()) == patterns)
 
 
 async def test_released_clients_meet() -> None:

@@ -121,9 +121,8 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
     monkeypatch.setattr(robot, "QUEUE_S", 0.1)
 
     async def story(viewer: Session, came: Came) -> None:
-        await until(
-            "two of each", lambda: all(len(came[topic]) >= 2 for topic in ("odom", "scan", "camera", "queue", "status"))
-        )
+        topics = ("odom", "scan", "camera", "queue", "status")
+        await until("two of each", lambda: all(len(came[topic]) >= 2 for topic in topics))
         for wrong in ({"command": "policy", "policy": "oracle"}, "stop", 3):
             await wait("an ack", viewer.command(corner.command, wrong))
         await wait("an ack", viewer.command(corner.command, {"command": "policy", "policy": "drop-newest"}))
