@@ -55,9 +55,8 @@ class Connection:
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
         greeted()
         writer = asyncio.create_task(self._outbox.run())
-        expiry = asyncio.get_running_loop().call_later(
-            min(caller.identity.until_s - time.time(), 2**20), lambda: self.end("the token has expired")
-        )
+        left_s = min(caller.identity.until_s - time.time(), 2**20)
+        expiry = asyncio.get_running_loop().call_later(left_s, self.end, "the token has expired")
         try:
             await self._read()
         except WebSocketException:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 OWN: Final = "relay"  # The relay's name as a sender, and the prefix of its topics
 STATUS: Final = f"/{OWN}/status"
+CONNECTED: Final = "connected"  # State of the connection to the other relays
 ROBOFLEET: Final = "robofleet"
 """Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
@@ -194,7 +195,7 @@ class Hub:
         """
         receivers = self._holders(sender, message.topic)
         if not receivers and not shared:
-            alone = self.peers is not None and self.peers.state != "connected"
+            alone = self.peers is not None and self.peers.state != CONNECTED
             other = ", and the other relays are out of reach" if alone else ""
             raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it{other}")
         frame = wire.encode(message)
@@ -213,13 +214,11 @@ class Hub:
         """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
         here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
         away = [
-            session
-            for session in self.store.sessions.values()
-            if session.durable
-            and session is not sender.session
-            and session not in here
-            and any(pattern(text).part(topic) for text in session.durable.values())
-            and Permissions(self.config.rules, session.identity).allow("receive", topic)
+            each
+            for each in self.store.sessions.values()
+            if each is not sender.session and each not in here
+            if any(pattern(text).part(topic) for text in each.durable.values())
+            if Permissions(self.config.rules, each.identity).allow("receive", topic)
         ]
         return here + away
 

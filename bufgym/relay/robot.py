@@ -29,9 +29,8 @@ STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
 POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "learned-scheduler")
 """Policies that a viewer may choose by default."""
-_OWN: Final = tuple(
-    Stream(Topic(name, priority=20.0, weight=0.0), rate_hz, 1000) for name, rate_hz in (("status", 1.0), ("queue", 5.0))
-)
+_RATES_HZ: Final = {"status": 1 / STATUS_S, "queue": 1 / QUEUE_S}
+_OWN: Final = tuple(Stream(Topic(name, priority=20.0, weight=0.0), hz, 1000) for name, hz in _RATES_HZ.items())
 
 
 class Source(Protocol):

@@ -24,7 +24,7 @@ from bufgym.relay import connection, pages, policies, wire
 from bufgym.relay.caller import Caller
 from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
-from bufgym.relay.hub import STATUS, Hub
+from bufgym.relay.hub import CONNECTED, STATUS, Hub
 from bufgym.relay.identity import Verifier, server_context
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
@@ -301,7 +301,7 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
-    if server.hub.peers is not None and server.hub.peers.state != "connected":
+    if server.hub.peers is not None and server.hub.peers.state != CONNECTED:
         say(f"{server.hub.peers.state}; goes on without the other relays until NATS is there")
     if server.window is not None:
         say(f"ws://{server.window.address}: Foxglove, Lichtblick")

@@ -87,7 +87,5 @@ class Subscription:
 
 def next_lane(subscriptions: Sequence[Subscription], now_s: float) -> Lane | None:
     """Choose the lane that sends next; None if nothing waits."""
-    ready = [
-        (one.priority * (now_s - lane.served_s), lane) for one in subscriptions for lane in one.lanes if lane.ready
-    ]
-    return max(ready, key=lambda each: each[0])[1] if ready else None
+    ready = [(one.priority, lane) for one in subscriptions for lane in one.lanes if lane.ready]
+    return max(ready, key=lambda each: each[0] * (now_s - each[1].served_s))[1] if ready else None

@@ -92,9 +92,8 @@ def decode(data: bytes, max_bytes: int = 2**26) -> Message:
     if len(data) != at + payload_bytes:
         raise WireError(f"frame of {len(data)} bytes: must be {at + payload_bytes}, as its header says")
     topic, kind_name, encoding, sender = names
-    message = Message(
-        topic, memoryview(data)[at:], encoding, kind_name, sender, seq, stamp_us, no_drop=bool(flags & NO_DROP)
-    )
+    payload, no_drop = memoryview(data)[at:], bool(flags & NO_DROP)
+    message = Message(topic, payload, encoding, kind_name, sender, seq, stamp_us, no_drop)
     _check(message)
     return message
 
@@ -166,9 +165,8 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
 def _kind(op: str, fields: Mapping[str, Any]) -> Any:
     """Make the type of an ``op``; fields that may be left out stand behind the others."""
     needed = [(name, kind) for name, kind in fields.items() if name[-1] != "?"]
-    return msgspec.defstruct(
-        op, [*needed, *((name[:-1], kind, None) for name, kind in fields.items() if name[-1] == "?")]
-    )
+    optional = [(name[:-1], kind, None) for name, kind in fields.items() if name[-1] == "?"]
+    return msgspec.defstruct(op, [*needed, *optional])
 
 
 _KINDS: Final = {op: _kind(op, fields) for op, fields in FIELDS.items()}

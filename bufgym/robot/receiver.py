@@ -150,9 +150,8 @@ class Receiver:
                 self._streams.pop(name, None)
                 return
             if frame.kind != DATA or frame.number > stream.expected:
-                raise FrameError(
-                    f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}"
-                )
+                what = f"frame of kind {frame.kind}, number {frame.number}"
+                raise FrameError(f"{what}: must be message {stream.expected}")
             if frame.number == stream.expected:
                 answer = self._on_message(Received(name.hex(), *frame[1:], time.time_ns()))
                 if inspect.isawaitable(answer):
