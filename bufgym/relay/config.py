@@ -85,6 +85,7 @@ class Limits(Section, frozen=True):
     topics: Count = 1_024
     """Topics that it publishes on."""
     subscriptions: Count = 512
+    """Subscriptions at a time; and the durable ones that the relay keeps for one session."""
     sessions: Count = 256
     """Sessions that the relay keeps, with the messages held for them."""
     connections: Count = 128
