@@ -119,7 +119,10 @@ class Connection:
 
     async def _hold(self, message: wire.Message) -> bool:
         """Hold a no_drop message; return whether it is held."""
-        shared = False if self._hub.peers is None else await self._hub.peers.hold(self.session, message)
+        shared: bool | None = False
+        if self._hub.peers is not None:
+            self._hub.make_room(self, message)  # what is refused here, the others must not have
+            shared = await self._hub.peers.hold(self.session, message)
         if shared is None:
             self.end("NATS does not answer")  # the client connects again, and sends this again
             return False

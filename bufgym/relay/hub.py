@@ -184,6 +184,11 @@ class Hub:
                     route.append((member, wanted))
         return route
 
+    def make_room(self, sender: Member, message: wire.Message) -> None:
+        """Make room for a no_drop message's receivers here; raise RefusedError if that cannot be."""
+        if receivers := self._holders(sender, message.topic):
+            self.store.make_room(len(wire.encode(message)), receivers)
+
     def hold(self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None) -> None:
         """Keep a no_drop message until its receivers have acked it.
 

@@ -163,7 +163,7 @@ class Store:
         Raises RefusedError: there is no room; then its number is not used.
         """
         if receivers:
-            self._make_room(len(frame), receivers)
+            self.make_room(len(frame), receivers)
         for session in (sender, *receivers):
             self._remember(session)
         with self._transaction():
@@ -183,7 +183,7 @@ class Store:
             receiver.held += 1
             receiver.held_bytes += len(frame)
 
-    def _make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> None:
+    def make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> None:
         """Let the oldest go: of a full session, and of the identity with the most bytes, so that others get theirs.
 
         Raises RefusedError: nobody but these has to wait; or the message is larger than the store.
