@@ -27,8 +27,6 @@ def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
         if encoding == "ros1":
             return _types(1).deserialize_ros1(payload, type)
         return _types().deserialize_cdr(payload, type)
-    except BufgymError:
-        raise
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type} in {encoding}: {error}") from None
 

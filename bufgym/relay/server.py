@@ -56,26 +56,20 @@ class Door:
         self.hub = hub
         self.waiting: Counter[str] = Counter()
         """Address -> its connections that have not said hello."""
-        self.open = 0
+        self.open: set[Accepted] = set()
 
-    def enter(self, address: str) -> None:
+    def enter(self, one: Accepted) -> None:
         """Count a new connection.
 
         Raises RefusedError: too many.
         """
         limits = self.hub.config.limits
-        if self.open >= limits.all_connections:
+        if len(self.open) >= limits.all_connections:
             raise RefusedError("too_many", f"must be at most {limits.all_connections} connections in all")
-        if self.waiting[address] >= limits.connections:
+        if self.waiting[one.address] >= limits.connections:
             raise RefusedError("too_many", f"must be at most {limits.connections} connections that have not said hello")
-        self.open += 1
-        self.waiting[address] += 1
-
-    def greeted(self, address: str) -> None:
-        """Note that a connection has said hello, or has ended without."""
-        self.waiting[address] -= 1
-        if self.waiting[address] <= 0:
-            del self.waiting[address]
+        self.open.add(one)
+        self.waiting[one.address] += 1
 
     def refusal(self, address: str, request: Request) -> RefusedError | None:
         """Give the reason to deny this request, or None."""
@@ -114,14 +108,13 @@ class Accepted(ServerConnection):
         super().__init__(*arguments, **settings)
         self._door = door
         self.address = ""
-        self._inside = False
         self._waits = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         try:
             self.address = plain_address(transport.get_extra_info("peername")[0])
-            self._door.enter(self.address)
+            self._door.enter(self)
         except (TypeError, IndexError):  # the peer has gone already
             self.transport.abort()
             return
@@ -129,7 +122,7 @@ class Accepted(ServerConnection):
             self.refused(refused.code, refused)
             self.transport.abort()
             return
-        self._inside = self._waits = True
+        self._waits = True
         tcp = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
             set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
@@ -140,12 +133,13 @@ class Accepted(ServerConnection):
         """Note that the client has said hello, or has gone."""
         if self._waits:
             self._waits = False
-            self._door.greeted(self.address)
+            self._door.waiting[self.address] -= 1
+            if not self._door.waiting[self.address]:
+                del self._door.waiting[self.address]
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self._inside:
-            self._inside = False
-            self._door.open -= 1
+        if self in self._door.open:
+            self._door.open.remove(self)
             if self.response is None:
                 fault = self.protocol.handshake_exc
                 self.refused("wrong", f"{type(fault).__name__}: {fault}" if fault else "no whole request in time")

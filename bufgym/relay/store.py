@@ -7,7 +7,6 @@ room is refused to its sender; but a receiver that acks nothing loses its own ol
 """
 
 import sqlite3
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -71,7 +70,7 @@ class Store:
     """
 
     def __init__(
-        self, config: Config, audit: Audit, tell: Callable[[Settled], None], clock: Callable[[], float] = time.monotonic
+        self, config: Config, audit: Audit, tell: Callable[[Settled], None], clock: Callable[[], float]
     ) -> None:
         self.limits, self._quota = config.store, config.limits
         self._audit, self._tell, self._clock = audit, tell, clock

@@ -112,7 +112,7 @@ async def test_who_acks_nothing_blocks_nobody(corner: Corner) -> None:
 def test_the_identity_with_most_bytes_makes_room() -> None:
     """10 bytes of room: the hog's two sessions hold 3 and 4, the robot's one 3. So 2 more cost the hog its 4."""
     lost = list[Settled]()
-    store = Store(settings(store=StoreLimits(bytes=10)), Audit(None, Rotation()), lost.append)
+    store = Store(settings(store=StoreLimits(bytes=10)), Audit(None, Rotation()), lost.append, time.monotonic)
     sender, robot, *hogs = (
         store.open(name, Identity(address), False, 0, 0)
         for name, address in (("s", "1.1.1.1"), ("r", "1.1.1.2"), ("a", "1.1.1.3"), ("b", "1.1.1.3"))
