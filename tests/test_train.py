@@ -25,7 +25,6 @@ from agents.settings import (
     Evolve,
     GuidedPPO,
     Learner,
-    Settings,
     SlotEnvironment,
     Suites,
 )

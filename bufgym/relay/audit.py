@@ -35,10 +35,8 @@ class _Lines(RotatingFileHandler):
             self.stream.write(text)
             self.stream.flush()
         except OSError:
-            stream, self.stream = self.stream, None
             with suppress(OSError):
-                if stream is not None:
-                    stream.close()
+                super().close()
             with suppress(OSError):
                 if before is not None:
                     os.truncate(self.baseFilename, before)

@@ -30,12 +30,9 @@ class BagSource:
         counts = dict(zip(bag.topics, np.bincount(bag.topic, minlength=len(bag.topics)).tolist(), strict=True))
         if streams is None:
             seconds = max(1.0, float(bag.time_ns[-1] - bag.time_ns[0]) / 1e9)
-            streams = tuple(
-                Stream(Topic(name.lstrip("/")), count / seconds, 1000) for name, count in counts.items() if count
-            )
-        self.path = path
-        self.streams = streams
-        self._loops = loops
+            rates_hz = {name.lstrip("/"): count / seconds for name, count in counts.items() if count}
+            streams = tuple(Stream(Topic(name), rate_hz, 1000) for name, rate_hz in rates_hz.items())
+        self.path, self.streams, self._loops = path, streams, loops
         self._names = {f"/{stream.topic.name.lstrip('/')}": stream.topic.name for stream in streams}
         for name in self._names:
             if not counts.get(name):

@@ -136,15 +136,12 @@ class Bus:
                 await self._client.close()
 
     async def publish(self, topic: str, frame: bytes, headers: dict[str, str]) -> None:
-        """Send a message, and wait until the server has it; one that is too large is dropped.
+        """Send a message, and wait until the server has it.
 
-        Raises an error if the server takes it too late; the connection must be given up then.
+        Raises RefusedError: it is too large. At any other error, as if the server takes it too late, the connection
+        must be given up.
         """
-        try:
-            self._check_size(topic, frame)
-        except RefusedError as refused:
-            self._note(str(refused))
-            return
+        self._check_size(topic, frame)
         await self._client.publish(MESSAGE, frame, headers=headers)
         await self._client.flush(ANSWER_S)
 

@@ -61,10 +61,10 @@ class Caller:
             self.answers.append(wire.say(op, **fields))
 
     def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
-        """Tell it of a refusal, and why; all but messages, which may come often, are audited here."""
+        """Tell it of a refusal, and why; all but those of messages are audited here."""
         code = error.code if isinstance(error, RefusedError) else "wrong"
         if what != "publish":
-            self.hub.audit("refused", what=what, code=code, why=str(error), **self.identity.as_json())
+            self.hub.audit.repeated(what=what, code=code, why=str(error), **self.identity.as_json())
         self.tell("refused", what=what, code=code, why=str(error), **fields)
 
     async def send_answers(self) -> None:

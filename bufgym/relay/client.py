@@ -84,9 +84,8 @@ class RobotClient(Session):
         """Change the policy from now on; messages already queued go first, under the previous policy."""
         log, number = self._log, self._changes
         own = None if log is None else lambda record: log(number, record)
-        queue = PolicyQueue(
-            policy, self._capacity, topics=self._topics, window=self._window, value=self._value, log=own
-        )
+        settings: dict[str, Any] = {"topics": self._topics, "window": self._window, "value": self._value}
+        queue = PolicyQueue(policy, self._capacity, log=own, **settings)
         self._changes += 1
         queue.left_bytes = self._left_bytes
         before = self._queues[-1] if self._queues else None

@@ -47,7 +47,8 @@ async def serve(*, config: str, check: bool = False) -> None:
     with needs("websockets"):
         from bufgym.relay import policies, server
     if check:
-        policies.check(settings.policies)
+        for name in settings.policies:
+            policies.policy(name)  # raises an error if there is none
         print(f"{config}: {len(settings.rules)} rules, {settings.host}:{settings.port}")
         return
     await server.serve_forever(settings, live.say)

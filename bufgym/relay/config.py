@@ -54,11 +54,9 @@ class Rule(Section, frozen=True, kw_only=True):
     topic: str = ".*"
 
     def __post_init__(self) -> None:
-        known = [self.address != "", self.email != "", self.recorder, self.foxglove, self.nats]
-        if sum(known) != 1:
-            raise BufgymError(
-                "rule: needs one identity: an address, an email, recorder = true, foxglove = true, or nats = true"
-            )
+        if sum(map(bool, (self.address, self.email, self.recorder, self.foxglove, self.nats))) != 1:
+            who = "an address, an email, recorder = true, foxglove = true, or nats = true"
+            raise BufgymError(f"rule: needs one identity: {who}")
         if not (self.send or self.receive):
             raise BufgymError("rule: must allow send or receive")
         if self.address:
@@ -87,6 +85,7 @@ class Limits(Section, frozen=True):
     topics: Count = 1_024
     """Topics that it publishes on."""
     subscriptions: Count = 512
+    """Subscriptions at a time; and the durable ones that the relay keeps for one session."""
     sessions: Count = 256
     """Sessions that the relay keeps, with the messages held for them."""
     connections: Count = 128
@@ -236,13 +235,12 @@ def load(path: str | Path) -> Config:
         config,
         tls=_beside(folder, config.tls, "certificate", "key", "clients"),
         nats=_beside(folder, config.nats, "credentials", "authority"),
-        tokens=config.tokens
-        if config.tokens and "://" in config.tokens.keys
-        else _beside(folder, config.tokens, "keys"),
+        tokens=_beside(folder, config.tokens, "keys"),
     )
 
 
 def _beside(folder: Path, table: Any, *names: str) -> Any:
-    """Resolve the table's file names in this folder."""
+    """Resolve the table's file names in this folder; a URL stays as it is."""
     files = {name: getattr(table, name, "") for name in names}
-    return table and replace(table, **{name: str(folder / file) for name, file in files.items() if file})
+    own = {name: str(folder / file) for name, file in files.items() if file and "://" not in file}
+    return table and replace(table, **own)

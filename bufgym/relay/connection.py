@@ -10,7 +10,7 @@ from typing import Any, Final
 from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import policies, protocol, replay, wire
+from bufgym.relay import outbox, policies, protocol, replay, wire
 from bufgym.relay.caller import POLICY_VIOLATION, Caller
 from bufgym.relay.hub import Outgoing
 from bufgym.relay.outbox import Outbox
@@ -48,16 +48,15 @@ class Connection:
     async def run(self, greeted: Callable[[], None]) -> None:
         """Serve the client to the end; call ``greeted`` after its welcome."""
         hub, caller, admitted = self._hub, self._caller, self._admitted
-        hub.settled(hub.store.acked(self.session, admitted.received))
+        hub.store.acked(self.session, admitted.received)
         hub.join(self)
         self._socket.protocol.max_message_size = hub.config.limits.message_bytes
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
         greeted()
         writer = asyncio.create_task(self._outbox.run())
-        expiry = asyncio.get_running_loop().call_later(
-            min(caller.identity.until_s - time.time(), 2**20), lambda: self.end("the token has expired")
-        )
+        left_s = min(caller.identity.until_s - time.time(), 2**20)
+        expiry = asyncio.get_running_loop().call_later(left_s, self.end, "the token has expired")
         try:
             await self._read()
         except WebSocketException:
@@ -84,7 +83,7 @@ class Connection:
                     self._hub.unsubscribe(self, id)
                 case {"op": "ack", "seq": number}:
                     self._outbox.acked(number)
-                    self._hub.settled(self._hub.store.acked(self.session, number))
+                    self._hub.store.acked(self.session, number)
                 case {"op": "recordings"}:
                     self.tell("recordings", files=await asyncio.to_thread(replay.recordings, self._recordings))
                 case said:
@@ -120,7 +119,10 @@ class Connection:
 
     async def _hold(self, message: wire.Message) -> bool:
         """Hold a no_drop message; return whether it is held."""
-        shared = False if self._hub.peers is None else await self._hub.peers.hold(self.session, message)
+        shared: bool | None = False
+        if self._hub.peers is not None:
+            self._hub.make_room(self, message)  # what is refused here, the others must not have
+            shared = await self._hub.peers.hold(self.session, message)
         if shared is None:
             self.end("NATS does not answer")  # the client connects again, and sends this again
             return False
@@ -160,7 +162,7 @@ class Connection:
 
     def _told(self) -> None:
         self._outbox.wake()
-        if self._outbox.full:
+        if len(self._caller.answers) > outbox.MAX_ANSWERS:
             self.end("reads none of the answers")
 
     def end(self, why: str) -> None:

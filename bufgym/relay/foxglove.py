@@ -73,12 +73,9 @@ class Screen:
         definition = ros_messages.definition(message.type, message.encoding)
         if message.encoding == "json":
             definition = b'{"type": "object"}'
-        schema = self._foxglove.Schema(
-            name=message.type or "object", encoding=SCHEMAS.get(message.encoding, ""), data=definition
-        )
-        return self._foxglove.Channel(
-            message.topic, schema=schema, message_encoding=message.encoding, context=self._context
-        )
+        encoding, name = message.encoding, message.type or "object"
+        schema = self._foxglove.Schema(name=name, encoding=SCHEMAS.get(encoding, ""), data=definition)
+        return self._foxglove.Channel(message.topic, schema=schema, message_encoding=encoding, context=self._context)
 
     def _transform(self, message: Any, topic: str, time_ns: int) -> None:
         from foxglove.channels import FrameTransformChannel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 OWN: Final = "relay"  # The relay's name as a sender, and the prefix of its topics
 STATUS: Final = f"/{OWN}/status"
+CONNECTED: Final = "connected"  # State of the connection to the other relays
 ROBOFLEET: Final = "robofleet"
 """Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
@@ -90,11 +91,11 @@ class Hub:
             config.folder.mkdir(parents=True, exist_ok=True)
         self.audit = Audit(config.folder, config.audit)
         self.quotas = Quotas(config.limits, clock)
-        self.store = Store(config.folder, config.store, self.audit, config.limits.sessions, clock)
+        self.members: dict[StoredSession, Member] = {}
+        self.store = Store(config, self.audit, self._settled, clock)
         self.recorder = Recorder.of(config, self.audit)
         self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
         self._failed: set[str] = set()
-        self.members: dict[StoredSession, Member] = {}
         self.received = 0
         self._sent = 0
         self._dropped = 0
@@ -114,7 +115,7 @@ class Hub:
         """Remove a member whose connection has ended."""
         if self.members.get(member.session) is member:
             self._detach(member)
-            self.settled(self.store.left(member.session))
+            self.store.left(member.session)
 
     def _detach(self, member: Member) -> None:
         del self.members[member.session]
@@ -125,18 +126,17 @@ class Hub:
     def subscribe(self, member: Member, subscription: Subscription) -> None:
         """Add a subscription; it replaces one with the same id.
 
-        Raises RefusedError: it is durable, and the store cannot be written.
+        Raises RefusedError: it is durable, and there are too many or the store cannot be written.
         """
-        wanted = subscription.pattern.text if subscription.durable else None
-        self.store.want(member.session, subscription.id, wanted)
-        old = member.subscriptions.pop(subscription.id, None)
-        self._dropped += old.dropped if old else 0
+        self.unsubscribe(member, subscription.id, subscription.pattern.text if subscription.durable else None)
         member.subscriptions[subscription.id] = subscription
-        self._routes.clear()
 
-    def unsubscribe(self, member: Member, id: str) -> None:
-        """Remove a subscription if there is one of this id."""
-        self.store.want(member.session, id, None)
+    def unsubscribe(self, member: Member, id: str, durable: str | None = None) -> None:
+        """Remove a subscription if there is one of this id; messages of the pattern ``durable`` are held all the same.
+
+        Raises RefusedError: they cannot be held.
+        """
+        self.store.want(member.session, id, durable)
         old = member.subscriptions.pop(id, None)
         self._dropped += old.dropped if old else 0
         self._routes.clear()
@@ -184,6 +184,11 @@ class Hub:
                     route.append((member, wanted))
         return route
 
+    def make_room(self, sender: Member, message: wire.Message) -> None:
+        """Make room for a no_drop message's receivers here; raise RefusedError if that cannot be."""
+        if receivers := self._holders(sender, message.topic):
+            self.store.make_room(len(wire.encode(message)), receivers)
+
     def hold(self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None) -> None:
         """Keep a no_drop message until its receivers have acked it.
 
@@ -195,39 +200,38 @@ class Hub:
         """
         receivers = self._holders(sender, message.topic)
         if not receivers and not shared:
-            alone = self.peers is not None and self.peers.state != "connected"
+            alone = self.peers is not None and self.peers.state != CONNECTED
             other = ", and the other relays are out of reach" if alone else ""
             raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it{other}")
         frame = wire.encode(message)
         number = message.seq if taken is None else taken
-        self.settled(self.store.hold(sender.session, number, message.topic, frame, receivers))
+        self.store.hold(sender.session, number, message.topic, frame, receivers)
         self._show(message)
         for session in receivers:
             if session in self.members:
                 self.members[session].wake()
+        outgoing = Outgoing(message)
         for member, subscription in self._route(message.topic):
             if member is not sender and not member.acks:
-                member.offer(subscription, Outgoing(message))
+                member.offer(subscription, outgoing)
 
     def _holders(self, sender: Member, topic: str) -> list[StoredSession]:
         """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
         here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
         away = [
-            session
-            for session in self.store.sessions.values()
-            if session.durable
-            and session is not sender.session
-            and session not in here
-            and any(pattern(text).part(topic) for text in session.durable.values())
-            and Permissions(self.config.rules, session.identity).allow("receive", topic)
+            each
+            for each in self.store.sessions.values()
+            if each is not sender.session and each not in here
+            if any(pattern(text).part(topic) for text in each.durable.values())
+            if Permissions(self.config.rules, each.identity).allow("receive", topic)
         ]
         return here + away
 
-    def settled(self, messages: Sequence[Settled]) -> None:
-        """Tell the senders of these messages their outcome."""
-        for sender, seq, receivers, lost in messages:
-            if sender in self.members:
-                self.members[sender].tell("delivered", seq=seq, receivers=receivers, lost=lost)
+    def _settled(self, message: Settled) -> None:
+        """Tell the sender of a message its outcome."""
+        if message.sender in self.members:
+            about = {"seq": message.seq, "receivers": message.receivers, "lost": message.lost}
+            self.members[message.sender].tell("delivered", **about)
 
     def status(self) -> dict[str, Any]:
         """The relay's counts, and how it stands with the other relays."""
@@ -253,7 +257,7 @@ class Hub:
         self.quotas.tidy()
         for session in self.store.expired(list(self.members)):
             self.audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
-            self.settled(self.store.forget(session))
+            self.store.forget(session)
 
     def close(self) -> None:
         """Finish the files."""

@@ -21,6 +21,7 @@ MAX_TOKEN_CHARACTERS: Final = 2**14
 KEYS_AGE_S: Final = 300.0  # Longest time for which a key is still trusted after the issuer withdrew it
 AGAIN_S: Final = 1.0  # Shortest time between two requests to the issuer because of tokens with unknown keys
 _FETCH_S: Final = 5.0
+_NO_KEYS: Final = (ValueError, RecursionError, AttributeError, TypeError)  # what a text that is no key set raises
 
 
 _unauthorized: Final = partial(RefusedError, "unauthorized")
@@ -33,8 +34,7 @@ class Verifier:
         import jwt
 
         self._jwt: Any = jwt
-        self._tokens = tokens
-        self._clock = clock
+        self._tokens, self._clock = tokens, clock
         self._keys: Mapping[str | None, Any] = {}
         self._fetched_s = -1e9
         self._fetching = asyncio.Lock()
@@ -70,8 +70,9 @@ class Verifier:
             if age_s > KEYS_AGE_S or (kid not in self._keys and age_s > AGAIN_S):
                 self._fetched_s = self._clock()
                 try:
-                    self._keys = self._parsed(await asyncio.to_thread(self._text))
-                except (OSError, BufgymError, ValueError, RecursionError) as error:
+                    text = await asyncio.to_thread(self._text)
+                    self._keys = {key.key_id: key for key in self._jwt.PyJWKSet.from_dict(json.loads(text)).keys}
+                except (OSError, BufgymError, self._jwt.PyJWTError, *_NO_KEYS) as error:
                     if age_s > KEYS_AGE_S:
                         self._keys = {}
                     raise _unauthorized(f"the issuer's keys cannot be read: {error}") from None
@@ -87,13 +88,6 @@ class Verifier:
             return read_utf8(keys, MAX_KEYS_BYTES)
         with urllib.request.urlopen(keys, timeout=_FETCH_S) as answer:
             return str(answer.read(MAX_KEYS_BYTES).decode())
-
-    def _parsed(self, text: str) -> dict[str | None, Any]:
-        try:
-            found = self._jwt.PyJWKSet.from_dict(json.loads(text)).keys
-        except (self._jwt.PyJWTError, AttributeError, TypeError) as error:
-            raise BufgymError(str(error)) from None
-        return {key.key_id: key for key in found}
 
 
 def _is_loopback(host: str | None) -> bool:

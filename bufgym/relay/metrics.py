@@ -1,7 +1,7 @@
 """A relay's counts as OpenMetrics text, for Prometheus and what reads its format."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
+from types import SimpleNamespace
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST as CONTENT_TYPE
@@ -16,21 +16,12 @@ _SO_FAR = {
 }
 
 
-class _Counts:
-    def __init__(self, status: Mapping[str, int], refusals: Mapping[str, int]) -> None:
-        self._status, self._refusals = status, refusals
-
-    def collect(self) -> Iterator[Any]:
-        for name, about in _NOW.items():
-            yield GaugeMetricFamily(f"bufgym_relay_{name}", about, self._status[name])
-        for name, about in _SO_FAR.items():
-            yield CounterMetricFamily(f"bufgym_relay_{name}", about, self._status[name])
-        refused = CounterMetricFamily("bufgym_relay_refused", "Refusals, also those beyond a quota.", labels=["code"])
-        for code, times in sorted(self._refusals.items()):
-            refused.add_metric([code], times)
-        yield refused
-
-
 def text(status: Mapping[str, int], refusals: Mapping[str, int]) -> bytes:
     """Write the counts of ``Hub.status``, and how often each code was refused."""
-    return bytes(generate_latest(_Counts(status, refusals)))  # type: ignore[no-untyped-call]
+    refused = CounterMetricFamily("bufgym_relay_refused", "Refusals, also those beyond a quota.", labels=["code"])
+    for code, times in sorted(refusals.items()):
+        refused.add_metric([code], times)
+    now = [GaugeMetricFamily(f"bufgym_relay_{name}", about, status[name]) for name, about in _NOW.items()]
+    so_far = [CounterMetricFamily(f"bufgym_relay_{name}", about, status[name]) for name, about in _SO_FAR.items()]
+    counts = SimpleNamespace(collect=lambda: [*now, *so_far, refused])
+    return bytes(generate_latest(counts))  # type: ignore[no-untyped-call]

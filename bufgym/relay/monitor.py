@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from bufgym.model import qoi
@@ -15,14 +16,15 @@ QOI_S: Final = 30.0  # Time before now whose messages count for QoI
 _MOST: Final = 10_000  # messages of a topic that are remembered for its QoI
 
 
+@dataclass(slots=True)
 class _Put:
     """A message: its time, its coordinate x and its outcome."""
 
-    __slots__ = ("left", "put_s", "size_bytes", "topic", "x")
-
-    def __init__(self, put_s: float, x: float, topic: int, size_bytes: int) -> None:
-        self.put_s, self.x, self.topic, self.size_bytes = put_s, x, topic, size_bytes
-        self.left: bool | None = None
+    put_s: float
+    x: float
+    topic: int
+    size_bytes: int
+    left: bool | None = None
 
 
 class _Counts:
@@ -41,9 +43,7 @@ class Monitor:
     def __init__(
         self, topics: Sequence[Topic], value: Value | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._topics = tuple(topics)
-        self._value = value or qoi.exponential()
-        self._clock = clock
+        self._topics, self._value, self._clock = tuple(topics), value or qoi.exponential(), clock
         self._counts = [_Counts() for _ in topics]
         self._left: deque[tuple[float, int]] = deque()
         self._queued: dict[tuple[int, int], _Put] = {}
@@ -81,7 +81,7 @@ class Monitor:
             self._left.popleft()
         qois = [self._qoi(k, now_s) for k in range(len(self._topics))]
         weights = [topic.share for topic, part in zip(self._topics, qois, strict=True) if part is not None]
-        parts = [part for part in qois if part is not None]
+        parts, whole = [part for part in qois if part is not None], sum(weights)
         names = [topic.name for topic in self._topics]
         return {
             "policy": self._policy,
@@ -93,7 +93,7 @@ class Monitor:
             "left": sum(counts.left for counts in self._counts),
             "dropped": sum(counts.dropped for counts in self._counts),
             "rate_bps": round(8 * sum(size for _, size in self._left) / RATE_S),
-            "qoi": _ratio(sum(w * p for w, p in zip(weights, parts, strict=True)), sum(weights)),
+            "qoi": round(sum(w * p for w, p in zip(weights, parts, strict=True)) / whole, 3) if whole else None,
             "topics": {
                 name: {
                     "put": counts.put,
@@ -130,7 +130,3 @@ def _grown(xs: list[float]) -> list[float]:
         grown.append(x + offset)
         before = x
     return grown
-
-
-def _ratio(part: float, whole: float) -> float | None:
-    return round(part / whole, 3) if whole else None

@@ -29,11 +29,6 @@ class Outbox:
         self._sent_number = received
         self._in_flight: deque[int] = deque()
 
-    @property
-    def full(self) -> bool:
-        """Whether the client reads too few answers."""
-        return len(self._caller.answers) > MAX_ANSWERS
-
     def wake(self) -> None:
         """Look for something to send."""
         self._awake.set()
@@ -79,15 +74,16 @@ class Outbox:
         """Send the next no_drop message, if the window has room and there is one."""
         if len(self._in_flight) >= self._hub.config.store.window:
             return False
-        waiting = self._hub.store.waiting(member.session, self._sent_number, 1)
-        for number, topic, frame in waiting:
-            self._sent_number = number
-            if member.permissions.allow("receive", topic):
-                self._in_flight.append(number)
-                await self._send(Outgoing(wire.decode(frame, len(frame))._replace(seq=number)))
-            else:
-                self._hub.settled(self._hub.store.denied(member.session, number))
-        return bool(waiting)
+        waiting = self._hub.store.next(member.session, self._sent_number)
+        if waiting is None:
+            return False
+        self._sent_number, topic, frame = waiting
+        if member.permissions.allow("receive", topic):
+            self._in_flight.append(self._sent_number)
+            await self._send(Outgoing(wire.decode(frame, len(frame))._replace(seq=self._sent_number)))
+        else:
+            self._hub.store.denied(member.session, self._sent_number)
+        return True
 
     async def _send(self, frame: Outgoing) -> None:
         await self._socket.send(frame.form(self._form))

@@ -21,14 +21,13 @@ from bufgym.relay import policies, protocol, wire
 from bufgym.relay.backoff import Backoff
 from bufgym.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
 from bufgym.relay.config import DEFAULT_CAPACITY, Nats
-from bufgym.relay.hub import OWN, Hub, Outgoing
+from bufgym.relay.hub import CONNECTED, OWN, Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import NATS, Permissions
 from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription, next_lane
 from bufgym.robot.tasks import Tasks, until_one_ends
 
-CONNECTED: Final = "connected"
 _RETRY_S: Final = 1.0
 _MINUTE_S: Final = 60.0
 _MOST_RELAYS: Final = 1_000
@@ -139,8 +138,11 @@ class Peers:
                 if item is not None:
                     frame, put_us = item.message
                     headers = {"Relay": self._settings.name, "Put": str(put_us)}
-                    await bus.publish(frame.message.topic, frame.binary, headers)
-                    self.sent += 1
+                    try:
+                        await bus.publish(frame.message.topic, frame.binary, headers)
+                        self.sent += 1
+                    except wire.RefusedError as refused:
+                        self._note(refused)
                 lane.gone()
 
     async def _heard(self, heard: Any) -> None:

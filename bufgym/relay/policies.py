@@ -9,7 +9,6 @@ import contextlib
 import functools
 import signal
 import threading
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
 from bufgym.ground.errors import BufgymError
@@ -31,12 +30,6 @@ def policy(name: str) -> Policy:
     from bufgym.relay import skip_pending
 
     return skip_pending.POLICY if name == SKIP_PENDING else registry.get(name)
-
-
-def check(names: Iterable[str]) -> None:
-    """Raise an error unless all of these are policies."""
-    for name in names:
-        policy(name)
 
 
 def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:

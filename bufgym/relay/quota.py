@@ -11,8 +11,7 @@ class Bucket:
     """A token bucket that fills at ``rate`` a second and holds a second's worth."""
 
     def __init__(self, rate: float) -> None:
-        self._rate = rate
-        self._left = rate
+        self._rate = self._left = rate
         self._at_s: float | None = None
 
     def take(self, amount: float, now_s: float) -> bool:
@@ -42,10 +41,9 @@ class Quota:
 
         Raises RefusedError: beyond a limit, as do all methods here.
         """
-        limits = self.limits
         if not (self.messages.take(1, now_s) and self.bytes.take(size_bytes, now_s)):
-            rule = f"must be at most {limits.messages_per_s} messages and {limits.bytes_per_s} bytes a second"
-            raise RefusedError("too_fast", rule)
+            most = f"{self.limits.messages_per_s} messages and {self.limits.bytes_per_s} bytes a second"
+            raise RefusedError("too_fast", f"must be at most {most}")
 
     def topic(self, topic: str) -> None:
         """Count a topic that it publishes on."""
@@ -68,8 +66,7 @@ class Quotas:
     """Quotas of all identities."""
 
     def __init__(self, limits: Limits, clock: Callable[[], float]) -> None:
-        self._limits = limits
-        self._clock = clock
+        self._limits, self._clock = limits, clock
         self._quotas: dict[str, Quota] = {}
 
     def of(self, key: str) -> Quota:

@@ -28,9 +28,7 @@ class Recorder:
     def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Audit) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        self._rotation = rotation
-        self._permissions = permissions
-        self._audit = audit
+        self._rotation, self._permissions, self._audit = rotation, permissions, audit
         self._file: McapFile | None = None
         self._full = False  # whether it was said of this file
         self._again_s = 0.0  # end of the pause after a failure, 0 if there was none

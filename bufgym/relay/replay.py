@@ -84,8 +84,7 @@ class _Index:
         """Number -> topic, type, encoding."""
         self.first_us = self.last_us = 0
         self._schemas: dict[int, str] = {0: ""}
-        self._times: list[int] = []
-        self._offsets: list[int] = []
+        self._times, self._offsets = list[int](), list[int]()
         self._end = len(_MAGIC)
 
     def walk(self) -> None:

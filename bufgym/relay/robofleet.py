@@ -63,9 +63,8 @@ def read(data: bytes) -> Flat:
         flat = Flat(text(metadata, 0), text(metadata, 1))
         if flat.type in SUBSCRIPTION_TYPES:
             action = table.Offset(_FIRST + 4)
-            flat = flat._replace(
-                pattern=text(table, 1), subscribe=bool(action and table.Get(Uint8Flags, action + table.Pos) == 1)
-            )
+            subscribes = bool(action and table.Get(Uint8Flags, action + table.Pos) == 1)
+            flat = flat._replace(pattern=text(table, 1), subscribe=subscribes)
     except (struct.error, IndexError, TypeError, ValueError, OverflowError) as error:
         raise error if isinstance(error, WireError) else WireError(f"flatbuffer: {error}") from None
     topic = flat.topic if flat.topic.startswith("/") else f"/{flat.topic}"
@@ -122,6 +121,7 @@ class RobofleetConnection(Connection):
             self._hub.unsubscribe(self, flat.pattern)
             return
         try:
+            self._quota.message(0, self._hub.clock())
             self.permissions.check_subscription(flat.pattern)
             chosen = pattern(flat.pattern)
             warmed = await asyncio.to_thread(policies.warm, SKIP_PENDING)

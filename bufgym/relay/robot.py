@@ -22,16 +22,15 @@ from bufgym.relay import ros_messages, wire
 from bufgym.relay.client import RobotClient
 from bufgym.relay.monitor import Monitor
 from bufgym.robot.odometry import Odometry
-from bufgym.robot.tasks import Tasks, until_one_ends
+from bufgym.robot.tasks import until_one_ends
 from bufgym.scenario import Stream
 
 STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
 POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "learned-scheduler")
 """Policies that a viewer may choose by default."""
-_OWN: Final = tuple(
-    Stream(Topic(name, priority=20.0, weight=0.0), rate_hz, 1000) for name, rate_hz in (("status", 1.0), ("queue", 5.0))
-)
+_RATES_HZ: Final = {"status": 1 / STATUS_S, "queue": 1 / QUEUE_S}
+_OWN: Final = tuple(Stream(Topic(name, priority=20.0, weight=0.0), hz, 1000) for name, hz in _RATES_HZ.items())
 
 
 class Source(Protocol):
@@ -68,8 +67,7 @@ class Robot:
         """Arguments as for ``RobotClient``; a command may choose one of ``policies``."""
         if not name or "/" in name:
             raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
-        self.name = name
-        self.source = source
+        self.name, self.source = name, source
         streams = [*source.streams]
         streams += [own for own in _OWN if own.topic.name not in {stream.topic.name for stream in streams}]
         self._streams = {stream.topic.name: stream for stream in streams}
@@ -80,7 +78,6 @@ class Robot:
         self._odometry = Odometry()
         self._location: dict[str, float] | None = None
         self._began_s = time.monotonic()
-        self._pings = Tasks()
         settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
         self.client = RobotClient(url, name, **settings)
         self.client.subscribe(f"^{self.topic('command')}$", self._command)
@@ -127,11 +124,16 @@ class Robot:
 
     async def run(self) -> None:
         """Run until the source has no more, or until cancelled."""
-        own = [self.client.run(), self._every(STATUS_S, self._say_status), self._every(QUEUE_S, self._say_queue)]
-        try:
-            await until_one_ends(self.source.run(self), *own)
-        finally:
-            await self._pings.end()
+
+        async def status() -> None:
+            self.say("status", self.status())
+
+        async def queue() -> None:
+            self.say("queue", self.monitor.state())
+
+        own = [(STATUS_S, status), (STATUS_S, self.client.ping), (QUEUE_S, queue)]
+        every = [self._every(period_s, work) for period_s, work in own]
+        await until_one_ends(self.source.run(self), self.client.run(), *every)
 
     async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         await self.client.connected.wait()
@@ -141,13 +143,6 @@ class Robot:
             await work()
             next_s = max(next_s + period_s, loop.time())
             await asyncio.sleep(next_s - loop.time())
-
-    async def _say_status(self) -> None:
-        self.say("status", self.status())
-        self._pings.begin(self.client.ping())
-
-    async def _say_queue(self) -> None:
-        self.say("queue", self.monitor.state())
 
     async def _command(self, message: wire.Message) -> None:
         try:

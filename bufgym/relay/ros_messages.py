@@ -14,29 +14,19 @@ POSES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Po
 
 
 @functools.cache
-def store() -> Any:
-    """Load the types of ROS 2."""
+def _types(version: int = 2) -> Any:
+    """Load the types of a version of ROS."""
     from rosbags.typesys import Stores, get_typestore
 
-    return get_typestore(Stores.ROS2_JAZZY)
-
-
-@functools.cache
-def _store_1() -> Any:
-    """Load the types of ROS 1."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC)
+    return get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_JAZZY)
 
 
 def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
     """Decode a message; raise a BufgymError if it is not of this type."""
     try:
         if encoding == "ros1":
-            return _store_1().deserialize_ros1(payload, type)
-        return store().deserialize_cdr(payload, type)
-    except BufgymError:
-        raise
+            return _types(1).deserialize_ros1(payload, type)
+        return _types().deserialize_cdr(payload, type)
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type} in {encoding}: {error}") from None
 
@@ -55,10 +45,10 @@ def planar(pose: Any) -> dict[str, float]:
 
 def modern(payload: bytes, type: str, encoding: str) -> tuple[str, bytes]:
     """Convert a ROS 1 payload of a type common to both versions to CDR; return (encoding, payload)."""
-    if encoding == "ros1" and type in store().types:
+    if encoding == "ros1" and type in _types().types:
         with contextlib.suppress(Exception):  # same type name, but another definition
-            message = _moulded(_store_1().deserialize_ros1(payload, type), store())
-            return "cdr", bytes(store().serialize_cdr(message, type))
+            message = _moulded(_types(1).deserialize_ros1(payload, type), _types())
+            return "cdr", bytes(_types().serialize_cdr(message, type))
     return encoding, payload
 
 
@@ -75,8 +65,8 @@ def _moulded(value: Any, types: Any) -> Any:
 def as_ros1(payload: bytes, type: str) -> bytes:
     """Convert a message from CDR to ROS 1."""
     try:
-        message = _moulded(store().deserialize_cdr(payload, type), _store_1())
-        return bytes(_store_1().serialize_ros1(message, type))
+        message = _moulded(_types().deserialize_cdr(payload, type), _types(1))
+        return bytes(_types(1).serialize_ros1(message, type))
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type}: {error}") from None
 
@@ -84,7 +74,7 @@ def as_ros1(payload: bytes, type: str) -> bytes:
 @functools.lru_cache(1_000)
 def definition(type: str, encoding: str = "cdr") -> bytes:
     """Write the type's definition with all types that it uses, as in recordings; empty for an unknown type."""
-    version, known = (1, _store_1()) if encoding == "ros1" else (2, store())
-    if encoding not in ("cdr", "ros1") or type not in known.types:
+    version = 1 if encoding == "ros1" else 2
+    if encoding not in ("cdr", "ros1") or type not in _types(version).types:
         return b""
-    return str(known.generate_msgdef(type, ros_version=version)[0]).encode()
+    return str(_types(version).generate_msgdef(type, ros_version=version)[0]).encode()

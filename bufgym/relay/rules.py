@@ -8,7 +8,7 @@ denied
 import ipaddress
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from bufgym.relay.config import Rule
@@ -35,7 +35,7 @@ class Identity:
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields that others may see."""
-        return {name: value for name, value in asdict(self).items() if name in ("address", "email")}
+        return {"address": self.address, "email": self.email}
 
 
 RECORDER, FOXGLOVE = Identity(own="recorder"), Identity(own="foxglove")

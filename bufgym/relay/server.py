@@ -24,7 +24,7 @@ from bufgym.relay import connection, pages, policies, wire
 from bufgym.relay.caller import Caller
 from bufgym.relay.config import Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
-from bufgym.relay.hub import STATUS, Hub
+from bufgym.relay.hub import CONNECTED, STATUS, Hub
 from bufgym.relay.identity import Verifier, server_context
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
@@ -56,26 +56,20 @@ class Door:
         self.hub = hub
         self.waiting: Counter[str] = Counter()
         """Address -> its connections that have not said hello."""
-        self.open = 0
+        self.open: set[Accepted] = set()
 
-    def enter(self, address: str) -> None:
+    def enter(self, one: Accepted) -> None:
         """Count a new connection.
 
         Raises RefusedError: too many.
         """
         limits = self.hub.config.limits
-        if self.open >= limits.all_connections:
+        if len(self.open) >= limits.all_connections:
             raise RefusedError("too_many", f"must be at most {limits.all_connections} connections in all")
-        if self.waiting[address] >= limits.connections:
+        if self.waiting[one.address] >= limits.connections:
             raise RefusedError("too_many", f"must be at most {limits.connections} connections that have not said hello")
-        self.open += 1
-        self.waiting[address] += 1
-
-    def greeted(self, address: str) -> None:
-        """Note that a connection has said hello, or has ended without."""
-        self.waiting[address] -= 1
-        if self.waiting[address] <= 0:
-            del self.waiting[address]
+        self.open.add(one)
+        self.waiting[one.address] += 1
 
     def refusal(self, address: str, request: Request) -> RefusedError | None:
         """Give the reason to deny this request, or None."""
@@ -113,23 +107,22 @@ class Accepted(ServerConnection):
     def __init__(self, door: Door, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
         self._door = door
-        self._address = ""
-        self._inside = False
+        self.address = ""
         self._waits = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         try:
-            self._address = plain_address(transport.get_extra_info("peername")[0])
-            self._door.enter(self._address)
+            self.address = plain_address(transport.get_extra_info("peername")[0])
+            self._door.enter(self)
         except (TypeError, IndexError):  # the peer has gone already
             self.transport.abort()
             return
         except RefusedError as refused:
-            self._refused(refused.code, str(refused))
+            self.refused(refused.code, refused)
             self.transport.abort()
             return
-        self._inside = self._waits = True
+        self._waits = True
         tcp = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
             set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
@@ -140,20 +133,22 @@ class Accepted(ServerConnection):
         """Note that the client has said hello, or has gone."""
         if self._waits:
             self._waits = False
-            self._door.greeted(self._address)
+            self._door.waiting[self.address] -= 1
+            if not self._door.waiting[self.address]:
+                del self._door.waiting[self.address]
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self._inside:
-            self._inside = False
-            self._door.open -= 1
+        if self in self._door.open:
+            self._door.open.remove(self)
             if self.response is None:
-                why = self.protocol.handshake_exc or "no whole request in time"
-                self._refused("wrong", f"{type(why).__name__}: {why}" if isinstance(why, Exception) else why)
+                fault = self.protocol.handshake_exc
+                self.refused("wrong", f"{type(fault).__name__}: {fault}" if fault else "no whole request in time")
             self.greeted()
         super().connection_lost(exc)
 
-    def _refused(self, code: str, why: str) -> None:
-        self._door.hub.audit.repeated(what="connection", code=code, address=self._address, why=why)
+    def refused(self, code: str, why: object) -> None:
+        """Log why it was not let in."""
+        self._door.hub.audit.repeated(what="connection", code=code, address=self.address, why=str(why))
 
 
 class Server:
@@ -223,7 +218,8 @@ class Server:
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     def _warm(self) -> None:
-        policies.check(self.config.policies)
+        for name in self.config.policies:
+            policies.policy(name)  # raises an error if there is none
         policies.warm(self.config.policies[0])
 
     async def warm(self) -> None:
@@ -261,30 +257,25 @@ class Server:
 
     def _request(self, socket: ServerConnection, request: Request) -> Response | None:
         """Deny a request, answer it with a page, or let it become a WebSocket."""
-        try:
-            address = plain_address(socket.remote_address[0])
-        except (TypeError, IndexError):
-            return pages.response(HTTPStatus.BAD_REQUEST, "gone\n")
-        refused = self._door.refusal(address, request)
+        assert isinstance(socket, Accepted)
+        refused = self._door.refusal(socket.address, request)
         if refused is not None:
-            self.hub.audit.repeated(what="connection", code=refused.code, address=address, why=str(refused))
+            socket.refused(refused.code, refused)
             return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")
         if _is_ours(request) or (self.config.robofleet and "Upgrade" in request.headers):
             return None
         match request.path.partition("?")[0]:
             case "/healthz":
-                runs = self._ticking is not None and not self._ticking.done()
-                return pages.response(
-                    *((HTTPStatus.OK, "ok\n") if runs else (HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n"))
-                )
+                if self._ticking is None or self._ticking.done():
+                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n")
+                return pages.response(HTTPStatus.OK, "ok\n")
             case "/metrics":
-                return self._metrics(address)
+                return self._metrics(socket.address)
         return pages.answer(request.path)
 
     def _metrics(self, address: str) -> Response:
         if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):
-            why = f"no rule lets this address receive {STATUS}\n"
-            return pages.response(HTTPStatus.FORBIDDEN, why)
+            return pages.response(HTTPStatus.FORBIDDEN, f"no rule lets this address receive {STATUS}\n")
         with needs("prometheus_client", "relay"):
             from bufgym.relay import metrics  # not at start-up: few need it
 
@@ -304,24 +295,21 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
-    if server.hub.peers is not None and server.hub.peers.state != "connected":
+    if server.hub.peers is not None and server.hub.peers.state != CONNECTED:
         say(f"{server.hub.peers.state}; goes on without the other relays until NATS is there")
     if server.window is not None:
         say(f"ws://{server.window.address}: Foxglove, Lichtblick")
     told = asyncio.Event()
     with contextlib.suppress(
         NotImplementedError, RuntimeError, ValueError
-    ):  # Windows; a thread that is not the main one
+    ):  # Windows; a thread other than the main one
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
-
-    async def ends() -> None:
-        await told.wait()
 
     async def works() -> None:
         await server.warm()
-        await ends()
+        await told.wait()
 
     try:
-        await until_one_ends(works(), ends())
+        await until_one_ends(works(), told.wait())
     finally:
         await server.close()

@@ -4,6 +4,7 @@ This is all that a viewer needs. ``client.RobotClient`` adds a queue for a robot
 """
 
 import asyncio
+import contextlib
 import inspect
 import json
 import os
@@ -249,9 +250,12 @@ class Session:
             await self._wanted.wait()
 
     async def ping(self) -> None:
-        """Measure ``round_trip_s``."""
-        if self._connection is not None:
-            self.round_trip_s = await (await self._connection.ping())
+        """Measure ``round_trip_s``, unless the connection ends before the answer."""
+        from websockets.exceptions import WebSocketException
+
+        with contextlib.suppress(WebSocketException):
+            if self._connection is not None:
+                self.round_trip_s = await (await self._connection.ping())
 
     async def _take_all(self) -> None:
         async for frame in self._connection:

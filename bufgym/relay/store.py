@@ -7,25 +7,22 @@ room is refused to its sender; but a receiver that acks nothing loses its own ol
 """
 
 import sqlite3
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay.audit import Audit
-from bufgym.relay.config import StoreLimits
+from bufgym.relay.config import Config
 from bufgym.relay.rules import Identity
 from bufgym.relay.wire import RefusedError
 
 FILE: Final = "held.sqlite"
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS session (
-    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER,
-    received INTEGER, numbered INTEGER, seen_s REAL);
+    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER);
 CREATE TABLE IF NOT EXISTS durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS message (
     id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
@@ -33,7 +30,7 @@ CREATE TABLE IF NOT EXISTS message (
 CREATE TABLE IF NOT EXISTS delivery (
     session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
 """
-_COLUMNS: Final = "name, address, email, temporary, received, numbered, seen_s"
+_COLUMNS: Final = "id, name, address, email, temporary, received, numbered"
 
 
 @dataclass(eq=False)
@@ -52,12 +49,6 @@ class StoredSession:
     id: int | None = None  # id in the store; None while there is nothing to remember
 
     @property
-    def columns(self) -> tuple[Any, ...]:
-        """The session as a row of the store."""
-        who = self.identity
-        return self.name, who.address, who.email, self.temporary, self.received, self.numbered, time.time()
-
-    @property
     def key(self) -> tuple[str, str]:
         """Identity and name; the same name under another identity is another session."""
         return self.identity.key, self.name
@@ -73,19 +64,17 @@ class Settled(NamedTuple):
 
 
 class Store:
-    """Sessions and the messages held for them; without a folder they are in memory only."""
+    """Sessions and the messages held for them; without a folder they are in memory only.
+
+    ``tell`` is called with each message as soon as it is settled.
+    """
 
     def __init__(
-        self,
-        folder: Path | None,
-        limits: StoreLimits,
-        audit: Audit,
-        sessions: int = 64,
-        clock: Callable[[], float] = time.monotonic,
+        self, config: Config, audit: Audit, tell: Callable[[Settled], None], clock: Callable[[], float]
     ) -> None:
-        self.limits, self._audit, self._clock = limits, audit, clock
-        self._most_sessions = sessions
-        path = ":memory:" if folder is None else str(folder / FILE)
+        self.limits, self._quota = config.store, config.limits
+        self._audit, self._tell, self._clock = audit, tell, clock
+        path = ":memory:" if config.folder is None else str(config.folder / FILE)
         try:
             self._db = sqlite3.connect(path, timeout=0.5, isolation_level=None)
             # A kill of the process loses nothing; a power failure may lose the last moments.
@@ -95,12 +84,12 @@ class Store:
         except sqlite3.Error as error:
             raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
         self.sessions: dict[tuple[str, str], StoredSession] = {}
-        self._by_id: dict[int, StoredSession] = {}
+        self._by_id: dict[int | None, StoredSession] = {}
         self._load()
 
     def _load(self) -> None:
-        for row in self._db.execute(f"SELECT id, {_COLUMNS} FROM session").fetchall():
-            id, name, address, email, temporary, received, numbered, _ = row
+        for row in self._db.execute(f"SELECT {_COLUMNS} FROM session").fetchall():
+            id, name, address, email, temporary, received, numbered = row
             session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
             session.away_s = self._clock()
             session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
@@ -119,46 +108,45 @@ class Store:
         """
         session = self.sessions.get((identity.key, name))
         if session is None:
-            if sum(key == identity.key for key, _ in self.sessions) >= self._most_sessions:
-                raise RefusedError("too_many", f"must be at most {self._most_sessions} sessions")
+            if sum(key == identity.key for key, _ in self.sessions) >= self._quota.sessions:
+                raise RefusedError("too_many", f"must be at most {self._quota.sessions} sessions")
             session = StoredSession(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
         session.identity, session.away_s = identity, self._clock()
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
-        self._save(session)
+        if session.id is not None:
+            with self._bearable():
+                self._save(session)
         return session
 
-    def left(self, session: StoredSession) -> list[Settled]:
+    def left(self, session: StoredSession) -> None:
         """Note the end of a session's connection; forget messages that nobody will ask for."""
         session.away_s = self._clock()
         if session.temporary or session.id is None:
-            return self.forget(session)
-        self._save(session)
-        return []
+            self.forget(session)
 
-    def forget(self, session: StoredSession) -> list[Settled]:
+    def forget(self, session: StoredSession) -> None:
         """Forget a session; messages held for it are lost. A disk that cannot be written keeps it for later."""
-        settled: list[Settled] = []
-        if session.id is not None:
-            gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
-            with self._bearable():
-                settled = self._settle(session, 0, 2**62, 1, *gone)
+        with self._bearable():
+            if session.id is not None:
+                gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
+                self._settle(session, 0, 2**62, 1, *gone)
                 del self._by_id[session.id]
                 session.id = None
-        if session.id is None:
             self.sessions.pop(session.key, None)
-        return settled
 
     def want(self, session: StoredSession, id: str, pattern: str | None) -> None:
         """Hold matching messages while the session is away; the pattern None ends that.
 
-        Raises RefusedError: the disk cannot be written.
+        Raises RefusedError: too many, also of connections that have ended; or the disk cannot be written.
         """
         if pattern is None:
             if session.durable.pop(id, None) is not None:
                 with self._bearable(), self._transaction():
                     self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
             return
+        if id not in session.durable and len(session.durable) >= self._quota.subscriptions:
+            raise RefusedError("too_many", f"must be at most {self._quota.subscriptions} durable subscriptions")
         self._remember(session)
         with self._transaction():
             self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
@@ -166,14 +154,15 @@ class Store:
 
     def hold(
         self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
-    ) -> list[Settled]:
-        """Store the sender's message number ``seq`` on disk for these receivers; return those settled by making room.
+    ) -> None:
+        """Store the sender's message number ``seq`` on disk for these receivers.
 
         Without receivers, whom other relays have, the number alone is taken.
 
         Raises RefusedError: there is no room; then its number is not used.
         """
-        gone = self._make_room(len(frame), receivers) if receivers else []
+        if receivers:
+            self.make_room(len(frame), receivers)
         for session in (sender, *receivers):
             self._remember(session)
         with self._transaction():
@@ -192,9 +181,8 @@ class Store:
             receiver.numbered += 1
             receiver.held += 1
             receiver.held_bytes += len(frame)
-        return gone
 
-    def _make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> list[Settled]:
+    def make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> None:
         """Let the oldest go: of a full session, and of the identity with the most bytes, so that others get theirs.
 
         Raises RefusedError: nobody but these has to wait; or the message is larger than the store.
@@ -202,7 +190,8 @@ class Store:
         full = [each for each in receivers if each.held >= self.limits.messages]
         if len(full) == len(receivers):
             raise RefusedError("store_full", f"session {full[0].name} has not acked {self.limits.messages} messages")
-        gone = [settled for each in full for settled in self._let_go(each)]
+        for each in full:
+            self._let_go(each)
         while self.bytes + size_bytes > self.limits.bytes:
             shares: Counter[str] = Counter()
             for session in self.sessions.values():
@@ -211,39 +200,35 @@ class Store:
             alone = all(each.identity.key == largest.identity.key for each in receivers)
             if alone or size_bytes > self.limits.bytes:
                 raise RefusedError("store_full", f"no room for {size_bytes} bytes beside {self.bytes}")
-            gone += self._let_go(largest)
-        return gone
+            self._let_go(largest)
 
-    def _let_go(self, session: StoredSession) -> list[Settled]:
+    def _let_go(self, session: StoredSession) -> None:
         (oldest,) = self._db.execute("SELECT min(number) FROM delivery WHERE session = ?", (session.id,)).fetchone()
         self._audit.repeated(what="held", code="store_full", session=session.name, identity=session.identity.key)
-        return self._settle(session, oldest, oldest, 1)
+        self._settle(session, oldest, oldest, 1)
 
-    def waiting(self, session: StoredSession, after: int, most: int) -> list[tuple[int, str, bytes]]:
-        """List number, topic and frame of the session's next messages."""
-        if session.id is None:
-            return []
+    def next(self, session: StoredSession, after: int) -> tuple[int, str, bytes] | None:
+        """Find number, topic and frame of the session's next message, None without one."""
         query = (
             "SELECT number, topic, frame FROM delivery JOIN message ON message.id = delivery.message "
-            "WHERE session = ? AND number > ? ORDER BY number LIMIT ?"
+            "WHERE session = ? AND number > ? ORDER BY number LIMIT 1"
         )
-        return self._db.execute(query, (session.id, after, most)).fetchall()
+        found: tuple[int, str, bytes] | None = self._db.execute(query, (session.id, after)).fetchone()
+        return found
 
-    def acked(self, session: StoredSession, number: int) -> list[Settled]:
-        """Note that the session has processed all messages up to this number; return the settled ones.
+    def acked(self, session: StoredSession, number: int) -> None:
+        """Note that the session has processed all messages up to this number.
 
         If the disk cannot be written, a later ack does it.
         """
-        if session.id is not None and session.held > 0:
+        if session.held > 0:
             with self._bearable():
-                return self._settle(session, 0, number, 0)
-        return []
+                self._settle(session, 0, number, 0)
 
-    def denied(self, session: StoredSession, number: int) -> list[Settled]:
-        """Drop a message that no rule lets the session have any more; return the settled ones."""
+    def denied(self, session: StoredSession, number: int) -> None:
+        """Drop a message that no rule lets the session have any more."""
         with self._bearable():
-            return self._settle(session, number, number, 1)
-        return []
+            self._settle(session, number, number, 1)
 
     def expired(self, connected: Sequence[StoredSession]) -> list[StoredSession]:
         """List the sessions that have been away for too long, counted while the relay runs."""
@@ -277,7 +262,7 @@ class Store:
         except RefusedError as refused:
             self._audit.repeated(what="store", code=refused.code, why=str(refused))
 
-    def _settle(self, session: StoredSession, first: int, last: int, lost: int, *also: str) -> list[Settled]:
+    def _settle(self, session: StoredSession, first: int, last: int, lost: int, *also: str) -> None:
         """End deliveries to a session; ``also`` are statements about its id for the same transaction."""
         settled, sizes, freed_bytes = [], [], 0
         chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
@@ -286,35 +271,34 @@ class Store:
             self._db.execute(f"DELETE {chosen}", (session.id, first, last))
             for statement in also:
                 self._db.execute(statement, (session.id,))
-            for (message,) in rows:
+            for (id,) in rows:
                 (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
                     "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
                     "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
-                    (lost, message),
+                    (lost, id),
                 ).fetchone()
                 sizes.append(size_bytes)
                 if waiting == 0:
-                    self._db.execute("DELETE FROM message WHERE id = ?", (message,))
+                    self._db.execute("DELETE FROM message WHERE id = ?", (id,))
                     freed_bytes += size_bytes
                     if sender in self._by_id:
                         settled.append(Settled(self._by_id[sender], seq, receivers, gone))
         session.held -= len(sizes)
         session.held_bytes -= sum(sizes)
         self.bytes -= freed_bytes
-        return settled
+        for message in settled:
+            self._tell(message)
 
     def _remember(self, session: StoredSession) -> None:
-        """Give the session an id in a transaction of its own, so that the id is never rolled back."""
         if session.id is None:
-            insert = f"INSERT INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
-            with self._transaction():
-                id = self._db.execute(insert, session.columns).lastrowid
-            assert id is not None
-            session.id = id
-            self._by_id[session.id] = session
+            self._save(session)
 
     def _save(self, session: StoredSession) -> None:
-        if session.id is not None:
-            places = ", ".join(f"{column} = ?" for column in _COLUMNS.split(", "))
-            with self._bearable(), self._transaction():
-                self._db.execute(f"UPDATE session SET {places} WHERE id = ?", (*session.columns, session.id))
+        """Write the session; a new one gets its id in a transaction of its own, so that the id is never rolled back."""
+        who = session.identity
+        row = session.id, session.name, who.address, who.email, session.temporary, session.received, session.numbered
+        with self._transaction():
+            insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+            id = self._db.execute(insert, row).lastrowid
+        session.id = id
+        self._by_id[id] = session

@@ -67,9 +67,10 @@ class Subscription:
         number = self._topics.get(topic)
         if number is None:
             places = MAX_QUEUES * (PLACES if self.policy.for_topics else 1)
-            number = len(self._topics) if len(self._topics) < places else zlib.crc32(topic.encode()) % places
             if len(self._topics) < places:
-                self._topics[topic] = number
+                number = self._topics[topic] = len(self._topics)
+            else:
+                number = zlib.crc32(topic.encode()) % places
         lane, place = divmod(number, PLACES) if self.policy.for_topics else (number, 0)
         while lane >= len(self.lanes):
             self.lanes.append(Lane(new_queue(self.policy, self.capacity), self.left_bytes))
@@ -87,7 +88,5 @@ class Subscription:
 
 def next_lane(subscriptions: Sequence[Subscription], now_s: float) -> Lane | None:
     """Choose the lane that sends next; None if nothing waits."""
-    ready = [
-        (one.priority * (now_s - lane.served_s), lane) for one in subscriptions for lane in one.lanes if lane.ready
-    ]
-    return max(ready, key=lambda each: each[0])[1] if ready else None
+    ready = [(one.priority, lane) for one in subscriptions for lane in one.lanes if lane.ready]
+    return max(ready, key=lambda each: each[0] * (now_s - each[1].served_s))[1] if ready else None

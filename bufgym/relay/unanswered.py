@@ -61,9 +61,8 @@ class Unanswered:
 
     def expects(self, topic: str, seq: int | None) -> bool:
         """Whether the next answer is about this message."""
-        return bool(
-            self._sent and self._sent[0].message.topic == topic and seq in (None, self.acked + self._refused + 1)
-        )
+        expected = self._sent[0].message.topic if self._sent else None
+        return topic == expected and seq in (None, self.acked + self._refused + 1)
 
     def refuse(self, code: str, why: str) -> None:
         """Note that the relay refused the oldest unanswered message."""

@@ -92,9 +92,8 @@ def decode(data: bytes, max_bytes: int = 2**26) -> Message:
     if len(data) != at + payload_bytes:
         raise WireError(f"frame of {len(data)} bytes: must be {at + payload_bytes}, as its header says")
     topic, kind_name, encoding, sender = names
-    message = Message(
-        topic, memoryview(data)[at:], encoding, kind_name, sender, seq, stamp_us, no_drop=bool(flags & NO_DROP)
-    )
+    payload, no_drop = memoryview(data)[at:], bool(flags & NO_DROP)
+    message = Message(topic, payload, encoding, kind_name, sender, seq, stamp_us, no_drop)
     _check(message)
     return message
 
@@ -119,18 +118,9 @@ def check_topic(topic: str) -> None:
 
 
 def check_name(what: str, name: str) -> None:
-    """A name is short, and prints as it stands."""
-    if not name.isprintable() or (not name.isascii() and _utf8_bytes(what, name) > MAX_NAME_BYTES):
+    """A name is short, and prints as it stands: so it is UTF-8."""
+    if not name.isprintable() or len(name.encode()) > MAX_NAME_BYTES:
         raise WireError(f"{what} {name!r}: must be printable, at most {MAX_NAME_BYTES} bytes")
-    if len(name) > MAX_NAME_BYTES:
-        raise WireError(f"{what} {name!r}: must be at most {MAX_NAME_BYTES} bytes")
-
-
-def _utf8_bytes(what: str, name: str) -> int:
-    try:
-        return len(name.encode())
-    except UnicodeEncodeError:
-        raise WireError(f"{what} {name!r}: must be UTF-8") from None
 
 
 Number = Annotated[int, Meta(ge=0, le=MAX_SEQ)]
@@ -175,9 +165,8 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
 def _kind(op: str, fields: Mapping[str, Any]) -> Any:
     """Make the type of an ``op``; fields that may be left out stand behind the others."""
     needed = [(name, kind) for name, kind in fields.items() if name[-1] != "?"]
-    return msgspec.defstruct(
-        op, [*needed, *((name[:-1], kind, None) for name, kind in fields.items() if name[-1] == "?")]
-    )
+    optional = [(name[:-1], kind, None) for name, kind in fields.items() if name[-1] == "?"]
+    return msgspec.defstruct(op, [*needed, *optional])
 
 
 _KINDS: Final = {op: _kind(op, fields) for op, fields in FIELDS.items()}

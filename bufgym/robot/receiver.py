@@ -1,12 +1,14 @@
 """The receiving end: takes messages from any number of senders, acks each, and delivers none twice."""
 
 import asyncio
+import contextlib
 import inspect
 import json
 import socket
 import time
 from collections import OrderedDict, deque
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
@@ -46,13 +48,13 @@ class Received(NamedTuple):
     """Time of receipt by this system's clock."""
 
 
+@dataclass
 class _Talk:
     """State of one sender's stream."""
 
-    def __init__(self, expected: int) -> None:
-        self.expected = expected
-        self.task: asyncio.Task[Any] | None = None
-        """Task of its connection, ended by cancelling; closing the socket would not end it."""
+    expected: int
+    task: asyncio.Task[Any] | None = None
+    """Task of its connection, ended by cancelling; closing the socket would not end it."""
 
 
 class Receiver:
@@ -72,20 +74,22 @@ class Receiver:
         self._room = Room(max(MAX_ARRIVING_BYTES, max_body_bytes))
         self._peers = 0
         self._tasks = Tasks()
-        self._listener: socket.socket | None = None
-        self._server: Any = None
-        self._bus: BusServer | None = None
+        self._ends = contextlib.AsyncExitStack()
 
     async def listen(self, port: int = 0, host: str = "127.0.0.1", transport: str = "tcp") -> int:
         """Begin to listen and return the port; 0 takes any free port, or the standard one of an MQTT broker."""
         if transport == "tcp":
-            self._listener = await listener(host, port)
-            self._tasks.begin(self._accept(self._listener))
-            return int(self._listener.getsockname()[1])
+            listening = await listener(host, port)
+            self._ends.callback(listening.close)
+            self._ends.push_async_callback(self._tasks.end)
+            self._tasks.begin(self._accept(listening))
+            return int(listening.getsockname()[1])
         if transport in BUSES:
             port = port or (MQTT_PORT if transport == "mqtt" else free_port(host))
-            self._bus = BusServer(self._serve, self._tasks.begin, self._max_body_bytes)
-            await self._bus.listen(BUSES[transport], host, port)
+            bus = BusServer(self._serve, self._tasks.begin, self._max_body_bytes)
+            self._ends.push_async_callback(self._tasks.end)
+            self._ends.push_async_callback(bus.close)
+            await bus.listen(BUSES[transport], host, port)
             return port
         if transport != "websocket":
             raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
@@ -94,19 +98,13 @@ class Receiver:
         most = self._max_body_bytes
         limits: dict[str, Any] = {"max_size": most + HEADER_BYTES, "max_queue": 1}
         limits |= {"compression": None, "ping_interval": None}
-        self._server = await serve(lambda one: self._serve(WebSocketChannel(one, most)), host, port, **limits)
-        return int(next(iter(self._server.sockets)).getsockname()[1])
+        server = await serve(lambda one: self._serve(WebSocketChannel(one, most)), host, port, **limits)
+        await self._ends.enter_async_context(server)
+        return int(next(iter(server.sockets)).getsockname()[1])
 
     async def close(self) -> None:
         """Close all connections and stop listening."""
-        if self._bus is not None:
-            await self._bus.close()
-        await self._tasks.end()
-        if self._listener is not None:
-            self._listener.close()
-        if self._server is not None:
-            self._server.close()
-            await self._server.wait_closed()
+        await self._ends.aclose()
 
     async def _accept(self, listening: socket.socket) -> None:
         while True:
@@ -121,7 +119,9 @@ class Receiver:
         try:
             if self._peers > MAX_PEERS:
                 raise ConnectionRefusedError(f"must be at most {MAX_PEERS} connections")
-            await self._take(channel, await asyncio.wait_for(channel.receive(), _GREETING_S))
+            async with asyncio.timeout(_GREETING_S):
+                greeting = await channel.receive()
+            await self._take(channel, greeting)
         except (OSError, TimeoutError) as error:
             self.faults.append(f"{type(error).__name__}: {error}")
         finally:
@@ -134,7 +134,7 @@ class Receiver:
         name = bytes(greeting.body)
         stream = self._streams.setdefault(name, _Talk(greeting.number))
         self._streams.move_to_end(name)
-        if stream.task is not None:
+        while stream.task is not None and not stream.task.done():  # another connection may have come while this waits
             stream.task.cancel()  # the sender has given that connection up
             await asyncio.wait([stream.task])
         stream.task = asyncio.current_task()
@@ -144,14 +144,14 @@ class Receiver:
                 oldest.task.cancel()
         await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes))
         while True:
-            frame = await asyncio.wait_for(channel.receive(), IDLE_S)
+            async with asyncio.timeout(IDLE_S):  # wait_for would lose a cancellation that comes with the frame
+                frame = await channel.receive()
             if frame.kind == GOODBYE:
                 self._streams.pop(name, None)
                 return
             if frame.kind != DATA or frame.number > stream.expected:
-                raise FrameError(
-                    f"frame of kind {frame.kind}, number {frame.number}: must be message {stream.expected}"
-                )
+                what = f"frame of kind {frame.kind}, number {frame.number}"
+                raise FrameError(f"{what}: must be message {stream.expected}")
             if frame.number == stream.expected:
                 answer = self._on_message(Received(name.hex(), *frame[1:], time.time_ns()))
                 if inspect.isawaitable(answer):

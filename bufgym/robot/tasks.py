@@ -30,7 +30,7 @@ class Tasks:
         await asyncio.gather(*self._running, return_exceptions=True)
 
 
-async def until_one_ends(*works: Coroutine[Any, Any, None]) -> None:
+async def until_one_ends(*works: Coroutine[Any, Any, Any]) -> None:
     """Run all until one ends, cancel the others and wait for them, then raise the first one's error."""
     tasks = [asyncio.create_task(work) for work in works]
     try:

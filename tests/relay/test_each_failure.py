@@ -1,7 +1,7 @@
 """A relay's day, again and again: each time another write, send, accept or reading of the clock fails once.
 
-A robot streams and takes commands, an operator sends them, a viewer watches, all is recorded. Whatever failed, the relay
-goes on, each acked command arrives once and in order, and the recording opens.
+A robot streams and takes commands, an operator sends them, a viewer watches, all is recorded. Whatever failed, the
+relay goes on, each acked command arrives once and in order, and the recording opens.
 """
 
 import asyncio

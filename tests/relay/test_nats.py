@@ -17,15 +17,14 @@ from bufgym.robot.sockets import free_port
 pytestmark = needs_server
 
 
-@pytest.fixture
-def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def _hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Relays wait little for NATS."""
     for name in ("ANSWER_S", "ASK_S"):
         monkeypatch.setattr(f"bufgym.relay.bus.{name}", 0.5)
     monkeypatch.setattr("bufgym.relay.backoff.MOST_S", 0.1)
 
 
-@pytest.mark.usefixtures("hasty")
 async def test_relays_hear_each_other_again_after_nats_has_stood_still(tmp_path: Path) -> None:
     """A stopped server still holds its connections. The relays give them up, and find each other on new ones."""
     port = free_port("127.0.0.1")
@@ -49,7 +48,6 @@ async def test_relays_hear_each_other_again_after_nats_has_stood_still(tmp_path:
                 seen += [bytes(each.payload) for each in await viewer.rest()]
 
 
-@pytest.mark.usefixtures("hasty")
 async def test_a_relay_connects_again_whose_library_has_stopped_to_read(tmp_path: Path) -> None:
     """A header that is no text ends the reader of the library, which tells nobody."""
     port, broken = free_port("127.0.0.1"), b"NATS/1.0 \xff\xff\xff x\r\n\r\n"
@@ -61,7 +59,6 @@ async def test_a_relay_connects_again_whose_library_has_stopped_to_read(tmp_path
         await connected(a)
 
 
-@pytest.mark.usefixtures("hasty")
 async def test_without_nats_a_relay_serves_its_own_robots_and_joins_when_it_comes(tmp_path: Path) -> None:
     """It says how it stands. A command for a robot elsewhere is refused, not held for nobody."""
     port, command = free_port("127.0.0.1"), "/robots/a/command"
@@ -91,7 +88,6 @@ def test_a_clock_that_is_set_back_makes_messages_late_for_two_minutes_at_most() 
     assert [delays.extra_s(14, now_s) for now_s in (40, 61, 122)] == [10, 10, 0]
 
 
-@pytest.mark.usefixtures("hasty")
 async def test_commands_outlive_the_loss_of_the_stream(tmp_path: Path) -> None:
     """NATS comes back with nothing on its disk. Relay b is away meanwhile: a keeps b's place among the relays."""
     port, command = free_port("127.0.0.1"), "/robots/a/command"
@@ -111,7 +107,6 @@ async def test_commands_outlive_the_loss_of_the_stream(tmp_path: Path) -> None:
                 await one.came(1)
 
 
-@pytest.mark.usefixtures("hasty")
 async def test_a_relay_that_is_gone_for_good_is_forgotten(tmp_path: Path) -> None:
     """Commands are kept for it no longer than for a session, here for a second; then there is room again."""
     port, command, limits = free_port("127.0.0.1"), "/robots/a/command", StoreLimits(keep_s=1.0, bytes=1_000)
@@ -128,7 +123,6 @@ async def test_a_relay_that_is_gone_for_good_is_forgotten(tmp_path: Path) -> Non
         await operator.acked(command, seq)
 
 
-@pytest.mark.usefixtures("hasty")
 async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path) -> None:
     """NATS stands still: the sender's connection ends, unanswered. It comes again and sends the same again."""
     port, command = free_port("127.0.0.1"), "/robots/a/command"

@@ -18,7 +18,7 @@ from relay_cases import Corner, client, nothing, process, relay, settings, until
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import backoff
 from bufgym.relay.audit import Audit
-from bufgym.relay.config import Rotation, Rule, StoreLimits
+from bufgym.relay.config import Limits, Rotation, Rule, StoreLimits
 from bufgym.relay.rules import Identity
 from bufgym.relay.session import Session
 from bufgym.relay.store import Settled, Store
@@ -111,20 +111,37 @@ async def test_who_acks_nothing_blocks_nobody(corner: Corner) -> None:
 
 def test_the_identity_with_most_bytes_makes_room() -> None:
     """10 bytes of room: the hog's two sessions hold 3 and 4, the robot's one 3. So 2 more cost the hog its 4."""
-    audit = Audit(None, Rotation())
-    store = Store(None, StoreLimits(bytes=10), audit)
+    lost = list[Settled]()
+    store = Store(settings(store=StoreLimits(bytes=10)), Audit(None, Rotation()), lost.append, time.monotonic)
     sender, robot, *hogs = (
         store.open(name, Identity(address), False, 0, 0)
         for name, address in (("s", "1.1.1.1"), ("r", "1.1.1.2"), ("a", "1.1.1.3"), ("b", "1.1.1.3"))
     )
     for seq, (size, receiver) in enumerate(((3, robot), (3, hogs[0]), (4, hogs[1])), start=1):
-        assert store.hold(sender, seq, "/a", bytes(size), [receiver]) == []
-    assert store.hold(sender, 4, "/a", bytes(2), [robot]) == [Settled(sender, 3, 1, 1)]
+        store.hold(sender, seq, "/a", bytes(size), [receiver])
+    assert lost == []
+    store.hold(sender, 4, "/a", bytes(2), [robot])
+    assert lost == [Settled(sender, 3, 1, 1)]
     assert [one.held_bytes for one in (robot, *hogs)] == [5, 3, 0] and store.bytes == 8
     with pytest.raises(BufgymError, match="no room for 3 bytes beside 8"):
         store.hold(sender, 5, "/a", bytes(3), [robot])  # now the robot has the most
     with pytest.raises(BufgymError, match="no room for 11 bytes beside 8"):
         store.hold(sender, 5, "/a", bytes(11), [robot, hogs[0]])
+    store.hold(sender, 5, "/a", bytes(4), [hogs[1]])  # costs the robot its 3
+    with pytest.raises(BufgymError, match="no room for 9 bytes beside 2"):
+        store.hold(sender, 6, "/a", bytes(9), [robot])  # without the hog's 4 and 3 either, whose loss is told
+    assert [one.seq for one in lost] == [3, 1, 5, 2]
+
+
+async def test_no_session_is_held_for_by_more_subscriptions_than_the_limit() -> None:
+    """Two at most, over all connections of the session; one may be asked for again, and given up for another."""
+    async with relay(settings(limits=Limits(subscriptions=2))) as server:
+        for ids, codes in (("ab", [None, None]), ("c", ["too_many"]), ("a", [None])):
+            async with client(server.port, session="a") as robot:
+                assert [(await robot.subscribe(id, id, durable=True)).get("code") for id in ids] == codes
+        async with client(server.port, session="a") as robot:
+            await robot.say("unsubscribe", id="b")
+            assert (await robot.subscribe("c", "c", durable=True))["op"] == "subscribed"
 
 
 def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +149,8 @@ def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatc
     now_s = 10.0
 
     def opened() -> Store:
-        return Store(tmp_path, StoreLimits(keep_s=100.0), Audit(None, Rotation()), clock=lambda: now_s)
+        config = settings(folder=tmp_path, store=StoreLimits(keep_s=100.0))
+        return Store(config, Audit(None, Rotation()), lambda settled: None, lambda: now_s)
 
     store = opened()
     robot = store.open("robot", Identity("1.1.1.1"), False, 0, 0)

@@ -70,13 +70,10 @@ def until(page: Any, *expressions: str) -> None:
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1360), pytest.param("dark", 390, marks=pytest.mark.nightly)])
 def test_it_shows_the_robots(browser: Any, port: int, scheme: str, width: int) -> None:
     with shows(browser, f"http://127.0.0.1:{port}/", scheme, width) as page:
-        until(
-            page,
-            "document.querySelectorAll('.card').length === 2",
-            "document.querySelector('#camera-says').textContent.startsWith('camera')",
-            "document.querySelector('#scan-says').textContent.startsWith('laser')",
-            "document.querySelectorAll('#topics tr').length === 5",
-        )
+        until(page, "document.querySelectorAll('.card').length === 2")
+        for id, text in (("camera", "camera"), ("scan", "laser")):
+            until(page, f"document.querySelector('#{id}-says').textContent.startsWith('{text}')")
+        until(page, "document.querySelectorAll('#topics tr').length === 5")
         names = page.eval_on_selector_all(".card b", "cards => cards.map(card => card.textContent)")
         assert names == ["robot-1", "robot-2"]
         page.click(".card:nth-of-type(2)")

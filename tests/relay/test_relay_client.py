@@ -97,18 +97,14 @@ async def test_commands_come_once_and_in_order_over_a_link_that_breaks(corner: C
             with pytest.raises(BufgymError, match=f"topic {corner.command}: refused: no_receiver"):
                 await wait("the refusal", sender.command(corner.command, {"command": "stop"}))
         sender = Session(sends, "a")
-        receiver.subscribe(
-            f"^{corner.command}$", lambda message: came.append(json.loads(bytes(message.payload))), durable=True
-        )
+        receiver.subscribe(f"^{corner.command}$", lambda one: came.append(json.loads(bytes(one.payload))), durable=True)
         async with within("20 commands"), beside(sender.run(), receiver.run()):
             await receiver.ready.wait()
             for k in range(20):
-                if k % 5 == 2:
-                    async with beside(cut(near, sender) if k % 2 else cut(far, receiver)) as (cutting,):
-                        await sender.command(corner.command, k)
-                        await cutting
-                else:
+                cuts = [cut(near, sender) if k % 2 else cut(far, receiver)] if k % 5 == 2 else []
+                async with beside(*cuts) as cutting:
                     await sender.command(corner.command, k)
+                    await asyncio.gather(*cutting)
             await until("the last", lambda: len(came) >= 20)
             assert sender.faults and receiver.faults
     assert came == list(range(20))
@@ -121,14 +117,8 @@ async def test_a_queue_over_a_break_and_a_change_of_policy(corner: Corner) -> No
     records: list[tuple[int, str]] = []
     topic = corner.topic("camera")
     async with links(corner, 1) as ((link, url),):
-        robot = RobotClient(
-            url,
-            "a",
-            topics=(Topic(topic),),
-            policy="drop-newest",
-            capacity=8,
-            log=lambda number, record: records.append((number, record["event"])),
-        )
+        about: dict[str, Any] = {"topics": (Topic(topic),), "policy": "drop-newest", "capacity": 8}
+        robot = RobotClient(url, "a", **about, log=lambda number, record: records.append((number, record["event"])))
         viewer = Session(corner.url, "v")
         viewer.subscribe(f"^{topic}$", came.append)
         async with within("what was queued"), beside(viewer.run(), robot.run()):

@@ -14,6 +14,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from bufgym.relay import robofleet
+from bufgym.relay.config import Limits
 from bufgym.relay.wire import WireError
 
 flatbuffers = pytest.importorskip("flatbuffers", reason="no flatbuffers here: the extra relay")
@@ -77,9 +78,8 @@ async def released(port: int) -> AsyncIterator[ClientConnection]:
 
 async def wanted(server: Server, patterns: int) -> None:
     """Return once clients have so many subscriptions in all: released ones are not told."""
-    await until(
-        "subscriptions", lambda: sum(len(member.subscriptions) for member in server.hub.members.values()) == patterns
-    )
+    members = server.hub.members
+    await until("subscriptions", lambda: sum(len(one.subscriptions) for one in members.values()) == patterns)
 
 
 async def test_released_clients_meet() -> None:
@@ -118,6 +118,22 @@ async def test_released_clients_meet() -> None:
         await robot.send(b"garbage")
         with pytest.raises(ConnectionClosed):  # and it has heard nothing
             await wait("the end", robot.recv())
+
+
+async def test_a_flood_of_requests_is_refused_and_fills_no_log() -> None:
+    """Three are taken at a time. Of the four beyond, the log has one line, and another with the count."""
+    async with (
+        relay(settings(robofleet=True, limits=Limits(messages_per_s=3))) as server,
+        released(server.port) as page,
+    ):
+        server.hub.clock = lambda: 0.0
+        for k in range(7):
+            await page.send(wants(f"/{k}"))
+        await page.send(wants("/2", 0))
+        await wanted(server, 2)
+        server.hub.audit.flush()
+        lines = [entry.get("times") for entry in server.hub.audit.recent if entry.get("code") == "too_fast"]
+        assert lines == [None, 3]
 
 
 async def test_it_is_off_unless_asked_for() -> None:

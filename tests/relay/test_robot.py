@@ -1,5 +1,6 @@
 """Robots: what a made-up one sees, how a queue is told, recordings, commands."""
 
+import asyncio
 import json
 import math
 import os
@@ -7,6 +8,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 from loop_cases import beside, compiled
 from made_up_robot import HALF_M, ODOMETRY, PICTURE, SCAN, MadeUp, Pose, cast, jpeg, odometry, picture, pose_at, scan
 from relay_cases import Corner, settings, until, wait
+from websockets.exceptions import ConnectionClosedError
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
@@ -121,9 +124,8 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
     monkeypatch.setattr(robot, "QUEUE_S", 0.1)
 
     async def story(viewer: Session, came: Came) -> None:
-        await until(
-            "two of each", lambda: all(len(came[topic]) >= 2 for topic in ("odom", "scan", "camera", "queue", "status"))
-        )
+        topics = ("odom", "scan", "camera", "queue", "status")
+        await until("two of each", lambda: all(len(came[topic]) >= 2 for topic in topics))
         for wrong in ({"command": "policy", "policy": "oracle"}, "stop", 3):
             await wait("an ack", viewer.command(corner.command, wrong))
         await wait("an ack", viewer.command(corner.command, {"command": "policy", "policy": "drop-newest"}))
@@ -140,6 +142,30 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
     pose = ros_messages.read(bytes(came["odom"][0].payload), ODOMETRY)
     assert abs(pose.pose.pose.position.y) < HALF_M[1]
     assert bytes(came["camera"][0].payload[:2]) == b"\xff\xd8"
+
+
+@compiled
+async def test_a_robot_pings_once_at_a_time(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No ping is answered while ten states come. One that ends with its connection ends no robot."""
+    asked = list[str]()
+
+    async def ping(client: Session) -> None:
+        asked.append(client.name)
+        await asyncio.Event().wait()
+
+    async def broken() -> None:
+        raise ConnectionClosedError(None, None)
+
+    async def story(viewer: Session, came: Came) -> None:
+        viewer._connection = SimpleNamespace(ping=broken, transport=viewer._connection.transport)
+        await viewer.ping()
+        assert viewer.round_trip_s is None
+        await until("ten", lambda: len(came["status"]) >= 10)
+
+    monkeypatch.setattr(robot, "STATUS_S", 0.05)
+    monkeypatch.setattr(robot.RobotClient, "ping", ping)
+    await watched(corner, MadeUp(), story, policy="drop-oldest")
+    assert asked == [corner.robot]
 
 
 def recording(path: Path) -> Path:

@@ -69,9 +69,7 @@ def main(folder: str) -> None:
         for one in publishers.values():
             one.publish(str(k))
     wait(lambda: all(len(texts) == MESSAGES for texts in came.values()))
-    kinds = {
-        topic: [type(one).__name__ for one in publisher.impl.connections] for topic, publisher in publishers.items()
-    }
+    kinds = {topic: [type(one).__name__ for one in each.impl.connections] for topic, each in publishers.items()}
     statistics = publishers["named"].impl.get_stats()
     second.close()
     rospy.signal_shutdown("done")  # ends the logs
