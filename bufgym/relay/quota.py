@@ -17,7 +17,7 @@ class Bucket:
     def take(self, amount: float, now_s: float) -> bool:
         """Take ``amount`` and return True if enough was left; a full bucket allows any amount."""
         if self._at_s is not None:
-            self._left = min(self._rate, self._left + (now_s - self._at_s) * self._rate)
+            self._left = min(self._rate, self._left + max(0.0, now_s - self._at_s) * self._rate)
         self._at_s = now_s
         if self._left < min(amount, self._rate):
             return False

@@ -94,7 +94,7 @@ class Ros2(_RosSource):
 
             self._listen(robot, advertise)
             async with spinning(here):
-                await look(here, self._wanted, subscribe, NODE, robot.client.note)
+                await look(here, sorted(self._wanted), subscribe, NODE, robot.client.note)
 
 
 class Ros1(_RosSource):

@@ -30,6 +30,7 @@ TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
 _MAX_TOKEN_BYTES: Final = 2**16
 _MAX_FRAME_BYTES: Final = 2**26
+_PASSING: Final = ("store_full", "too_fast")  # Codes of refusals after which it is tried again
 
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
 
@@ -286,6 +287,8 @@ class Session:
         elif said["op"] == "refused":
             if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])
+            elif said["what"] == "subscribe" and said["code"] in _PASSING:
+                raise ConnectionResetError(f"subscribe refused: {said['code']}: {said['why']}")  # and once more
             else:
                 self.note(f"{said['what']} refused: {said['code']}: {said['why']}")
         self._wanted.set()

@@ -7,7 +7,6 @@ relay goes on, each acked command arrives once and in order, and the recording o
 import asyncio
 import contextlib
 import errno
-import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -75,7 +74,7 @@ class Database:
 @contextlib.contextmanager
 def failing(fails: Fails) -> Iterator[None]:
     """Within the block the n-th of these fails."""
-    began, made, clock = Store.__init__, server.Accepted.connection_made, Hub.__init__
+    began, made, clock, sent = Store.__init__, server.Accepted.connection_made, Hub.__init__, ServerConnection.send
 
     def store(self: Store, *words: Any, **named: Any) -> None:
         began(self, *words, **named)
@@ -91,12 +90,17 @@ def failing(fails: Fails) -> Iterator[None]:
         real = self.clock
         self.clock = lambda: real() + 3_600 * fails.due("clock")
 
-    gone = ConnectionClosedError(None, None)
+    async def send(self: ServerConnection, *words: Any) -> None:
+        if fails.due("send"):
+            self.transport.abort()
+            raise ConnectionClosedError(None, None)
+        await sent(self, *words)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Store, "__init__", store)
         patch.setattr(Hub, "__init__", hub)
         patch.setattr(server.Accepted, "connection_made", accepted)
-        patch.setattr(ServerConnection, "send", fails.wrapped("send", ServerConnection.send, gone))
+        patch.setattr(ServerConnection, "send", send)
         for name in ("write", "flush"):
             patch.setattr(McapFile, name, fails.wrapped(f"recording's {name}", getattr(McapFile, name), FULL))
         patch.setattr(audit._Lines, "write", fails.wrapped("audit", audit._Lines.write, FULL))
@@ -131,12 +135,12 @@ async def day(folder: Path, fails: Fails) -> None:
     assert [k for k in came if k in acked] == acked and len(acked) >= COMMANDS - 1, fails.failed
     assert sorted(set(came)) == sorted(came), fails.failed
     recorded = sum(len(bags.read_bag(path).time_ns) for path in sorted((folder / FOLDER).glob("*.mcap")))
-    assert recorded >= len(came) + len(seen) - 2, fails.failed
+    # A recording whose disk is full pauses for some seconds.
+    assert recorded >= len(came) + len(seen) or "recording" in fails.failed, fails.failed
 
 
 @compiled
 async def test_whatever_fails_once_the_relay_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every tenth point in a commit; all of them in the night, as ``HYPOTHESIS_PROFILE`` says."""
     monkeypatch.setattr(backoff, "MOST_S", 0.01)
     calm = Fails(0)
     await day(tmp_path / "calm", calm)
@@ -149,6 +153,5 @@ async def test_whatever_fails_once_the_relay_goes_on(tmp_path: Path, monkeypatch
         "recording's flush",
         "audit",
     }
-    step = 1 if os.environ.get("HYPOTHESIS_PROFILE") == "nightly" else 10
-    for n in range(1, calm.counts.total() + 1, step):
+    for n in range(1, calm.counts.total() + 1):
         await day(tmp_path / str(n), Fails(n))
