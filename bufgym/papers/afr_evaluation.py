@@ -20,10 +20,8 @@ from bufgym.traces import Trace
 class LinkFigure(Figure):
     """A figure in which ``frames`` frames of ``size_bytes`` are sent over the link."""
 
-    data: Path | None = None
-    """Folder of recordings, with belgium_4g/csv/report_car_0002.csv."""
-    trace: str | None = None
-    """Trace to use in place of car_0002: a shipped name or a file."""
+    data: Path | None = None  # folder of recordings, with belgium_4g/csv/report_car_0002.csv
+    trace: str | None = None  # trace to use in place of car_0002: a shipped name or a file
     frames: int = PAPER_FRAMES
     size_bytes: int = FRAME_BYTES
 

@@ -131,8 +131,7 @@ class Reproduction(Figure):
     capacity: int = 8
     decisions: int = 1_000_000
     calls: int = 20_000
-    images: int = 30
-    """Decisions of ORBBuf by images; 0 for none."""
+    images: int = 30  # decisions of ORBBuf by images; 0 for none
 
     RULES = {"images": whole(0)}
 

@@ -40,8 +40,7 @@ class Reproduction(LinkFigure):
 
     capacities: Sequence[int] = CAPACITIES
     runs: int = 10
-    sweep_kb: Sequence[float] = (140, 150, 170, 180, 200, 230)
-    """Further frame sizes, kB."""
+    sweep_kb: Sequence[float] = (140, 150, 170, 180, 200, 230)  # further frame sizes, kB
 
     SIZE_INCHES = (9.0, 3.8)
 

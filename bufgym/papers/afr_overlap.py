@@ -37,8 +37,7 @@ class Reproduction(FrameFigure):
     capacity: int = 8
     distances: Sequence[int] = (1, 2, 4, 8, 12, 18, 27, 40, 60, 90)
     """Distances d in messages; those above L are also the lengths T of interruptions."""
-    motions: Sequence[float] = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5)
-    """Distances d in fields of view."""
+    motions: Sequence[float] = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5)  # distances d in fields of view
 
     SIZE_INCHES = (11.0, 3.8)
 

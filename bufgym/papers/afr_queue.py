@@ -26,8 +26,7 @@ class Reproduction(Figure):
 
     capacity: int = 8
     last_T: int = 26
-    seed: int = 0
-    """Seed of Random's draws."""
+    seed: int = 0  # seed of Random's draws
 
     RULES = {"last_T": whole(2)}
     SIZE_INCHES = (10.0, 4.2)

@@ -76,16 +76,11 @@ class Forward(CameraMotion):
 class GeometryFigure(Figure):
     """A figure of the four motions."""
 
-    base: float = 0.618
-    """Fraction of a wall's view that was in the previous message's view (Fig. 5 of the paper)."""
-    turn_degrees: float = 7.5
-    """Angle turned between two messages."""
-    step_m: float = 0.15
-    """Distance driven along the corridor between two messages."""
-    range_m: float = 4.0
-    """How far the camera sees along the corridor, about what a Kinect does."""
-    wall_m: float = 1.5
-    """Distance to the corridor's side wall, and to the other wall at the start."""
+    base: float = 0.618  # fraction of a wall's view that was in the previous message's view (Fig. 5 of the paper).
+    turn_degrees: float = 7.5  # angle turned between two messages
+    step_m: float = 0.15  # distance driven along the corridor between two messages
+    range_m: float = 4.0  # how far the camera sees along the corridor, about what a Kinect does
+    wall_m: float = 1.5  # distance to the corridor's side wall, and to the other wall at the start
 
     SIZE_INCHES = (12.0, 3.9)
 
@@ -138,8 +133,7 @@ class GeometryFigure(Figure):
 class Reproduction(GeometryFigure):
     """Picture of the camera's first views in each motion, seen from above."""
 
-    shown: int = 4
-    """Number of messages drawn."""
+    shown: int = 4  # number of messages drawn
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
         panels = figure.subplots(1, 4)

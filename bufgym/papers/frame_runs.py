@@ -66,17 +66,13 @@ class FrameRun(NamedTuple):
 class FrameFigure(Figure):
     """A figure with a run of every policy at each L and fade offset on each recording."""
 
-    data: Path | None = None
-    """Folder of recordings; None uses only the made-up room and fade."""
+    data: Path | None = None  # folder of recordings; None uses only the made-up room and fade
     frames: int = PAPER_FRAMES
     capacities: Sequence[int] = CAPACITIES
     policies: Sequence[str] = tuple(POLICIES)
-    offsets: int = OFFSETS
-    """Runs of the sweep; each shifts the fade earlier by a tenth of the stream."""
-    jobs: int = -1
-    """Parallel processes; -1 starts one per core."""
-    store: Path | None = None
-    """Folder of the finished tasks' results; None keeps nothing."""
+    offsets: int = OFFSETS  # runs of the sweep; each shifts the fade earlier by a tenth of the stream
+    jobs: int = -1  # parallel processes; -1 starts one per core
+    store: Path | None = None  # folder of the finished tasks' results; None keeps nothing
 
     RULES = {"frames": whole(30), "offsets": whole(1, OFFSETS), "jobs": whole(-1)}
 

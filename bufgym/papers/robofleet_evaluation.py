@@ -174,10 +174,8 @@ class ClientFigure(Figure):
 
     round_trip_ms: float = ROUND_TRIP_MS
     """Time from the end of a message's transmission to its pong; half of it is the way to the server."""
-    runs: int = 5
-    """Number of runs, which differ by arrival jitter."""
-    live: float = 0.0
-    """Speed-up of a run on real sockets; 0 simulates."""
+    runs: int = 5  # number of runs, which differ by arrival jitter
+    live: float = 0.0  # speed-up of a run on real sockets; 0 simulates
 
     RULES = {"live": at_least_0, "round_trip_ms": at_least_0}
 
@@ -222,10 +220,8 @@ def played_once(run: Run) -> Run:
 class CloudFigure(ClientFigure):
     """A figure of one PointCloud2 topic."""
 
-    points: int = POINTS
-    """Points of a cloud, 16 bytes each."""
-    queue_size: int = QUEUE_SIZE
-    """Queue of native ROS, messages."""
+    points: int = POINTS  # points of a cloud, 16 bytes each
+    queue_size: int = QUEUE_SIZE  # queue of native ROS, messages
 
 
 def p95(numbers: NDArray[np.float64]) -> float:

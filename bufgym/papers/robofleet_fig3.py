@@ -30,10 +30,8 @@ class Reproduction(CloudFigure):
     """Fig. 3 for these publish rates."""
 
     rates_hz: Sequence[float] = (5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100, 120)
-    mbit_per_s: float = 100.0
-    """Rate of the link, which is steady."""
-    duration_s: float = 20.0
-    """Publishing time; without drops the latency depends on it."""
+    mbit_per_s: float = 100.0  # rate of the link, which is steady
+    duration_s: float = 20.0  # publishing time; without drops the latency depends on it
 
     LIVE = {"rates_hz": (2, 8, 16, 24), "mbit_per_s": 20.0, "duration_s": 3.0, "runs": 1, "live": 1.0}
     SIZE_INCHES = (10.0, 4.4)

@@ -44,10 +44,8 @@ class Reproduction(CloudFigure):
 
     dropouts_s: Sequence[float] = (1, 2, 5, 10, 20, 30)
     links_mbit_per_s: Sequence[float] = (12, 25, 50, 100)
-    kinds: Sequence[str] = tuple(RATES_HZ)
-    """Kinds of messages, with one topic in each run."""
-    silence_s: float = 0.0
-    """Silence after the link's return, as TCP may wait for its next retransmission."""
+    kinds: Sequence[str] = tuple(RATES_HZ)  # kinds of messages, with one topic in each run
+    silence_s: float = 0.0  # silence after the link's return, as TCP may wait for its next retransmission
 
     RULES = {"silence_s": at_least_0}
     LIVE = {"dropouts_s": (2, 4), "links_mbit_per_s": (6,), "kinds": ("CompressedImage",), "runs": 1, "live": 4.0}

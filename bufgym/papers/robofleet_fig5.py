@@ -34,10 +34,8 @@ class Reproduction(CloudFigure):
     rate_hz: float = 10.0
     from_mbit_per_s: float = 100.0
     to_mbit_per_s: float = 4.0
-    fall_s: float = 15.0
-    """Time over which capacity falls."""
-    stay_s: float = 5.0
-    """Time at the last capacity, during which messages still arrive."""
+    fall_s: float = 15.0  # time over which capacity falls
+    stay_s: float = 5.0  # time at the last capacity, during which messages still arrive
     RULES = {"stay_s": at_least_0}
     LIVE = dict(rate_hz=5.0, points=5_000, from_mbit_per_s=25.0, to_mbit_per_s=1.0, stay_s=3.0, runs=1, live=1.0)
     """Options of a live run: a quarter of the bytes per second over a quarter of the link."""

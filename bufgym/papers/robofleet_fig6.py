@@ -29,15 +29,12 @@ STRAIGHT = 0.98  # Least correlation of native ROS's mean latency with the numbe
 class Reproduction(ClientFigure):
     """Fig. 6 for clouds of ``points`` points and 1 to ``max_consumers`` consumers."""
 
-    points: Sequence[int] = (1_500, 4_000, 10_000)
-    """Numbers of points of a cloud, 16 bytes each; one panel per number."""
+    points: Sequence[int] = (1_500, 4_000, 10_000)  # numbers of points of a cloud, 16 bytes each; one panel per number
     max_consumers: int = 8
     rate_hz: float = 5.0
     mbit_per_s: float = 12.0
-    queue_sizes: Sequence[int] = (1, 10)
-    """Queues of native ROS, in messages to each consumer; one line per size."""
-    duration_s: float = 60.0
-    """Publishing time."""
+    queue_sizes: Sequence[int] = (1, 10)  # queues of native ROS, in messages to each consumer; one line per size
+    duration_s: float = 60.0  # publishing time
 
     LIVE = {"points": (4_000,), "max_consumers": 4, "queue_sizes": (10,), "duration_s": 6.0, "runs": 1, "live": 1.0}
     RULES = {"points": several(whole(1, 10**7)), "max_consumers": whole(2, 100)}

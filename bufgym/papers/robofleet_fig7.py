@@ -60,14 +60,10 @@ class Reproduction(ClientFigure):
     """Link rate outside the zone. At 100 rosbridge's backlog vanishes at once, which hides its long recovery."""
     image_priorities: Sequence[float] = (1.0, 0.1, 0.01)
     """Priorities of Robofleet's images: the first in every zone, all of them in the zone shown."""
-    bad_from: int = 430
-    """Message of a 10 Hz topic at which the zone begins."""
-    bad_s: float = 30.0
-    """Length of the zone."""
-    after_s: float = 60.0
-    """Time of good link after the zone."""
-    queue_size: int = QUEUE_SIZE
-    """Queue of native ROS, messages per topic."""
+    bad_from: int = 430  # message of a 10 Hz topic at which the zone begins
+    bad_s: float = 30.0  # length of the zone
+    after_s: float = 60.0  # time of good link after the zone
+    queue_size: int = QUEUE_SIZE  # queue of native ROS, messages per topic
     LIVE = dict(bad_mbit_per_s=(1.0,), image_priorities=(1.0,), bad_from=50, bad_s=15.0, after_s=25.0, runs=1, live=2.0)
     SIZE_INCHES = (8.0, 7.2)
 

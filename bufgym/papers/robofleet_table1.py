@@ -43,10 +43,8 @@ MAX_FRAME_ID = 64  # Longest frame_id, in letters, that we consider likely
 class Reproduction(Figure):
     """Table I for every kind of message in ``encodings``."""
 
-    beams: int = 1800
-    """Beams of the LaserScan; its frame_id is made as long as the paper's size needs."""
-    points: int = 10_000
-    """Points of the PointCloud2, which the paper's table leaves out."""
+    beams: int = 1800  # beams of the LaserScan; its frame_id is made as long as the paper's size needs
+    points: int = 10_000  # points of the PointCloud2, which the paper's table leaves out
 
     RULES = {"points": whole(1, 10**6)}
     SIZE_INCHES = (9.0, 4.8)

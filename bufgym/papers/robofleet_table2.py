@@ -43,8 +43,7 @@ class Reproduction(Figure):
     runs: int = 10
     seconds: float = 15.0
     hz: float = 10.0
-    points: int = POINTS
-    """Points of a cloud, 16 bytes each; the paper gives no size."""
+    points: int = POINTS  # points of a cloud, 16 bytes each; the paper gives no size
 
     RULES = {"points": whole(1, 10**6)}
 

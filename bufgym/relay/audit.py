@@ -47,12 +47,9 @@ class Audit:
     """The log; in memory alone without a folder."""
 
     def __init__(self, folder: Path | None, rotation: Rotation) -> None:
-        self.recent: deque[dict[str, Any]] = deque(maxlen=_RECENT)
-        """The last entries."""
-        self.refusals: Counter[str] = Counter()
-        """Code -> how often it was refused."""
-        self.lost = 0
-        """Entries that the disk did not take; the next one that it takes follows their count."""
+        self.recent: deque[dict[str, Any]] = deque(maxlen=_RECENT)  # the last entries
+        self.refusals: Counter[str] = Counter()  # code -> how often it was refused
+        self.lost = 0  # entries that the disk did not take; the next one that it takes follows their count
         self._repeated: Counter[tuple[str, ...]] = Counter()
         self._lines = None
         if folder is not None:

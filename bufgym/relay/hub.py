@@ -100,8 +100,7 @@ class Hub:
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
-        self.peers: Peers | None = None
-        """The other relays, if it shares topics with any."""
+        self.peers: Peers | None = None  # the other relays, if it shares topics with any
 
     def join(self, member: Member) -> None:
         """Add a member that has said hello; end any other connection of its session."""

@@ -32,8 +32,7 @@ class _Counts:
 
     def __init__(self) -> None:
         self.put = self.left = self.dropped = 0
-        self.latest_s: float | None = None
-        """Time at which the latest departed message was put."""
+        self.latest_s: float | None = None  # time at which the latest departed message was put
         self.lately: deque[_Put] = deque(maxlen=_MOST)
 
 

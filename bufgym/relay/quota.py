@@ -33,8 +33,7 @@ class Quota:
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
         self.json = Bucket(limits.json_bytes_per_s)
         self.topics: set[str] = set()
-        self.connections: list[Mapping[str, object]] = []
-        """The subscriptions of each of its connections, by id."""
+        self.connections: list[Mapping[str, object]] = []  # the subscriptions of each of its connections, by id
 
     def message(self, size_bytes: int, now_s: float) -> None:
         """Count a published message.

@@ -26,15 +26,12 @@ class Unanswered:
     """The messages of one session, in order."""
 
     def __init__(self) -> None:
-        self.acked = 0
-        """Highest number that the relay holds."""
-        self.window = 1
-        """n_T, the most messages unanswered at a time."""
+        self.acked = 0  # highest number that the relay holds
+        self.window = 1  # n_T, the most messages unanswered at a time
         self._waiting: deque[Pending] = deque()
         self._sent: deque[Pending] = deque()
         self._again: list[Pending] = []
-        self._refused = 0
-        """Refusals since the last ack, while more are to come."""
+        self._refused = 0  # refusals since the last ack, while more are to come
 
     def __len__(self) -> int:
         """Number of messages that the relay has not answered."""

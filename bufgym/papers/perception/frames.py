@@ -59,14 +59,10 @@ class Camera:
 class Sequence(ABC):
     """A recording: frames in the order of time, each with its true pose."""
 
-    name: str
-    """What to call it in tables."""
-    camera: Camera
-    """Of depth and image alike."""
-    time_us: Int64Array
-    """int64[n], microseconds, increasing from 0."""
-    poses: Float64Array
-    """float64[n, 4, 4], camera to world, metres."""
+    name: str  # what to call it in tables
+    camera: Camera  # of depth and image alike
+    time_us: Int64Array  # int64[n], microseconds, increasing from 0
+    poses: Float64Array  # float64[n, 4, 4], camera to world, metres
 
     def __len__(self) -> int:
         return len(self.time_us)

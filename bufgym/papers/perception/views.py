@@ -114,8 +114,7 @@ class Coverage:
         saw = np.zeros((len(cells), len(every)), np.bool_)
         saw[frame, number] = True
         self._saw = np.packbits(saw[:, counts], axis=1)
-        self.cells = int(counts.sum())
-        """Number of cells that count."""
+        self.cells = int(counts.sum())  # number of cells that count
 
     def share(self, frames: Iterable[int]) -> float:
         """Part of all cells that these frames have seen, in [0, 1]."""
