@@ -194,7 +194,7 @@ def test_the_command_writes_the_header(tmp_path, capsys):
     [
         ("codel --to c --out {}", "policy codel: has no C; known: afr, afr-paper, decimate, "),
         ("learned-scheduler {} --to c", ", and learned agents for one queue"),
-        ("afr --to c", "--out requires an argument"),
+        ("afr --to c", "export needs --out"),
         ("afr {} --to c --name mine", "--name belongs to --to safetensors"),
         ("model.zip {} --capacity 4 --name a", "--capacity belongs to --to c"),
         ("model.zip {}", "--name must be given"),
