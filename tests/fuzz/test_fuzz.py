@@ -187,29 +187,19 @@ def test_command_lines() -> None:
 STEPS = st.tuples(st.sampled_from([0.01, 0.3, 2]), st.sampled_from([0, 0, 1, 3e3, 1e5]))
 LINKS = st.builds(
     lambda steps, after: (Trace.steps([*steps, (0.2, 5e3)], after=after),),
-    st.lists(STEPS, min_size=1, max_size=5),
-    st.sampled_from(["loop", "hold"]),
+    *(st.lists(STEPS, min_size=1, max_size=5), st.sampled_from(["loop", "hold"])),
 )
+OF_UPLINKS = {"rate_hz": [5, 30, 1000], "duration_s": [0.2, 0.5, 1.0], "jitter": [0, 0.1, 1], "size_cv": [0, 0.5, 3]}
+OF_UPLINKS |= {"size_bytes": [1, 40, 1000, 10**6]}
+VALUES = st.sampled_from([qoi.exponential(), qoi.exponential(0.01), qoi.saturating(7)])
 UPLINKS = st.builds(
-    Uplink,
-    traces=LINKS,
-    rate_hz=st.sampled_from([5, 30, 1000]),
-    duration_s=st.sampled_from([0.2, 0.5, 1.0]),
-    jitter=st.sampled_from([0, 0.1, 1]),
-    size_bytes=st.sampled_from([1, 40, 1000, 10**6]),
-    size_cv=st.sampled_from([0, 0.5, 3]),
-    value=st.sampled_from([qoi.exponential(), qoi.exponential(0.01), qoi.saturating(7)]),
+    Uplink, traces=LINKS, value=VALUES, **{name: st.sampled_from(chosen) for name, chosen in OF_UPLINKS.items()}
 )
 POLICIES = [name for name in policies.names(for_topics=False) if name != "clairvoyant"]
+CAPACITIES, LIMITS = st.sampled_from([1, 2, 3, 8, 40]), st.sampled_from([None, None, 2 * 10**6])
 
 
-@given(
-    met=UPLINKS,
-    name=st.sampled_from(POLICIES),
-    capacity=st.sampled_from([1, 2, 3, 8, 40]),
-    limit=st.sampled_from([None, None, 2 * 10**6]),
-    first=st.integers(0, 2**31),
-)
+@given(UPLINKS, st.sampled_from(POLICIES), CAPACITIES, LIMITS, st.integers(0, 2**31))
 def test_random_episodes_keep_invariants(met: Uplink, name: str, capacity: int, limit: int | None, first: int) -> None:
     """Each message ends somewhere, once; no more than L wait; H is within its bounds."""
     policy, episodes = policies.get(name), []

@@ -9,10 +9,10 @@ from pathlib import Path
 import fleet_demo
 import pytest
 from cli_cases import fails
+from refusal_cases import refuse
 from relay_cases import client, nothing
 
 from bufgym.ground import processes
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, registry
 from bufgym.relay import policies
 
@@ -51,8 +51,7 @@ def test_what_is_not_kept_another_process_compiles(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(policies, "compiling", compiling)
     assert policies.compiled(registry.get("afr")).name == "afr"
     code = -2  # Ctrl-C
-    with pytest.raises(BufgymError, match="policy afr: stopped while it was compiled"):
-        policies.compiled(registry.get("afr"))
+    refuse("policy afr: stopped while it was compiled", policies.compiled, registry.get("afr"))
     assert asked == 2 * [("bufgym.relay.policies", "fill_cache", "afr")]
 
 

@@ -7,9 +7,9 @@ import signal
 from pathlib import Path
 
 import pytest
+from refusal_cases import refuse
 from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, until, wait, within
 
-from bufgym.ground.errors import BufgymError
 from bufgym.relay.audit import FILE, Audit
 from bufgym.relay.config import Rotation, Rule
 from bufgym.relay.recorder import FOLDER, Recorder
@@ -124,10 +124,8 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
     assert recordings(None) == [] and recordings(tmp_path / "none") == []
     (tmp_path / "own.mcap").write_bytes(b"no recording at all")
     for name in ("../own.mcap", "/etc/passwd", "", "none.mcap"):
-        with pytest.raises(BufgymError, match="there is none of this name"):
-            piece(tmp_path, name, 0, 1, every)
-    with pytest.raises(BufgymError, match=r"recording own\.mcap: must be an MCAP file"):
-        piece(tmp_path, "own.mcap", 0, 1, every)
+        refuse("there is none of this name", piece, tmp_path, name, 0, 1, every)
+    refuse(r"recording own\.mcap: must be an MCAP file", piece, tmp_path, "own.mcap", 0, 1, every)
 
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])

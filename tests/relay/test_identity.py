@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusal_cases import refuse
 from relay_cases import client, relay, settings, wait
 from websockets.exceptions import WebSocketException
 
@@ -100,21 +101,11 @@ SHARED = "a secret of thirty-two bytes and more"
 @pytest.mark.parametrize(
     "claims",
     [
-        {"exp": 1.0},
-        {"exp": None},
-        {"nbf": 2**33},
-        {"iss": "https://other.test"},
-        {"aud": "shop"},
-        {"aud": None},
-        {"email": None},
-        {"email": ["anna@x.org"]},
-        {"email_verified": False},
-        {"email_verified": "false"},
-        {"email_verified": "true"},
-        {"email_verified": 1},
-        {"email_verified": None},
-        {"algorithm": "HS256", "key": SHARED},
-        {"algorithm": "none"},
+        *({"exp": end} for end in (1.0, None)),
+        *({"aud": audience} for audience in ("shop", None)),
+        *({"email": email} for email in (None, ["anna@x.org"])),
+        *({"email_verified": verified} for verified in (False, "false", "true", 1, None)),
+        *({"nbf": 2**33}, {"iss": "https://other.test"}, {"algorithm": "none"}, {"algorithm": "HS256", "key": SHARED}),
         {"key": ec.generate_private_key(ec.SECP256R1())},
         *("", "a.b.c", "." * 3, "x" * 20_000, "e30.e30.", "\u0000"),
     ],
@@ -151,8 +142,7 @@ async def test_the_keys_come_over_http_no_more_often_than_they_may(issuer: Issue
                 await verifier.email(issuer.token(f"forged {k}"))
         server.shutdown()
     assert asked == ["/jwks.json"]
-    with pytest.raises(BufgymError, match="must be an https address"):
-        identity.Verifier(Tokens(ISSUER, "fleet", "http://issuer.test/jwks.json"))
+    refuse("must be an https address", identity.Verifier, Tokens(ISSUER, "fleet", "http://issuer.test/jwks.json"))
 
 
 HERE = x509.IPAddress(ipaddress.ip_address("127.0.0.1"))
@@ -207,5 +197,4 @@ async def test_a_certificate_names_who_it_is(tmp_path: Path) -> None:
             with pytest.raises((OSError, WebSocketException)):
                 async with client(server.port, tls=tls):
                     pass
-    with pytest.raises(BufgymError, match="tls"):
-        identity.server_context(Tls(certificate, str(tmp_path / "missing.key")))
+    refuse("tls", identity.server_context, Tls(certificate, str(tmp_path / "missing.key")))

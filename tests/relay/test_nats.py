@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from nats_cases import alone, connected, nats_server, needs_server, shared
+from refusal_cases import refuse
 from relay_cases import client, nothing, relay, settings, stranger, until, wait, within
 
 from bufgym.ground.errors import BufgymError
@@ -163,11 +164,9 @@ def test_credentials_are_looked_at_before_the_start(tmp_path: Path, monkeypatch:
     credentials = tmp_path / "west.creds"
     with_them = settings(nats=Nats("nats://127.0.0.1:1", "a", str(credentials)))
     monkeypatch.setitem(sys.modules, "nkeys", None)
-    with pytest.raises(BufgymError, match=r"bufgym\.relay needs nkeys: pip install "):
-        Peers(Hub(with_them), with_them.nats)
+    refuse(r"bufgym\.relay needs nkeys: pip install ", Peers, Hub(with_them), with_them.nats)
     monkeypatch.setitem(sys.modules, "nkeys", object())
-    with pytest.raises(BufgymError, match=r"west\.creds: no such file"):
-        Peers(Hub(with_them), with_them.nats)
+    refuse(r"west\.creds: no such file", Peers, Hub(with_them), with_them.nats)
     credentials.write_text("a password\n")
     with pytest.raises(BufgymError, match=r"west\.creds: no NATS credentials: must have -----BEGIN NATS USER JWT-----"):
         Peers(Hub(with_them), with_them.nats)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from loop_cases import beside
+from refusal_cases import refuse
 from relay_cases import Corner, client, nothing, process, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
@@ -123,10 +124,8 @@ def test_the_identity_with_most_bytes_makes_room() -> None:
     store.hold(sender, 4, "/a", bytes(2), [robot])
     assert lost == [Settled(sender, 3, 1, 1)]
     assert [one.held_bytes for one in (robot, *hogs)] == [5, 3, 0] and store.bytes == 8
-    with pytest.raises(BufgymError, match="no room for 3 bytes beside 8"):
-        store.hold(sender, 5, "/a", bytes(3), [robot])  # now the robot has the most
-    with pytest.raises(BufgymError, match="no room for 11 bytes beside 8"):
-        store.hold(sender, 5, "/a", bytes(11), [robot, hogs[0]])
+    refuse("no room for 3 bytes beside 8", store.hold, sender, 5, "/a", bytes(3), [robot])  # now the robot has the most
+    refuse("no room for 11 bytes beside 8", store.hold, sender, 5, "/a", bytes(11), [robot, hogs[0]])
     store.hold(sender, 5, "/a", bytes(4), [hogs[1]])  # costs the robot its 3
     with pytest.raises(BufgymError, match="no room for 9 bytes beside 2"):
         store.hold(sender, 6, "/a", bytes(9), [robot])  # without the hog's 4 and 3 either, whose loss is told

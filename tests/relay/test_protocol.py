@@ -2,12 +2,11 @@
 
 import contextlib
 import random
-from typing import Any
 
 import pytest
+from refusal_cases import refuse
 from relay_cases import settings
 
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 from bufgym.relay import backoff, protocol, wire
 from bufgym.relay.backoff import Backoff
@@ -36,21 +35,20 @@ RULES = (Rule(address="10.0.0.0/8", send=True, receive=True, topic="/open/.*"),)
 CONFIG = settings(rules=RULES)
 
 
-@pytest.mark.parametrize(
-    ("first", "error"),
-    [
-        (b"\x00", "a binary frame: must be hello first"),
-        (wire.say("ack", seq=1), "ack: must be hello first"),
-        (wire.say("hello", version=9), "hello: must be of version 1, of form binary or json"),
-        (wire.say("hello", version=1, form="xml"), "hello: must be of version 1, of form binary or json"),
-        (wire.say("hello", version=1, session="a b"), "hello: session = 'a b': must be 1 to 64 letters"),
-        (wire.say("hello", version=1, name="relay"), "hello: name = 'relay': must be a name, not the relay's"),
-        (wire.say("hello", version=1, name="\n"), "hello: name '\\\\n': must be printable"),
-    ],
-)
-def test_a_hello_that_is_refused(first: str | bytes, error: str) -> None:
-    with pytest.raises(WireError, match=error):
+def test_a_hello_that_is_refused() -> None:
+    def begin(first: str | bytes) -> None:
         protocol.admit(protocol.hello(first), ANNA, RULES, "fresh")
+
+    refuse("a binary frame: must be hello first", begin, b"\x00", kind=WireError)
+    refuse("ack: must be hello first", begin, wire.say("ack", seq=1), kind=WireError)
+    for version, given, error in (
+        (9, {}, "must be of version 1, of form binary or json"),
+        (1, {"form": "xml"}, "must be of version 1, of form binary or json"),
+        (1, {"session": "a b"}, "session = 'a b': must be 1 to 64 letters"),
+        (1, {"name": "relay"}, "name = 'relay': must be a name, not the relay's"),
+        (1, {"name": "\n"}, "name '\\\\n': must be printable"),
+    ):
+        refuse(f"hello: {error}", begin, wire.say("hello", version=version, **given), kind=WireError)
 
 
 def test_who_is_let_in_and_welcomed() -> None:
@@ -61,8 +59,7 @@ def test_who_is_let_in_and_welcomed() -> None:
     welcome = protocol.welcome(CONFIG, admitted, ANNA, 5)
     assert wire.heard(wire.say("welcome", **welcome))["received"] == 5 and welcome["session"] == "a"
     assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*"}]
-    with pytest.raises(RefusedError, match="no rule allows anything"):
-        protocol.admit(said, Identity("11.0.0.1"), RULES, "fresh")
+    refuse("no rule allows anything", protocol.admit, said, Identity("11.0.0.1"), RULES, "fresh", kind=RefusedError)
 
 
 def test_what_a_frame_asks() -> None:
@@ -70,13 +67,10 @@ def test_what_a_frame_asks() -> None:
     assert protocol.asked(wire.encode(message), 100) == message
     assert protocol.asked(wire.say("publish", topic="/open/a", data={"x": 1}, seq=2, no_drop=True), 0) == message
     assert protocol.asked(wire.say("ack", seq=1), 0) == {"op": "ack", "seq": 1}
-    for frame, error in (
-        (wire.encode(message), "frame of 50 bytes: must be from 32 to 40"),
-        (wire.say("hello", version=1), "hello: must be one of subscribe, unsubscribe"),
-        ("x" * 2**21, "text of 2097152 characters"),
-    ):
-        with pytest.raises(WireError, match=error):
-            protocol.asked(frame, 40)
+    refuse("frame of 50 bytes: must be from 32 to 40", protocol.asked, wire.encode(message), 40, kind=WireError)
+    hello = wire.say("hello", version=1)
+    refuse("hello: must be one of subscribe, unsubscribe", protocol.asked, hello, 40, kind=WireError)
+    refuse("text of 2097152 characters", protocol.asked, "x" * 2**21, 40, kind=WireError)
 
 
 def test_which_messages_are_taken() -> None:
@@ -100,21 +94,18 @@ def test_which_messages_are_taken() -> None:
     assert code(Message("/open/a", b"1")) == "too_fast" and code(command) is False
 
 
-@pytest.mark.parametrize(
-    ("asked", "error"),
-    [
-        ({"topic": "("}, "pattern"),
-        ({"policy": "afr"}, "policy 'afr': must be one of drop-oldest"),
-        ({"capacity": 0}, "capacity"),
-        ({"priority": -1}, "priority = -1.0: must be from 0 to 1e"),
-        ({"durable": True}, "durable: needs a session of a name"),
-        ({"id": "\n"}, "id"),
-    ],
-)
-def test_a_subscription_that_is_refused(asked: dict[str, Any], error: str) -> None:
-    policy = None if "policy" in asked else registry.get("drop-oldest")
-    with pytest.raises(BufgymError, match=error):
-        protocol.subscription({"id": "a", "topic": "a", **asked}, CONFIG, policy, True, lambda: 0)
+def test_a_subscription_that_is_refused() -> None:
+    for name, given, error in (
+        *(("topic", "(", "pattern"), ("capacity", 0, "capacity"), ("id", "\n", "id")),
+        ("policy", "afr", "policy 'afr': must be one of drop-oldest"),
+        ("priority", -1, "priority = -1.0: must be from 0 to 1e"),
+        ("durable", True, "durable: needs a session of a name"),
+    ):
+        policy, asked = (
+            None if name == "policy" else registry.get("drop-oldest"),
+            {"id": "a", "topic": "a", name: given},
+        )
+        refuse(error, protocol.subscription, asked, CONFIG, policy, True, lambda: 0)
 
 
 def test_a_quota_counts_what_its_connections_have() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from loop_cases import beside, compiled
+from refusal_cases import refuse
 from relay_cases import Corner, relay, settings, until, wait, within
 
 from bufgym.ground.errors import BufgymError
@@ -185,12 +186,8 @@ def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setenv("BUFGYM_RELAY_TOKEN", "one")
     (tmp_path / "token").write_text("two\n")
     assert token() == "one" and token(tmp_path / "token") == "two"
-    with pytest.raises(BufgymError, match="robot:7420: must be ws://HOST:PORT"):
-        Session("robot:7420", "a")
+    refuse("robot:7420: must be ws://HOST:PORT", Session, "robot:7420", "a")
     assert security() is None
-    with pytest.raises(BufgymError, match="token: no certificate"):
-        security(certificate=str(tmp_path / "token"))
-    with pytest.raises(BufgymError, match=r"subscription '\[': no regular expression"):
-        Session("ws://a:1", "a").subscribe("[", print)
-    with pytest.raises(BufgymError, match="topic '/b': this client publishes nothing"):
-        RobotClient("ws://a:1", "a").publish("/b", b"")
+    refuse("token: no certificate", security, certificate=str(tmp_path / "token"))
+    refuse(r"subscription '\[': no regular expression", Session("ws://a:1", "a").subscribe, "[", print)
+    refuse("topic '/b': this client publishes nothing", RobotClient("ws://a:1", "a").publish, "/b", b"")

@@ -174,9 +174,7 @@ async def test_half_a_request_and_no_hello_end_in_time() -> None:
         assert server.hub.members == {}
 
 
-@pytest.mark.parametrize(
-    "first", [wire.say("ack", seq=1), b"\x00", wire.say("hello", version=9), "x" * 70_000], ids=len
-)
+@pytest.mark.parametrize("first", [b"\x00", "x" * 70_000], ids=len)
 async def test_no_hello(first: str | bytes, server: Server) -> None:
     async with connect(f"ws://127.0.0.1:{server.port}/relay", subprotocols=[wire.SUBPROTOCOL], proxy=None) as socket:
         await socket.send(first)

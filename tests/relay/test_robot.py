@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from loop_cases import beside, compiled
 from made_up_robot import HALF_M, ODOMETRY, PICTURE, SCAN, MadeUp, Pose, cast, jpeg, odometry, picture, pose_at, scan
+from refusal_cases import refuse
 from relay_cases import Corner, settings, until, wait
 from websockets.exceptions import ConnectionClosedError
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.relay import robot, ros_messages, wire
@@ -95,8 +95,7 @@ def test_messages_read_as_they_were_made() -> None:
     angles = np.radians([-90.0, 0.0, 90.0])
     laser = ros_messages.read(scan(0, "r", angles, np.array([1.0, 2.0, 3.0])), SCAN)
     assert laser.ranges.tolist() == [1, 2, 3] and laser.angle_increment == pytest.approx(math.pi / 2)
-    with pytest.raises(BufgymError, match="message of 3 bytes: no nav_msgs/msg/Odometry in cdr"):
-        ros_messages.read(b"abc", ODOMETRY)
+    refuse("message of 3 bytes: no nav_msgs/msg/Odometry in cdr", ros_messages.read, b"abc", ODOMETRY)
     old = ros_messages.as_ros1(made, ODOMETRY)
     assert ros_messages.modern(old, ODOMETRY, "ros1") == ("cdr", made)
     assert ros_messages.modern(b"?", "my_msgs/msg/Own", "ros1") == ("ros1", b"?")
@@ -206,12 +205,9 @@ async def test_a_recording_is_a_robot(corner: Corner, tmp_path: Path) -> None:
 def test_what_a_recording_lacks(tmp_path: Path) -> None:
     path = recording(tmp_path / "drive.mcap")
     camera = [stream for stream in MadeUp().streams if stream.topic.name == "camera"]
-    with pytest.raises(BufgymError, match=r"no messages of topic '/camera'; it has: /notes, /scan"):
-        BagSource(path, camera)
-    with pytest.raises(BufgymError, match="no such file"):
-        BagSource(tmp_path / "none.mcap")
-    with pytest.raises(BufgymError, match="robot 'a/b': a name must be a text without '/'"):
-        Robot("ws://a:1", "a/b", MadeUp())
+    refuse(r"no messages of topic '/camera'; it has: /notes, /scan", BagSource, path, camera)
+    refuse("no such file", BagSource, tmp_path / "none.mcap")
+    refuse("robot 'a/b': a name must be a text without '/'", Robot, "ws://a:1", "a/b", MadeUp())
 
 
 # --- robots of ROS: what a node publishes arrives byte by byte, and commands become messages of ROS ------------------

@@ -12,6 +12,7 @@ from typing import Any, get_args
 import pytest
 from live_cases import in_order, meeting_port, put, receiving, sending
 from loop_cases import beside, until
+from refusal_cases import refuse
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
@@ -279,8 +280,7 @@ def test_a_log_of_a_killed_sender_can_be_read(tmp_path: Path) -> None:
     assert replay(path).differences == ()
     (tmp_path / "empty.mcap").write_bytes(b"")
     for name in ("empty", "none"):
-        with pytest.raises(BufgymError, match=rf"{name}\.mcap"):
-            read_log(tmp_path / f"{name}.mcap")
+        refuse(rf"{name}\.mcap", read_log, tmp_path / f"{name}.mcap")
 
 
 def test_what_comes_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -339,7 +339,5 @@ def test_headers_by_hand() -> None:
     data = header(frame)
     assert len(data) == HEADER_BYTES
     assert parse(data, 10) == (frame._replace(body=b""), 3)
-    with pytest.raises(FrameError, match="at most 2"):
-        parse(data, 2)
-    with pytest.raises(FrameError, match="at least"):
-        parse(data[:-1], 10)
+    refuse("at most 2", parse, data, 2, kind=FrameError)
+    refuse("at least", parse, data[:-1], 10, kind=FrameError)

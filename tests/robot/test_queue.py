@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from live_cases import Bench
+from refusal_cases import refuse
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.robot import PolicyQueue, replay
@@ -35,8 +35,7 @@ def test_drop_oldest_by_hand() -> None:
     assert bench.gone(7000) is None
     bench.queue.close()
     assert bench.queue.get() is None
-    with pytest.raises(BufgymError, match="closed"):
-        bench.put(8000)
+    refuse("closed", bench.put, 8000)
     played = replay(bench.records)
     assert played.differences == ()
     assert played.outcome.delivered == 3 and played.outcome.dropped == 1
@@ -144,16 +143,13 @@ def test_what_breaks_the_rules_is_refused() -> None:
         ("topic = -1", {"topic": -1}),
         ("at_us = -1", {"at_us": -1}),
     ):
-        with pytest.raises(BufgymError, match=rule):
-            bench.queue.put("message", **{"size_bytes": 1, **settings})
+        refuse(rule, bench.queue.put, "message", **{"size_bytes": 1, **settings})
         bench.put(20, x=1.0)  # nothing happened
         assert replay(bench.records).differences == ()
-    with pytest.raises(BufgymError, match="handed out"):
-        bench.queue.gone()
+    refuse("handed out", bench.queue.gone)
     for name in policies.names():
         if not policies.get(name).ranked:
-            with pytest.raises(BufgymError, match="live queue"):
-                PolicyQueue(name, 4)
+            refuse("live queue", PolicyQueue, name, 4)
 
 
 def test_a_policy_that_raises_an_error_ends_its_queue() -> None:
@@ -171,5 +167,4 @@ def test_a_policy_that_raises_an_error_ends_its_queue() -> None:
     item = bench.queue.get()
     assert item is not None and item.seq == 0
     assert bench.queue.get() is None
-    with pytest.raises(BufgymError, match="closed"):
-        bench.put(40)
+    refuse("closed", bench.put, 40)

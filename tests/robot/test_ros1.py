@@ -15,9 +15,9 @@ import pytest
 from cli_cases import fails
 from live_cases import VALIDATE, as_simulated
 from loop_cases import compiled
+from refusal_cases import refuse
 from ros1_cases import played
 
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import get
 from bufgym.robot import PolicyQueue, replay, ros1
 from bufgym.robot.log import of, read_log
@@ -72,8 +72,7 @@ def test_an_episode_through_a_node_is_that_of_the_simulator(ros: dict[str, str],
 
 def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, "rospy", None)
-    with pytest.raises(BufgymError, match=r"bufgym\.robot\.ros1 needs rospy: .* python3-rospy"):
-        ros1.install("afr")
+    refuse(r"bufgym\.robot\.ros1 needs rospy: .* python3-rospy", ros1.install, "afr")
     fails([*VALIDATE[1:], "ros1"], "bufgym.robot.ros1 needs rospy", capsys)
 
 
@@ -195,8 +194,7 @@ def test_what_sending_raised_is_told_at_the_next_message(transport: Transport) -
     connection.write_data(b"a")
     while connection.queue.in_flight:
         time.sleep(0.001)
-    with pytest.raises(ConnectionResetError, match="gone"):
-        connection.write_data(b"b")
+    refuse("gone", connection.write_data, b"b", kind=ConnectionResetError)
     transport.close()
     assert ended_thread(connection)
 

@@ -15,6 +15,7 @@ from cli_cases import fails
 from hypothesis import given
 from hypothesis import strategies as st
 from live_cases import VALIDATE, as_simulated
+from refusal_cases import refuse
 from ros1_cases import played
 
 from bufgym.ground.errors import BufgymError
@@ -78,16 +79,14 @@ def test_a_topic_goes_with_each_of_its_messages() -> None:
 
 @given(st.binary(max_size=60))
 def test_what_is_no_message_of_a_relay_ends_the_connection(body: bytes) -> None:
-    with pytest.raises(FrameError, match="no message of a relay"):
-        parse(b"\x03\x05\0\0\x01" + b"/a;" + body)
+    refuse("no message of a relay", parse, b"\x03\x05\0\0\x01" + b"/a;" + body, kind=FrameError)
 
 
 def test_topics_that_cannot_be_relayed() -> None:
     """Names that are none, a type that is not installed, and what moves without odometry."""
     wrong = [("camera", "a/msg/B"), ("/a//b", "a/msg/B"), ("/a", "os"), ("/a", "../os/msg/B"), ("/a", "a/srv/B")]
     for name, kind in wrong:
-        with pytest.raises(BufgymError, match="must"):
-            Published(name, kind)
+        refuse("must", Published, name, kind)
     with pytest.raises(BufgymError, match=r"topic /a: messages of no_such_msgs/msg/B, which is not installed here"):
         _ = Published("/a", "no_such_msgs/msg/B").message_class
     with pytest.raises(BufgymError, match=r"topic 'pointcloud': moves, which needs a topic with odometry"):
