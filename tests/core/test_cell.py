@@ -189,11 +189,3 @@ def test_cells_of_a_batch_know_nothing_of_each_other():
                 assert cases.log(both.senders, row) == cases.log(alone[c ^ again].senders, i)
             both.load(c, episodes[1 - c])
         both.run(afr)
-
-
-def test_policies_remember_each_robot_for_itself():
-    # AFR's index moves with the buffer that it is about: robots with different streams part, those alike do not.
-    made, (episode, _) = drawn_episodes(2, size_bytes=900_000)
-    twins = FleetEpisode((episode.arrivals[0], episode.arrivals[0], episode.arrivals[1]), episode.link)
-    fleet = run_fleet(policies.get("afr"), [twins], 4, made.value)
-    assert cases.log(fleet.senders, 0) == cases.log(fleet.senders, 1) != cases.log(fleet.senders, 2)

@@ -182,30 +182,14 @@ def test_is_the_best_integer_solution_of_an_interruption(v, T, L):
     assert plan.qoi - 1 == pytest.approx(integer(L, T, v), abs=EXACT) and plan.certified
 
 
-def no_policy_beats(names, episodes: list[Episode], L: int, v: qoi.Value, **limits) -> None:
-    for policy in map(policies.get, names):
-        senders = run(policy, episodes, L, v, **limits)
-        bytes_limit = None if policy.unbounded else limits.get("max_bytes")
-        for i, episode in enumerate(episodes):
-            bound = clairvoyant(episode, senders.capacity if policy.unbounded else L, v, max_bytes=bytes_limit).qoi
-            assert outcome(senders, i).qoi <= bound + EXACT, policy.name
-
-
 @given(cases(max_messages=25), VALUES, st.lists(st.sampled_from(list(policies.names())), min_size=4, max_size=4))
 def test_no_policy_beats_it(case, v, names):
-    no_policy_beats(names, [case.episode], case.capacity, v, max_bytes=case.max_bytes, decide_at=case.decide_at)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("cv", [0.0, 0.4])
-def test_no_policy_beats_it_over_lte(cv):
-    lte = scenario.get("lte", duration_s=8.0, size_bytes=500_000, size_cv=cv)
-    episodes = [draw(lte, seed) for seed in range(4)]
-    plans = [clairvoyant(episode, 8, lte.value) for episode in episodes]
-    # The link is too slow for all, so that there is something to decide.
-    assert any(not plan.kept.all() for plan in plans)
-    assert all(plan.certified for plan in plans) or cv > 0
-    no_policy_beats(policies.names(), episodes, 8, lte.value)
+    limits = {"max_bytes": case.max_bytes, "decide_at": case.decide_at}
+    for policy in map(policies.get, names):
+        senders = run(policy, [case.episode], case.capacity, v, **limits)
+        bytes_limit = None if policy.unbounded else case.max_bytes
+        bound = clairvoyant(case.episode, senders.capacity, v, max_bytes=bytes_limit).qoi
+        assert outcome(senders, 0).qoi <= bound + EXACT, policy.name
 
 
 @kernels

@@ -53,12 +53,6 @@ LENGTHS = range(1, 81)
 EPISODES = [Interruption(t_max=80).episode(T).with_uniforms(np.random.default_rng(T)) for T in LENGTHS]
 
 
-@given(VALUES, st.integers(1, 12), st.sampled_from([name for name in policies.names() if policies.get(name).ranked]))
-def test_no_policy_beats_it(v, L, name):
-    gained = run(policies.get(name), EPISODES, L, v).batch.senders["delivered_gain"]
-    assert (gained <= np.array([integer(L, T, v) for T in LENGTHS]) + 1e-9).all()
-
-
 @pytest.mark.parametrize("limits", [{}, {"max_bytes": 3 * 230_000}])
 def test_as_a_policy_it_reaches_its_number(limits):
     v = qoi.exponential()
