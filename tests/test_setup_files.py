@@ -4,7 +4,6 @@ import importlib.util
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -76,15 +75,6 @@ def test_every_supported_python_is_tried() -> None:
     assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
 
 
-def test_hooks_run_what_make_check_runs() -> None:
-    (local,) = read_yaml(".pre-commit-config.yaml")["repos"]
-    assert local["repo"] == "local"  # nothing is fetched from elsewhere
-    checked = {(Path(stage.command[0]).name, *stage.command[1:2]) for stage in stages.check()}
-    for hook in local["hooks"]:
-        program, *words = hook["entry"].split()
-        assert program.startswith(".venv/bin/") and (Path(program).name, *words[:1]) in checked
-
-
 @pytest.mark.parametrize("tier", ["check", "test", "nightly"])
 def test_stages_name_programs_and_rules_that_there_are(tier: str) -> None:
     made = stages.check() if tier == "check" else getattr(stages, tier)([])
@@ -118,24 +108,6 @@ def test_a_stage_says_what_came_of_it(tmp_path: Path, text: str, came_of_it: tup
     assert run(program(text), tmp_path / "log") == came_of_it
 
 
-def test_a_stage_beyond_its_limit_is_killed_with_all_that_it_started(tmp_path: Path) -> None:
-    held = tmp_path / "held"
-    child = f"open({str(held)!r}, 'w'); import time; time.sleep(60)"
-    text = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
-    assert run(program(text, limit_s=0.5), tmp_path / "log") == ("TOO SLOW", "killed after 0.5 s")
-    assert str(held) not in subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
-
-
-def test_pytest_stages_name_the_failed_test_and_the_slowest(tmp_path: Path) -> None:
-    (tmp_path / "test_tale.py").write_text("def test_good(): pass\ndef test_bad(): assert False\n")
-    stage = stages.pytest("tale", tmp_path, str(tmp_path / "test_tale.py"), "-n", "0", f"--rootdir={tmp_path}")
-    result = stages.carry_out(stage, tmp_path / "log")
-    assert (result.outcome, result.remark) == ("FAILED", "2 tests, 0 skipped, 1 failed: test_tale.py::test_bad")
-    rows = stages.table([result]).splitlines()
-    assert rows[0].startswith("tale          FAILED")
-    assert {row.split()[-1] for row in rows[-2:]} == {f"test_tale.py::test_{name}" for name in ("good", "bad")}
-
-
 @pytest.mark.parametrize("tier, ran", [("test", ["one"]), ("nightly", ["one", "two"])])
 def test_a_failure_ends_a_commit_but_no_night(tmp_path: Path, monkeypatch: Patch, tier: str, ran: list[str]) -> None:
     monkeypatch.setattr(stages, "REPO", tmp_path)
@@ -146,41 +118,5 @@ def test_a_failure_ends_a_commit_but_no_night(tmp_path: Path, monkeypatch: Patch
     assert [line.split()[0] for line in summary] == ran
 
 
-def test_a_night_ends_in_time(tmp_path: Path, monkeypatch: Patch) -> None:
-    monkeypatch.setattr(stages, "REPO", tmp_path)
-    monkeypatch.setattr(stages, "NIGHT_S", 0.0)
-    monkeypatch.setattr(stages, "nightly", lambda arguments: [program("import time; time.sleep(60)")])
-    assert stages.main("nightly", []) == 1
-    assert "tale          TOO SLOW" in (tmp_path / "build" / "nightly" / "summary.txt").read_text()
-
-
-KERNELS = '''
-@kernel
-def one(k):
-    """Says what it does."""
-    return k
-
-@register("two", compile=True, on_departure=three)
-def two(buffer): return 0
-
-def three(buffer): pass
-
-@register("four")
-def four(buffer): return 0
-
-five = compile_for(signature, six)
-def six(): pass
-'''
-
-
 def test_the_sdist_runs_tests_that_there_are() -> None:
     assert all((REPO / name).exists() for name in script("sdist").TESTS)
-
-
-def test_functions_that_are_compiled_are_found() -> None:
-    assert [found.name for found in script("kernel_lines").kernels(KERNELS)] == ["one", "two", "three", "six"]
-
-
-def test_the_oldest_dependencies_are_those_of_this_python() -> None:
-    names = [line.partition("==")[0] for line in script("installed").oldest(str(REPO / "pyproject.toml"))]
-    assert sorted(set(names)) == sorted(names) and {"numpy", "numba", "gymnasium"} < set(names)

@@ -1,10 +1,8 @@
 """Tuning on validation episodes: the best setting of a suite that is worked out by hand, chance, ties, bad input."""
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cli_cases import Capsys, Patch
@@ -17,10 +15,8 @@ from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.tasks import TASKS
 from bufgym.cli.options import OPTIONS
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.scenario import Interruption, Uplink, suites
-from bufgym.traces import Trace
+from bufgym.scenario import Interruption, suites
 
 LENGTHS = {"tiny-twelve": 12, "tiny-nine": 9}
 """T of each suite, L = 2. Of messages 1..T, `decimate:every=k` accepts 1, 1 + k, 1 + 2k, ... and keeps the last two.
@@ -80,24 +76,6 @@ def test_the_default_is_kept_where_it_is_best_and_on_ties() -> None:
     assert choice.chosen is choice.default
 
 
-def test_test_episodes_are_refused_before_any_is_drawn(splits: list[str]) -> None:
-    with pytest.raises(BufgymError, match=r"split = 'test': .* never chosen on test episodes"):
-        tune.tune("tiny-twelve", ["decimate"], split="test", jobs=1)
-    assert splits == []
-
-
-@pytest.mark.parametrize(
-    ("suite", "names", "more", "message"),
-    [
-        ("tiny-twelve", ["decimate:every=2"], {}, "policy 'decimate:every=2': no grid"),
-        ("tiny-twelve", ["ros-keep-last"], {}, "ros-keep-last: is not tuned: it stands for ROS 2"),
-        ("topics-v1", ["decimate"], {}, "suite topics-v1: only policies of one queue are tuned"),
-    ],
-)
-def test_what_cannot_be_tuned(suite: str, names: list[str], more: dict[str, Any], message: str) -> None:
-    refuse(message, tune.tune, suite, names, jobs=1, **more)
-
-
 def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> None:
     """Settings begin with the default and repeat nothing."""
     built_in = [policies.get(name) for name in policies.names()]
@@ -110,36 +88,6 @@ def test_every_built_in_policy_with_parameters_is_tuned_or_says_why_not() -> Non
         assert specs[0] == name and len(parameters) == len(specs) > 1
 
 
-def test_one_parameter_at_a_time_around_the_default() -> None:
-    default = policies.get("gap-price").parameters
-    specs = tune.settings("gap-price")
-    assert len(specs) == 1 + len(tune.FACTORS) * sum(number > 0 for number in default.values())
-    assert "gap-price:near=3" in specs and "gap-price:kappa=0.96" in specs  # twice 1.5 and 0.48
-    for spec in specs[1:]:
-        assert len(dict(policies.get(spec).parameters).items() - default.items()) == 1
-    assert not any("discount" in spec for spec in tune.settings("price-dp"))
-
-
-@pytest.mark.parametrize("sizes", ["equal", "jpeg"])
-def test_our_own_rules_are_tuned_for_equal_and_unequal_sizes(sizes: str, monkeypatch: Patch, splits: list[str]) -> None:
-    """The price of bytes changes what gap-price does only where sizes differ; price-dp reads each of its numbers."""
-    link = Trace.steps([(2, 2e6), (1, 0), (3, 1e6), (2, 4e6)], name="fading")
-    scenario = Uplink((link,), sizes=sizes, duration_s=20.0, value=qoi.exponential(0.5))
-    settings = {"one": suites.Setting(scenario, "a camera")}
-    tiny = suites.Suite("tiny-camera", "", lambda split, data: settings, capacities=(4,), seeds=3)
-    monkeypatch.setitem(suites.SUITES, "tiny-camera", tiny)
-    moved: dict[str, set[str]] = {}
-    for choice in tune.tune("tiny-camera", list(tune.AROUND), split="train", jobs=1):
-        gained = [tried.spec.partition(":")[2] for tried in choice.tried if abs(tried.gain.value) > 1e-12]
-        moved[choice.policy] = {spec.partition("=")[0] for spec in gained}
-        assert choice.chosen.gain.value >= 0 and 0 < choice.default.score.value < 1
-    assert "horizon_s" in moved["target-gap"]
-    assert moved["price-dp"] <= set(tune.AROUND["price-dp"]) and "kappa" in moved["price-dp"]
-    assert ("kappa" in moved["gap-price"]) == (sizes == "jpeg")
-    if sizes == "equal":
-        assert moved["gap-price"] - moved["target-gap"] <= {"share_low"}  # half of it is a share of .18 for equal sizes
-
-
 def compared(base: Sequence[float], default: Sequence[float], other: Sequence[float], best: float) -> Choice:
     rows = [
         {"scenario": "s", "capacity": 2, "trace": "t", "seed": i, "policy": name, "qoi": float(h), "clairvoyant": best}
@@ -149,31 +97,12 @@ def compared(base: Sequence[float], default: Sequence[float], other: Sequence[fl
     return tune.compare("p", rows, ["p", "p:a=1"])
 
 
-def test_the_gain_is_the_paired_difference_of_the_scores() -> None:
-    """Every episode gains 1 of the 10 that can be gained: whatever is drawn, 0.1, though the scores themselves vary."""
-    choice = compared([10, 10, 10, 10], [11, 15, 12, 18], [12, 16, 13, 19], 20)
-    assert choice.default.score.value == pytest.approx((1 + 5 + 2 + 8) / 40)
-    assert choice.tried[1].score.value == pytest.approx(choice.default.score.value + 0.1)
-    assert choice.tried[1].gain == pytest.approx((0.1, 0.1, 0.1))
-    assert choice.default.gain == pytest.approx((0, 0, 0), abs=1e-12)
-    assert choice.chosen.spec == "p:a=1"
-
-
 def test_a_gain_that_may_be_chance_is_none() -> None:
     choice = compared([10] * 4, [15] * 4, [18, 13, 18, 13], 20)  # +3, -2, +3, -2
     assert choice.best.spec == "p:a=1"
     assert choice.best.gain.value == pytest.approx(0.05)
     assert choice.best.gain.low < 0 < choice.best.gain.high
     assert choice.chosen is choice.default
-
-
-def test_where_no_cell_is_discriminative_regrets_are_compared() -> None:
-    """Drop Oldest loses 0.5 %: no scores. Of 200, the default gets 180 and the other setting 190."""
-    choice = compared([199, 199], [180, 180], [190, 190], 200)
-    assert math.isnan(choice.best.score.value) and choice.chosen.spec == "p:a=1"
-    assert [tried.regret.value for tried in choice.tried] == pytest.approx([0.1, 0.05])
-    assert choice.chosen.gain == pytest.approx((0.05, 0.05, 0.05))
-    assert compared([199, 199], [190, 190], [180, 180], 200).chosen.spec == "p"
 
 
 def test_the_command_writes_what_bench_then_reads(capsys: Capsys) -> None:
@@ -190,20 +119,6 @@ def test_the_command_writes_what_bench_then_reads(capsys: Capsys) -> None:
     cli("tiny-nine --policies decimate --write", capsys)
     assert [tuned.tuned(name) for name in (*LENGTHS, "lte-v1")] == [["decimate:every=4"], [], []]
     assert default_policies("tiny-twelve") == [*policies.names(for_topics=False), "decimate:every=4"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (b"{", "line 1: must be JSON"),
-        (b'{"lte-v1": {"decimate": 3}}', r"lte-v1.decimate.setting = '': must be a setting of that policy"),
-        (b'{"lte-v1": {"decimate": {"setting": "afr"}}}', r"lte-v1.decimate.setting = afr: must be a setting of that"),
-        (b'{"lte-v1": {"nobody": {"setting": "nobody:a=2"}}}', "lte-v1.nobody: unknown policy 'nobody'"),
-    ],
-)
-def test_a_broken_file_is_named(text: bytes, message: str) -> None:
-    tuned.FILE.write_bytes(text)
-    refuse(f"{tuned.FILE.name}.*{message}", default_policies, "lte-v1")
 
 
 def test_what_is_shipped(monkeypatch: Patch) -> None:

@@ -54,13 +54,6 @@ def test_zenoh_a_lost_fragment_loses_the_message_and_the_others_cross_in_vain():
     assert delivered(f"zenoh-drop:{SMALL}", [0, 50, 100, 150], 400, 10) == [0, 1, 2, 3]
 
 
-@kernels
-def test_zenoh_a_message_of_one_batch_waits_for_room_only():
-    # 100 bytes each; 10 bytes cross in a ms. At 5 ms 150 bytes are ahead of 2: 250 - 10 is too much. At 9 ms 110 are
-    # ahead of 3, and 210 - 10 is not. It is for 4, at the same time.
-    assert delivered(f"zenoh-drop:{SMALL}", [0, 0, 5, 9, 9, 150], 100, 10) == [0, 1, 3, 5]
-
-
 @pytest.mark.parametrize(
     ("megabytes_per_s", "sent", "real"),
     [(3, 240, 3), (4, 300, 2), (5, 300, 128), (6, 300, 222), (6.5, 300, 268), (8, 300, 300)],

@@ -128,8 +128,6 @@ def test_linear_with_alpha_1_is_afr(case, v):
         # 0.883. At 4: 1 against 0.7, and of the gaps 2, 2, 2 the oldest is the least: 1 goes. At 5: 1 against 0.875;
         # gaps 3, 2, 2 count 1.95, 1.53, 1.77: 3 goes. At 6: 1 against 1.05: rejected. At 7: 2 against 1.225; gaps 4, 3,
         # 3 count 2.6, 2.3, 2.65: 4 goes.
-        ("paced-motion-gap", 3, 4, [2, 3, 4]),
-        ("paced-motion-gap", 3, 5, [2, 4, 5]),
         ("paced-motion-gap", 3, 6, [2, 4, 5]),
         ("paced-motion-gap", 3, 7, [2, 5, 7]),
         ("paced-motion-gap:discount=0.01", 3, 5, [2, 4, 5]),

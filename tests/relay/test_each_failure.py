@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from loop_cases import beside, compiled
@@ -36,6 +37,7 @@ RULES = (ALL, Rule(recorder=True, receive=True, topic="/robots/.*"))
 CAMERA, COMMAND = "/robots/a/camera", "/robots/a/command"
 COMMANDS = 4
 FULL = OSError(errno.ENOSPC, "No space left on device")
+DISK = ((McapFile, "write"), (McapFile, "flush"), (audit._Lines, "write"))
 
 
 class Fails:
@@ -60,35 +62,26 @@ class Fails:
         return call
 
 
-class Database:
-    """A connection of SQLite of which each statement may fail."""
-
-    def __init__(self, real: Any, fails: Fails) -> None:
-        self._real = real
-        self.execute = fails.wrapped("statement", real.execute, sqlite3.OperationalError("disk I/O error"))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._real, name)
-
-
 @contextlib.contextmanager
 def failing(fails: Fails) -> Iterator[None]:
     """Within the block the n-th of these fails."""
-    began, made, clock, sent = Store.__init__, server.Accepted.connection_made, Hub.__init__, ServerConnection.send
+    began, made, sent, clock = (Store.__init__, server.Accepted.connection_made, ServerConnection.send, Hub.__init__)
 
     def store(self: Store, *words: Any, **named: Any) -> None:
         began(self, *words, **named)
-        self._db = Database(self._db, fails)
-
-    def accepted(self: Any, transport: Any) -> None:
-        if fails.due("accept"):
-            transport.abort()  # the peer has gone already
-        made(self, transport)
+        real, broken = self._db, sqlite3.OperationalError("disk I/O error")
+        self._db = Mock(wraps=real, execute=fails.wrapped("statement", real.execute, broken))
+        type(self._db).in_transaction = property(lambda _: real.in_transaction)
 
     def hub(self: Hub, *words: Any, **named: Any) -> None:
         clock(self, *words, **named)
         real = self.clock
         self.clock = lambda: real() + 3_600 * fails.due("clock")
+
+    def accepted(self: Any, transport: Any) -> None:
+        if fails.due("accept"):
+            transport.abort()  # the peer has gone already
+        made(self, transport)
 
     async def send(self: ServerConnection, *words: Any) -> None:
         if fails.due("send"):
@@ -97,13 +90,12 @@ def failing(fails: Fails) -> Iterator[None]:
         await sent(self, *words)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Store, "__init__", store)
-        patch.setattr(Hub, "__init__", hub)
-        patch.setattr(server.Accepted, "connection_made", accepted)
-        patch.setattr(ServerConnection, "send", send)
-        for name in ("write", "flush"):
-            patch.setattr(McapFile, name, fails.wrapped(f"recording's {name}", getattr(McapFile, name), FULL))
-        patch.setattr(audit._Lines, "write", fails.wrapped("audit", audit._Lines.write, FULL))
+        for kind, name, function in (
+            *((Store, "__init__", store), (Hub, "__init__", hub)),
+            *((server.Accepted, "connection_made", accepted), (ServerConnection, "send", send)),
+            *((kind, name, fails.wrapped(f"{kind.__name__}.{name}", getattr(kind, name), FULL)) for kind, name in DISK),
+        ):
+            patch.setattr(kind, name, function)
         yield
 
 
@@ -136,7 +128,7 @@ async def day(folder: Path, fails: Fails) -> None:
     assert sorted(set(came)) == sorted(came), fails.failed
     recorded = sum(len(bags.read_bag(path).time_ns) for path in sorted((folder / FOLDER).glob("*.mcap")))
     # A recording whose disk is full pauses for some seconds.
-    assert recorded >= len(came) + len(seen) or "recording" in fails.failed, fails.failed
+    assert recorded >= len(came) + len(seen) or "McapFile" in fails.failed, fails.failed
 
 
 @compiled
@@ -144,14 +136,6 @@ async def test_whatever_fails_once_the_relay_goes_on(tmp_path: Path, monkeypatch
     monkeypatch.setattr(backoff, "MOST_S", 0.01)
     calm = Fails(0)
     await day(tmp_path / "calm", calm)
-    assert set(calm.counts) == {
-        "statement",
-        "accept",
-        "clock",
-        "send",
-        "recording's write",
-        "recording's flush",
-        "audit",
-    }
+    assert {"statement", "accept", "clock", "send", "McapFile.write", "_Lines.write"} <= set(calm.counts)
     for n in range(1, calm.counts.total() + 1):
         await day(tmp_path / str(n), Fails(n))

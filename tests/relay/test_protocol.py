@@ -1,9 +1,13 @@
 """What both ends decide, without sockets: when to try again, and what a frame leads to."""
 
 import contextlib
+import json
 import random
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from refusal_cases import refuse
 from relay_cases import settings
 
@@ -41,14 +45,14 @@ def test_a_hello_that_is_refused() -> None:
 
     refuse("a binary frame: must be hello first", begin, b"\x00", kind=WireError)
     refuse("ack: must be hello first", begin, wire.say("ack", seq=1), kind=WireError)
-    for version, given, error in (
+    for version, more, error in (
         (9, {}, "must be of version 1, of form binary or json"),
         (1, {"form": "xml"}, "must be of version 1, of form binary or json"),
         (1, {"session": "a b"}, "session = 'a b': must be 1 to 64 letters"),
         (1, {"name": "relay"}, "name = 'relay': must be a name, not the relay's"),
         (1, {"name": "\n"}, "name '\\\\n': must be printable"),
     ):
-        refuse(f"hello: {error}", begin, wire.say("hello", version=version, **given), kind=WireError)
+        refuse(f"hello: {error}", begin, wire.say("hello", version=version, **more), kind=WireError)
 
 
 def test_who_is_let_in_and_welcomed() -> None:
@@ -95,16 +99,14 @@ def test_which_messages_are_taken() -> None:
 
 
 def test_a_subscription_that_is_refused() -> None:
-    for name, given, error in (
+    for name, wrong, error in (
         *(("topic", "(", "pattern"), ("capacity", 0, "capacity"), ("id", "\n", "id")),
         ("policy", "afr", "policy 'afr': must be one of drop-oldest"),
         ("priority", -1, "priority = -1.0: must be from 0 to 1e"),
         ("durable", True, "durable: needs a session of a name"),
     ):
-        policy, asked = (
-            None if name == "policy" else registry.get("drop-oldest"),
-            {"id": "a", "topic": "a", name: given},
-        )
+        policy = None if name == "policy" else registry.get("drop-oldest")
+        asked = {"id": "a", "topic": "a", name: wrong}
         refuse(error, protocol.subscription, asked, CONFIG, policy, True, lambda: 0)
 
 
@@ -121,3 +123,78 @@ def test_a_quota_counts_what_its_connections_have() -> None:
             quotas.connection("a", {}).__enter__()
         raise ValueError
     assert quota.connections == []
+
+
+# Frames byte by byte, and what is none.
+
+
+names = st.text(st.characters(exclude_categories=("C", "Z")), max_size=60)
+whole = st.integers(0, 2**53)
+messages = st.builds(
+    Message, names.map("/{}".format), st.binary(max_size=50), st.just("raw"), names, names, whole, whole, st.booleans()
+)
+
+
+def test_byte_by_byte() -> None:
+    message = Message("/a/b", b"\x01\x02", "jpeg", "T", "me", seq=258, stamp_us=-1, no_drop=True)
+    assert wire.encode(message) == (
+        b"bR\x01\x01\x01\x04\x01\x04\x02\0\0\0"
+        b"\0\0\0\x02"
+        b"\0\0\0\0\0\0\x01\x02"
+        b"\xff\xff\xff\xff\xff\xff\xff\xff"
+        b"/a/bTjpegme\x01\x02"
+    )
+
+
+@given(messages)
+def test_what_is_written_is_read(message: Message) -> None:
+    assert wire.decode(wire.encode(message)) == message
+    assert wire.from_json(wire.heard(wire.to_json(message))) == message
+
+
+def test_json_payloads_are_values() -> None:
+    message = Message("/a", b'{"x": [1, null, "\\u00e4"]}')
+    assert json.loads(wire.to_json(message))["data"] == {"x": [1, None, "ä"]}
+    assert json.loads(bytes(wire.from_json(wire.heard(wire.to_json(message))).payload)) == {"x": [1, None, "ä"]}
+
+
+GOOD = wire.encode(Message("/a", b"12"))
+TWO = {2: "version 1", 3: "kind 1", 4: "a known flag"}
+"""What a 2 at this place breaks."""
+
+
+@pytest.mark.parametrize(
+    ("read", "given", "error"),
+    [
+        (wire.decode, b"", "frame of 0 bytes"),
+        (wire.decode, GOOD[:-1], "frame of 39 bytes: must be 40"),
+        (wire.decode, GOOD + b"1", "frame of 41 bytes: must be 40"),
+        *((wire.decode, data, "header") for data in (b"bX" + GOOD[2:], GOOD[:9] + b"\x01" + GOOD[10:])),
+        *((wire.decode, GOOD[:k] + b"\x02" + GOOD[k + 1 :], says) for k, says in TWO.items()),
+        (wire.decode, GOOD[:16] + b"\xff" * 8 + GOOD[24:], "seq"),
+        (wire.decode, GOOD[:24] + b"\x7f" + GOOD[25:], "stamp_us"),
+        (wire.decode, GOOD.replace(b"/a", b"aa"), "must begin with '/'"),
+        (wire.decode, GOOD.replace(b"/a", b"/\n"), "must be printable"),
+        (wire.decode, GOOD.replace(b"/a", b"/\xff"), "must be UTF-8"),
+        *((wire.heard, text, "must be JSON") for text in ("", "[" * 10_000, "9" * 5_000)),
+        (wire.heard, "3", "must be an object"),
+        *((wire.heard, text, "must be an object whose op") for text in ('{"op": "dance"}', '{"op": ["hello"]}')),
+        (wire.heard, '{"op": "hello"}', "missing required field `version`"),
+        (wire.heard, '{"op": "hello", "version": true}', "Expected `int`, got `bool`"),
+        (wire.heard, '{"op": "hello", "version": -1}', "Expected `int` >= 0"),
+        (wire.heard, '{"op": "hello", "version": 1e99}', "Expected `int`, got `float`"),
+        (wire.heard, '{"op": "publish", "topic": "/a", "data": NaN}', "NaN is no JSON"),
+        (wire.heard, '{"op": "subscribe", "id": "a", "topic": 3}', r"Expected `str`, got `int` - at `\$.topic`"),
+        (wire.heard, '{"op": "subscribe", "id": "a", "topic": "a", "priority": "1"}', "Expected `float`, got `str`"),
+        (wire.from_json, {"topic": "a", "data": 1}, "must begin with '/'"),
+        (wire.from_json, {"topic": "/\ud800", "data": 1}, "must be"),
+        *((wire.from_json, {"topic": f"/{name}", "data": 1}, "at most 255 bytes") for name in ("a" * 255, "ä" * 128)),
+        *((wire.from_json, {"topic": "/a", "encoding": "jpeg", "data": data}, "must be base64") for data in ("*", 3)),
+        (wire.from_json, {"topic": "/a", "encoding": "", "data": ""}, "must not be empty"),
+        (wire.heard, '{"op": "publish", "topic": "/a", "data": -1e400}', "the number -1e400 is no JSON"),
+        *((wire.to_json, Message("/a", payload), "payload must be JSON") for payload in (b"{", b"1e400")),
+    ],
+)
+def test_each_fault_is_named(read: Any, given: Any, error: str) -> None:
+    with pytest.raises(WireError, match=error):
+        read(given)

@@ -98,20 +98,16 @@ async def test_a_topic_is_subscribed_again_when_its_publisher_comes_back_otherwi
 ) -> None:
     """A camera goes, comes back best effort, and stays; a topic of a type that is not here stops no other."""
     camera, odd = Published("/camera", "a/msg/B"), Published("/odd", "no_such_msgs/msg/B")
-    seen = iter([None, camera, None, replace(camera, reliable=False), replace(camera, reliable=False)])
+    seen = [None, camera, None, *[replace(camera, reliable=False)] * 2]
     made: list[Published] = []
     gone: list[Published] = []
     told: list[str] = []
     ended = asyncio.Event()
 
     def published(node: Any, name: str, but_not: str) -> Published | None:
-        if name == "/odd":
-            return odd
-        try:
-            return next(seen)
-        except StopIteration:
+        if name == "/camera" and not seen:
             ended.set()
-            return None
+        return odd if name == "/odd" else seen.pop(0) if seen else None
 
     def found(topic: Published) -> list[Published]:
         if topic is odd:
