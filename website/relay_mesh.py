@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import json
 import shutil
+import socket
 import sys
 import tempfile
 import time
@@ -30,10 +31,15 @@ from bufgym.relay.client import RobotClient
 from bufgym.relay.config import Limits
 from bufgym.relay.server import serve_forever
 from bufgym.relay.session import Session
-from bufgym.robot.sockets import free_port
 
 RELAYS, RATE_HZ, SIZE_BYTES, KILL_S, COMMAND_S = 3, 2.0, 20_000, 10.0, 0.5
 MANY = Limits(connections=1_000, sessions=1_000, subscriptions=10_000)
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
 
 
 async def serve(port: int, nats: int, name: str, folder: str) -> None:
@@ -55,8 +61,8 @@ async def started(*words: object) -> asyncio.subprocess.Process:
 async def mesh(robots: int, viewers: int, seconds: float) -> None:
     folder, nats, ports = (
         Path(tempfile.mkdtemp()),
-        free_port("127.0.0.1"),
-        [free_port("127.0.0.1") for _ in range(RELAYS)],
+        free_port(),
+        [free_port() for _ in range(RELAYS)],
     )
     stack = contextlib.AsyncExitStack()
     await stack.enter_async_context(nats_server(nats, folder / "nats"))

@@ -15,14 +15,13 @@ import os
 import sys
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import bufgym
 from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import PACKAGE
 from bufgym.ground.libraries import library
 from bufgym.papers import table2_programs
 from bufgym.papers.encodings import content, encode
@@ -67,7 +66,7 @@ class Reproduction(Figure):
     async def _run(self, program: str, port: int, cloud: bytes) -> dict[str, float]:
         """Play the clouds to a program; return its costs."""
         words = [sys.executable, table2_programs.__file__, program, str(port)]
-        here = {**os.environ, "PYTHONPATH": str(Path(bufgym.__file__).parent.parent)}
+        here = {**os.environ, "PYTHONPATH": str(PACKAGE.parent)}
         pipe = asyncio.subprocess.PIPE
         process = await asyncio.create_subprocess_exec(*words, stdin=pipe, stdout=pipe, stderr=pipe, env=here)
         assert process.stdin is not None and process.stdout is not None and process.stderr is not None

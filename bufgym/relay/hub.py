@@ -25,13 +25,11 @@ if TYPE_CHECKING:
     from bufgym.relay.foxglove import Window
     from bufgym.relay.peers import Peers
 
-OWN: Final = "relay"  # The relay's name as a sender, and the prefix of its topics
-STATUS: Final = f"/{OWN}/status"
+STATUS: Final = f"/{wire.OWN}/status"
 CONNECTED: Final = "connected"  # State of the connection to the other relays
 ROBOFLEET: Final = "robofleet"
 """Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
-MAX_JSON_BYTES: Final = 2**20  # Size limit of a text frame and of a JSON payload, which take time to read
 
 
 @dataclass(eq=False)
@@ -249,7 +247,7 @@ class Hub:
     def tick(self) -> None:
         """Publish the relay's state once a second, and forget what has expired."""
         payload = json.dumps(self.status()).encode()
-        self.publish(None, wire.Message(STATUS, payload, sender=OWN, stamp_us=time.time_ns() // 1000))
+        self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=time.time_ns() // 1000))
         self.audit.flush()
         if self.recorder is not None:
             self.recorder.flush()

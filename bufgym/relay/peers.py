@@ -21,7 +21,7 @@ from bufgym.relay import policies, protocol, wire
 from bufgym.relay.backoff import Backoff
 from bufgym.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
 from bufgym.relay.config import DEFAULT_CAPACITY, Nats
-from bufgym.relay.hub import CONNECTED, OWN, Hub, Outgoing
+from bufgym.relay.hub import CONNECTED, Hub, Outgoing
 from bufgym.relay.patterns import pattern
 from bufgym.relay.rules import NATS, Permissions
 from bufgym.relay.store import StoredSession
@@ -120,7 +120,7 @@ class Peers:
         self._hub.audit.repeated(what="nats", code="wrong", why=str(why))
 
     def _goes(self, verb: Any, topic: str) -> bool:
-        return not topic.startswith(f"/{OWN}/") and self.permissions.allow(verb, topic)
+        return not topic.startswith(f"/{wire.OWN}/") and self.permissions.allow(verb, topic)
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message of this relay."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from bufgym.model.checks import whole
 from bufgym.relay import wire
 from bufgym.relay.config import DEFAULT_CAPACITY, Config, Rule
-from bufgym.relay.hub import MAX_JSON_BYTES, OWN
 from bufgym.relay.patterns import pattern
 from bufgym.relay.quota import Quota
 from bufgym.relay.rules import Identity, Permissions
@@ -62,7 +61,7 @@ def admit(said: Mapping[str, Any], identity: Identity, rules: Sequence[Rule], fr
     if not _SESSION.fullmatch(session):
         raise WireError(f"hello: session = {session!r}: must be 1 to 64 letters, digits, '-', '_', '.'")
     wire.check_name("hello: name", name)
-    if not name or name == OWN:
+    if not name or name == wire.OWN:
         raise WireError(f"hello: name = {name!r}: must be a name, not the relay's")
     numbers = int(said.get("received", 0)), int(said.get("acked", 0))
     return Admitted(permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers)
@@ -92,8 +91,8 @@ def asked(data: bytes | str, max_bytes: int) -> wire.Message | dict[str, Any]:
     """What a later frame asks: to publish a message, or another order."""
     if isinstance(data, bytes):
         return wire.decode(data, max_bytes)
-    if len(data) > MAX_JSON_BYTES:
-        raise WireError(f"text of {len(data)} characters: must be at most {MAX_JSON_BYTES}")
+    if len(data) > wire.MAX_JSON_BYTES:
+        raise WireError(f"text of {len(data)} characters: must be at most {wire.MAX_JSON_BYTES}")
     said = wire.heard(data)
     if said["op"] not in ORDERS:
         raise WireError(f"{said['op']}: must be one of {', '.join(ORDERS)}")
@@ -111,7 +110,7 @@ def check(
     if message.no_drop and 0 < message.seq <= received:
         return False
     quota.message(len(message.payload), now_s)
-    if topic.startswith(f"/{OWN}/") or not permissions.allow("send", topic):
+    if topic.startswith(f"/{wire.OWN}/") or not permissions.allow("send", topic):
         raise RefusedError("unauthorized", f"topic {topic}: no rule allows to send there")
     quota.topic(topic)
     if message.no_drop != no_drop:
@@ -126,8 +125,8 @@ def check_json(message: wire.Message) -> None:
     """Raise RefusedError if the payload is not the JSON that its encoding promises."""
     topic = message.topic
     if message.encoding == "json":
-        if len(message.payload) > MAX_JSON_BYTES:
-            raise RefusedError("too_large", f"topic {topic}: JSON must be at most {MAX_JSON_BYTES} bytes")
+        if len(message.payload) > wire.MAX_JSON_BYTES:
+            raise RefusedError("too_large", f"topic {topic}: JSON must be at most {wire.MAX_JSON_BYTES} bytes")
         try:
             wire.loads(bytes(message.payload))
         except (ValueError, RecursionError) as error:

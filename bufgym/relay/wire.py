@@ -20,6 +20,8 @@ from bufgym.ground.errors import BufgymError
 
 PATH: Final = "/relay"
 SUBPROTOCOL: Final = "bufgym.relay.v1"
+OWN: Final = "relay"  # The relay's name as a sender, and the prefix of its topics
+MAX_JSON_BYTES: Final = 2**20  # Size limit of a text frame and of a JSON payload, which take time to read
 VERSION: Final = 1
 MESSAGE: Final = 1  # The one kind of binary frame
 NO_DROP: Final = 1  # A flag
