@@ -67,7 +67,7 @@ def validate(files: Files, /, *, format: Format = None, column: Column = None) -
 
 
 def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format = None, column: Column = None) -> None:
-    """Write bandwidth traces in another format and say what was lost.
+    """Write bandwidth traces in another format and name the loss.
 
     Args:
         out: The file to write; a folder for several files.

@@ -1,4 +1,4 @@
-"""A relay's decisions about a client, without sockets: whom it lets in, what a frame asks, what it refuses.
+"""A relay's decisions about a client, without sockets: its admission, its requests, its refusals.
 
 All functions are pure but ``check``, which counts the message in its sender's quota.
 """
