@@ -230,7 +230,6 @@ def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
 
 # The agents that come with bufgym: small, named, with their command, and as good as their file says.
 
-
 SHIPPED = files.shipped("agents", "agents/pretrained", "*.safetensors")
 NAMED = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
 TOPICS = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")

@@ -196,7 +196,6 @@ def test_sizes_and_rates() -> None:
 
 # A wrong name of any kind ends in one sentence that says which was meant.
 
-
 LTE = ("duration_s", "rate_hz", "size_bytes", "propagation_us", "random_offset", "traces", "motion")
 TOPIC = ("priority", "deadline_s", "no_drop", "rate_limit_hz", "size_bytes")
 

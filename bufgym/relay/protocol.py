@@ -57,7 +57,7 @@ def admit(said: Mapping[str, Any], identity: Identity, rules: Sequence[Rule], fr
     permissions = Permissions(rules, identity)
     if not permissions.rules:
         raise RefusedError("unauthorized", "no rule allows anything to this identity")
-    session, name = said.get("session", fresh), said.get("name", identity.key)
+    session, name = said.get("session", fresh), said.get("name", identity.email or identity.address)
     if not _SESSION.fullmatch(session):
         raise WireError(f"hello: session = {session!r}: must be 1 to 64 letters, digits, '-', '_', '.'")
     wire.check_name("hello: name", name)

@@ -31,7 +31,7 @@ class Identity:
     @property
     def key(self) -> str:
         """Key under which limits are counted."""
-        return self.email or self.address
+        return f"<{self.email.lower()}>" if self.email else self.address  # no address reads so
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields that others may see."""

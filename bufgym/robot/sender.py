@@ -81,8 +81,8 @@ class Sender:
         first = self._unacked[0].number if self._unacked else self._next
         await channel.send(Frame(GREETING, first, body=self._stream))
         answer = await asyncio.wait_for(channel.receive(), PATIENCE_S)
-        if answer.kind != GREETING:
-            raise FrameError(f"frame of kind {answer.kind}: must be the answer to the greeting")
+        if answer.kind != GREETING or answer.seq < 1:
+            raise FrameError(f"frame of kind {answer.kind}: must be the answer to the greeting, and take messages")
         self._max_body_bytes = answer.seq
         while self._unacked and self._unacked[0].number < answer.number:
             self._take_ack()

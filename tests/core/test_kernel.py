@@ -260,7 +260,6 @@ def test_without_numbas_private_parts_episodes_are_equal() -> None:
 
 # Ctrl-C is answered within a second while a kernel works, and what a kernel's thread raises arrives.
 
-
 LONG = """
 import signal
 

@@ -229,7 +229,6 @@ def test_each_victim_is_a_draw_of_its_own():
 
 # What a run was worth, worked by hand.
 
-
 S = 1_000_000
 
 

@@ -157,7 +157,6 @@ def test_unknown_names_and_unusable_options_are_refused() -> None:
 
 # Recordings of depth cameras: read as they were written, and one clear error for each way in which they are broken.
 
-
 LAYOUTS = {"tum": frame_cases.tum, "7-scenes": frame_cases.seven_scenes, "packed": frame_cases.packed}
 
 
@@ -254,7 +253,6 @@ def test_the_size_of_a_frame() -> None:
 
 
 # Figures on frames that are mapped and tracked: tasks that are kept, the sweep, what the texts say of the numbers.
-
 
 LINK = Trace.constant(1e6, 10.0, name="link")
 

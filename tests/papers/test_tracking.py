@@ -127,7 +127,6 @@ def test_a_single_wall_leaves_the_way_along_it_open(monkeypatch: pytest.MonkeyPa
 
 # Frames sent over a link, what arrives, how much of it is new, and which frames images call similar.
 
-
 TRACE = Trace.steps([(1, 100.0), (1, 50.0), (2, 10.0)], name="falling")
 
 

@@ -127,7 +127,6 @@ def test_a_quota_counts_what_its_connections_have() -> None:
 
 # Frames byte by byte, and what is none.
 
-
 names = st.text(st.characters(exclude_categories=("C", "Z")), max_size=60)
 whole = st.integers(0, 2**53)
 messages = st.builds(

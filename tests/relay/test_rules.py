@@ -66,6 +66,7 @@ def test_rules_are_asked_before_a_subscription(text: str, allowed: bool) -> None
 
 
 def test_addresses_are_taken_as_they_are_meant() -> None:
+    assert Identity("10.0.0.7").key != Identity("10.0.0.8", "10.0.0.7").key  # an e-mail is nobody's address
     assert plain_address("::ffff:10.0.0.7") == "10.0.0.7"
     assert plain_address("fe80::1%eth0") == "fe80::1"
 
@@ -134,9 +135,6 @@ def test_random_rules_as_the_reference() -> None:
             assert {one for one in every if ear.permissions.allow(*one)} == expected, k  # type: ignore[arg-type]
             assert ear.came == {topic for verb, topic in expected if verb == "receive"}, k
     hub.close()
-
-
-# Configurations: the example is read, each fault is named.
 
 
 REPO = Path(__file__).resolve().parents[2]

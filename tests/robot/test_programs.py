@@ -128,7 +128,6 @@ def test_what_came_is_told_as_messages_of_the_episode_in_real_time() -> None:
 
 # Robofleet's figures on real sockets: the same messages, and what became of them.
 
-
 SMALL: dict[str, dict[str, Any]] = {
     "robofleet-fig3": {"rates_hz": (10,), "duration_s": 0.5},
     "robofleet-fig4": {"dropouts_s": (1,), "links_mbit_per_s": (12,), "kinds": ("LaserScan",), "live": 20.0},

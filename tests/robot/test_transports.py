@@ -5,6 +5,7 @@ import contextlib
 import itertools
 import socket
 from typing import Any
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from bufgym.robot.frames import DATA, GREETING, Frame, header
 from bufgym.robot.log import Record
 from bufgym.robot.receiver import Received
 from bufgym.robot.runs import LiveRun, orders, table
+from bufgym.robot.sender import Sender
 from bufgym.robot.shaped import ShapedLink
 from bufgym.robot.validate import over, play, validate
 from bufgym.scenario import Episode, Uplink, messages
@@ -189,7 +191,6 @@ async def test_waiting_for_a_processor_is_not_waiting_for_bytes(monkeypatch: pyt
 
 # What strangers cannot take from a receiver: its memory, its sockets, its time.
 
-
 HALF = header(Frame(GREETING, 0, body=bytes(16))) + bytes(range(16)) + header(Frame(DATA, 0, body=bytes(60)))
 """A greeting, and the header of a message of 60 bytes that never comes."""
 
@@ -248,3 +249,14 @@ async def test_no_more_peers_than_it_has_room_for(monkeypatch: pytest.MonkeyPatc
             stack.callback(writer.close)
         await until(lambda: len(receiver.faults) == 2)
         assert set(receiver.faults) == {"ConnectionRefusedError: must be at most 3 connections"}
+
+
+async def test_a_receiver_that_takes_no_byte_is_asked_again() -> None:
+    answers = [Frame(GREETING, 0, 0), Frame(GREETING, 0, 100)]
+    channel = AsyncMock(receive=lambda: asyncio.sleep(0, answers.pop(0)) if answers else asyncio.sleep(60))
+    channel.close = lambda: None
+    one = Sender(PolicyQueue("fifo", 2), AsyncMock(return_value=channel))
+    running = asyncio.create_task(one.run())
+    await until(one.connected.is_set)
+    running.cancel()
+    assert [fault.endswith("and take messages") for fault in one.faults] == [True]

@@ -120,7 +120,6 @@ def test_a_format_must_be_known_and_said_where_two_fit(tmp_path: Path, monkeypat
 
 # Every recorded link agrees with STATS.csv of the recorded data: duration, mean, seconds under 500 KB/s, and the rest.
 
-
 SETS = {
     "belgium_4g": ("belgium_4g/csv/*.csv", "csv", 30),
     "belgium_4g raw": ("belgium_4g/raw/*.log", "belgium", 5),

@@ -219,7 +219,6 @@ def test_the_command_writes_traces_and_motion(tmp_path: Path, capsys: Capsys) ->
 
 # Workloads: in and out of CSV files, summed up by topic, and played over a link.
 
-
 CSV = """time_s,bytes,topic,x
 100.5,1000,/camera,2
 101.5,500,/odom,2
