@@ -124,8 +124,9 @@ async def test_a_relay_that_is_gone_for_good_is_forgotten(tmp_path: Path) -> Non
         await operator.acked(command, seq)
 
 
-async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path) -> None:
+async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """NATS stands still: the sender's connection ends, unanswered. It comes again and sends the same again."""
+    monkeypatch.setattr("bufgym.relay.bus.ASK_S", 60.0)  # nothing but the command finds out
     port, command = free_port("127.0.0.1"), "/robots/a/command"
     async with (
         nats_server(port, tmp_path) as server,
