@@ -114,7 +114,7 @@ class Reproduction(Figure):
         best = rows.column("oracle")
         near = np.array([row["random_within"] for row in beyond if row["random_sd"] > EQUAL])
         return {
-            "never": bool((np.diff(best) >= -EQUAL).all() and best.max() < PAPER_L + 1),
+            "never": bool((np.diff(best) > 0).all() and best.max() < PAPER_L + 1),
             "best": best.max(),
             "within": bool(0.63 <= near.mean() <= 0.73) if len(near) else None,
             "near": f"{near.mean():.1%} on average, from {near.min():.0%} to {near.max():.0%} at single T"

@@ -103,7 +103,6 @@ class Reproduction(LinkFigure):
             "rates": ", ".join(f"{hz:.1f}" for hz in rates[main]),
             "least_L": min(self.capacities),
             "sizes": listed(self.capacities),
-            "full": min(shares) > 0.5,
             "full_shares": listed([f"{share:.0%}" for share in shares]),
         }
 
