@@ -25,22 +25,22 @@ from bufgym.benchmark import summary
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
-from bufgym.benchmark.table import NONE, aligned, apart, same, told_once
+from bufgym.benchmark.table import aligned, apart, decimal, same, told_once
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
 from bufgym.oracle import BASELINE
 from bufgym.policies import Policy, load, registry, weights
 
 COLUMNS = (
-    ("QoI", "qoi", 1, ".3f"),
-    ("delivered", "delivered", 1, ".1f"),
-    ("dropped", "dropped", 1, ".1f"),
-    ("longest gap", "longest_gap", 1, ".3f"),
-    ("gap s", "longest_gap_s", 1, ".2f"),
-    ("sojourn ms", "mean_sojourn_s", 1000, ".0f"),
-    ("age ms", "mean_age_s", 1000, ".0f"),
+    ("QoI", "qoi", 1, 3),
+    ("delivered", "delivered", 1, 1),
+    ("dropped", "dropped", 1, 1),
+    ("longest gap", "longest_gap", 1, 3),
+    ("gap s", "longest_gap_s", 1, 2),
+    ("sojourn ms", "mean_sojourn_s", 1000, 0),
+    ("age ms", "mean_age_s", 1000, 0),
 )
-"""(heading, Outcome field, unit factor, format)"""
+"""(heading, Outcome field, unit factor, digits)"""
 
 
 def lines_to_beat(settings: Settings) -> dict[str, float]:
@@ -242,7 +242,7 @@ def table(
         low, high = entry["minus_agent_95"]
         difference = "" if name == agent else f"{entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
         score = written(Interval(entry["score"], *entry["score_95"]), ".3f")
-        numbers = [format(entry[column] * factor, spec).replace("nan", NONE) for _, column, factor, spec in COLUMNS]
+        numbers = [decimal(entry[column] * factor, digits) for _, column, factor, digits in COLUMNS]
         label = f"> {name}" if name == agent else name
         blocks[name in unranked].append([label, score, *numbers, difference])
     lines = aligned([head, *blocks[0], *blocks[1]])

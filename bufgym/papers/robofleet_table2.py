@@ -2,7 +2,7 @@
 
 The paper [sikand2021robofleet] plays 15 s of PointCloud2 messages at 10 Hz to a client, Robofleet's or RosLibPy, and
 measures CPU time over wall-clock time and virtual memory, ten times. We run the same. RosLibPy is the real one.
-Robofleet's client is written in C++ with Qt and is not at hand: bufgym's sender with Robofleet's rule takes its
+Robofleet's client is written in C++ and is not at hand: bufgym's sender with Robofleet's rule takes its
 place. The messages are made up, as the paper's recording is not published.
 """
 

@@ -34,12 +34,6 @@ def plain(value: Any, arrays_as_lists: bool) -> Any:
     return value.tolist() if arrays_as_lists and hasattr(value, "tolist") else value
 
 
-def _store() -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC)
-
-
 class Cost:
     """The costs since ``begin``."""
 
@@ -58,8 +52,9 @@ class Cost:
 def rosbridge(port: int) -> None:
     """RosLibPy's client: JSON in which bytes are numbers."""
     import roslibpy
+    from rosbags.typesys import Stores, get_typestore  # not bufgym's, which this program must not load
 
-    store, cost = _store(), Cost()
+    store, cost = get_typestore(Stores.ROS1_NOETIC), Cost()
     ros = roslibpy.Ros("127.0.0.1", port)
     ros.run(timeout=30)
     topic = roslibpy.Topic(ros, TOPIC, TYPE.replace("/msg/", "/"))
@@ -74,12 +69,12 @@ def rosbridge(port: int) -> None:
 
 async def robofleet(port: int) -> None:
     """Our sender with Robofleet's rule, n_T = 1 and a flatbuffer for each message, in the place of Robofleet's own."""
-    from bufgym.papers.encodings import encode
+    from bufgym.papers.encodings import encode, stores
     from bufgym.robot.channels import WebSocketChannel
     from bufgym.robot.queue import PolicyQueue
     from bufgym.robot.sender import Sender
 
-    store, cost, queue = _store(), Cost(), PolicyQueue("robofleet", 32, window=1)
+    store, cost, queue = stores()["ros1"], Cost(), PolicyQueue("robofleet", 32, window=1)
     sender = Sender(queue, lambda: WebSocketChannel.connect("127.0.0.1", port))
     sending = asyncio.create_task(sender.run())
     await asyncio.wait_for(sender.connected.wait(), 60)

@@ -61,7 +61,7 @@ class Caller:
             self.answers.append(wire.say(op, **fields))
 
     def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
-        """Tell it of a refusal, and why; all but those of messages are audited here."""
+        """Tell it of a refusal and the reason. Refusals of messages are audited elsewhere."""
         code = error.code if isinstance(error, RefusedError) else "wrong"
         if what != "publish":
             self.hub.audit.repeated(what=what, code=code, why=str(error), **self.identity.as_json())

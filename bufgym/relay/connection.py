@@ -85,7 +85,7 @@ class Connection:
                     self._outbox.acked(number)
                     self._hub.store.acked(self.session, number)
                 case {"op": "recordings"}:
-                    folder = self._recordings if any(rule.receive for rule in self.permissions.rules) else None
+                    folder = self._recordings if self.permissions.receives else None
                     self.tell("recordings", files=await asyncio.to_thread(replay.recordings, folder))
                 case said:
                     await self._replay(said)

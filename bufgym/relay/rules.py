@@ -76,6 +76,11 @@ class Permissions:
             self._answers[verb, topic] = answer
         return answer
 
+    @property
+    def receives(self) -> bool:
+        """Whether a rule allows to receive anything."""
+        return any(rule.receive for rule in self.rules)
+
     def check_subscription(self, text: str) -> None:
         """Ask the rules before a subscription (Algorithm 3, line 9); each message is asked for again.
 
@@ -87,5 +92,5 @@ class Permissions:
         if text == f"^{topic}$" and not set(topic) & set(r".^$*+?{}[]\|()"):
             if not self.allow("receive", topic):
                 raise RefusedError("unauthorized", f"topic {topic}: no rule allows to receive it")
-        elif not any(rule.receive for rule in self.rules):
+        elif not self.receives:
             raise RefusedError("unauthorized", "no rule allows to receive anything")
