@@ -121,7 +121,7 @@ class Reproduction(Figure):
                 axes.bar(x, numbers.mean(), 0.6, yerr=numbers.std(), color=colour)
                 for place, marker in zip(PAPER[program], "ox", strict=True):
                     axes.plot(x, place[k], marker, color=COLOURS["oracle-ideal"])
-            axes.set_xticks(np.arange(len(PROGRAMS)), list(PROGRAMS.values()))
+            axes.set_xticks(np.arange(len(PROGRAMS)), ["bufgym, for Robofleet", PROGRAMS["rosbridge"]])
             finish(axes, label + (" (o, x: paper's i7, TX2)" if k == 0 else ""))
 
 
