@@ -4,8 +4,8 @@ python -m website.relay_load load --robots 20 --viewers 5 --seconds 60 [--slow]
 python -m website.relay_load idle --connections 1000
 python -m website.relay_load page --robots 20 --seconds 10   # frames that the page drops; needs Playwright, Chromium
 
-A relay has a process of its own; all else shares another. Robots send messages that are made beforehand.
-``page --robots 0`` says what the machine drops of an empty page.
+A relay is the command ``bufgym relay serve``; all else shares another process. Robots send messages that are made
+beforehand. ``page --robots 0`` says what the machine drops of an empty page.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import os
 import shutil
 import struct
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -28,40 +29,48 @@ sys.path[:0] = [str(REPO / "tests"), str(REPO / "tests" / "relay"), str(REPO / "
 
 from loop_cases import beside
 from made_up_robot import ODOMETRY, SCAN, cast, jpeg, odometry, picture, pose_at, scan
-from relay_cases import client, settings
+from relay_cases import client
 
 from bufgym.relay import wire
-from bufgym.relay.config import Limits
-from bufgym.relay.server import serve_forever
 from bufgym.relay.wire import Message
 
 SIZE_BYTES, RATE_HZ, MEMORY_S = 50_000, 10, 30.0
 _BINARY, _PING, _PONG, _MASKED = 0x82, 0x89, 0x8A, 0x80
-MANY = Limits(connections=10_000, all_connections=10_000, sessions=10_000, subscriptions=10_000)
+CONFIG = """port = 0
+[[rules]]
+send = true
+receive = true
+address = "127.0.0.1"
+topic = ".*"
+[limits]
+connections = 10000
+all_connections = 10000
+sessions = 10000
+subscriptions = 10000
+"""
 
 
-@contextlib.asynccontextmanager
-async def process(*words: str) -> Any:
-    """This program with these words, and the first line that it says."""
-    one = await asyncio.create_subprocess_exec(sys.executable, __file__, *words, stdout=-1)
+async def served(config: str, folder: Path) -> tuple[asyncio.subprocess.Process, int]:
+    """A relay with this configuration, and its port."""
+    folder.mkdir(exist_ok=True)
+    (folder / "relay.toml").write_text(config)
+    words = ("-m", "bufgym", "relay", "serve", "--config", str(folder / "relay.toml"))
+    one = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=-1)
     assert one.stdout is not None
-    try:
-        yield one, (await one.stdout.readline()).decode()
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            one.kill()
-        await one.wait()
-
-
-async def serve() -> None:
-    await serve_forever(settings(policies=("robofleet",), limits=MANY), lambda text: print(text, flush=True))
+    said = (await one.stdout.readline()).decode()
+    return one, int(said.partition("/ is")[0].rpartition(":")[2])
 
 
 @contextlib.asynccontextmanager
 async def relay() -> Any:
     """The number of its process, and its port."""
-    async with process("serve") as (one, said):
-        yield one.pid, int(said.partition("/ is")[0].rpartition(":")[2])
+    with tempfile.TemporaryDirectory() as folder:
+        one, port = await served(CONFIG, Path(folder))
+        try:
+            yield one.pid, port
+        finally:
+            one.kill()
+            await one.wait()
 
 
 def cpu_s(pid: int) -> float:
@@ -217,7 +226,7 @@ async def page(robots: int, seconds: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     verbs = parser.add_subparsers(required=True)
-    for work in (load, idle, page, serve):
+    for work in (load, idle, page):
         verbs.add_parser(work.__name__).set_defaults(work=work)
     of = verbs.choices
     for verb in ("load", "page"):

@@ -4,7 +4,7 @@ python -m website.relay_mesh --robots 60 --viewers 20 --seconds 60
 
 Robots and viewers are spread over the relays. Each robot sends pictures of 20 kB twice a second. A viewer watches three
 robots, of all relays. An operator at each relay sends commands to robots of all relays, two a second. A killed relay
-starts again at once. Needs nats-server.
+starts again at once; another stands in for it meanwhile. Needs nats-server.
 """
 
 import argparse
@@ -12,8 +12,6 @@ import asyncio
 import contextlib
 import json
 import shutil
-import socket
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -21,54 +19,44 @@ from typing import Any
 
 from website import relay_load
 
-from relay_cases import ALL, settings  # isort: skip  (relay_load has made it known)
-from nats_cases import nats_server  # isort: skip
+from nats_cases import nats_server  # isort: skip  (relay_load has made it known)
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
-from bufgym.relay import Nats, Rule
 from bufgym.relay.client import RobotClient
-from bufgym.relay.config import Limits
-from bufgym.relay.server import serve_forever
 from bufgym.relay.session import Session
+from bufgym.robot.sockets import free_port
 
 RELAYS, RATE_HZ, SIZE_BYTES, KILL_S, COMMAND_S = 3, 2.0, 20_000, 10.0, 0.5
-MANY = Limits(connections=1_000, sessions=1_000, subscriptions=10_000)
+SHARED = """
+[[rules]]
+nats = true
+send = true
+receive = true
+topic = "/robots/.*"
+[nats]
+url = "nats://127.0.0.1:{nats}"
+name = "{name}"
+"""
 
 
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
-async def serve(port: int, nats: int, name: str, folder: str) -> None:
-    shared = Rule(nats=True, send=True, receive=True, topic="/robots/.*")
-    where = Nats(f"nats://127.0.0.1:{nats}", name)
-    config = settings(
-        port=port, rules=(ALL, shared), nats=where, folder=Path(folder), limits=MANY, policies=("robofleet",)
-    )
-    await serve_forever(config, lambda text: print(text, flush=True))
-
-
-async def started(*words: object) -> asyncio.subprocess.Process:
-    one = await asyncio.create_subprocess_exec(sys.executable, "-m", "website.relay_mesh", *map(str, words), stdout=-1)
-    assert one.stdout is not None
-    await one.stdout.readline()
+async def started(port: int, nats: int, folder: Path) -> asyncio.subprocess.Process:
+    config = relay_load.CONFIG.replace("port = 0", f'port = {port}\nfolder = "held"')
+    one, _ = await relay_load.served(config + SHARED.format(nats=nats, name=folder.name), folder)
     return one
 
 
 async def mesh(robots: int, viewers: int, seconds: float) -> None:
     folder, nats, ports = (
         Path(tempfile.mkdtemp()),
-        free_port(),
-        [free_port() for _ in range(RELAYS)],
+        free_port("127.0.0.1"),
+        [free_port("127.0.0.1") for _ in range(RELAYS)],
     )
     stack = contextlib.AsyncExitStack()
     await stack.enter_async_context(nats_server(nats, folder / "nats"))
-    words = [("serve", ports[k], nats, f"relay-{k}", folder / str(k)) for k in range(RELAYS)]
+    words = [(ports[k], nats, folder / f"relay-{k}") for k in range(RELAYS)]
     relays = [await started(*each) for each in words]
-    url = [f"ws://127.0.0.1:{port}" for port in ports]
+    url = [",".join(f"ws://127.0.0.1:{port}" for port in ports[k:] + ports[:k]) for k in range(RELAYS)]
     came: list[list[Any]] = [[] for _ in range(robots)]
     sent: list[list[Any]] = [[] for _ in range(robots)]
     gaps_s, last_s = [0.0] * viewers, [0.0] * viewers
@@ -155,10 +143,6 @@ async def mesh(robots: int, viewers: int, seconds: float) -> None:
 
 
 def main() -> None:
-    if sys.argv[1:2] == ["serve"]:
-        port, nats, name, folder = sys.argv[2:]
-        asyncio.run(serve(int(port), int(nats), name, folder))
-        return
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--robots", type=int, default=60)
     parser.add_argument("--viewers", type=int, default=20)

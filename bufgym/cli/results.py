@@ -94,12 +94,14 @@ def perf(*, json: Path | None = None, history: Path | None = None, repeats: Coun
 
 def warmup() -> None:
     """Compile beforehand what environments and benchmarks need."""
+    import os
     import time
     from concurrent.futures import ProcessPoolExecutor, as_completed
     from multiprocessing import get_context
 
     from bufgym.benchmark import warmup as compiling
     from bufgym.ground import kernel
+    from bufgym.ground.processes import end_with
 
     if not kernel.JIT:
         print("compilation is off (NUMBA_DISABLE_JIT): nothing to do")
@@ -107,7 +109,7 @@ def warmup() -> None:
     began_s = time.perf_counter()
     print(f"compiling {len(compiling.PARTS)} parts: {', '.join(compiling.PARTS)}", flush=True)
     # A process for each core. Code that two of them need is compiled twice, with equal results.
-    with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+    with ProcessPoolExecutor(None, get_context("spawn"), end_with, (os.getpid(),)) as processes:
         parts = {processes.submit(compiling.compile_part, what): what for what in compiling.PARTS}
         for number, part in enumerate(as_completed(parts), 1):
             print(f"{number}/{len(parts)} {parts[part]}: {part.result():.1f} s", flush=True)

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from bufgym.cli.options import Count, Natural, PolicyFile, one_policy
+from bufgym.cli.options import Count, PolicyFile, PortNumber, one_policy
 from bufgym.ground.errors import BufgymError
 from bufgym.robot import commands as live
 
@@ -15,7 +15,7 @@ from bufgym.robot import commands as live
 @dataclass(frozen=True)
 class SessionOptions:
     to: str = "ws://127.0.0.1:7420"
-    """URL of the relay."""
+    """URL of the relay; others behind commas stand in while it is away."""
     token_file: str | None = None
     """Who this is (default: $BUFGYM_RELAY_TOKEN)."""
     ca: str | None = None
@@ -110,17 +110,20 @@ async def foxglove(
     *,
     session: SessionOptions = SessionOptions(),
     name: str = "foxglove",
-    port: Annotated[Natural, Parameter(help="Where they connect to.")] = 8765,
+    port: Annotated[PortNumber, Parameter(help="Where they connect to.")] = 8765,
     topics: str = "^/",
+    origins: list[str] | None = None,
 ) -> None:
     """Run a viewer that Foxglove and Lichtblick connect to; Ctrl-C ends it.
 
     Args:
         topics: Topics to show, a regular expression.
+        origins: Other web pages that may connect, as https://lichtblick.example.org.
     """
     from bufgym.relay.foxglove import Bridge
     from bufgym.relay.session import Session
 
-    bridge = Bridge(Session(session.to, name, say=say, **session.settings()), port, pattern=topics)
+    viewer = Session(session.to, name, say=say, **session.settings())
+    bridge = Bridge(viewer, port, pattern=topics, origins=origins or ())
     live.say(f"ws://{bridge.address}: Foxglove, Lichtblick -> {session.to}; Ctrl-C ends it")
     await bridge.run()

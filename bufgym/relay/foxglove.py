@@ -4,7 +4,6 @@ Foxglove and Lichtblick connect to it as to any robot. Messages of ROS go throug
 pictures become CompressedImage, and poses also transforms, so that the map shows every robot where it is.
 """
 
-import asyncio
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -12,12 +11,14 @@ from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import ros_messages, wire
-from bufgym.relay.config import Foxglove, Rule
+from bufgym.relay.config import Config, Foxglove
+from bufgym.relay.gate import Gate, hidden_host
 from bufgym.relay.recorder import SCHEMAS
 from bufgym.relay.rules import FOXGLOVE, Permissions
 from bufgym.relay.session import Session
 from bufgym.robot.extra import needs
 
+OWN_PAGES: Final = ("https://app.foxglove.dev", "file://")  # The web page, and programs that are pages of their own
 MAX_CHANNELS: Final = 10_000  # Limit on channels, which clients open by topic and type; further channels are not shown
 _TRANSFORMS: Final = ("/tf", "", "")
 _PICTURES: Final = ("jpeg", "png")
@@ -27,21 +28,26 @@ _ROBOT: Final = re.compile(r"/robots/([^/]+)/")
 class Screen:
     """Foxglove's server; each message given to ``show`` goes to everybody connected."""
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, origins: Sequence[str] = ()) -> None:
+        """Web pages of ``origins`` may connect, besides Foxglove's own and programs that are no page."""
         with needs("foxglove", "foxglove", "bufgym.relay"):
             import foxglove
         self._foxglove = foxglove
         self._context = foxglove.Context()
+        inside = hidden_host()  # as the library asks for no origin
+        self._server = foxglove.start_server(name="bufgym relay", host=inside, port=0, context=self._context)
         try:
-            self._server = foxglove.start_server(name="bufgym relay", host=host, port=port, context=self._context)
-        except Exception as error:  # the library has its own error types
-            raise BufgymError(f"{host}:{port}: Foxglove's server: {error}") from None
-        self.address = f"{host}:{self._server.port}"
+            self._gate = Gate(host, port, (inside, self._server.port), {*OWN_PAGES, *origins})
+        except OSError as error:
+            self._server.stop()
+            raise BufgymError(f"{host}:{port}: Foxglove's server: {error.strerror or error}") from None
+        self.address = f"{host}:{self._gate.port}"
         """Address where it listens."""
         self._channels: dict[tuple[str, str, str], Any] = {}
 
     def close(self) -> None:
         """Disconnect everybody and stop."""
+        self._gate.close()
         self._server.stop()
 
     def show(self, message: wire.Message) -> None:
@@ -100,8 +106,10 @@ class Screen:
 class Bridge:
     """A screen for the messages that ``session`` receives on topics that contain ``pattern``."""
 
-    def __init__(self, session: Session, port: int, host: str = "127.0.0.1", pattern: str = "^/") -> None:
-        self._screen = Screen(host, port)
+    def __init__(
+        self, session: Session, port: int, host: str = "127.0.0.1", pattern: str = "^/", origins: Sequence[str] = ()
+    ) -> None:
+        self._screen = Screen(host, port, origins)
         self.address = self._screen.address
         self.session = session
         session.subscribe(pattern, self._screen.show)
@@ -111,15 +119,15 @@ class Bridge:
         try:
             await self.session.run()
         finally:
-            await asyncio.to_thread(self._screen.close)
+            self._screen.close()
 
 
 class Window(Screen):
     """The relay's own screen, which shows what rules with ``foxglove`` allow."""
 
-    def __init__(self, settings: Foxglove, rules: Sequence[Rule]) -> None:
-        super().__init__(settings.host, settings.port)
-        self._permissions = Permissions(rules, FOXGLOVE)
+    def __init__(self, settings: Foxglove, config: Config) -> None:
+        super().__init__(settings.host, settings.port, config.origins)
+        self._permissions = Permissions(config.rules, FOXGLOVE)
 
     def __call__(self, message: wire.Message) -> None:
         """Show a message if a rule allows it."""

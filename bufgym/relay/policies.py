@@ -9,31 +9,35 @@ import contextlib
 import functools
 import signal
 import threading
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.processes import compiling
-from bufgym.relay.config import SKIP_PENDING
+from bufgym.relay.plain import PLAIN, Latest
 
 if TYPE_CHECKING:
     from bufgym.policies.registry import Policy
     from bufgym.robot import PolicyQueue
 
+Rule: TypeAlias = "Policy | type[Latest]"
 PLACES: Final = 32  # Topics that share a queue, where the policy knows topics
 ROOM: Final = 64  # Messages between two cleanups of a queue's bookkeeping; few, because there are many queues
 _COMPILING: Final = threading.Lock()
 
 
-def policy(name: str) -> Policy:
+def policy(name: str) -> Rule:
     """Find the policy of this name; it may have settings, as in ``decimate:every=2``."""
+    if name in PLAIN:
+        return PLAIN[name]
     from bufgym.policies import registry
-    from bufgym.relay import skip_pending
 
-    return skip_pending.POLICY if name == SKIP_PENDING else registry.get(name)
+    return registry.get(name)
 
 
-def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:
+def new_queue(chosen: Rule, capacity: int) -> PolicyQueue | Latest:
     """Make a queue for up to ``PLACES`` topics, or for one topic if the policy knows none."""
+    if isinstance(chosen, type):
+        return chosen(capacity)
     from bufgym.model.topics import Topic
     from bufgym.robot import PolicyQueue
 
@@ -42,9 +46,10 @@ def new_queue(chosen: Policy, capacity: int) -> PolicyQueue:
 
 
 @functools.lru_cache(256)
-def warm(name: str) -> Policy:
+def warm(name: str) -> Rule:
     """Compile the policy of this name by sending one message through a queue; return the policy."""
-    return compiled(policy(name))
+    chosen = policy(name)
+    return chosen if isinstance(chosen, type) else compiled(chosen)
 
 
 def compiled(chosen: Policy) -> Policy:
@@ -56,7 +61,8 @@ def compiled(chosen: Policy) -> Policy:
     with _COMPILING:
         if not kept(chosen) and compiling(__name__, "fill_cache", chosen.name) < 0:
             raise BufgymError(f"policy {chosen.name}: stopped while it was compiled")
-        return _used(chosen)
+        _used(chosen)
+        return chosen
 
 
 def kept(chosen: Policy) -> bool:
@@ -78,10 +84,9 @@ def fill_cache(name: str) -> None:
         _used(policy(name))
 
 
-def _used(chosen: Policy) -> Policy:
+def _used(chosen: Rule) -> None:
     """Send one message through a queue with this policy."""
     queue = new_queue(chosen, PLACES)
-    queue.put(b"", 1)
+    queue.put(b"", 1, topic=0)
     queue.get(0)
     queue.gone()
-    return queue.policy

@@ -19,7 +19,7 @@ from bufgym.relay.subscriber import Subscription
 from bufgym.relay.wire import RefusedError, WireError
 
 if TYPE_CHECKING:
-    from bufgym.policies.registry import Policy
+    from bufgym.relay.policies import Rule as Chosen
 
 MAX_PRIORITY: Final = 1e6
 MAX_CAPACITY: Final = 1_000  # Largest L of a subscriber's queue
@@ -134,7 +134,7 @@ def check_json(message: wire.Message) -> None:
 
 
 def subscription(
-    said: Mapping[str, Any], config: Config, policy: Policy | None, temporary: bool, left_bytes: Callable[[], int]
+    said: Mapping[str, Any], config: Config, policy: Chosen | None, temporary: bool, left_bytes: Callable[[], int]
 ) -> Subscription:
     """The subscription that is asked for, under a ``policy`` that the configuration names, or else None.
 

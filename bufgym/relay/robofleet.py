@@ -5,10 +5,6 @@ begins with ``__metadata``, a table of ``type`` and ``topic``. The rest is the m
 unchanged. A message of type ``amrl_msgs/RobofleetSubscription`` is a request to the relay: ``action`` 1 subscribes to
 ``topic_regex`` and 0 unsubscribes. Text frames are JSON, and ``{"id_token": ...}`` gives the identity. There is no
 hello and no ack.
-
-The same rules hold as for all clients, while Robofleet's server lets everybody receive topics that end in ``/status``.
-Robofleet's clients receive only messages of Robofleet's clients: flatbuffers are not converted to or from other
-encodings.
 """
 
 import asyncio

@@ -22,7 +22,7 @@ from websockets.typing import Subprotocol
 from bufgym.ground.errors import BufgymError
 from bufgym.relay import connection, pages, policies, wire
 from bufgym.relay.caller import Caller
-from bufgym.relay.config import Config
+from bufgym.relay.config import POLICIES, Config
 from bufgym.relay.connection import HELLO_BYTES, Connection
 from bufgym.relay.hub import CONNECTED, STATUS, Hub
 from bufgym.relay.identity import Verifier, server_context
@@ -181,7 +181,7 @@ class Server:
         if self.config.foxglove is not None:
             from bufgym.relay.foxglove import Window  # not at start-up: few need it
 
-            self.window = Window(self.config.foxglove, self.config.rules)
+            self.window = Window(self.config.foxglove, self.config)
             self.hub.own.append(self.window)
         try:
             self._server = await serve(
@@ -219,7 +219,8 @@ class Server:
 
     def _warm(self) -> None:
         for name in self.config.policies:
-            policies.policy(name)  # raises an error if there is none
+            if name not in POLICIES:
+                policies.policy(name)  # raises an error if there is none
         policies.warm(self.config.policies[0])
 
     async def warm(self) -> None:

@@ -1,6 +1,10 @@
 """A session at a relay: keeps a connection, subscribes, and sends commands that arrive exactly once.
 
 This is all that a viewer needs. ``client.RobotClient`` adds a queue for a robot's messages.
+
+Of several relays that share topics, the first is the client's home. While it is away, the next one that answers stands
+in for it: messages and subscriptions go over that one until home is back. No_drop messages and durable subscriptions
+wait for home, which alone knows what has arrived.
 """
 
 import asyncio
@@ -15,15 +19,15 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import Any, Final, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
-from bufgym.relay import wire
+from bufgym.relay import address, wire
 from bufgym.relay.backoff import Backoff
 from bufgym.relay.unanswered import Unanswered
 from bufgym.relay.wire import RefusedError
-from bufgym.robot.sockets import connected, unacked_bytes
+from bufgym.robot.sockets import unacked_bytes
 from bufgym.robot.tasks import Tasks, until_one_ends
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
@@ -33,6 +37,10 @@ _MAX_FRAME_BYTES: Final = 2**26
 _PASSING: Final = ("store_full", "too_fast")  # Codes of refusals after which it is tried again
 
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
+
+
+class _HomeError(Exception):
+    """The first relay is back, and this connection is to another."""
 
 
 class Wish(NamedTuple):
@@ -77,15 +85,15 @@ class Session:
     ) -> None:
         """
         Args:
-            url: the relay's, ``ws://HOST:PORT`` or ``wss://HOST:PORT``.
+            url: the relay's, ``ws://HOST:PORT`` or ``wss://HOST:PORT``; of several with commas between them, the
+                first is home, and the others stand in while it is away.
             name: sender's name as others see it.
             token: proof of identity if the relay wants one; ``token()`` finds it.
             tls: for ``wss``, with a client's certificate if the relay knows it by that (default: the system's).
             say: called with a line for each refusal and each connection's end.
         """
-        self.address = urlsplit(url)
-        if self.address.scheme not in ("ws", "wss") or not self.address.hostname:
-            raise BufgymError(f"{url}: must be ws://HOST:PORT or wss://HOST:PORT")
+        self._addresses = [address.parsed(one.strip()) for one in url.split(",")]
+        self._at = 0
         self.name = name
         self.connected = asyncio.Event()
         """Set while the relay has accepted the connection."""
@@ -102,11 +110,22 @@ class Session:
         self._no_drop: tuple[re.Pattern[str], ...] = ()
         self._unanswered = Unanswered()
         self._wanted = asyncio.Event()
-        self._received = 0
+        self._received = [0, 0]
+        """Number of the last no_drop message received from home and from the relay that stands in."""
         self._subscriptions: dict[str, Wish] = {}
         self._confirmed: set[str] = set()
         self._connection: Any = None
         self._tasks = Tasks()
+
+    @property
+    def address(self) -> SplitResult:
+        """The relay that it is connected to, or tries."""
+        return self._addresses[self._at]
+
+    @property
+    def stands_in(self) -> bool:
+        """Whether that is another than its home."""
+        return self._at > 0
 
     async def command(self, topic: str, data: Any, type: str = "") -> None:
         """Send ``data`` on a no_drop topic and wait until the relay holds it; it arrives exactly once.
@@ -146,7 +165,7 @@ class Session:
         except re.error as error:
             raise BufgymError(f"subscription {pattern!r}: no regular expression: {error}") from None
         self.ready.clear()
-        if self.connected.is_set():
+        if self.connected.is_set() and not (self.stands_in and durable):
             self._tasks.begin(self._say_it("subscribe", **fields))
 
     async def run(self) -> None:
@@ -157,7 +176,7 @@ class Session:
         """
         from websockets.exceptions import WebSocketException
 
-        backoff = Backoff()
+        backoff, self._home = Backoff(), Backoff()
         try:
             while True:
                 try:
@@ -165,7 +184,16 @@ class Session:
                         self._connection = await self._connect()
                         await self._greet()
                     backoff.connected()
+                    if not self.stands_in:
+                        self._home.connected()
                     await until_one_ends(*self._works())
+                except _HomeError:
+                    self._at = 0
+                    continue
+                except RefusedError as refused:
+                    if not self.stands_in:
+                        raise
+                    self.note(str(refused))
                 except (OSError, TimeoutError, wire.WireError, WebSocketException) as error:
                     # A relay that refuses this address says why in its HTTP answer.
                     page = getattr(getattr(error, "response", None), "body", None) or b""
@@ -177,7 +205,9 @@ class Session:
                     if self._connection is not None:
                         self._connection.transport.abort()
                         self._connection = None
-                await asyncio.sleep(backoff.delay_s())
+                self._at = (self._at + 1) % len(self._addresses)
+                if not self.stands_in:
+                    await asyncio.sleep(backoff.delay_s())
         finally:
             self._unanswered.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
@@ -193,13 +223,12 @@ class Session:
         from websockets.typing import Subprotocol
 
         secure = self.address.scheme == "wss"
-        host, port = self.address.hostname or "", self.address.port or (443 if secure else 80)
         return await connect(
             f"{self.address.scheme}://{self.address.netloc}{wire.PATH}",
-            sock=await connected(host, port),
+            sock=await address.reached(self.address),
             subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
             ssl=(self._tls or ssl.create_default_context()) if secure else None,
-            server_hostname=host if secure else None,
+            server_hostname=self.address.hostname if secure else None,
             compression=None,
             ping_interval=None,  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
             proxy=None,
@@ -211,10 +240,14 @@ class Session:
         await self._connection.send(wire.say(op, **fields))
 
     async def _greet(self) -> None:
-        hello: dict[str, Any] = {"version": wire.VERSION, "name": self.name, "session": self._session, "form": "binary"}
+        hello: dict[str, Any] = {"version": wire.VERSION, "name": self.name, "form": "binary"}
         if self._token is not None:
             hello["token"] = self._token
-        await self._say_it("hello", **hello, received=self._received, acked=self._unanswered.acked)
+        if self.stands_in:  # for a session that ends with the connection
+            self._received[1] = 0
+        else:
+            hello |= {"session": self._session, "received": self._received[0], "acked": self._unanswered.acked}
+        await self._say_it("hello", **hello)
         said = wire.heard(await self._connection.recv())
         if said["op"] == "refused":
             raise RefusedError(said["code"], f"{self.address.geturl()}: refused: {said['code']}: {said['why']}")
@@ -222,19 +255,33 @@ class Session:
             raise wire.WireError(f"op {said['op']!r}: must be welcome")
         self.welcome = said
         self._no_drop = tuple(re.compile(pattern) for pattern in said.get("no_drop", ()))
-        self._unanswered.resume(said["received"], max(1, said["window"]))
-        for subscription in self._subscriptions.values():
+        if not self.stands_in:
+            self._unanswered.resume(said["received"], max(1, said["window"]))
+        for subscription in self._asked:
             await self._say_it("subscribe", **subscription.fields)
         self.connected.set()
         self._confirm()
 
+    @property
+    def _asked(self) -> list[Wish]:
+        """The subscriptions that this relay is asked for."""
+        return [one for one in self._subscriptions.values() if not (self.stands_in and "durable" in one.fields)]
+
     def _confirm(self) -> None:
-        if self._confirmed.issuperset(self._subscriptions):
+        if self._confirmed.issuperset(one.fields["id"] for one in self._asked):
             self.ready.set()
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         """List the tasks that run while there is a connection."""
-        return [self._send_no_drop(), self._take_all()]
+        return [self._until_home() if self.stands_in else self._send_no_drop(), self._take_all()]
+
+    async def _until_home(self) -> None:
+        while True:
+            await asyncio.sleep(self._home.delay_s())
+            with contextlib.suppress(OSError, TimeoutError):
+                async with asyncio.timeout(PATIENCE_S):
+                    (await address.reached(self._addresses[0])).close()
+                raise _HomeError
 
     def _left_bytes(self) -> int | None:
         connection = self._connection
@@ -267,7 +314,7 @@ class Session:
         raise ConnectionResetError("the relay has closed the connection")
 
     async def _take(self, message: wire.Message) -> None:
-        if message.no_drop and message.seq <= self._received:
+        if message.no_drop and message.seq <= self._received[self.stands_in]:
             return  # it came before the connection broke
         for subscription in list(self._subscriptions.values()):
             if subscription.pattern.search(message.topic):
@@ -275,7 +322,7 @@ class Session:
                 if inspect.isawaitable(done):
                     await done
         if message.no_drop:
-            self._received = message.seq
+            self._received[self.stands_in] = message.seq
             await self._say_it("ack", seq=message.seq)
 
     def _answer(self, said: dict[str, Any]) -> None:

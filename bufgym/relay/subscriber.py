@@ -13,10 +13,10 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from bufgym.relay.patterns import Pattern
-from bufgym.relay.policies import PLACES, new_queue
+from bufgym.relay.plain import Latest
+from bufgym.relay.policies import PLACES, Rule, new_queue
 
 if TYPE_CHECKING:
-    from bufgym.policies.registry import Policy
     from bufgym.robot import Item, PolicyQueue
 
 MAX_QUEUES: Final = 64  # Limit on the queues of a subscription; further topics share queues
@@ -25,7 +25,7 @@ MAX_QUEUES: Final = 64  # Limit on the queues of a subscription; further topics 
 class Lane:
     """A queue, with a flag for a message of it on the connection."""
 
-    def __init__(self, queue: PolicyQueue, left_bytes: Callable[[], int]) -> None:
+    def __init__(self, queue: PolicyQueue | Latest, left_bytes: Callable[[], int]) -> None:
         self.queue = queue
         self.served_s = 0.0
         self.carried = False
@@ -36,7 +36,7 @@ class Lane:
         """Whether a message can be sent."""
         return not self.carried and self.queue.in_flight > 0
 
-    def take(self, now_s: float) -> Item | None:
+    def take(self, now_s: float) -> Item | Latest.Item | None:
         """Take the next message."""
         self.carried, self.served_s = True, now_s
         return self.queue.get(0)
@@ -53,7 +53,7 @@ class Subscription:
 
     id: str
     pattern: Pattern
-    policy: Policy
+    policy: Rule
     capacity: int
     _: KW_ONLY
     priority: float = 1.0

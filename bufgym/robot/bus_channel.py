@@ -8,15 +8,19 @@ announces its presence, and a sender that sees it go gives the connection up. An
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import os
 import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, Final, Protocol
+from weakref import WeakSet
 
-from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, header, whole
+from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, whole
 
 _MOST_WAITING: Final = 1024  # limit on frames waiting to be taken, more than a sender ever has unacked
+_LEAVE_S: Final = 3.0  # time for a library to leave when the program ends
+_aside_threads: WeakSet[threading.Thread] = WeakSet()
 
 
 class Bus(Protocol):
@@ -40,11 +44,11 @@ Open = Callable[[str, int, str, Hear, Peer], Bus]
 class BusChannel:
     """Frames between one sender and the receiver."""
 
-    def __init__(self, name: str, max_body_bytes: int = MAX_BODY_BYTES) -> None:
+    def __init__(self, name: str, max_body_bytes: int = MAX_BODY_BYTES, room: Room | None = None) -> None:
         self.name = name
         self.publish: Callable[[str, bytes], None] = lambda name, data: None
         self.on_close: Callable[[], None] = lambda: None
-        self._max_body_bytes = max_body_bytes
+        self._max_body_bytes, self._room = max_body_bytes, room or Room(_MOST_WAITING * max_body_bytes)
         self._loop = asyncio.get_running_loop()
         self._came: asyncio.Queue[bytes] = asyncio.Queue()
         self._there = asyncio.Event()
@@ -74,8 +78,10 @@ class BusChannel:
             self._loop.call_soon_threadsafe(do, *arguments)
 
     def take(self, data: bytes) -> None:
-        """Take data that arrived."""
-        self._came.put_nowait(data if self._came.qsize() < _MOST_WAITING else b"")
+        """Take data that arrived; hang up if too much waits."""
+        fits = self._came.qsize() < _MOST_WAITING and len(data) <= self._room.left_bytes
+        self._came.put_nowait(data if fits else b"")
+        self._room.left_bytes -= len(data) if fits else 0
 
     def peer(self, there: bool) -> None:
         """Note that the receiver is there or gone; its going ends the connection."""
@@ -90,6 +96,7 @@ class BusChannel:
 
     async def receive(self) -> Frame:
         data = await self._came.get()
+        self._room.left_bytes += len(data)
         if not data:
             raise ConnectionResetError("the peer has gone")
         return whole(data, self._max_body_bytes)
@@ -98,15 +105,19 @@ class BusChannel:
         return None
 
     def close(self) -> None:
+        while not self._came.empty():
+            self._room.left_bytes += len(self._came.get_nowait())
         self.on_close()
 
 
 class BusServer:
     """The receiver's end: a channel for each sender that speaks."""
 
-    def __init__(self, serve: Callable[[BusChannel], Coroutine[Any, Any, None]], begin: Any, max_body_bytes: int):
+    def __init__(
+        self, serve: Callable[[BusChannel], Coroutine[Any, Any, None]], begin: Any, max_body_bytes: int, room: Room
+    ):
         """``begin`` runs ``serve`` of a channel as a task."""
-        self._serve, self._begin, self._max_body_bytes = serve, begin, max_body_bytes
+        self._serve, self._begin, self._max_body_bytes, self._room = serve, begin, max_body_bytes, room
         self._channels: dict[str, BusChannel] = {}
         self._loop = asyncio.get_running_loop()
         self._bus: Bus | None = None
@@ -138,7 +149,7 @@ class BusServer:
         if channel is None:
             if len(data) < HEADER_BYTES or self._bus is None:
                 return
-            channel = self._channels[name] = BusChannel(name, self._max_body_bytes)
+            channel = self._channels[name] = BusChannel(name, self._max_body_bytes, self._room)
             channel.publish, channel.on_close = self._bus.publish, lambda: self._hang_up(name)
             self._begin(self._serve(channel))
         channel.take(data)
@@ -161,4 +172,13 @@ def _aside(do: Callable[..., None], *arguments: Any) -> None:
         with contextlib.suppress(Exception):
             do(*arguments)
 
-    threading.Thread(target=quietly, daemon=True).start()
+    thread = threading.Thread(target=quietly, daemon=True)
+    _aside_threads.add(thread)
+    thread.start()
+
+
+@atexit.register
+def _leave() -> None:
+    """Let the libraries leave: Zenoh's threads abort a program that ends under them."""
+    for thread in list(_aside_threads):
+        thread.join(_LEAVE_S)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final, Protocol
 
 from bufgym.robot.bus_channel import BusChannel
 from bufgym.robot.buses import BUSES
 from bufgym.robot.extra import needs
-from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, header, parse, whole
+from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, Room, header, parse, whole
 from bufgym.robot.sockets import connected, unacked_bytes
 
 PIECE_BYTES: Final = 16_384
@@ -33,24 +33,6 @@ class Channel(Protocol):
 
     def close(self) -> None:
         """Close at once."""
-
-
-class Room:
-    """Room for the bodies that arrive at one receiver at the same time, over all its connections."""
-
-    def __init__(self, most_bytes: int) -> None:
-        self.left_bytes = most_bytes
-
-    @contextlib.contextmanager
-    def taken(self, size_bytes: int) -> Iterator[None]:
-        """Take room until the block ends; raise a FrameError if too little is left."""
-        if size_bytes > self.left_bytes:
-            raise FrameError(f"body of {size_bytes} bytes: must wait, {self.left_bytes} are left for all senders")
-        self.left_bytes -= size_bytes
-        try:
-            yield
-        finally:
-            self.left_bytes += size_bytes
 
 
 class TcpChannel:

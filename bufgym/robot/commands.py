@@ -7,14 +7,14 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from bufgym.cli.options import Count, Least0, Natural, PolicyFile, Positive, one_policy
+from bufgym.cli.options import Count, Least0, PolicyFile, PortNumber, Positive, one_policy
 from bufgym.ground.errors import BufgymError
 
 PORT = 7410  # Default port of a receiver
 RECEIVER = f"127.0.0.1:{PORT}"
 
 Transport = Annotated[Literal["tcp", "websocket", "zenoh", "mqtt"], Parameter(help="What carries messages.")]
-Port = Annotated[Natural, Parameter(help="Where to listen.")]
+Port = Annotated[PortNumber, Parameter(help="Where to listen.")]
 Host = Annotated[str, Parameter(help="Address to listen on; by default this machine alone reaches it.")]
 
 REDRAW_S = 0.25  # Time between two drawings of a view

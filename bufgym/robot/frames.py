@@ -5,7 +5,9 @@ of the next message that it expects. So after a broken connection no message is 
 again. Each message (DATA) is then answered by an ACK with its number. A sender that has sent all says GOODBYE.
 """
 
+import contextlib
 import struct
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 GREETING, DATA, ACK, GOODBYE = 1, 2, 3, 4
@@ -64,3 +66,21 @@ def whole(data: bytes, max_body_bytes: int) -> Frame:
     if len(data) != HEADER_BYTES + body_bytes:
         raise FrameError(f"message of {len(data)} bytes: must be {HEADER_BYTES + body_bytes}, as its header says")
     return frame._replace(body=memoryview(data)[HEADER_BYTES:])
+
+
+class Room:
+    """Room for the bodies that arrive at one receiver at the same time, over all its connections."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.left_bytes = most_bytes
+
+    @contextlib.contextmanager
+    def taken(self, size_bytes: int) -> Iterator[None]:
+        """Take room until the block ends; raise a FrameError if too little is left."""
+        if size_bytes > self.left_bytes:
+            raise FrameError(f"body of {size_bytes} bytes: must wait, {self.left_bytes} are left for all senders")
+        self.left_bytes -= size_bytes
+        try:
+            yield
+        finally:
+            self.left_bytes += size_bytes

@@ -8,8 +8,6 @@ The program puts messages in. A transport takes out each message that the socket
     item = queue.get()                        # in the sending thread; or ``await queue.aget()``
     connection.send_and_wait_for_ack(item.message)
     queue.gone()
-
-The message that ``get`` returns has left the queue and can't be dropped any more; the next one follows after ``gone``.
 """
 
 import asyncio

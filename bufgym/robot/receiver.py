@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
+from bufgym.model.checks import whole
 from bufgym.robot.bus_channel import BusServer
 from bufgym.robot.buses import BUSES, MQTT_PORT
-from bufgym.robot.channels import TRANSPORTS, Channel, Room, TcpChannel, WebSocketChannel
+from bufgym.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
 from bufgym.robot.extra import needs
-from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError
+from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, Room
 from bufgym.robot.mcap_file import McapFile
 from bufgym.robot.sockets import free_port
 from bufgym.robot.tasks import Tasks
@@ -24,7 +25,7 @@ from bufgym.robot.tasks import Tasks
 MAX_STREAMS: Final = 64  # Number of latest senders that are remembered
 MAX_PEERS: Final = 2 * MAX_STREAMS  # Connections at a time, with those that senders have given up
 MAX_ARRIVING_BYTES: Final = 2**28
-"""Bodies that arrive at the same time over TCP; a sender beyond is hung up on, and tries again."""
+"""Bodies that arrive at the same time, but over WebSockets; a sender beyond is hung up on, and tries again."""
 IDLE_S: Final = 600.0
 """Time for a whole frame; later the connection is closed. A sender that is still there connects again."""
 _GREETING_S: Final = 20.0  # time for a sender's greeting; later the connection is closed
@@ -86,7 +87,7 @@ class Receiver:
             return int(listening.getsockname()[1])
         if transport in BUSES:
             port = port or (MQTT_PORT if transport == "mqtt" else free_port(host))
-            bus = BusServer(self._serve, self._tasks.begin, self._max_body_bytes)
+            bus = BusServer(self._serve, self._tasks.begin, self._max_body_bytes, self._room)
             self._ends.push_async_callback(self._tasks.end)
             self._ends.push_async_callback(bus.close)
             await bus.listen(BUSES[transport], host, port)
@@ -162,6 +163,7 @@ class Receiver:
 
 async def listener(host: str, port: int, receive_buffer_bytes: int | None = None) -> socket.socket:
     """Open a listening TCP socket."""
+    whole("port", port, 0, 2**16 - 1)
     found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
     family, kind, protocol, _, address = found[0]
     listening = socket.socket(family, kind, protocol)

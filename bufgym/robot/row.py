@@ -1,14 +1,6 @@
 """A sender that learns of its messages and its link as they happen: one row of the simulator's batch.
 
-A real link's progress is known only afterwards, as points (time, bytes carried so far). These points are the knots of a
-trace, and a trace is all that the simulator knows of a link. So a live run *is* a simulation over the trace that it
-measures. The row holds the last two knots. A log holds them all, and from it the simulator makes the same decisions
-again. Two rules make that exact:
-
-* An event at time t is told after the knot of time t, so that nothing depends on a future knot.
-* A message has left at the knot at which the link has carried exactly its last byte, and not before.
-
-Memory is bounded: settled messages are forgotten when their columns are needed.
+See docs/methods.md, "A live run is a simulation".
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,10 @@
 """Asyncio tasks that belong to one end of a connection and end with it."""
 
 import asyncio
-from collections.abc import Coroutine
-from typing import Any
+from collections.abc import Coroutine, Iterable
+from typing import Any, Final
+
+AGAIN_S: Final = 5.0  # Time after which a task that has been cancelled and goes on is cancelled again
 
 
 class Tasks:
@@ -25,9 +27,7 @@ class Tasks:
 
     async def end(self) -> None:
         """Cancel all tasks and wait for their end."""
-        for task in self._running:
-            task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+        await _ended(self._running)
 
 
 async def until_one_ends(*works: Coroutine[Any, Any, Any]) -> None:
@@ -38,6 +38,15 @@ async def until_one_ends(*works: Coroutine[Any, Any, Any]) -> None:
         for task in done:
             task.result()
     finally:
-        for task in tasks:
+        await _ended(tasks)
+
+
+async def _ended(tasks: Iterable[asyncio.Task[Any]]) -> None:
+    """Cancel tasks until all have ended; ``asyncio.wait_for`` of Python 3.11, in libraries, may lose a cancellation."""
+    waiting = set(tasks)
+    while waiting:
+        for task in waiting:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        done, waiting = await asyncio.wait(waiting, timeout=AGAIN_S)
+        for task in done:
+            _ = task.cancelled() or task.exception()  # which asyncio would report as never retrieved

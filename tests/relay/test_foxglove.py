@@ -1,5 +1,7 @@
 """Foxglove's protocol, as Foxglove speaks it: channels are advertised, and their messages come."""
 
+import asyncio
+import contextlib
 import json
 import struct
 from typing import Any
@@ -12,6 +14,7 @@ from relay_cases import ALL, Corner, client, relay, settings, until, within
 pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
 
 from websockets.asyncio.client import connect
+from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
 from bufgym.ground.errors import BufgymError
@@ -109,7 +112,25 @@ async def test_without_a_rule_it_shows_nothing(monkeypatch: pytest.MonkeyPatch) 
     assert [message.topic for message in shown] == ["/robots/r/text"]
 
 
-def test_strangers_cannot_fill_it(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_only_pages_that_are_named_get_in() -> None:
+    """A program says no origin; a page of any other server is refused, and so is what is no request."""
+    screen = Screen("127.0.0.1", 0, ["https://lichtblick.example.org"])
+    url, spoken = f"ws://{screen.address}", [Subprotocol("foxglove.sdk.v1")]
+    for origin in (None, "https://app.foxglove.dev", "https://lichtblick.example.org"):
+        async with connect(url, subprotocols=spoken, proxy=None, origin=origin) as viewer:
+            assert json.loads(await viewer.recv())["op"] == "serverInfo"
+    for origin in ("https://evil.example.org", "null", "https://app.foxglove.dev.example.org"):
+        with pytest.raises(InvalidStatus, match="HTTP 403"):
+            await connect(url, subprotocols=spoken, proxy=None, origin=origin)
+    reader, writer = await asyncio.open_connection(*screen.address.split(":"))
+    writer.write(bytes(2**17))
+    with contextlib.suppress(ConnectionError):
+        assert not await reader.read()
+    screen.close()
+    await until("an end", lambda: not screen._gate._open)
+
+
+async def test_strangers_cannot_fill_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bufgym.relay.foxglove.MAX_CHANNELS", 3)
     screen = Screen("127.0.0.1", 0)
     for k in range(9):

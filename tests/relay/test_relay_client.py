@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import re
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 from loop_cases import beside, compiled
 from refusal_cases import refuse
-from relay_cases import Corner, relay, settings, until, wait, within
+from relay_cases import Corner, client, relay, settings, until, wait, within
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
@@ -21,6 +22,7 @@ from bufgym.relay.session import Session, security, token
 from bufgym.relay.unanswered import Unanswered
 from bufgym.relay.wire import Message, RefusedError
 from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.sockets import free_port
 from bufgym.traces import Trace
 
 
@@ -169,6 +171,41 @@ async def test_a_message_is_on_its_way_until_the_relay_answers_the_ping_behind_i
         assert (robot.queue.in_flight, len(pongs)) == (2, 3)
 
 
+@compiled
+async def test_another_relay_stands_in_while_home_is_away(tmp_path: Path) -> None:
+    """Pictures and ordinary subscriptions go over it. Commands wait for home, and arrive there once."""
+    ours, camera, command = (
+        settings(port=free_port("127.0.0.1"), folder=tmp_path),
+        "/robots/r/camera",
+        "/robots/r/command",
+    )
+    commands, news = list[int](), list[bytes]()
+    async with relay() as other, client(other.port) as viewer:
+        urls = f"ws://127.0.0.1:{ours.port},ws://127.0.0.1:{other.port}"
+        robot = RobotClient(urls, "r", topics=(Topic(camera),), policy="drop-oldest")
+        robot.subscribe(f"^{command}$", lambda one: commands.append(json.loads(bytes(one.payload))), durable=True)
+        robot.subscribe("^/news$", lambda one: news.append(bytes(one.payload)))
+        await viewer.subscribe("camera")
+        async with within("both relays"), beside(robot.run()):
+            async with relay(ours):
+                await until("home", lambda: robot.ready.is_set() and not robot.stands_in)
+            await until("the other", lambda: robot.ready.is_set() and robot.stands_in)
+            robot.publish(camera, b"picture", "raw")
+            assert bytes((await viewer.next()).payload) == b"picture"
+            await viewer.put("/news", b"all is well")
+            await until("the news", lambda: news)
+            await viewer.command(1, command)
+            assert (await viewer.next())["code"] == "no_receiver"
+            waiting = asyncio.ensure_future(robot.command("/robots/other/command", 7))
+            async with relay(ours) as home, client(home.port) as operator:
+                await operator.subscribe("/robots/other/command")
+                await operator.acked(command, 1)
+                await waiting
+                await until("the command", lambda: commands)
+                assert [one.payload for one in await operator.rest() if isinstance(one, Message)] == [b"7"]
+    assert commands == [1]
+
+
 async def test_who_is_not_let_in_is_told_why(corner: Corner) -> None:
     """An address without a rule is not talked to, and tries again; one whose token is no good gives up."""
     async with relay(settings(rules=())) as server:
@@ -186,7 +223,8 @@ def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setenv("BUFGYM_RELAY_TOKEN", "one")
     (tmp_path / "token").write_text("two\n")
     assert token() == "one" and token(tmp_path / "token") == "two"
-    refuse("robot:7420: must be ws://HOST:PORT", Session, "robot:7420", "a")
+    for url in ("robot:7420", "ws://a:99999", "ws://a:x", "ws://[::1"):
+        refuse(f"{re.escape(url)}: must be ws://HOST:PORT", Session, f"ws://b:1,{url}", "a")
     assert security() is None
     refuse("token: no certificate", security, certificate=str(tmp_path / "token"))
     refuse(r"subscription '\[': no regular expression", Session("ws://a:1", "a").subscribe, "[", print)

@@ -9,23 +9,29 @@ import itertools
 import random
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mutations import COUNT, SEED
 from refusal_cases import refuse
 from relay_cases import Corner, Server, relay, settings
 
 from bufgym import cli
 from bufgym.ground.errors import BufgymError
+from bufgym.model.topics import Topic
 from bufgym.relay import policies
-from bufgym.relay.config import POLICIES, Config, Foxglove, Rotation, Rule, load
+from bufgym.relay.config import Config, Foxglove, Rotation, Rule, load
 from bufgym.relay.hub import Hub, Outgoing
 from bufgym.relay.patterns import MAX_CHARACTERS, pattern
+from bufgym.relay.plain import Latest
 from bufgym.relay.quota import Bucket, Quotas
 from bufgym.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
 from bufgym.relay.store import StoredSession
 from bufgym.relay.subscriber import Subscription, next_lane
 from bufgym.relay.wire import Message, RefusedError
+from bufgym.robot.queue import PolicyQueue
 
 VERBS = ("send", "receive")
 
@@ -239,15 +245,21 @@ def test_the_policy_decides(policy: str, went: str) -> None:
     assert sent(one) == ["5"]
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-def test_each_policy_of_the_default_serves_several_topics(policy: str) -> None:
-    one = subscription(policy)
-    for k in range(3):
-        for topic in "ab":
-            one.offer(f"/{topic}", f"{topic}{k}", 10)
-    went = sent(one)
-    assert {str(message)[0] for message in went} >= ({"a"} if policy == "skip-pending" else {"a", "b"})
-    assert len(went) + one.dropped == 6
+@given(st.integers(1, 5), st.lists(st.integers(-2, 6), max_size=60))
+def test_the_default_is_robofleets_rule(capacity: int, steps: list[int]) -> None:
+    """Message for message: a step puts a message on a topic, or below 0 lets one go."""
+    topics = tuple(Topic(f"/{k}") for k in range(policies.PLACES))
+    both: tuple[Any, Any] = Latest(capacity), PolicyQueue("robofleet", capacity, topics=topics)
+    for number, topic in enumerate(steps):
+        if topic >= 0:
+            for queue in both:
+                queue.put(number, 10, topic=topic)
+        elif both[0].in_flight:
+            went = [queue.get(0).message for queue in both]
+            assert went[0] == went[1]
+            for queue in both:
+                queue.gone()
+        assert len({(len(queue), queue.dropped, queue.in_flight) for queue in both}) == 1
 
 
 def test_topics_of_a_policy_that_knows_none_do_not_push_each_other_out() -> None:

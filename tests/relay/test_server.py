@@ -25,8 +25,9 @@ from bufgym.relay.wire import Message
 
 
 def test_a_relay_listens_before_the_compiler_is_imported() -> None:
-    """Robots come back to one that was killed as soon as it listens; the policies follow in a thread."""
-    program = "import bufgym.relay.server, sys; print('numba' in sys.modules)"
+    """Robots come back to one that was killed as soon as it listens; its default rule needs no compiler at all."""
+    queue = "p.new_queue(p.warm('robofleet'), 8).put(b'', 1, topic=0)"
+    program = f"import sys; from bufgym.relay import policies as p, server; {queue}; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.strip() == "False"
 

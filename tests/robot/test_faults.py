@@ -22,7 +22,7 @@ from bufgym.robot.bus_channel import BusChannel, BusServer
 from bufgym.robot.buses import BUSES
 from bufgym.robot.channels import TRANSPORTS, TcpChannel
 from bufgym.robot.commands import Transport
-from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Frame, FrameError, header, parse
+from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Frame, FrameError, Room, header, parse
 from bufgym.robot.receiver import Received, Recording, listener
 from bufgym.robot.sender import Sender
 from bufgym.robot.shaped import ShapedLink
@@ -179,7 +179,7 @@ async def test_who_greets_before_the_receiver_has_its_bus_is_served() -> None:
     async def serve(channel: BusChannel) -> None:
         came.put_nowait(await channel.receive())
 
-    await BusServer(serve, tasks.begin, 1000).listen(opening, "", 0)
+    await BusServer(serve, tasks.begin, 1000, Room(1000)).listen(opening, "", 0)
     assert (await came.get()).kind == GREETING
     await tasks.end()
 

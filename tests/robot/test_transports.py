@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 import itertools
 import socket
+import subprocess
+import sys
 from typing import Any
 from unittest.mock import AsyncMock
 
@@ -16,13 +18,15 @@ from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.robot import PolicyQueue, replay, shaped
+from bufgym.robot.bus_channel import BusChannel
 from bufgym.robot.channels import TRANSPORTS
-from bufgym.robot.frames import DATA, GREETING, Frame, header
+from bufgym.robot.frames import DATA, GREETING, HEADER_BYTES, Frame, Room, header
 from bufgym.robot.log import Record
 from bufgym.robot.receiver import Received
 from bufgym.robot.runs import LiveRun, orders, table
 from bufgym.robot.sender import Sender
 from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.tasks import Tasks
 from bufgym.robot.validate import over, play, validate
 from bufgym.scenario import Episode, Uplink, messages
 from bufgym.traces import Trace
@@ -260,3 +264,39 @@ async def test_a_receiver_that_takes_no_byte_is_asked_again() -> None:
     await until(one.connected.is_set)
     running.cancel()
     assert [fault.endswith("and take messages") for fault in one.faults] == [True]
+
+
+async def test_what_waits_on_buses_has_a_limit_in_bytes() -> None:
+    """Room for 100 bytes: one channel has taken 60, so another's 60 end it; what waited there gives its room back."""
+    room = Room(100)
+    one, other = (BusChannel(name, room=room) for name in "ab")
+    frame = header(Frame(DATA, 0, body=bytes(60 - HEADER_BYTES))) + bytes(60 - HEADER_BYTES)
+    for channel in (one, other):
+        channel.take(frame)
+    assert len((await one.receive()).body) == 60 - HEADER_BYTES
+    with pytest.raises(ConnectionResetError):
+        await other.receive()
+    other.take(frame)
+    assert room.left_bytes == 40
+    other.close()
+    assert room.left_bytes == 100
+
+
+def test_a_program_ends_once_its_library_has_left() -> None:
+    """Zenoh's threads abort a program that ends under them."""
+    last = "import time; from bufgym.robot import bus_channel as b; b._aside(lambda: (time.sleep(0.3), print('left')))"
+    assert subprocess.run([sys.executable, "-c", last], capture_output=True, check=True).stdout == b"left\n"
+
+
+async def test_what_loses_its_cancellation_is_cancelled_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bufgym.robot.tasks.AGAIN_S", 0.01)
+
+    async def deaf() -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(60)
+        await asyncio.sleep(60)
+
+    tasks = Tasks()
+    tasks.begin(deaf())
+    await asyncio.sleep(0)
+    await tasks.end()

@@ -1,13 +1,6 @@
 """ROS 1: a policy rules the queue inside rospy, whose interface stays the same.
 
-    import bufgym.robot.ros1
-
-    bufgym.robot.ros1.install(policy="afr")  # before the first subscriber comes; the node stays as it is
-    publisher = rospy.Publisher("/camera", Image, queue_size=15)
-
-or, for an unmodified node,
-
-    python -m bufgym.robot.ros1 --policy learned --odom /odom NODE.py ARGS
+``install(policy="afr")`` or, for an unmodified node, ``python -m bufgym.robot.ros1 --policy afr NODE.py ARGS``.
 
 ``queue_size`` is L, and each subscriber has a queue of its own. Publishers without ``queue_size`` send at once in
 ``publish``, and ``queue_size=0`` is unbounded. Both, and the topics of ``UNTOUCHED``, stay rospy's.
