@@ -118,11 +118,7 @@ def uncompiled(folder: Path, arguments: list[str]) -> list[Stage]:
 def test(arguments: list[str]) -> list[Stage]:
     """What protects a commit."""
     folder = REPO / "build" / "test"
-    return [
-        *check(),
-        pytest("compiled", folder, "-m", "not nightly", *arguments),
-        *uncompiled(folder, arguments),
-    ]
+    return [*check(), pytest("compiled", folder, "-m", "not nightly", *arguments), *uncompiled(folder, arguments)]
 
 
 def nightly(arguments: list[str]) -> list[Stage]:

@@ -91,12 +91,7 @@ class Validation(BetweenUpdates):
     """
 
     def __init__(
-        self,
-        home: Path,
-        validations: Validations,
-        measure: Callable[[Any], Numbers],
-        message: str,
-        curve: Curve,
+        self, home: Path, validations: Validations, measure: Callable[[Any], Numbers], message: str, curve: Curve
     ) -> None:
         super().__init__()
         self.home, self.validations, self.measure, self.message, self.curve = home, validations, measure, message, curve

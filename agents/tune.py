@@ -63,10 +63,7 @@ GRIDS = {
         {"lifespan_s": (0.1, 0.2, 1, 2, 5, 20)},
         "from three frames of 30/s to the length of an outage; without an end it is drop-oldest",
     ),
-    "time-filter": Grid(
-        {"separation_s": (0.05, 0.2, 0.3, 0.5, 1, 2)},
-        "15 (one in two) to 0.5 frames/s of 30",
-    ),
+    "time-filter": Grid({"separation_s": (0.05, 0.2, 0.3, 0.5, 1, 2)}, "15 (one in two) to 0.5 frames/s of 30"),
     "codel": Grid(
         {"target_ms": (5, 50, 200, 1000), "interval_ms": (100, 500, 2000)},
         "the RFC's 5 and 100 ms suit packets of 1500 bytes; 230 kB take tens of ms, a queue of 25 a second",
@@ -79,19 +76,12 @@ GRIDS = {
         {"step": (0.01, 0.02, 0.1, 0.2, 0.5, 2, 4, 8, 16)},
         "x is in fields of view (up to 0.5: half of the picture is new) or in frames (from 2 on)",
     ),
-    "decimate": Grid(
-        {"every": (1.25, 1.5, 2, 4, 6, 10, 20)},
-        "24 to 1.5 frames/s of 30",
-    ),
+    "decimate": Grid({"every": (1.25, 1.5, 2, 4, 6, 10, 20)}, "24 to 1.5 frames/s of 30"),
 }
 """Grids of the tuned policies. At one end, such as a long lifespan or a small step, some become drop-oldest."""
 
 _TARGET = ("horizon_s", "short", "long", "link_s", "paced", "pace_s")
-AROUND = {
-    "target-gap": (),
-    "price-dp": (*_TARGET, "kappa", "tail", "price_threshold", "price_near"),
-    "gap-price": (),
-}
+AROUND = {"target-gap": (), "price-dp": (*_TARGET, "kappa", "tail", "price_threshold", "price_near"), "gap-price": ()}
 """Policies whose parameters are tried one at a time, and which; empty for all. ``price-dp`` has those of ``gap-price``
 too and reads only these."""
 FACTORS = (0.5, 0.7, 1.4, 2.0)

@@ -33,7 +33,7 @@ ON_TASKS = {
     "bufgym/Mapping-v0": (
         "bufgym.papers.perception.worth:mapping",
         "a made-up room is filmed: what are the frames worth?",
-    ),
+    )
 }
 """Id -> task, for environments whose reward is a robot's own task; they need the extra ``perception``."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_cases import fails, shown
+from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
@@ -212,5 +213,4 @@ def test_what_has_c_is_a_drop_rule_of_the_registry():
         assert not (policy.schedules or policy.drops_at_dequeue)
     with pytest.raises(BufgymError, match="policy codel: is asked when the socket is free"):
         recorded(policies.get("codel"), [random_episode(np.random.default_rng(0), 5)], 4, EXPONENTIAL)
-    with pytest.raises(BufgymError, match="policy afr: has no C"):
-        header(Policy("afr", lambda buffer, arrival, memory: -1), 8, EXPONENTIAL)
+    refuse("policy afr: has no C", header, Policy("afr", lambda buffer, arrival, memory: -1), 8, EXPONENTIAL)

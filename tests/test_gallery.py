@@ -1,38 +1,13 @@
-"""The gallery: films show what the simulator says, and the interactive page holds bufgym's own numbers."""
+"""The interactive page holds bufgym's own numbers."""
 
 from pathlib import Path
 
 import pytest
 from browser_cases import embedded, opened
 
-from bufgym.envs.render.scene import DELIVERED, DROPPED, QUEUED, SENDING
-from bufgym.scenario import Interruption
-from bufgym.scenario.numbered import draw
-from website import films, picture
+from website import films
 
 REPO = Path(__file__).resolve().parent.parent
-FILMS = REPO / "docs" / "gallery"
-MAX_ALL_BYTES = 2_000_000
-
-
-def test_an_interruption_second_by_second() -> None:
-    """T = 4, L = 2 under Drop Oldest: 3 evicts 1, 4 evicts 2; the link returns half a period after 4."""
-    scenario = Interruption(law="fixed", t_max=4, rate_hz=10)
-    (run,) = picture.play(["drop-oldest"], draw(scenario, 0), 2, scenario)
-    assert run.received.tolist() == [0, 3, 4, 5]
-    assert picture.states_at(run, 250_000).tolist() == [SENDING, QUEUED, QUEUED, -1, -1, -1]
-    assert picture.states_at(run, 300_000).tolist() == [SENDING, DROPPED, QUEUED, QUEUED, -1, -1]
-    assert picture.states_at(run, 900_000).tolist() == [DELIVERED, DROPPED, DROPPED, DELIVERED, DELIVERED, DELIVERED]
-    assert run.longest_gap_s == pytest.approx(0.3)
-    # Gaps of 3, 1 and 1 with V = 1 - 0.618^d.
-    assert run.h == pytest.approx(1 + (1 - 0.618**3) + 2 * (1 - 0.618))
-
-
-def test_the_films_in_docs_are_small_and_all_there() -> None:
-    sizes = {path.stem: path.stat().st_size for path in FILMS.glob("*.webp")}
-    assert set(sizes) == set(films.FILMS)
-    assert max(sizes.values()) < films.MAX_BYTES
-    assert sum(sizes.values()) < MAX_ALL_BYTES
 
 
 @pytest.mark.nightly

@@ -17,17 +17,7 @@ from agents.callbacks import Curve, checkpoints
 from agents.held_out import FixedEpisodes
 from agents.objectives import guided
 from agents.report import verdict
-from agents.settings import (
-    DQN,
-    PPO,
-    Cluster,
-    Environment,
-    Evolve,
-    GuidedPPO,
-    Learner,
-    SlotEnvironment,
-    Suites,
-)
+from agents.settings import DQN, PPO, Cluster, Environment, Evolve, GuidedPPO, Learner, SlotEnvironment, Suites
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.ground.errors import BufgymError

@@ -6,13 +6,14 @@ import html
 import math
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bufgym import policies, scenario
-from bufgym.benchmark import report, sources, summary, table, tasks
+from bufgym.benchmark import bootstrap, report, sources, summary, table, tasks
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
@@ -56,6 +57,7 @@ class Comparison:
     """The scenario or suite."""
     unranked: Mapping[str, str]
     """The policies that do not compete, with the reasons."""
+    page: Callable[[str], str]  # the page, for the command that it names
     plain: str  # the table as aligned text
     markdown: str
     html: str
@@ -96,6 +98,10 @@ class Comparison:
         if len(capacities) > 1:
             axes.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
         return axes
+
+    def report(self, path: str | Path, command: str = "bufgym.compare(...)") -> Path:
+        """Write the page of ``bufgym report`` to this file (extra ``report``); return its path."""
+        return report.save(self.page(command), Path(path))
 
     def __str__(self) -> str:
         return f"{self.about}\n\n{self.plain}"
@@ -176,27 +182,30 @@ def beside(
     task = tasks.of(stream)
     chosen = _with(chosen, rival, task)
     alone = all(policy.name != task.baseline for policy in chosen)
-    if alone and task.kind != "queue":
-        chosen = [*chosen, make_policy(task.baseline)]
+    chosen = [*chosen, make_policy(task.baseline)] if alone and chosen else chosen
     unranked, named = table.apart(chosen), "" if rival is None else rival.name
-    rows = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
+    played = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
     heading = about or label or scenario.about(stream)
+    page = partial(report.page_of, played, () if queue else chosen, unranked, stream, heading)
     if task.kind != "queue":
-        found = task.summary(rows, unranked, named)
-        shown = summary.table_of(found, {label: scenario.about(stream)}, ["", *task.notes(rows, found)])
-        return Comparison(rows, heading, unranked, *shown.forms())
-    floor = run([BASELINE], stream, capacities, seeds, label=label, bound=rival is not None, **queue) if alone else []
-    shown = table.of(rows, floor, unranked)
+        found = task.summary(played, unranked, named)
+        shown = summary.table_of(found, {label: scenario.about(stream)}, ["", *task.notes(played, found)])
+        return Comparison(played, heading, unranked, page, *shown.forms())
+    rows = [row for row in played if not (alone and row["policy"] == BASELINE)]
+    floor = [row for row in played if alone and row["policy"] == BASELINE]
+    found = task.summary(played, unranked, named)
+    cells = [cell for cell in found.scores.cells if cell.episodes > 1] if found.scores else []
+    behind = {(cell.capacity, cell.policy): bootstrap.written(cell.score, table.score)[1] for cell in cells}
+    shown = table.of(rows, floor, unranked, behind)
     if "score" in shown.head:
-        shown = shown._replace(notes=[table.SCORE, *shown.notes])
+        shown = shown._replace(notes=[table.SCORE, *[table.BRACKETS] * any(behind.values()), *shown.notes])
     texts = shown.forms()
     if rival is not None:
-        found = task.summary([*rows, *floor], unranked, named)
         paired = [quantity for quantity in found.quantities if quantity.key in ("share", "against")]
         notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
         more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
         texts = ["\n\n".join(both) for both in zip(texts, more.forms(), strict=True)]
-    return Comparison(rows, heading, unranked, *texts)
+    return Comparison(rows, heading, unranked, page, *texts)
 
 
 def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
@@ -227,4 +236,6 @@ def _on_suite(
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
         shown = [form(out, against) for form in (report.plain, report.markdown, report.html)]
-        return Comparison(rows, f"suite {name}", table.apart(chosen), *shown)
+        found = report.run_of(out)
+        page = lambda command: report.page.html(*found)  # noqa: E731  (which names its own command)
+        return Comparison(rows, f"suite {name}", table.apart(chosen), page, *shown)

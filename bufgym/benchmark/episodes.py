@@ -42,6 +42,8 @@ def _by_run(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, Cell], dict[Ru
         for key in ("scenario", "trace", "seed", "capacity", "policy", "qoi"):
             if row.get(key) is None:
                 raise BufgymError(f"rows[{number}]: no {key}")
+        if not math.isfinite(row["qoi"]):
+            raise BufgymError(f"rows[{number}]: qoi = {row['qoi']}: must be a finite number")
         cell, episode = (row["scenario"], row["capacity"]), (row["trace"], row["seed"])
         runs = groups.setdefault((row["policy"], cell), {})
         run = (row.get("training_seed"), episode)

@@ -3,18 +3,9 @@
 A *cell* is a scenario with a capacity, and an *episode* of it is a trace with a seed. Every policy meets the same
 episodes at every capacity of the scenario, so policies are compared episode by episode.
 
-Every interval is a paired percentile bootstrap over links (Efron and Tibshirani 1993, chapter 13). Links, which are
-traces, are drawn with replacement, each with all its seeds, and the statistic is computed again. One draw serves all
-capacities, all policies and the scenarios on the same links, see ``bootstrap.links_drawn``. For a policy trained
-several times, training seeds are drawn too. The draws depend only on the seed and the links, so neither the order of
-the rows nor the other policies change an interval. An interval describes fresh links; where a scenario has one link or
-none, fresh episodes.
-
-Two aggregates compare regrets over several cells. They differ, so each has one name everywhere:
-
-* *share of AFR's regret*: (sum over the cells of the policy's regret) / (sum over the cells of AFR's regret), a ratio
-  of sums. The cells are the discriminative ones unless a page names others.
-* *mean ratio*: the mean over the cells of (the policy's regret / the other's regret in this cell).
+Every interval is a paired percentile bootstrap over links (Efron and Tibshirani 1993, chapter 13), and depends neither
+on the order of the rows nor on other policies (``bootstrap.links_drawn``). docs/guide/suites.md says what it describes,
+and what *share of AFR's regret* and *mean ratio* are: each has one name everywhere.
 
 Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS 2021) and their library rliable.
 """

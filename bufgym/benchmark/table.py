@@ -138,6 +138,7 @@ SCORE = (
     " regret = 1 - QoI / the clairvoyant's"
 )
 """The line below a table with scores."""
+BRACKETS = "in brackets: 95 % intervals, for fresh links, or for fresh episodes of one link"
 REGRET_AT_MOST = "regret, at most"  # Title of regrets if some rest on an uncertified bound
 UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exact here: it is at most this"
 """The note below them."""
@@ -204,10 +205,16 @@ def apart(chosen: Iterable[Policy]) -> dict[str, str]:
     return {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
 
 
-def of(rows: RunRows, floor: RunRows = (), alone: Unranked = NOBODY) -> Table:
+def of(
+    rows: RunRows,
+    floor: RunRows = (),
+    alone: Unranked = NOBODY,
+    intervals: Mapping[tuple[int, str], str] = MappingProxyType({}),
+) -> Table:
     """Make the table of ``means``, with one line for policies that are the ``same``.
 
     Score and regret are left out if no row has them. ``floor`` and ``alone``, see ``apart``, are as in ``means``.
+    ``intervals`` has the text behind the score at (L, policy).
     """
     alike = same(rows, alone)
     others = {name for names in alike.values() for name in names}
@@ -217,7 +224,12 @@ def of(rows: RunRows, floor: RunRows = (), alone: Unranked = NOBODY) -> Table:
     inexact = any(row.get("certified") is False and row.get("regret") is not None for row in rows)
     titles = [REGRET_AT_MOST if c.key == "regret" and inexact else c.title for c in columns]
     by_capacity = [list(block) for _, block in itertools.groupby(entries, lambda entry: entry["capacity"])]
-    blocks = [("", [[c.write(entry[c.key]) for c in columns] for entry in block]) for block in by_capacity]
+
+    def written(entry: Mapping[str, Any], c: Column) -> str:
+        behind = intervals.get((entry["capacity"], entry["policy"]), "") if c.key == "score" else ""
+        return f"{c.write(entry[c.key])} {behind}".rstrip()
+
+    blocks = [("", [[written(entry, c) for c in columns] for entry in block]) for block in by_capacity]
     notes = [f"note: {policy} does not compete: {reason}" for policy, reason in alone.items()]
     notes += [*told_once(alike), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(rows)]
     return Table(titles, blocks, notes)

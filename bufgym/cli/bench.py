@@ -18,6 +18,7 @@ from bufgym.cli.options import (
     OutOptions,
     SuiteOptions,
     WhoOptions,
+    command_line,
     given,
     load_policies,
     loaded,
@@ -85,7 +86,10 @@ def bench(
     refuse(given(suite), "needs --suite")
     if drops is not None and workload.workload is None:
         raise BufgymError("--drops needs --workload")
-    _bench(options.scenario(who.seeds), who, buffer, out, drops, against, by_topic)
+    said: dict[str, Any] = {"policies": tuple(who.policies or ()) or None, "capacity": who.capacity, "seeds": who.seeds}
+    said |= {"against": against, **options.given(), **given(buffer), "policy_file": who.policy_file}
+    command = command_line("bufgym bench", **said, report=out.report)
+    _bench(options.scenario(who.seeds), who, buffer, out, drops, against, by_topic, command)
 
 
 def _bench(
@@ -96,6 +100,7 @@ def _bench(
     drops: str | None,
     against: str | None,
     by_topic: str | None,
+    command: str,
 ) -> None:
     from bufgym import policies
     from bufgym.benchmark import table, tasks
@@ -110,7 +115,7 @@ def _bench(
         chosen = [policy for policy in chosen if policy.privileged is None]  # see QueueTask.check
     by_name = topic_policy(by_topic, task, [policy.name for policy in chosen])
     rival = None if against is None else policies.get(one_policy(against))
-    file, folder = out.file(), out.folder()
+    file, folder, page = out.file(), out.folder(), out.page()
     capacity = who.capacity or (task.capacity,)
     seeds = who.seeds or (1 if made.recorded else task.seeds)
     queue: dict[str, Any] = given(buffer)
@@ -128,6 +133,8 @@ def _bench(
     if by_name is not None:
         print_topics(done.rows, by_name)
     _write(done, task, file, folder, out.format, bounds)
+    if page is not None:
+        print(f"\nwrote {done.report(page, command)}")
 
 
 def _about(made: Described, task: Task, seeds: int | None) -> str:

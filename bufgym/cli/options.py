@@ -11,6 +11,7 @@ from cyclopts import Group, Parameter
 
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, install, printable
+from bufgym.ground.libraries import library
 from bufgym.ground.units import bytes_of, rate_or_number
 
 MAX_EPISODES = 100_000  # Limit on episodes of each trace; memory holds a row for each, times policies and capacities
@@ -54,6 +55,7 @@ Bytes = Annotated[
 ]
 Rate = Annotated[float, checked(rate_or_number, lambda rate: 0 < rate < math.inf, "bytes/s > 0, or as in 20Mbit/s")]
 Natural = Annotated[int, checked(int, lambda number: number >= 0, "a whole number >= 0")]
+PortNumber = Annotated[int, checked(int, lambda number: 0 <= number < 2**16, "a whole number from 0 to 65535")]
 Seeds = Annotated[
     int, checked(int, lambda number: 1 <= number <= MAX_EPISODES, f"a whole number >= 1 and at most {MAX_EPISODES}")
 ]
@@ -121,6 +123,8 @@ class OutOptions:
     """Write rows and what was run into this folder, or rows alone into this .csv or .parquet file."""
     format: Literal["csv", "parquet"] | None = None
     """Format of the rows (default: parquet if it can)."""
+    report: str | None = None
+    """Write the page to this HTML file: ranking with intervals, charts, one episode (extra 'report')."""
 
     def file(self) -> Path | None:
         """The file of ``--out``; None for a folder or nothing. Another kind of file is an error."""
@@ -133,6 +137,17 @@ class OutOptions:
         file = checked_target(self.out)
         if not file.absolute().parent.is_dir():
             raise BufgymError(f"{self.out}: no folder to write this file to")
+        return file
+
+    def page(self) -> Path | None:
+        """The file of ``--report``; None without. What could not be written in the end is an error now."""
+        if self.report is None:
+            return None
+        library("jinja2", "report", "the report")
+        library("matplotlib", "report", "the report")
+        file = Path(self.report)
+        if file.is_dir() or file.suffix != ".html" or not file.absolute().parent.is_dir():
+            raise BufgymError(f"--report {self.report}: must be FILE.html in a folder that there is")
         return file
 
     def folder(self) -> Path | None:

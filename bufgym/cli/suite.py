@@ -36,7 +36,7 @@ def run_suite(
     from bufgym.benchmark.tasks import TASKS
     from bufgym.scenario import suites
 
-    suite, file = suites.get(options.suite or ""), out.file()
+    suite, file, page = suites.get(options.suite or ""), out.file(), out.page()
     task = TASKS[suite.kind]
     named, sources = loaded(who.policies)
     specs = named or task.default_policies(suite.name)
@@ -88,6 +88,8 @@ def run_suite(
         except KeyboardInterrupt:
             raise KeyboardInterrupt(*["the same command resumes it"] * (folder == Path(out.out or ""))) from None
         print(report.plain(folder, against))
+        if page is not None:
+            print(f"\nwrote {report.write(folder, page)}")
     if file is not None:
         print(f"\n{len(rows)} rows in {write_rows(rows, file, task.layout)}")
     elif out.out is not None:

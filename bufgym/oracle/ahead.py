@@ -1,9 +1,6 @@
 """The gain still attainable from any moment of an episode: the clairvoyant for states that policies reach.
 
-As in ``labels``, sizes are equal (b bytes) and C(t) counts the bytes that the link can carry. ``F(i, e)`` is the
-largest gain after message i if it is sent, ends at byte e, and no other message that arrived before it is kept. As a
-function of e it is a falling staircase. Message i's staircase follows from all later messages' staircases, so one
-backward sweep over the episode (``find_steps``) finds all of them exactly. ``from_queue`` adds the queued messages.
+See docs/methods.md, "The best from any moment on".
 """
 
 from typing import NamedTuple

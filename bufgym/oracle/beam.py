@@ -1,9 +1,6 @@
 """A good plan for messages of unequal sizes: beam search along the episode, guided by the priced programme.
 
-For each message the search keeps a few *states*, ways to send it last. A state has the byte at which the message ends,
-its gain, and the message and state before it. So the queue at a later arrival is known exactly: all messages of the
-state that have not begun by then. States are ranked by their gain, less the prices paid, plus the gain that the
-programme (``programme``) promises.
+See docs/methods.md, "The search for a plan of unequal sizes".
 """
 
 from typing import NamedTuple

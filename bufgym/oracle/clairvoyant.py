@@ -1,16 +1,6 @@
 """The clairvoyant: the best QoI that any policy could reach on an episode, knowing the whole link and workload.
 
-Let C(t) be the bytes that the link can carry by time t, b_i the size of message i and c_i = C(its arrival time). In
-hindsight a policy is the set of messages that it sent. If e is the end of the message sent before, message i begins at
-byte s_i = max(c_i, e) of the link and ends at e_i = s_i + b_i. The reason is that the socket sends one message at a
-time and never idles while a message waits. Rejecting all other messages at their arrival keeps the queue shortest. With
-equal sizes b, the queue (message i included) then holds ceil((s_i - c_i) / b) messages after arrival i. So there is
-room for i if and only if
-
-    s_i - c_i <= L b.
-
-``labels.py`` finds the best set under that condition. With unequal sizes the room left depends on which messages wait:
-``unequal.py`` finds a good set and a close upper bound.
+See docs/methods.md, "The clairvoyant".
 """
 
 from dataclasses import dataclass

@@ -1,10 +1,6 @@
 """The value of every action at a queue, combining the queued messages with ``ahead`` for later arrivals.
 
-A plan first sends some of the s messages queued after the action, then only later arrivals, for which F is known. A
-queue of s messages means s transmissions without a pause, whatever the policy decides: a decision exchanges one message
-per arrival and never shortens the queue. Let the t-th transmission begin at byte u_t. It can send message m only if m
-and s - t later messages were there before byte u_t. Plans without this condition give a bound, and nearly always they
-meet it anyway. If not, ``forced`` finds the best.
+See docs/methods.md, "The best from a queue on".
 """
 
 from typing import Any, NamedTuple

@@ -1,22 +1,6 @@
 """The dynamic programme behind the clairvoyant: which messages to send for the most information.
 
-Message i may be sent after message j, which ends at byte e of the link, if s = max(e, c_i) leaves s - c_i <= limit_i.
-It then ends at s + size_i and adds V(x_i - x_j). A *label* (end, gain) at message i is a way to send i last. A label is
-dominated by another at the same message that ends no later and has gained no less, as every continuation of the first
-also fits the second. Dropping dominated labels loses nothing, so the best label of all is the optimum.
-
-Two observations keep the labels few.
-
-*Idle time is never worth leaving out a message.* If some m between j and i could be sent whole before i arrives, the
-plan j, m, i ends where j, i ends and has gained no less, as V(a) + V(b) >= V(a + b). So j counts only if nothing else
-could have been sent in time after it.
-
-*Bounds.* With ends rounded down to a grid, the labels at a message are a fixed array. One backward sweep fills it with
-``future``, an upper bound of the gain to come. A label can be dropped if its gain and future together stay below a
-known reachable gain. The search first assumes that the optimum lies close to the upper bound. If it finds nothing
-there, it looks further down, at last from the gain of a plan that ``future`` itself has led to.
-
-Sizes are equal here; ``unequal`` handles others.
+See docs/methods.md, "The clairvoyant, messages of equal sizes".
 """
 
 from typing import NamedTuple

@@ -1,15 +1,6 @@
 """The online optimum: the best that any policy can do in one interruption whose length T it does not know.
 
-The model is ``bufgym.scenario.Interruption``. Message 0 is sent before, messages 1..T arrive one a period, and T + 1 is
-sent after; at most L are kept meanwhile. T has a known law; at each arrival a policy learns only that T is not smaller.
-The optimum is exact, by dynamic programming backwards over the sets of kept messages.
-
-Two facts keep the programme small. First, accepting an arrival is best while there is room. V is concave, so more
-messages never inform less, and a policy that keeps a superset can imitate every later decision. So only full queues
-need a decision: L of the messages 1..t after t arrivals. Second, sets are numbered in colexicographic order
-(combinatorial number system): the set p_1 < ... < p_L is number C(p_1 - 1, 1) + ... + C(p_L - 1, L), whatever t is.
-Sets without message t + 1 come before those with it, so values after t arrivals overwrite values after t + 1 in place.
-The decision on message t + 1 is numbered by the set of L + 1 messages; one of them must go.
+See docs/methods.md, "The online optimum".
 """
 
 import itertools

@@ -1,21 +1,6 @@
 """Messages of unequal sizes: a good plan, and a close upper bound.
 
-With unequal sizes the room left at an arrival depends on which messages wait, which a label (end, gain) cannot carry.
-So room gets a price (Lagrangian relaxation: Fisher, Management Science 27(1), 1981). A message that waits while message
-i arrives pays ``price_i``; in return every plan receives L x the sum of all prices. For any prices >= 0
-
-    max over all plans of  gain + sum over i of price_i (L - messages queued after arrival i)
-
-is an upper bound of the best plan's gain, as a plan that keeps to L loses nothing by it. The payment of message j
-depends only on the byte at which it begins, as j waits during the arrivals j, j + 1, ... before that byte. So the
-``programme`` finds the maximum. Under a byte limit B waiting bytes have prices too. As in ``labels``, leaving a message
-out while the link is idle is never worth it. This is used only if the message finds room whichever messages wait.
-On a coarser grid messages end no later than in truth, so the maximum does not fall and the bound holds on every grid.
-
-The plan comes from a beam search (``beam``) that the programme guides. Prices follow the subgradient (Held, Wolfe and
-Crowder, Mathematical Programming 6, 1974). They rise where the programme's own plan queues too much and fall where it
-leaves room. Steps have Polyak's length towards the best plan known, and are halved when the bound stands still. Every
-round gives a bound; the least of all is returned.
+See docs/methods.md, "The clairvoyant, messages of unequal sizes".
 """
 
 import math

@@ -1,13 +1,6 @@
 """Eq. 3-6 of the AFR paper tested on views of real frames: do the assumptions on V hold, and does it matter?
 
-The paper's V is a function of the distance d between two frames. It is 0 at 0 (Eq. 3), at most 1 (Eq. 4),
-non-decreasing (Eq. 5) and concave (Eq. 6). The paper calls Eq. 6 "a little strong". Here ``perception.views``
-measures V(i, j), the fraction of frame j that frame i has not seen, for every pair of frames of a recording. Eq. 3 and
-4 then hold by definition. Eq. 5 is tested at each frame i as V(i, i + 2d) >= V(i, i + d), and Eq. 6 as V(i, i + 2d) <=
-2 V(i, i + d). The distance is a number of frames or the camera's motion.
-
-To see whether it matters, we follow the paper's theorems: an interruption of T frames begins at frame i, with a queue
-of L messages. By the measured V we compare H of AFR, of Drop Oldest and of the best L frames in hindsight.
+See docs/methods.md, "The assumptions on V, on real frames".
 """
 
 from __future__ import annotations

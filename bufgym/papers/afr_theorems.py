@@ -1,17 +1,6 @@
 """Theorems of the AFR paper [wang2022afr], checked on the simulator for every L, T and V of a grid.
 
-"Every V" is checked exactly, not by sampling. H depends on V at integer gaps only. There a concave, non-decreasing V
-with V(0) = 0 is a sum of V(d) = min(d, D), D = 1, 2, ..., with weights >= 0. H is linear in V, so an inequality that
-holds for each min(d, D) holds for every V. All sums are then integers, and comparisons are exact.
-
-The ratio of Theorem 2 is not linear in V. But for gaps g that add up to T + 1 = (L + 1) m, the ratio sum V(g) / ((L +
-1) V(m)) is smallest for V(d) = min(1, d / m). With t = V(m), concavity gives V(g) >= t g / m for g <= m, and V(g) >= t
-for g >= m as V does not fall. The worst ratio over all V is therefore sum min(1, g / m) / (L + 1).
-
-We add to the paper's theorems a sharper bound, 2(sqrt((2L + 1) / (L + 1)) - 1), the
-minimum of the same ratio. About AFR's gaps (Appendix I): one pass of p merges gaps of r to gaps of 2r, so the largest
-gap between kept messages is at most twice the smallest. The gap at the edge, from the newest kept message to message T
-+ 1, is at most the smallest of these gaps.
+See docs/methods.md, "The theorems of AFR, exactly".
 """
 
 from __future__ import annotations

@@ -1,14 +1,6 @@
 """Camera views under four motions: three of the AFR paper, and a look aside along a corridor, which is ours.
 
-| motion | the view | V(d), the fraction of a view that is new d messages later |
-|---|---|---|
-| forward along a corridor | the area between the walls that the camera sees up to its range | d / D, then it bends |
-| moving back from a wall | a square of the wall that grows by the same factor with each message | 1 - b^d |
-| turning in place | an angle that turns by the same angle with each message | min(1, d / D) |
-| along a corridor | a stretch of the side wall that moves on by the same length with each message | min(1, d / D) |
-
-The overlap of two views is computed from their edges and compared with the formula. V is also checked against Eq. 3-6:
-it starts at 0, does not fall, stays at most 1 and is concave.
+See docs/methods.md, "Views under four motions".
 """
 
 from __future__ import annotations

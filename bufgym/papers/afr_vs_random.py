@@ -1,13 +1,6 @@
 """AFR against Random's expectation over every concave V, a claim that the AFR paper does not prove.
 
-Random drops the newcomer or one of the L queued messages, each with probability 1 / (L + 1) (Eq. 9). For a pair of
-messages i < j, the number m of messages still kept between them is therefore a Markov chain. A drop hits i or j with
-probability 2 / (L + 1), and a message between them with probability m / (L + 1). The chain gives the probability that i
-and j are neighbours among the kept messages. From that follow the expected number of gaps of each size and E[H],
-without sampling.
-
-As in `afr_theorems`, V(d) = min(d, D) for every D stands for every concave V. H is linear in V, and on integer gaps a
-concave, non-decreasing V with V(0) = 0 is a sum of these with weights >= 0.
+See docs/methods.md, "AFR against Random over every concave V".
 """
 
 from __future__ import annotations

@@ -1,12 +1,6 @@
 """Recordings, link and runs shared by Fig. 7 and 8 of the AFR paper when frames are really mapped and tracked.
 
-The paper streams 794 RGB-D frames at 30 Hz over car_0002. Here the same number of frames comes from a made-up room and,
-with ``--data``, from a Kinect recording of 7-Scenes. Each frame has its real encoded size. With ``--data`` the link is
-the paper's; otherwise it is a made-up fade. The link lasts as long as the stream and then repeats.
-
-Results depend strongly on where the fade meets the camera's motion. The paper shows one *alignment*, in which the link
-begins with the stream. We add a sweep that was fixed before any run: the stream begins k tenths of its length into the
-link, so the fade comes earlier by as much. k runs from 0, the paper's alignment, to ``offsets`` - 1.
+See docs/methods.md, "Mapping and tracking with the frames that arrive".
 """
 
 from __future__ import annotations

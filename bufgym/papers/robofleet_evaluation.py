@@ -1,12 +1,6 @@
 """Messages, sending programs and outcomes shared by Robofleet's Fig. 3 to 7.
 
-The paper [sikand2021robofleet] sends with n_T = 1 in its experiments, and so do we. Parameters that it leaves open are
-options of each figure. Runs differ only in the arrival jitter, up to a tenth of the period. Every sender meets the same
-arrivals.
-
-With ``live`` the same messages go over real sockets (``on_sockets``), in the fewer and shorter runs of a figure's
-``LIVE``. The simulation leaves out TCP, the bytes of pings and pongs, encoding time, and everything behind the server.
-Without TCP, sending resumes as soon as the link returns, unless a figure has an option for a silence.
+See docs/methods.md, "Robofleet's figures".
 """
 
 from __future__ import annotations

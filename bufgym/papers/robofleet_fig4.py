@@ -1,11 +1,6 @@
 """Fig. 4 of the Robofleet paper: time until latency is nominal again after a dropout.
 
-A sender's nominal latency is the median over messages received before the dropout. The sender has recovered once every
-further message received has at most ``factor`` times the nominal latency. Its recovery time runs from the link's return
-to the first of these messages, and is infinite if even the last message is later.
-
-The paper leaves open the dropout's length, the messages and the link's rate. So we sweep the length and the
-link, for one topic of each kind, at the rates of the paper's Fig. 6 and 7.
+See docs/methods.md, "Recovery after a dropout".
 """
 
 from __future__ import annotations

@@ -1,15 +1,6 @@
 """Middleware that cuts a message into fragments, and all must arrive: Zenoh, and DDS over UDP.
 
-A message that fits only in part is sent in part. Losing one fragment loses the message, yet its other fragments use up
-the link. On a link somewhat too slow for the stream, next to nothing may arrive. The sender here carries whole messages
-only. So each policy keeps an account (``Pipe``) of the bytes ahead of a newcomer, lost fragments included, and rejects
-a message that would lose a fragment. It uses a robot's knowledge: its queue, its clock and the transmitted part of the
-current message, which gives the rate of the link.
-
-Limits of this model. Lost fragments delay later decisions, not the queued messages. The rate is invisible while only
-fragments of lost messages would cross. It then counts as unchanged for `rate_memory_s`, a setting of this model and not
-of the program. Afterwards the link counts as free, and the next message measures it. So on a link that stays too slow,
-about one message in `rate_memory_s` arrives that in reality would not.
+See docs/methods.md, "Messages in fragments".
 """
 
 import math

@@ -1,15 +1,6 @@
 """Learned policies: a slot scorer's weights from a file, decided by a compiled forward pass. No torch, no code.
 
-One small network scores every candidate, a queued message or the newcomer. Its inputs are the features of the candidate
-and of the context (``model.observe``), so one set of weights serves every L; ``scoring`` has the formula. The *drop*
-network scores dropping the candidate. The *accept* network scores accepting the newcomer, where there is room. The
-policy takes the decision that scores highest; ties go to the oldest message. Under a byte limit a newcomer that would
-take the place of several messages is dropped, unless messages with no lower a score make room.
-
-The network decides at every decision. No rule stands beside it: what rules know, such as the link's rate or the mean
-motion, is among the fields that it may read.
-
-The file is safetensors with JSON metadata: reading it runs nothing.
+See docs/methods.md, "Slot scorers".
 """
 
 from dataclasses import dataclass, replace

@@ -12,17 +12,8 @@ to evict for the newcomer, 0 being the oldest. Settings are ``parameters``, whic
 sender. Both follow the order of the registration. ``arrival.uniform`` is a uniform draw in [0, 1) for policies that
 randomise; the functions themselves are deterministic.
 
-    from bufgym.policies import ACCEPT, REJECT, register
-
-    @register("keep-even", parameters={"every": 2}, memory={"count": 0})
-    def keep_even(buffer, arrival, memory):
-        "When the queue is full, every second newcomer replaces the oldest message; the others are rejected."
-        if len(buffer.slots) < buffer.capacity:
-            return ACCEPT
-        memory[0] += 1
-        return REJECT if memory[0] % buffer.parameters[0] else 0
-
-The name then works like a built-in policy's. With ``compile=True`` the same function runs compiled.
+docs/guide/own-policy.md has an example. The name then works like a built-in policy's. With ``compile=True`` the same
+function runs compiled.
 """
 
 from __future__ import annotations

@@ -1,20 +1,6 @@
 """Learned policies in files: safetensors with JSON metadata, which is read without running code.
 
-The file has the float32 tensors of ``learned.Weights`` by name. ``drop.skip`` is [inputs] and ``drop.bias`` [1]. Each
-hidden layer has ``drop.0.weight`` [inputs, outputs] and ``drop.0.bias`` [outputs]. ``drop.out`` is [outputs of the last
-layer]. The names ``accept.*`` follow. An agent that guides a rule has the one tensor ``guided.weight``
-(``guided``) or ``scheduler.weight`` (``guided_topics``) [outputs, inputs]. The header's metadata has one entry,
-``bufgym``, a JSON object that describes the file:
-
-    format        number of this format
-    name          the policy's
-    about         a sentence: what it does (may be absent)
-    fields        the observation's fields that it reads, in the order of the networks' inputs
-    observation   hash of what defines them (``bufgym.model.observe.FIELDS``, and those on board among them)
-    bufgym        version that wrote the file
-    sha256        of fields and tensors
-
-The author may add notes: the training command, seeds, suite, scores. A file is accepted whole or refused.
+See docs/methods.md, "The file of an agent".
 """
 
 import hashlib

@@ -2,13 +2,6 @@
 
 Scoring slots one by one builds knowledge of the problem in. A message's worth depends on its neighbours (the slot's own
 features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
-
-    from sb3_contrib import MaskablePPO
-    from bufgym.sb3 import SlotExtractor, SlotPolicy, make_vec_env
-
-    env = make_vec_env("bufgym/Uplink-v0", 256, capacity=8)
-    MaskablePPO(SlotPolicy, env, policy_kwargs={"width": 32})
-    MaskablePPO("MultiInputPolicy", env, policy_kwargs={"features_extractor_class": SlotExtractor})
 """
 
 from typing import Any

@@ -31,10 +31,7 @@ SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {
     "interruption": (Interruption, "one interruption of unknown length (AFR paper, Sec. III-B)"),
     "lte": (uplink_over_lte, "30 Hz RGB-D camera on a driving robot over the shipped synthetic LTE traces"),
     "topics": (client_over_lte, "the topics of Robofleet's example client over the shipped synthetic LTE traces"),
-    "afr-evaluation": (
-        afr_evaluation,
-        "AFR's evaluation: 794 frames at 30 Hz over car_0002 or a stand-in",
-    ),
+    "afr-evaluation": (afr_evaluation, "AFR's evaluation: 794 frames at 30 Hz over car_0002 or a stand-in"),
     "suite": (_suite, "the scenarios of a suite's split, one of them drawn for each episode"),
 }
 """Name -> (function or class that makes it, one line about it)."""

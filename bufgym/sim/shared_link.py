@@ -1,11 +1,6 @@
 """Processor sharing in whole bytes and microseconds: the link that the robots of a cell share.
 
-With n senders busy, one byte for each moves the cell n bytes along its trace. So the cell counts ``served``, the bytes
-given to a sender that is busy from the beginning. A message of b bytes that starts at S has been transmitted at
-``served`` = S + b, whoever else comes and goes. The message with the least such goal finishes next. When a sender
-joins, every busy sender is given the whole bytes that its share has come to. The rest, less than one byte for each,
-stays with the cell (in ``position``) and is shared among all who are busy from then on. So no byte of capacity is lost
-or given twice.
+See docs/methods.md, "A cell's link".
 """
 
 import functools

@@ -7,10 +7,6 @@ trace = markov_link("tram", seed=3)        # as recorded in trams
 motion = read_motion("freiburg1_desk.groundtruth.txt.gz")
 workload = read_workload("drive.mcap", topics=["/camera/*"], odom="/odom")
 
-This room holds `Trace`, `Motion` and `Workload`, and `shipped`, which loads them by name. `formats` reads and writes
-files, `generate` makes links and motions, `fit` fits links to recordings, and `datasets`
-fetches public recordings.
-
 An argument out of its range raises a BufgymError. A file that cannot be read or written, or that breaks a rule of its
 format, raises its subclass TraceError, whose message names the file, the line, the value and the rule.
 """

@@ -1,20 +1,6 @@
 """Fit the parameters of `generate.markov` to recordings: `bufgym trace fit FILES`.
 
-Everything is searched on grids or by a fixed number of steps and rounded, so the same recordings give the same file.
-
-- Rates: quantiles of the seconds that are neither in an outage nor beside one (of all at or above the threshold, if
-  those are under 60 s), over all recordings of a mode.
-- Memory: rates are correlated at lags of 1 to 60 s (pairs within a recording, about the mean of all). For each of some
-  place shares, level and fast part are the least squares fit to these correlations, weighted by the numbers of pairs.
-  The fit is repeated with what the generated links lack added to its target, because outages and the distribution of
-  the rates remove some correlation (indirect inference: C. Gourieroux, A. Monfort, E. Renault, J. of Applied
-  Econometrics 8(S1), 1993). The parameters whose links come nearest win, about the mean of all and about each
-  recording's own.
-- Lengths of outages: maximum likelihood of a discrete Lomax distribution.
-- Gaps between outages: expectation-maximisation for two geometric distributions. A gap cut off by a recording's end
-  counts as "at least as long"; what precedes its first outage, as a long gap.
-
-With under 10 outages, their lengths and rates are taken over all modes together, and gaps have a single distribution.
+See docs/methods.md, "How links are fitted to recordings".
 """
 
 import itertools

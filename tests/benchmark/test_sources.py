@@ -148,7 +148,7 @@ def stubborn(buffer, arrival, memory):
     return REJECT
 
 
-def test_a_scenario_by_name_or_made_and_policies_of_each_kind() -> None:
+def test_a_scenario_by_name_or_made_and_policies_of_each_kind(tmp_path: Path) -> None:
     done = bufgym.compare(["afr", stubborn], "interruption", capacity=[2, 4], seeds=3, t_max=20, progress=False)
     made = scenario.get("interruption", t_max=20)
     rows = run([policies.get("afr"), policies.get(stubborn)], made, [2, 4], 3, label="interruption")
@@ -157,9 +157,10 @@ def test_a_scenario_by_name_or_made_and_policies_of_each_kind() -> None:
     # The score needs Drop Oldest on the same episodes, though it is no row.
     head, *lines = done.table().splitlines()
     assert head.split()[:5] == ["policy", "L", "score", "QoI", "regret"]
-    assert [line.split()[0] for line in lines if line] == ["afr", "stubborn", "afr", "stubborn", "score:"]
+    assert [line.split()[0] for line in lines if line] == ["afr", "stubborn", "afr", "stubborn", "score:", "in"]
     assert done.table("markdown").startswith("| policy | L |") and str(done).startswith("interruption\n\n")
     assert done._repr_html_().count("<tr>") == 5
+    assert "<b>afr</b> is first" in done.report(tmp_path / "page.html").read_text()
 
 
 def test_the_paired_difference_to_a_policy() -> None:

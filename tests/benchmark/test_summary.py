@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from cli_cases import fails, shown
+from refusal_cases import refuse
 from sweep_cases import exactly
 from test_score import rows_of
 
@@ -196,8 +197,7 @@ def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     fails(["validate", "lte-v1/afr"], "docs/leaderboard.csv is that of bufgym's repository", capsys)
     fails(["leaderboard", "no-suite", "--file", path], "no-suite", capsys)
-    with pytest.raises(BufgymError, match=r"written to a \.csv file"):
-        leaderboard.write([], tmp_path / "board.txt")
+    refuse(r"written to a \.csv file", leaderboard.write, [], tmp_path / "board.txt")
 
 
 def test_the_published_rows_are_of_known_suites_and_policies() -> None:

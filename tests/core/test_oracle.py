@@ -8,6 +8,7 @@ import pytest
 from cases import VALUES
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
@@ -73,5 +74,4 @@ def test_as_a_policy_it_plays_one_interruption_only():
 def test_l_and_t_are_checked():
     for truth in (ideal, integer):
         for L, T in ((0, 5), (3, -1)):
-            with pytest.raises(BufgymError, match=f"oracle: L = {L}, T = {T}: need L >= 1 and T >= 0"):
-                truth(L, T, qoi.exponential())
+            refuse(f"oracle: L = {L}, T = {T}: need L >= 1 and T >= 0", truth, L, T, qoi.exponential())

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 from bufgym import oracle
 from bufgym.cli import main
@@ -65,8 +66,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     from bufgym.envs.expert import dataset
 
-    with pytest.raises(BufgymError, match="for equal sizes only"):
-        dataset.make("Uplink-v0", "random", 2, out=tmp_path, size_cv=0.5, **SHORT)
+    refuse("for equal sizes only", dataset.make, "Uplink-v0", "random", 2, out=tmp_path, size_cv=0.5, **SHORT)
     with pytest.raises(BufgymError, match="must be of the form"):
         dataset.make("Uplink-v0", "random", 2, out=tmp_path, name="no version!", regret=False, **SHORT)
     assert not [path for path in tmp_path.iterdir() if path.is_dir() and path.name != "bufgym"]

@@ -4,6 +4,7 @@ from collections import Counter
 from typing import Any
 
 import pytest
+from refusal_cases import refuse
 
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
 from bufgym.ground.errors import BufgymError
@@ -50,8 +51,7 @@ def test_fleets_have_one_too() -> None:
 
 @pytest.mark.parametrize("pool", [0, -1, 1.5, "many", True])
 def test_a_pool_is_a_whole_number(pool: Any) -> None:
-    with pytest.raises(BufgymError, match=r"pool = .*: must be a whole number from 1 to 1000000"):
-        SenderEnv(UPLINK, L, pool=pool)
+    refuse(r"pool = .*: must be a whole number from 1 to 1000000", SenderEnv, UPLINK, L, pool=pool)
 
 
 def test_a_reset_that_is_refused_touches_no_row() -> None:

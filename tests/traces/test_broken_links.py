@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from link_files import HEADER, UCC_HEADER, written
+from refusal_cases import refuse
 
-from bufgym.ground.errors import BufgymError, TraceError
+from bufgym.ground.errors import TraceError
 from bufgym.traces import FORMATS, Trace, describe, read_trace
 from bufgym.traces.datasets.unpack import unpack
 from bufgym.traces.formats import links, mahimahi
@@ -114,8 +115,7 @@ def test_a_format_must_be_known_and_said_where_two_fit(tmp_path: Path, monkeypat
         (tmp_path, "csv", "is a directory"),
         (tmp_path / "pipe", "csv", "must be a regular file"),
     ):
-        with pytest.raises(BufgymError, match=says):
-            read_trace(source, format=format)
+        refuse(says, read_trace, source, format=format)
 
 
 # Every recorded link agrees with STATS.csv of the recorded data: duration, mean, seconds under 500 KB/s, and the rest.

@@ -6,7 +6,6 @@ import hashlib
 import os
 import re
 import shutil
-import socket
 import threading
 import zipfile
 from pathlib import Path
@@ -54,8 +53,7 @@ def test_from_a_file(tmp_path: Path) -> None:
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
-        with pytest.raises(BufgymError, match=says):
-            fetch_dataset(dataset, tmp_path / "other", [tmp_path / name])
+        refuse(says, fetch_dataset, dataset, tmp_path / "other", [tmp_path / name])
         assert left(tmp_path / "other") == []
     with pytest.raises(BufgymError, match=r"ucc-4g: the address .* not known: fetch them by hand from https://www.ucc"):
         fetch_dataset("ucc-4g", tmp_path)
@@ -93,7 +91,6 @@ def test_the_table_says_what_is_known() -> None:
             assert remote.sha256 is None or re.fullmatch("[0-9a-f]{64}", remote.sha256)
             if "githubusercontent" in remote.address:
                 assert re.search("/[0-9a-f]{40}/", remote.address)  # a commit, not a branch that moves
-    assert datasets()["belgium-4g"].licence is None
 
 
 @pytest.mark.nightly
@@ -195,14 +192,6 @@ def test_redirections_and_names(site: Site, tmp_path: Path, monkeypatch: pytest.
     response.status_code, response.url, response.request = 302, "https://a/", PreparedRequest()
     response.headers["Location"] = "http://b/"
     refuse("https://a/: redirects to http://b/, which is not allowed", fetch._refuse_plain, response)
-
-    def unresolved(*arguments: object, **options: object) -> None:
-        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-
-    monkeypatch.setattr(socket, "getaddrinfo", unresolved)
-    monkeypatch.setenv("no_proxy", "*")
-    with pytest.raises(BufgymError, match=r"http://data\.example/x: no network, no such server, .*Name or service"):
-        get(site, tmp_path / "other", address="http://data.example/x")
 
 
 def test_a_full_disk_and_a_file_without_end(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

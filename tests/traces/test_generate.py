@@ -17,7 +17,7 @@ from refusal_cases import refuse
 
 from bufgym import policies, scenario, traces
 from bufgym.benchmark import drops
-from bufgym.ground.errors import BufgymError, TraceError
+from bufgym.ground.errors import TraceError
 from bufgym.traces import (
     Motion,
     Trace,
@@ -330,8 +330,7 @@ def test_the_drops_of_a_recording() -> None:
         ("drop-oldest", 2, 1, 1.0, "/odom", 0.0, 3.0),
         ("drop-newest", 2, 3, 3.0, "/odom", 2.0, 3.0),
     ]
-    with pytest.raises(BufgymError, match="must play a recording"):
-        list(drops.drops(chosen, scenario.Uplink(traces=(NOTHING,)), [1], 1))
+    refuse("must play a recording", list, drops.drops(chosen, scenario.Uplink(traces=(NOTHING,)), [1], 1))
 
 
 def test_an_episode_is_the_recording_with_x_of_its_own_or_from_elsewhere_or_from_the_number() -> None:

@@ -6,33 +6,57 @@ It reads a folder of ``bufgym bench --suite``. It simulates nothing and takes al
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from bufgym import policies
+from bufgym.benchmark import tasks
 from bufgym.benchmark.folder import SuiteRun, read
 from bufgym.benchmark.report import page, tables
+from bufgym.benchmark.rows import Row
 from bufgym.benchmark.summary import Summary
+from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
+from bufgym.policies import Policy
+from bufgym.scenario import about
+from bufgym.scenario.suites import Setting
 
-__all__ = ["html", "markdown", "plain", "write"]
+__all__ = ["html", "markdown", "page_of", "plain", "run_of", "save", "write"]
 
 
-def write(folder: str | Path) -> Path:
-    """Write ``report.html`` into the folder of a run; return its path.
+def write(folder: str | Path, target: Path | None = None) -> Path:
+    """Write the page of a run to ``target``, or as ``report.html`` into its folder; return its path.
 
     Raises:
         BufgymError: for a folder without a run, a broken file in it, rows that can't be scored, or where matplotlib or
             Jinja is not installed.
     """
-    run, summary = _read(folder)
-    text = page.html(run, summary)
-    target = run.folder / "report.html"
+    run, summary = run_of(folder)
+    return save(page.html(run, summary), target or run.folder / "report.html")
+
+
+def save(text: str, target: Path) -> Path:
+    """Write a page, whole or not at all; return its path."""
     with replaced(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return target
+
+
+def page_of(
+    rows: Sequence[Row], shown: Sequence[Policy], unranked: Mapping[str, str], stream: Any, heading: str, command: str
+) -> str:
+    """The page of rows of one scenario that is no suite's, with an episode of ``shown``. Errors as for ``write``."""
+    task, name = tasks.of(stream), rows[0]["scenario"] or "this stream"
+    rows = [{**row, "scenario": name} for row in rows]
+    manifest = {"task": task.kind, "suite": name, "split": "", "about": heading, "episodes": ""}
+    manifest |= {"bufgym": __version__, "made": "", "command": command, "unranked": unranked, "changes": {}}
+    manifest |= {"scenarios": {name: {"about": about(stream), "value": stream.value.name}}}
+    example = task.example(shown, rows, lambda row: Setting(stream, about(stream))) if shown else None
+    return page.html(*_summed(SuiteRun(Path(), manifest, rows, Path("rows"), example), None))
 
 
 def markdown(folder: str | Path, against: str | None = None) -> str:
@@ -40,17 +64,17 @@ def markdown(folder: str | Path, against: str | None = None) -> str:
 
     ``against`` is the policy that every other is compared with, by default ``best_rule``; empty for none.
     """
-    return tables.markdown(*_read(folder, against))
+    return tables.markdown(*run_of(folder, against))
 
 
 def html(folder: str | Path, against: str = "") -> str:
     """The ranking as an HTML table, for a notebook. Errors as for ``write``."""
-    return tables.html(_read(folder, against)[1])
+    return tables.html(run_of(folder, against)[1])
 
 
 def plain(folder: str | Path, against: str = "") -> str:
     """The summary as text, for a terminal. Errors as for ``write``."""
-    return tables.plain(*_read(folder, against))
+    return tables.plain(*run_of(folder, against))
 
 
 def best_rule(summary: Summary) -> str:
@@ -62,9 +86,13 @@ def best_rule(summary: Summary) -> str:
     return ""
 
 
-def _read(folder: str | Path, against: str | None = None) -> tuple[SuiteRun, Summary]:
+def run_of(folder: str | Path, against: str | None = None) -> tuple[SuiteRun, Summary]:
+    """Read a run and sum it up."""
+    return _summed(read(Path(folder)), against)
+
+
+def _summed(run: SuiteRun, against: str | None) -> tuple[SuiteRun, Summary]:
     """The run and its summary, scores in the order of the manifest's scenarios."""
-    run = read(Path(folder))
     try:
         summary = run.task.summary(run.rows, run.manifest["unranked"], against or "")
         if against is None and (rule := best_rule(summary)):

@@ -1,13 +1,6 @@
 """How Numba compiles kernels here: each is typed and translated once, and optimised only where Python calls it.
 
-By default Numba optimises every kernel together with all that it calls, and makes machine code of it. The innermost of
-a hundred nested kernels is then optimised a hundred times. Here the code of a *part*, a kernel inside another, stays as
-the translation made it. The kernel that Python calls links its parts, inlines them and optimises the *whole*, once.
-
-What each part pays, switched off alone, in time of the processor (5.9 s to compile the step of ``Uplink-v0``, 210 ns a
-step with n = 1024). Parts neither optimised nor made into machine code: 2.6 s. No entry from Python into parts: about
-3 s. Named tuples as one argument: 0.3 s. Fetching ahead: about 30 ns. ``njit`` alone: 15 s to compile an episode that
-takes 7 s here.
+See docs/methods.md, "Kernels in parts".
 """
 
 from typing import Any, cast

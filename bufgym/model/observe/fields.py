@@ -1,16 +1,6 @@
 """Observation fields and reward terms, one table each, from which spaces, code and docs are made.
 
-Every field is computed from the ``Buffer`` view and the arrival alone, that is from a robot's own buffer, clock,
-odometry and socket. Nothing comes from the server or the link's future.
-
-Every field lies in [0, 1] and is free of scale. Lengths g (of time, motion, bytes) appear as g / (g + r) with a stated
-reference r, so 0.5 means "as long as the reference". For gaps r is the *even spacing*: the distance from the message
-dequeued last to the newcomer, divided by L + 1. That is the gap between neighbours if L messages thin this stretch
-evenly (AFR's aim). So one set of weights serves every L and frame rate.
-
-With several topics a message's neighbours belong to its own topic. The even spacing is the distance from the topic's
-message dequeued last to its last arrival, divided by one more than its queued messages. Values are weighted: QoI is in
-units of the largest weight. Further fields describe the topics.
+See docs/methods.md, "What observation fields mean".
 """
 
 from dataclasses import dataclass

@@ -1,20 +1,6 @@
 """Observation fields and reward terms of one's own, by name: ``@field`` and ``@reward_term``.
 
-    from bufgym.model.observe import field, reward_term
-
-    @field("waiting", per="slot", unit="g/(g+r), r = 1 s", compile=True)
-    def waiting(buffer, arrival, k):
-        "time since slot k arrived; the newcomer is slot len(buffer.slots)"
-        arrival_us = arrival.arrival_us if k == len(buffer.slots) else buffer.slots[k].arrival_us
-        waited_us = buffer.now_us - arrival_us
-        return waited_us / (waited_us + 1_000_000)
-
-    @reward_term("drops", unit="messages", compile=True)
-    def drops(step, memory):
-        "minus the messages dropped in this step"
-        return -step.drops
-
-    env = gym.make("bufgym/Uplink-v0", fields=["rank", "loss", "waiting"], reward={"retained": 1, "drops": 0.1})
+docs/guide/yours-to-change.md has an example of each.
 
 Fields and terms take part only where they are named. Text that has to stand alone names ``module:function``, which
 imports the module that registers them. ``compile=True`` promises that Numba can compile the function.

@@ -1,13 +1,6 @@
 """Camera tracking by KinectFusion on the frames that arrived alone, and where it fails.
 
-The model begins with the first frame at its true pose. Each further frame is aligned, coarse to fine, with the model as
-seen from the frame before, and then fused into it at the pose found. There is no model of motion and no relocation. A
-camera that moves too far between two frames that arrived is lost, as it is for the robot's server.
-
-The papers do not define a tracking failure. Here a run fails at the first frame where the alignment finds too few
-pairs, so that the tracker knows that it is lost. It also fails where the step from the frame before is too far from
-the true step, so that the tracker is lost without knowing. Slow drift is no failure, because it depends on the
-recording's camera model.
+See docs/methods.md, "When a camera is lost".
 """
 
 from __future__ import annotations

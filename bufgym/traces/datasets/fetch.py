@@ -2,10 +2,7 @@
 
 Every file in the cache is complete and has the checksum that is known for it: pooch downloads and verifies it in a
 folder of its own (`.NAME.part`), from which it takes its place by one renaming. Each data set has a lock, so that one
-process fetches at a time; the others wait and then find the files.
-
-    <cache>/ucc-5g/5G-production-dataset.zip     as published
-    <cache>/ucc-5g/5G-production-dataset/...     unpacked
+process fetches at a time; the others wait and then find the files. An archive is unpacked beside itself.
 """
 
 import hashlib

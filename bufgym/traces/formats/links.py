@@ -1,22 +1,8 @@
 """Bandwidth traces from files, in the formats that public data sets come in.
 
-| format | a line | used by |
-|---|---|---|
-| `mahimahi` | ms, one 1500-byte packet each | mahimahi (`mahimahi.py` says how packets become capacity) |
-| `csv` | `t_ms,bytes,interval_ms` under that header; t_ms is the interval's END | bufgym's own; Belgium 4G |
-| `mbit` | seconds and Mbit/s separated by white space | Pensieve-cooked Norway HSDPA, Lumos5G, Solis WiFi |
-| `belgium` | epoch ms, ms since start, latitude, longitude, bytes, interval ms | raw Belgium 4G logs |
-| `rates` | `time_s,bytes_per_s` or `time,mbps` under that header; a rate holds until the next line | any tool |
-| `ucc` | under a header with Timestamp, DL_bitrate and UL_bitrate, kbit/s | UCC 4G and 5G data sets |
-| `nyu` | `0.57,Mbits/sec`, a line a second | NYU-METS |
-| `sabre` | JSON: `[{"duration_ms": 1000, "bandwidth_kbps": 33809}, ...]` | Sabre |
-| `nuttcp` | `3.1250 MB / 0.50 sec = 52.4220 Mbps ...`, with or without a stamp, remarks around them | nuttcp |
-| `iperf3` | JSON: an object with `intervals` | `iperf3 --json` |
-| `runs` | `Run 1`, then a line of Mbit/s each 0.1 s, or of times and one of Mbit/s | 5G mmWave uplinks |
-
-Any of them may be gzip'd. The format is recognised by the first line that is not blank, and stated in the trace's
-`source`; a line that fits two formats is an error. Blank lines are skipped. Every other line must follow its format
-exactly, because a wrong capacity is worse than none. Under the header of `rates` a time is in seconds or an ISO date.
+docs/guide/recordings.md has a table of them. Any may be gzip'd. The format is recognised by the first line that is not
+blank, and stated in the trace's `source`; a line that fits two formats is an error. Blank lines are skipped. Every
+other line must follow its format exactly, because a wrong capacity is worse than none.
 
 Limits beyond which a number counts as a mistake: 10**7 s in all, 86,400 s from one rate to the next, 10**12 bytes in an
 interval, 10**6 Mbit/s. `text.py` has the limits of text files.

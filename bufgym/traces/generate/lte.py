@@ -1,14 +1,6 @@
 """LTE-like links from a seed, for users without recordings.
 
-Shape and numbers come from the 30 Belgium 4G logs [vanderhooft2016http2], whose rates over 1 s have a coefficient of
-variation of 0.26-0.82 (median 0.42) and a lag-1 autocorrelation of 0.33-0.91 (0.61) that is still 0.16-0.73 (0.46) at
-10 s. They fall under a quarter of their median in 0.4 % (bus) to 14 % (tram) of all samples, mostly for 1-3 s, at worst
-for 12 s.
-
-Two deviations are deliberate. Rates are higher, because a robot that offers 6.9 MB/s (30 frames of 230 kB a second)
-needs a link that suits it most of the time. Outages are more frequent and longer, because they are what a full send
-buffer is about. One deviation is a shortcoming: 10 s apart the generated rates are correlated by 0.1-0.4, less than
-most of the real ones.
+See docs/methods.md, "LTE-like links from a seed".
 """
 
 import math

@@ -1,25 +1,6 @@
 """A mobile link whose rate follows a hidden Markov process, with outages; one set of parameters for each mode.
 
-The normal score z of a second's rate is a sum of three independent parts whose variances add up to 1: the *place*
-(drawn once a trace: some routes are better than others), the *level* (held for a geometric time, then drawn again: how
-good the coverage is there) and a *fast* AR(1) process. The rate is the quantile of the recordings that corresponds to
-z, so rates have the recordings' own distribution. Their autocorrelation at lag k is, on the scale of z,
-place + level (1 - 1/stay)**k + fast memory**k.
-
-Outages come on top: runs of seconds under 500 KB/s, separated by gaps that are randomly short or long (which makes
-clusters), with lengths whose distribution can be heavy-tailed (for most modes it is nearly geometric). When they occur
-does not depend on z, but rates within 5 s of one are lowered by a factor, because links fade and recover.
-
-The Belgium logs, except those in trains, also have a rhythm of 5 s, which may come from their measurement: in trams,
-rates 5 s apart are correlated by 0.81, 3 or 7 s apart by 0.67 and 0.64. The model has none, so its correlation at 5 s
-is too low.
-
-Both processes are Markov modulated in the sense of W. Fischer and K. Meier-Hellstern, "The Markov-modulated Poisson
-process (MMPP) cookbook", Performance Evaluation 18(2), 1993: a rate governed by a hidden chain.
-
-Fitted to: 30 Belgium 4G logs [vanderhooft2016http2] for the ways of moving; the Solis WiFi traces (G. Lv, MIT licence)
-[solis] for the places; the training links of the suites over uplinks. How well it fits: docs/generators.md and
-docs/generators-uplink.md.
+See docs/methods.md, "Mobile links with outages".
 """
 
 import math

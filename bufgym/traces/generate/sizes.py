@@ -1,17 +1,8 @@
 """Laws of message sizes, as text: how the bytes of the messages of one stream vary.
 
-- `equal`: all the same.
-- `jpeg`: each picture by itself. A slow log-normal part, AR(1) in the logarithm, times one drawn anew for each.
-- `gop`: H.264. Every so many frames a whole picture (I) is sent, `ratio` times as large as the changes (P) between. The
-  slow part belongs to P.
-- `depth-colour`: two messages of one camera in turn, depth `ratio` times as large as colour, with one slow part.
-- `motion`: (`FLOOR` + speed)^exponent times a part drawn anew, where speed is that of the last `WINDOW_US`, relative to
-  the recording's mean.
-- `recorded:NAME`: a shipped sequence from a random place on, in a loop.
-
-`jpeg:cv=0.3,rho=0.9` changes parameters: `rho` from one frame to the next and `cv` of the slow part, `noise`, the
-coefficient of variation of the part drawn anew, and those named above. Each law has the asked mean in expectation: it
-is divided by its own mean, not by the drawn sequence's.
+docs/guide/unequal-sizes.md lists them. `jpeg:cv=0.3,rho=0.9` changes parameters: `rho` from one frame to the next and
+`cv` of the slow part, `noise`, the coefficient of variation of the part drawn anew, and a law's own. Each law has the
+asked mean in expectation: it is divided by its own mean, not by the drawn sequence's.
 """
 
 import functools
