@@ -1,6 +1,6 @@
 """How fast relays are, and their page.
 
-python -m website.relay_load load --robots 20 --viewers 5 --seconds 60 [--slow]
+python -m website.relay_load load --robots 20 --viewers 5 --seconds 60 [--slow] [--flood]
 python -m website.relay_load idle --connections 1000
 python -m website.relay_load page --robots 20 --seconds 10   # frames that the page drops; needs Playwright, Chromium
 
@@ -40,7 +40,7 @@ CONFIG = """port = 0
 [[rules]]
 send = true
 receive = true
-address = "127.0.0.1"
+address = "127.0.0.0/8"
 topic = ".*"
 [limits]
 connections = 10000
@@ -139,7 +139,14 @@ async def publish(port: int, k: int, robots: int, seconds: float) -> None:
             one.socket.transport.write(bytes(frame))
 
 
-async def load(robots: int, viewers: int, seconds: float, slow: bool) -> None:
+async def flood(port: int) -> None:
+    """Publish JSON of 100 kB from another address, as fast as it is taken."""
+    async with client(port, local="127.0.0.2", name="flood") as one:
+        while True:
+            await one.put("/flood", json.dumps("x" * 100_000).encode(), encoding="json")
+
+
+async def load(robots: int, viewers: int, seconds: float, slow: bool, loud: bool) -> None:
     latency_us: list[list[int]] = [[] for _ in range(viewers)]
     memory_mb: list[float] = []
 
@@ -150,7 +157,7 @@ async def load(robots: int, viewers: int, seconds: float, slow: bool) -> None:
 
     async with relay() as (pid, port):
         views = [view(port, slow and k == 0, latency_us[k]) for k in range(viewers)]
-        async with beside(*views, watch()):
+        async with beside(*views, watch(), *([flood(port)] if loud else [])):
             await asyncio.sleep(5.0)  # until the policy is compiled
             began_s, began_cpu_s, before = time.monotonic(), cpu_s(pid), megabytes(pid)
             await asyncio.gather(*(publish(port, k, robots, seconds) for k in range(robots)))
@@ -234,6 +241,7 @@ def main() -> None:
         of[verb].add_argument("--seconds", type=float, default=10.0)
     of["load"].add_argument("--viewers", type=int, default=3)
     of["load"].add_argument("--slow", action="store_true", help="the first viewer reads 100 kB/s")
+    of["load"].add_argument("--flood", dest="loud", action="store_true", help="another client floods it with JSON")
     of["idle"].add_argument("--connections", type=int, default=1000)
     options = vars(parser.parse_args())
     asyncio.run(options.pop("work")(**options))

@@ -91,7 +91,7 @@ class Limits(Section, frozen=True):
     connections: Count = 128
     messages_per_s: Count = 10_000
     bytes_per_s: Count = 10**8
-    json_bytes_per_s: Count = 2**23
+    json_bytes_per_s: Count = 2**22
     """Bytes of JSON that it may have parsed; beyond, its frames wait. A text frame counts for 500 bytes more."""
     all_connections: Count = 4_096
     """Connections of all identities together."""
