@@ -1,14 +1,6 @@
 """Robofleet's client, as published and as released, and native ROS; `rosbridge` is in ``middleware.py``.
 
-Robofleet [sikand2021robofleet] limits each topic's rate, queues ``no_drop`` messages, and keeps one slot for any other
-topic. It sends while fewer than n_T messages are in flight, that is sent and not yet acked (by a pong, in its terms).
-In the paper the topic with the largest priority x wait goes first. The released scheduler (MessageSchedulerLib.hpp of
-github ut-amrl/robofleet_client_lib) sorts the same product in ascending order, so the smallest goes first. Here a rate
-limit counts from the message kept last. In the paper t_tau is the time since the topic was last transmitted;
-`robofleet-literal` follows this wording.
-
-Robofleet's queue of ``no_drop`` messages has no limit. Here it has the sender's L, and makes room like the other
-schedulers. On a sender with a single topic, both clients keep one slot, and native ROS drops its oldest.
+See docs/methods.md, "Robofleet's clients, ours beside theirs".
 """
 
 import math

@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final, Protocol
 
 from bufgym.robot.bus_channel import BusChannel
 from bufgym.robot.buses import BUSES
 from bufgym.robot.extra import needs
-from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, Room, header, parse, whole
+from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, parse, whole
 from bufgym.robot.sockets import connected, unacked_bytes
 
 PIECE_BYTES: Final = 16_384
@@ -84,11 +84,13 @@ class TcpChannel:
 
 
 class WebSocketChannel:
-    """Frames as binary messages of a WebSocket (the library ``websockets``)."""
+    """Frames as binary messages of a WebSocket (the library ``websockets``), in fragments."""
 
-    def __init__(self, connection: Any, max_body_bytes: int = MAX_BODY_BYTES) -> None:
+    def __init__(self, connection: Any, max_body_bytes: int = MAX_BODY_BYTES, room: Room | None = None) -> None:
         self._connection = connection
         self._max_body_bytes = max_body_bytes
+        self._room = room or Room(max_body_bytes)
+        self._unwritten_bytes = 0
 
     @classmethod
     async def connect(cls, host: str, port: int, *, small: bool = True) -> WebSocketChannel:
@@ -107,19 +109,34 @@ class WebSocketChannel:
 
     async def send(self, frame: Frame) -> None:
         with _as_connection_errors():
-            await self._connection.send(header(frame) + bytes(frame.body))
+            await self._connection.send(self._fragments(header(frame), memoryview(frame.body)))
+
+    def _fragments(self, head: bytes, body: memoryview) -> Iterator[bytes]:
+        yield head
+        for start in range(0, len(body), PIECE_BYTES):
+            self._unwritten_bytes = len(body) - start
+            yield bytes(body[start : start + PIECE_BYTES])
+        self._unwritten_bytes = 0
 
     async def receive(self) -> Frame:
-        with _as_connection_errors():
-            data = await self._connection.recv()
-        if not isinstance(data, bytes):
-            raise FrameError("a text message: must be binary")
-        return whole(data, self._max_body_bytes)
+        """Receive the next frame; its body takes room once its header is there, and no more than it announces."""
+        data, most_bytes, taken = bytearray(), HEADER_BYTES, contextlib.ExitStack()
+        with taken, _as_connection_errors():
+            async for fragment in self._connection.recv_streaming(decode=False):
+                data += fragment
+                if len(data) >= HEADER_BYTES == most_bytes:
+                    _, body_bytes = parse(data[:HEADER_BYTES], self._max_body_bytes)
+                    taken.enter_context(self._room.taken(body_bytes))
+                    most_bytes += body_bytes
+                if len(data) > most_bytes:
+                    break
+        return whole(bytes(data), self._max_body_bytes)
 
     def left_bytes(self) -> int | None:
         transport = self._connection.transport
         unacked = unacked_bytes(transport.get_extra_info("socket"))
-        return None if unacked is None else transport.get_write_buffer_size() + unacked
+        waiting = self._unwritten_bytes + transport.get_write_buffer_size()
+        return None if unacked is None else waiting + unacked
 
     def close(self) -> None:
         self._connection.transport.abort()

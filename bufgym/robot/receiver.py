@@ -25,7 +25,9 @@ from bufgym.robot.tasks import Tasks
 MAX_STREAMS: Final = 64  # Number of latest senders that are remembered
 MAX_PEERS: Final = 2 * MAX_STREAMS  # Connections at a time, with those that senders have given up
 MAX_ARRIVING_BYTES: Final = 2**28
-"""Bodies that arrive at the same time, but over WebSockets; a sender beyond is hung up on, and tries again."""
+"""Bodies that arrive at the same time; a sender beyond is hung up on, and tries again."""
+FRAGMENT_BYTES: Final = 2**20
+"""A fragment of a WebSocket's message, which the library holds as a whole before its header is seen."""
 IDLE_S: Final = 600.0
 """Time for a whole frame; later the connection is closed. A sender that is still there connects again."""
 _GREETING_S: Final = 20.0  # time for a sender's greeting; later the connection is closed
@@ -97,9 +99,9 @@ class Receiver:
         with needs("websockets"):
             from websockets.asyncio.server import serve
         most = self._max_body_bytes
-        limits: dict[str, Any] = {"max_size": most + HEADER_BYTES, "max_queue": 1}
+        limits: dict[str, Any] = {"max_size": (most + HEADER_BYTES, FRAGMENT_BYTES), "max_queue": 1}
         limits |= {"compression": None, "ping_interval": None}
-        server = await serve(lambda one: self._serve(WebSocketChannel(one, most)), host, port, **limits)
+        server = await serve(lambda one: self._serve(WebSocketChannel(one, most, self._room)), host, port, **limits)
         await self._ends.enter_async_context(server)
         return int(next(iter(server.sockets)).getsockname()[1])
 

@@ -92,13 +92,6 @@ def test_a_worker_that_dies_is_one_line_and_a_retry(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "rows.csv").exists() and "frail" in out
 
 
-@pytest.mark.nightly
-def test_one_that_always_dies_is_an_error(tmp_path: Path) -> None:
-    code, _, err = ended(*words(policy_file(tmp_path, "doomed", "os.kill(os.getpid(), 9)"), tmp_path / "out"))
-    told = "bufgym: error: a worker process ended before"
-    assert code == 2 and any(line.startswith(told) for line in err.splitlines()), err
-
-
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["bench", "--suite", "interruption-v1", "--policies", THREE[0], "--capacity", 2, "--seeds", 1]
     command += ["--backend", "sequential", "--format", "csv", "--out", tmp_path]

@@ -12,14 +12,14 @@ from unittest.mock import AsyncMock
 import numpy as np
 import pytest
 from live_cases import in_order, meeting_port, receiving, sending
-from loop_cases import compiled, until
+from loop_cases import beside, compiled, until
 
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.robot import PolicyQueue, replay, shaped
 from bufgym.robot.bus_channel import BusChannel
-from bufgym.robot.channels import TRANSPORTS
+from bufgym.robot.channels import TRANSPORTS, WebSocketChannel
 from bufgym.robot.frames import DATA, GREETING, HEADER_BYTES, Frame, Room, header
 from bufgym.robot.log import Record
 from bufgym.robot.receiver import Received
@@ -215,6 +215,23 @@ async def test_strangers_share_the_room_and_end(monkeypatch: pytest.MonkeyPatch)
         async with sending(port) as (queue, _):
             queue.put(bytes(60), 60)
             await until(lambda: len(came) == 1)
+
+
+async def test_over_a_websocket_a_body_takes_room_before_it_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bufgym.robot.receiver.MAX_ARRIVING_BYTES", 100)
+
+    async def half(name: bytes) -> None:
+        channel = await WebSocketChannel.connect("127.0.0.1", port)
+        await channel.send(Frame(GREETING, 0, body=name * 16))
+        with contextlib.suppress(Exception):  # hung up on
+            await channel._connection.send(await asyncio.sleep(600 * k, HALF[-HEADER_BYTES:]) for k in range(2))
+
+    async with (
+        receiving(transport="websocket", max_body_bytes=80) as (receiver, port, _),
+        beside(half(b"a"), half(b"b")),
+    ):
+        await until(lambda: receiver.faults)
+    assert receiver.faults[0] == "FrameError: body of 60 bytes: must wait, 40 are left for all senders"
 
 
 async def test_one_connection_of_a_sender_at_a_time() -> None:

@@ -1,18 +1,6 @@
 """Recordings of robots: when each message arrived, how large it was, on which topic; and the poses among them.
 
-| recording | read with |
-|---|---|
-| MCAP file, or a folder of them (rosbag2 with mcap storage) | `mcap` |
-| ROS 1 bag (`.bag`), rosbag2 with sqlite3 storage (its folder, or the `.db3` alone) | `rosbags` |
-
-Both come with the extra ``ros``. The kind is recognised by the content, not by the name. A message arrives when the
-recorder logged it, and its size is the size of its serialised form (CDR or ROS 1), which is what a bridge forwards. A
-message without content counts as 1 byte. Poses come from nav_msgs/Odometry, geometry_msgs/PoseStamped and
-PoseWithCovarianceStamped, and from tf, at the same arrival times.
-
-A recording that breaks off (as when a robot loses power) is refused as a whole; the recorder's own tools (``mcap
-recover``, ``rosbag reindex``) save what can be saved. Files that bufgym itself wrote are read to their last whole
-message.
+See docs/methods.md, "Recordings of robots".
 """
 
 from __future__ import annotations
