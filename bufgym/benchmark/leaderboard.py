@@ -173,10 +173,11 @@ def markdown(board: Sequence[Entry]) -> str:
         lines = []
         for entry in group:
             values = [" ".join(filter(None, shown(entry.values[q.key], q))) for q in quantities]
-            lines.append([str(entry.rank or NONE), entry.policy, *values, f"`{entry.command}`"])
-        head = ["#", "policy", *(quantity.title for quantity in quantities), "command"]
+            lines.append([str(entry.rank or NONE), entry.policy, *values])
+        head = ["#", "policy", *(quantity.title for quantity in quantities)]
         about = suites.get(suite).about
-        out += ["", f"## {suite}", "", f"{about[0].upper()}{about[1:]}.", ""]
+        command = replace(group[0], policy="POLICY").command
+        out += ["", f"## {suite}", "", f"{about[0].upper()}{about[1:]}. `{command}` makes a row again.", ""]
         out += [*(f"- {quantity.title}: {quantity.about}." for quantity in quantities), ""]
         out.append(Table(head, [("", lines)], left=2).markdown())
     return "\n".join(out) + "\n"
