@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import io
 import itertools
+import os
 import re
 import zlib
 from collections.abc import Iterable, Iterator
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import IO, Final, NamedTuple
 
 from bufgym.ground.errors import TraceError
-from bufgym.ground.files import replaced
+from bufgym.ground.files import replaced, unpacked_limit
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
 
 # Text after decompression; reading stops as soon as there is more.
@@ -107,16 +108,15 @@ def open_text(path: StrPath) -> Iterator[TextFile]:
         if magic == _ZIP_MAGIC:
             raise fault(path, "is a zip archive: must be unpacked first")
         stream: IO[bytes] = gzip.GzipFile(fileobj=raw) if magic.startswith(_GZIP_MAGIC) else raw  # type: ignore[assignment]
-        yield TextFile(path, stream)
+        yield TextFile(path, stream, min(MAX_TEXT_BYTES, unpacked_limit(os.fstat(raw.fileno()).st_size)))
 
 
 class TextFile:
     """An open text file. Use one of `lines`, `first`, `text` and `whole`; all of them respect the module's limits."""
 
-    def __init__(self, path: StrPath, stream: IO[bytes]) -> None:
-        """Take the file's name, for error messages, and its bytes after decompression."""
-        self.path = path
-        self._stream = stream
+    def __init__(self, path: StrPath, stream: IO[bytes], most_bytes: int = MAX_TEXT_BYTES) -> None:
+        """Take the file's name, for error messages, and its bytes after decompression, at most ``most_bytes``."""
+        self.path, self._stream, self._most_bytes = path, stream, most_bytes
         self._read_bytes = 0
 
     def lines(self) -> Iterator[Line]:
@@ -184,8 +184,8 @@ class TextFile:
             raise fault(self.path, f"cannot be read: {error.strerror or error}", line=line) from error
         is_start = self._read_bytes == 0
         self._read_bytes += len(data)
-        if self._read_bytes > MAX_TEXT_BYTES:
-            raise fault(self.path, f"more than {MAX_TEXT_BYTES} bytes of text: must be less", line=line)
+        if self._read_bytes > self._most_bytes:
+            raise fault(self.path, f"more than {self._most_bytes} bytes of text: must be less", line=line)
         if is_start and data.startswith(_BYTE_ORDER_MARK):
             # Some editors write it. It is no part of the text; a file of nothing else counts as a blank line.
             return data.removeprefix(_BYTE_ORDER_MARK) or b"\n"
