@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import shutil
+import signal
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,11 @@ async def nats_server(port: int, folder: Path, *more: str) -> AsyncIterator[Any]
         with contextlib.suppress(ProcessLookupError):
             process.kill()
         await wait("the end of NATS", process.wait())
+
+
+async def still(server: Any) -> None:
+    server.send_signal(signal.SIGSTOP)
+    await until("NATS to stand still", lambda: ") T " in Path(f"/proc/{server.pid}/stat").read_text())
 
 
 def shared(port: int, name: str, **changed: Any) -> contextlib.AbstractAsyncContextManager[Server]:

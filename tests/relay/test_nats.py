@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from nats_cases import alone, connected, nats_server, needs_server, shared
+from nats_cases import alone, connected, nats_server, needs_server, shared, still
 from refusal_cases import refuse
 from relay_cases import client, nothing, relay, settings, stranger, until, wait, within
 
@@ -37,7 +37,7 @@ async def test_relays_hear_each_other_again_after_nats_has_stood_still(tmp_path:
         client(b.port) as viewer,
     ):
         await viewer.subscribe("odom$")
-        server.send_signal(signal.SIGSTOP)
+        await still(server)
         await robot.put("/robots/a/odom", b"1")
         await alone(a, b)
         server.send_signal(signal.SIGCONT)
@@ -136,7 +136,7 @@ async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path, monk
     ):
         await one.subscribe("^/robots/")
         async with client(a.port, session="operator") as operator:
-            server.send_signal(signal.SIGSTOP)
+            await still(server)
             await operator.command(1, command, stamp_us=1)
             with pytest.raises(Exception, match="NATS does not answer"):
                 await operator.next()
