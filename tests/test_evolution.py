@@ -123,6 +123,7 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("backend", ["dask", "ray"])
+@pytest.mark.timeout(900)  # three trainings, two of them on a cluster that begins
 def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pytest.FixtureRequest) -> None:
     """Two seeds; on the cluster half of the steps, and then the rest."""
     if importlib.util.find_spec(LIBRARY[backend]) is None:

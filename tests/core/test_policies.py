@@ -88,8 +88,8 @@ def test_worst_gaps():
     assert worst_ratio("min-gap", 8, range(8, 300)) == pytest.approx(1.80, abs=0.005)
     # AFR's tends to 2 as T grows, that of times which grow as powers to the paper's 1.59, both for large L.
     assert 1.9 < worst_ratio("afr", 8, range(8, 600)) < 2
-    assert worst_ratio("afr", 32, range(512, 1_500)) == pytest.approx(2, abs=0.01)
-    assert worst_ratio("linear-alpha", 32, range(512, 1_500)) == pytest.approx(1.59, abs=0.07)
+    assert worst_ratio("afr", 32, range(512, 1_500, 5)) == pytest.approx(2, abs=0.01)
+    assert worst_ratio("linear-alpha", 32, range(512, 1_500, 5)) == pytest.approx(1.59, abs=0.07)
 
 
 @kernels
