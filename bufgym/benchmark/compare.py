@@ -14,6 +14,7 @@ from typing import Any
 
 from bufgym import policies, scenario
 from bufgym.benchmark import bootstrap, report, sources, summary, table, tasks
+from bufgym.benchmark.report import tables
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
@@ -235,7 +236,6 @@ def _on_suite(
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
-        shown = [form(out, against) for form in (report.plain, report.markdown, report.html)]
-        found = report.run_of(out)
-        page = lambda command: report.page.html(*found)  # noqa: E731  (which names its own command)
-        return Comparison(rows, f"suite {name}", table.apart(chosen), page, *shown)
+        suite, found = report.run_of(out, against)
+        shown = tables.plain(suite, found), tables.markdown(suite, found), tables.html(found)
+        return Comparison(rows, f"suite {name}", table.apart(chosen), partial(report.page_for, suite), *shown)

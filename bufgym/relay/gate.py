@@ -10,7 +10,7 @@ import secrets
 import socket
 import sys
 from collections.abc import Collection
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Final
 
 from bufgym.robot.tasks import Tasks, until_one_ends
@@ -50,17 +50,16 @@ class Gate:
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._open += 1
-        with suppress(OSError, EOFError, TimeoutError, asyncio.LimitOverrunError):
+        with suppress(OSError, EOFError, TimeoutError, asyncio.LimitOverrunError), closing(writer):
             async with asyncio.timeout(_HEAD_S):
                 head = await reader.readuntil(b"\r\n\r\n")
             if self._open <= _MOST and self._origins.issuperset(_ORIGIN.findall(head)):
                 answers, asks = await asyncio.open_connection(*self._inside)
-                asks.write(head)
-                await until_one_ends(_copied(reader, asks), _copied(answers, writer))
-                asks.close()
+                with closing(asks):
+                    asks.write(head)
+                    await until_one_ends(_copied(reader, asks), _copied(answers, writer))
             else:
                 writer.write(_REFUSED)
-        writer.close()
         self._open -= 1
 
     def close(self) -> None:

@@ -93,7 +93,7 @@ class Session:
             say: called with a line for each refusal and each connection's end.
         """
         self._addresses = [address.parsed(one.strip()) for one in url.split(",")]
-        self._at = 0
+        self._at, self._home = 0, Backoff()
         self.name = name
         self.connected = asyncio.Event()
         """Set while the relay has accepted the connection."""
@@ -176,7 +176,7 @@ class Session:
         """
         from websockets.exceptions import WebSocketException
 
-        backoff, self._home = Backoff(), Backoff()
+        backoff = Backoff()
         try:
             while True:
                 try:

@@ -25,7 +25,7 @@ from bufgym.policies import Policy
 from bufgym.scenario import about
 from bufgym.scenario.suites import Setting
 
-__all__ = ["html", "markdown", "page_of", "plain", "run_of", "save", "write"]
+__all__ = ["markdown", "page_for", "page_of", "plain", "run_of", "save", "write"]
 
 
 def write(folder: str | Path, target: Path | None = None) -> Path:
@@ -53,10 +53,15 @@ def page_of(
     task, name = tasks.of(stream), rows[0]["scenario"] or "this stream"
     rows = [{**row, "scenario": name} for row in rows]
     manifest = {"task": task.kind, "suite": name, "split": "", "about": heading, "episodes": ""}
-    manifest |= {"bufgym": __version__, "made": "", "command": command, "unranked": unranked, "changes": {}}
+    manifest |= {"bufgym": __version__, "made": "", "unranked": unranked, "changes": {}}
     manifest |= {"scenarios": {name: {"about": about(stream), "value": stream.value.name}}}
     example = task.example(shown, rows, lambda row: Setting(stream, about(stream))) if shown else None
-    return page.html(*_summed(SuiteRun(Path(), manifest, rows, Path("rows"), example), None))
+    return page_for(SuiteRun(Path(), manifest, rows, Path("rows"), example), command)
+
+
+def page_for(run: SuiteRun, command: str) -> str:
+    """The page of a run that is at hand, made again by ``command``. Errors as for ``write``."""
+    return page.html(*_summed(replace(run, manifest={**run.manifest, "command": command}), None))
 
 
 def markdown(folder: str | Path, against: str | None = None) -> str:
@@ -65,11 +70,6 @@ def markdown(folder: str | Path, against: str | None = None) -> str:
     ``against`` is the policy that every other is compared with, by default ``best_rule``; empty for none.
     """
     return tables.markdown(*run_of(folder, against))
-
-
-def html(folder: str | Path, against: str = "") -> str:
-    """The ranking as an HTML table, for a notebook. Errors as for ``write``."""
-    return tables.html(run_of(folder, against)[1])
 
 
 def plain(folder: str | Path, against: str = "") -> str:
