@@ -69,7 +69,7 @@ async def running(
             await asyncio.shield(compiling)
             source = MadeUp(number, client.streams)
             url, name = f"ws://127.0.0.1:{to}", f"robot-{number + 1}"
-            await Robot(url, name, source, policy=chosen, capacity=16, window=client.window, say=say).run()
+            await Robot(url, name, source, policy=chosen, capacity=16, say=say).run()
 
         tasks = []
         for number in range(robots):

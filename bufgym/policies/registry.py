@@ -24,12 +24,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, NamedTuple, cast, get_type_hints
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.kernel import compile_for
+from bufgym.ground.kernel import JIT, compile_for
 from bufgym.ground.modules import first_line, takes
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.checks import changed, check_name, constants, named_settings
@@ -205,12 +204,14 @@ class Policy:
 @functools.lru_cache(maxsize=256)
 def _compiled(*functions: Any) -> Functions:
     """Compile once for all policies that share these functions, whatever their parameters or weights."""
-    return cast(Functions, tuple(map(compile_for, signatures(), functions)))
+    return cast(Functions, tuple(map(compile_for, signatures(), functions)) if JIT else functions)
 
 
 @functools.cache
 def view_type() -> Any:
     """Numba's type of a ``Buffer``."""
+    import numba
+
     real = numba.types.float64
     constants = numba.types.Array(real, 1, "C", readonly=True)
     types = {
@@ -226,6 +227,8 @@ def view_type() -> Any:
 @functools.cache
 def signatures() -> tuple[Any, Any, Any, Any]:
     """Numba types of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
+    import numba
+
     int_, view, message = numba.types.int64, view_type(), numba.from_dtype(MESSAGE)
     reals = numba.types.Array(numba.types.float64, 1, "C")
     return (

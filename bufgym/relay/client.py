@@ -6,9 +6,10 @@
     client.publish("/robots/robot-3/camera", jpeg, encoding="jpeg")  # never blocks; the policy decides what goes
     await client.command("/robots/robot-4/command", {"command": "stop"})  # returns once the relay holds it
 
-Little waits outside the queue: the system's buffers are small, and a message counts as on its way until the relay has
-answered the PING behind it with its PONG, as at Robofleet's client (Sec. III-B). After a reconnect, messages still on
-their way are sent again under their original numbers.
+Little waits outside the queue: the next message is chosen when the system has sent nearly all of the last one,
+whatever is still in flight. With ``window`` at most so many messages are on their way, as at Robofleet's client (Sec.
+III-B). A message is on its way until the relay has answered the PING behind it with its PONG. After a reconnect,
+messages still on their way are sent again under their original numbers.
 """
 
 import asyncio
@@ -27,6 +28,7 @@ from bufgym.relay import wire
 from bufgym.relay.session import Session
 from bufgym.robot.log import Record
 from bufgym.robot.queue import Item, PolicyQueue
+from bufgym.robot.sockets import until_writable
 
 
 @dataclass(eq=False)
@@ -37,6 +39,13 @@ class _Away:
     item: Item
     held: asyncio.Future[None] | None = None  # on a no_drop topic: done when the relay holds it
     pong: Any = None  # on others: done when the relay has it
+    left: bool = False  # whether the queue was told that it has left
+
+    def leave(self) -> None:
+        """Tell the queue, once."""
+        if not self.left:
+            self.left = True
+            self.queue.gone()
 
 
 class RobotClient(Session):
@@ -50,7 +59,7 @@ class RobotClient(Session):
         topics: Sequence[Topic] = (),
         policy: str | Policy = "robofleet",
         capacity: int = 32,
-        window: int = 1,
+        window: int | None = None,
         value: Value | None = None,
         token: str | None = None,
         tls: ssl.SSLContext | None = None,
@@ -62,7 +71,7 @@ class RobotClient(Session):
             topics: topics to publish on and their rules; without any, ordinary messages can't be published.
             policy: a drop rule for one topic, a scheduler for several.
             capacity: L, messages of all topics together.
-            window: n_T, messages sent and not yet answered by the relay, at most.
+            window: n_T, messages sent and not yet answered by the relay, at most; None: as many as fill the link.
             value: V of topics that have none of their own.
             log: called with the number of the queue, which ``change`` counts, and each record of its events.
             url, name, token, tls, say: as for ``Session``.
@@ -84,7 +93,7 @@ class RobotClient(Session):
         """Change the policy from now on; messages already queued go first, under the previous policy."""
         log, number = self._log, self._changes
         own = None if log is None else lambda record: log(number, record)
-        settings: dict[str, Any] = {"topics": self._topics, "window": self._window, "value": self._value}
+        settings: dict[str, Any] = {"topics": self._topics, "window": self._window or 1, "value": self._value}
         queue = PolicyQueue(policy, self._capacity, log=own, **settings)
         self._changes += 1
         queue.left_bytes = self._left_bytes
@@ -148,6 +157,9 @@ class RobotClient(Session):
             away = _Away(self._queues[0], item)
             self._away.append(away)
             await self._send(away)
+            if away.held is None and self._window is None:
+                await until_writable(self._connection.transport.get_extra_info("socket"))
+                away.leave()
 
     async def _send(self, away: _Away) -> None:
         message = away.item.message
@@ -170,4 +182,4 @@ class RobotClient(Session):
                     if answer is not self._away[0].held:
                         raise error  # the connection has ended
                     self.note(str(error))
-                self._away.popleft().queue.gone()
+                self._away.popleft().leave()

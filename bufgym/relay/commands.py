@@ -9,6 +9,7 @@ from cyclopts import Group, Parameter
 from bufgym.cli.options import Count, PolicyFile, PortNumber, one_policy
 from bufgym.ground.errors import BufgymError
 from bufgym.robot import commands as live
+from bufgym.robot.decided_in import Compiled, decide_in_python
 
 
 @Parameter(name="*", group=Group.create_ordered("The relay"))
@@ -66,6 +67,8 @@ async def robot(
     policies: str = "robofleet",
     policy_file: PolicyFile = None,
     capacity: Count = 32,
+    window: live.Window = None,
+    compiled: Compiled = False,
 ) -> None:
     """Run a robot, recorded or of ROS; Ctrl-C ends it.
 
@@ -78,6 +81,7 @@ async def robot(
         policies: The policy, as in bench.
         capacity: L, messages.
     """
+    decide_in_python(unless=compiled)
     from bufgym.relay.robot import Robot
     from bufgym.scenario import read_client
 
@@ -86,7 +90,7 @@ async def robot(
     policy = one_policy(policies, policy_file)
     client = None if config is None else read_client(config)
     streams = None if client is None else client.streams
-    settings: dict[str, Any] = {} if client is None else {"window": client.window, "value": client.value}
+    settings: dict[str, Any] = {"window": window, "value": None if client is None else client.value}
     source: Any
     if bag is not None:
         from bufgym.relay.bag import BagSource

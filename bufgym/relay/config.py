@@ -199,7 +199,7 @@ class Config(Section, frozen=True, kw_only=True):
     folder: Path | None = None
     """Folder for held messages, the audit log and recordings; without it they end with the relay."""
     small_buffers: bool = True
-    """Whether the system's buffers to clients are small; no policy can drop the messages in them."""
+    """Whether little waits unsent in the system's buffers to clients, where no policy can drop it."""
     limits: Limits = Limits()
     store: StoreLimits = StoreLimits()
     audit: Rotation = Rotation()

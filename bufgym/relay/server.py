@@ -30,7 +30,7 @@ from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
 from bufgym.relay.wire import RefusedError
 from bufgym.robot.extra import needs
-from bufgym.robot.sockets import DEAD_AFTER_S, set_option, small_buffers
+from bufgym.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
 from bufgym.robot.tasks import until_one_ends
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class Accepted(ServerConnection):
         with contextlib.suppress(OSError):
             set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
             if self._door.hub.config.small_buffers:
-                small_buffers(tcp)
+                little_unsent(tcp)
 
     def greeted(self) -> None:
         """Note that the client has said hello, or has gone."""

@@ -27,7 +27,7 @@ from bufgym.relay import address, wire
 from bufgym.relay.backoff import Backoff
 from bufgym.relay.unanswered import Unanswered
 from bufgym.relay.wire import RefusedError
-from bufgym.robot.sockets import unacked_bytes
+from bufgym.robot.sockets import unsent_bytes
 from bufgym.robot.tasks import Tasks, until_one_ends
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
@@ -287,8 +287,8 @@ class Session:
         connection = self._connection
         if connection is None:
             return None
-        unacked = unacked_bytes(connection.transport.get_extra_info("socket"))
-        return None if unacked is None else connection.transport.get_write_buffer_size() + unacked
+        unsent = unsent_bytes(connection.transport.get_extra_info("socket"))
+        return None if unsent is None else connection.transport.get_write_buffer_size() + unsent
 
     async def _send_no_drop(self) -> None:
         while True:

@@ -101,6 +101,9 @@ class BusChannel:
             raise ConnectionResetError("the peer has gone")
         return whole(data, self._max_body_bytes)
 
+    async def until_wanted(self) -> bool:
+        return False
+
     def left_bytes(self) -> int | None:
         return None
 

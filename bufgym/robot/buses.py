@@ -10,14 +10,13 @@ Both send and receive reliably, drop nothing themselves, and are given the next 
 
 import contextlib
 import json
-import socket
 import threading
 import time
 from typing import Any, Final
 
 from bufgym.robot.bus_channel import Hear, Open, Peer
 from bufgym.robot.extra import needs
-from bufgym.robot.sockets import DEAD_AFTER_S, small_buffers
+from bufgym.robot.sockets import DEAD_AFTER_S, little_unsent
 
 ROOT: Final = "bufgym"
 MQTT_PORT: Final = 1883  # Standard port of an MQTT broker
@@ -106,7 +105,7 @@ class MqttBus:
         self._client.on_message = on_message
         self._client.on_subscribe = lambda *_: joined.set()
         self._client.on_disconnect = on_disconnect
-        self._client.on_socket_open = lambda _, __, connection: _prompt(connection)
+        self._client.on_socket_open = lambda _, __, connection: little_unsent(connection)
         if not name:
             self._client.will_set(presence, b"", qos=1, retain=True)
         self._presence = presence
@@ -133,12 +132,6 @@ class MqttBus:
                 self._client.publish(self._presence, b"", qos=1, retain=True).wait_for_publish(1)
         self._client.disconnect()
         self._client.loop_stop()
-
-
-def _prompt(connection: Any) -> None:
-    """Keep the system's buffers small, and send small packets at once."""
-    small_buffers(connection)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 BUSES: Final[dict[str, Open]] = {"zenoh": ZenohBus, "mqtt": MqttBus}  # Name of a library -> class that opens either end

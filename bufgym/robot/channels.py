@@ -13,7 +13,7 @@ from bufgym.robot.bus_channel import BusChannel
 from bufgym.robot.buses import BUSES
 from bufgym.robot.extra import needs
 from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, parse, whole
-from bufgym.robot.sockets import connected, unacked_bytes
+from bufgym.robot.sockets import connected, unsent_bytes, until_writable
 
 PIECE_BYTES: Final = 16_384
 """Bytes written at a time, so that ``left_bytes`` is known while a large message is under way."""
@@ -28,8 +28,11 @@ class Channel(Protocol):
     async def receive(self) -> Frame:
         """Receive the next frame; raise a ConnectionError when there are no more."""
 
+    async def until_wanted(self) -> bool:
+        """Wait until the system wants more bytes, whatever is in flight; False at once if the socket is hidden."""
+
     def left_bytes(self) -> int | None:
-        """Bytes given to ``send`` that the peer's system has not acked; None if unknown."""
+        """Bytes given to ``send`` that the system has not sent; None if unknown."""
 
     def close(self) -> None:
         """Close at once."""
@@ -75,9 +78,13 @@ class TcpChannel:
             got += more
         return data
 
+    async def until_wanted(self) -> bool:
+        await until_writable(self._socket)
+        return True
+
     def left_bytes(self) -> int | None:
-        unacked = unacked_bytes(self._socket)
-        return None if unacked is None else self._unwritten_bytes + unacked
+        unsent = unsent_bytes(self._socket)
+        return None if unsent is None else self._unwritten_bytes + unsent
 
     def close(self) -> None:
         self._socket.close()
@@ -132,11 +139,15 @@ class WebSocketChannel:
                     break
         return whole(bytes(data), self._max_body_bytes)
 
+    async def until_wanted(self) -> bool:
+        await until_writable(self._connection.transport.get_extra_info("socket"))
+        return True
+
     def left_bytes(self) -> int | None:
         transport = self._connection.transport
-        unacked = unacked_bytes(transport.get_extra_info("socket"))
+        unsent = unsent_bytes(transport.get_extra_info("socket"))
         waiting = self._unwritten_bytes + transport.get_write_buffer_size()
-        return None if unacked is None else waiting + unacked
+        return None if unsent is None else waiting + unsent
 
     def close(self) -> None:
         self._connection.transport.abort()

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from bufgym.cli.options import Count, PolicyFile, Positive, command_line, load_policies, loaded
+from bufgym.cli.options import Count, Least0, PolicyFile, Positive, command_line, load_policies, loaded
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.commands import REDRAW_S, redraw
 
 if TYPE_CHECKING:
+    from bufgym.robot.tunnel import Tunnel
     from bufgym.robot.validate import Play
 
 
@@ -26,6 +28,7 @@ def validate(
     size: Count = 230_000,
     scale: Positive = 1.0,
     transport: list[Literal["tcp", "websocket", "zenoh", "ros1", "ros2"]] | None = None,
+    rtt: Least0 = 0.0,
     speed: Positive = 1.0,
     out: Path | None = None,
 ) -> None:
@@ -40,11 +43,13 @@ def validate(
         size: Of a message, bytes.
         scale: The traces' capacity times this.
         transport: One or more (default: tcp).
+        rtt: Round trip of the link, ms.
         speed: Time runs so many times as fast.
         out: Write every run to this folder (JSON).
     """
     from bufgym import traces
     from bufgym.policies import get
+    from bufgym.robot import tunnel as tunnels
     from bufgym.robot import validate as sockets
     from bufgym.robot.margins import margins
     from bufgym.robot.runs import save, table
@@ -58,16 +63,24 @@ def validate(
         size_bytes=size,
         duration_s=duration,
         scale=(scale,),
-        propagation_us=0,
+        propagation_us=round(rtt * 500),
     )
     transport = transport or ["tcp"]
-    plays: dict[str, Play] = {name: _play_over(name) for name in transport}
     about = (
-        f"{duration:g} s, {size} bytes at 30 Hz, L = {capacity}, V = {scenario.value.name}, "
-        f"over {', '.join(transport)} (one message at a time) and in the simulator"
+        f"{duration:g} s, {size} bytes at 30 Hz, L = {capacity}, V = {scenario.value.name}, round trip {rtt:g} ms, "
+        f"over {', '.join(transport)} and in the simulator"
     )
     print(f"{about}\n")
-    runs = sockets.validate([get(name) for name in names], scenario, capacity, seeds=seeds, plays=plays, speed=speed)
+    with contextlib.ExitStack() as stack:
+        tunnel = stack.enter_context(tunnels.opened()) if rtt and not tunnels.impossible() else None
+        if rtt and tunnel is None:
+            print(
+                f"note: {tunnels.impossible()}. Instead a proxy delays all bytes. It ends TCP, so it cannot show what"
+            )
+            print("TCP's own acks and its growing window cost over the round trip.\n")
+        plays: dict[str, Play] = {name: _play_over(name, tunnel) for name in transport}
+        policies_of = [get(name) for name in names]
+        runs = sockets.validate(policies_of, scenario, capacity, seeds=seeds, plays=plays, speed=speed)
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if out is not None:
         again = command_line(
@@ -81,19 +94,20 @@ def validate(
             size=size,
             scale=scale,
             transport=transport,
+            rtt=rtt,
             speed=speed,
         )
         print(f"\nwrote {save(runs, about, again, out)}")
 
 
-def _play_over(transport: str) -> Play:
+def _play_over(transport: str, tunnel: Tunnel | None) -> Play:
     """Find the player for a transport; raise an error if it is not installed."""
     if transport in ("ros1", "ros2"):
-        player: Play = importlib.import_module(f"bufgym.robot.{transport}.episode").player()
+        player: Play = importlib.import_module(f"bufgym.robot.{transport}.episode").player(tunnel)
         return player
-    from bufgym.robot.validate import over
+    from bufgym.robot import far, validate
 
-    return over(transport)
+    return validate.over(transport) if tunnel is None else far.over(tunnel, transport)
 
 
 def replay(log: str, /, *, policy_file: PolicyFile = None) -> None:

@@ -3,12 +3,16 @@
 import asyncio
 import contextlib
 import sys
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from bufgym.cli.options import Count, Least0, PolicyFile, PortNumber, Positive, one_policy
 from bufgym.ground.errors import BufgymError
+from bufgym.robot.decided_in import Compiled, decide_in_python
+
+if TYPE_CHECKING:
+    from bufgym.robot.sender import Sender
 
 PORT = 7410  # Default port of a receiver
 RECEIVER = f"127.0.0.1:{PORT}"
@@ -16,6 +20,9 @@ RECEIVER = f"127.0.0.1:{PORT}"
 Transport = Annotated[Literal["tcp", "websocket", "zenoh", "mqtt"], Parameter(help="What carries messages.")]
 Port = Annotated[PortNumber, Parameter(help="Where to listen.")]
 Host = Annotated[str, Parameter(help="Address to listen on; by default this machine alone reaches it.")]
+Window = Annotated[
+    Count | None, Parameter(help="Messages sent and not yet acked, at most (default: as many as fill the link).")
+]
 
 REDRAW_S = 0.25  # Time between two drawings of a view
 
@@ -49,6 +56,8 @@ async def send(
     duration: Positive = 30.0,
     motion: str = "drive-0",
     transport: Transport = "tcp",
+    window: Window = None,
+    compiled: Compiled = False,
     log: str | None = None,
     view: bool = False,
 ) -> None:
@@ -67,13 +76,14 @@ async def send(
     """
     import math
 
+    decide_in_python(unless=compiled)
     from bufgym import traces
     from bufgym.model import qoi
     from bufgym.policies import get
     from bufgym.robot import LogFile, PolicyQueue
     from bufgym.robot.channels import TRANSPORTS
     from bufgym.robot.log import Record
-    from bufgym.robot.sender import Sender
+    from bufgym.robot.sender import Leaves, Sender
     from bufgym.robot.view import View
 
     policy, (host, port) = get(one_policy(policies, policy_file)), address(to)
@@ -88,8 +98,9 @@ async def send(
                     taker(one)
 
         value = qoi.exponential(math.exp(-1))
-        queue = PolicyQueue(policy, capacity, value=value, duration_s=duration, log=record)
-        loop, sender = asyncio.get_running_loop(), Sender(queue, lambda: TRANSPORTS[transport](host, port))
+        queue = PolicyQueue(policy, capacity, value=value, duration_s=duration, log=record, window=window or 1)
+        leaves: Leaves = "sent" if window is None else "acked"
+        loop, sender = asyncio.get_running_loop(), Sender(queue, lambda: TRANSPORTS[transport](host, port), leaves)
         sending, began_s, body = asyncio.create_task(sender.run()), loop.time(), bytes(size)
         for k in range(round(rate * duration)):
             await asyncio.sleep(began_s + k / rate - loop.time())
@@ -100,15 +111,31 @@ async def send(
                 if k % max(1, round(rate * REDRAW_S)) == 0:
                     redraw(shown.text())
             elif k % round(max(1.0, rate)) == 0:
-                say(f"{k / rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued")
+                say(f"{k / rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued{_alone(sender, to)}")
         queue.close()
+        if alone := _alone(sender, to):
+            say(f"{len(queue) + queue.in_flight} messages wait for the receiver, Ctrl-C drops them{alone}")
         await sending
         if shown is not None:
             redraw(shown.text())
         say(f"all put, {queue.dropped} dropped, {len(sender.faults)} broken connections {list(sender.faults)[-1:]}")
 
 
+def _alone(sender: "Sender", to: str) -> str:
+    """Why nothing goes, where no receiver has answered."""
+    if sender.connected.is_set():
+        return ""
+    return f"; nobody answers at {to}" + (f" ({sender.faults[-1]})" if sender.faults else "")
+
+
+def listens_at(at: str | None, host: str, port: int) -> tuple[str, int]:
+    """Address to listen on: ``HOST:PORT`` if it is given, otherwise the options."""
+    return (host, port) if at is None else address(at)
+
+
 async def receive(
+    at: str | None = None,
+    /,
     *,
     port: Port = PORT,
     host: Host = "127.0.0.1",
@@ -119,12 +146,14 @@ async def receive(
     """Receive, ack and count the messages sent here; Ctrl-C ends it.
 
     Args:
+        at: HOST:PORT to listen on, in place of --host and --port.
         out: Write received messages to this file (.mcap).
         messages: Stop after so many.
     """
     from bufgym.robot.mcap_file import MAX_CHANNELS
     from bufgym.robot.receiver import Received, Receiver, Recording
 
+    host, port = listens_at(at, host, port)
     enough, taken = asyncio.Event(), 0
 
     def take(message: Received) -> None:

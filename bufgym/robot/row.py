@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import entry, located
+from bufgym.ground.kernel import JIT, entry, located
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
@@ -53,7 +53,9 @@ class LiveRow:
         self.senders.follow(policy)
         self.memory = policy.new_memory(1, self.senders.capacity)
         self._use(self.senders.batch, room)
-        self._functions = tuple(map(located, signatures(), policy.compiled)) if policy.compile else None
+        self._functions: Any = policy.compiled if policy.compile else None
+        if JIT and policy.compile:
+            self._functions = tuple(map(located, signatures(), policy.compiled))
         self._rollout: Any = entry(compiled_rollout(False, bool(self.batch.several))) if self._functions else None
 
     def _use(self, batch: Batch, room: int) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Final, Literal
@@ -9,16 +10,21 @@ from typing import Final, Literal
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.channels import Channel
 from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, STREAM_BYTES, Frame, FrameError
+from bufgym.robot.path_window import PathWindow
 from bufgym.robot.queue import Item, PolicyQueue
 from bufgym.robot.tasks import until_one_ends
 
-Leaves = Literal["acked", "sent", "written"]
-"""Event at which a message has left: acked by the receiver, acked by the receiver's system (SIOCOUTQ), or taken by this
-system. "written" hides a queue in the system's buffers; it serves to measure the cost of that."""
+Leaves = Literal["sent", "acked", "written"]
+"""Event at which a message has left.
+
+"sent": the system wants more bytes, because it has sent nearly all of them. Where a library hides its socket, the
+    receiver's acks say when the next message is due (``PathWindow``).
+"acked": the receiver has acked it. With the queue's ``window`` this is Robofleet's n_T.
+"written": this system has taken it. That hides a queue in the system's buffers, and serves to measure what that costs.
+"""
 
 RETRY_S: Final = 0.5
 PATIENCE_S: Final = 20.0  # Time for the receiver's answer to the greeting
-_POLL_S: Final = 0.001
 _MOST_UNACKED: Final = 256  # limit on messages that await the receiver's ack, where they count as left before it
 
 
@@ -26,22 +32,23 @@ class Sender:
     """Sends the queue's messages in order, each once.
 
     After a broken connection it reconnects and resumes where the receiver says. Memory holds the queue and the messages
-    that the receiver has not acked, at most the queue's window.
+    that the receiver has not acked: those in flight, or at most the queue's window.
     """
 
-    def __init__(self, queue: PolicyQueue, connect: Callable[[], Awaitable[Channel]], leaves: Leaves = "acked") -> None:
+    def __init__(self, queue: PolicyQueue, connect: Callable[[], Awaitable[Channel]], leaves: Leaves = "sent") -> None:
         """``connect`` makes a new connection to the receiver at each call."""
-        if leaves not in ("acked", "sent", "written"):
-            raise BufgymError(f"leaves = {leaves!r}: must be 'acked', 'sent' or 'written'")
+        if leaves not in ("sent", "acked", "written"):
+            raise BufgymError(f"leaves = {leaves!r}: must be 'sent', 'acked' or 'written'")
         self.queue = queue
         self.connected = asyncio.Event()
-        """Set at the receiver's first answer."""
+        """Set while the receiver has answered on this connection."""
         self.faults: deque[str] = deque(maxlen=100)
         """Reasons of the last 100 ends of a connection."""
         self._connect, self._leaves = connect, leaves
         self._stream = os.urandom(STREAM_BYTES)
         self._unacked: deque[Item] = deque()
         self._acked = asyncio.Event()
+        self._window = PathWindow()
         self._max_body_bytes = 0
         self._next = 0  # the number of the message that the queue hands out next
         self._left = 0  # messages reported to the queue as left
@@ -70,6 +77,7 @@ class Sender:
                 self._note(error)
             finally:
                 self.queue.left_bytes = lambda: None
+                self.connected.clear()
                 channel.close()
             await asyncio.sleep(RETRY_S)
 
@@ -79,8 +87,10 @@ class Sender:
     async def _greet(self, channel: Channel) -> None:
         """Name the stream; skip messages that the receiver already has."""
         first = self._unacked[0].number if self._unacked else self._next
+        asked_s = time.monotonic()
         await channel.send(Frame(GREETING, first, body=self._stream))
         answer = await asyncio.wait_for(channel.receive(), PATIENCE_S)
+        self._window = PathWindow(time.monotonic() - asked_s)
         if answer.kind != GREETING or answer.seq < 1:
             raise FrameError(f"frame of kind {answer.kind}: must be the answer to the greeting, and take messages")
         self._max_body_bytes = answer.seq
@@ -114,9 +124,11 @@ class Sender:
             raise BufgymError(
                 f"message {item.seq} of {len(item.message)} bytes: the receiver takes at most {self._max_body_bytes}"
             )
+        self._window.sends(item.number, time.monotonic())
         await channel.send(Frame(DATA, item.number, item.seq, item.at_us, item.x, item.topic, item.message))
-        while self._leaves == "sent" and channel.left_bytes():
-            await asyncio.sleep(_POLL_S)
+        if self._leaves == "sent" and not await channel.until_wanted():
+            while len(self._unacked) >= self._window.messages:
+                await self._an_ack()
         if self._leaves != "acked":
             self._leave(item)
 
@@ -129,6 +141,7 @@ class Sender:
             frame = await channel.receive()
             if frame.kind != ACK or not self._unacked or frame.number != self._unacked[0].number:
                 raise FrameError(f"frame of kind {frame.kind}, number {frame.number}: must be the next ack")
+            self._window.acked(frame.number, self._unacked[0].size_bytes, time.monotonic())
             self._take_ack()
 
     def _take_ack(self) -> None:

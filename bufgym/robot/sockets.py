@@ -1,38 +1,72 @@
-"""A sender's TCP socket that hides no queue.
+"""A sender's TCP socket that hides no queue and still fills the link at any round trip.
 
-The system's default buffers take megabytes at once, and no policy can drop messages in them. So the socket gets a small
-send buffer, and TCP_NOTSENT_LOWAT limits unsent bytes in the kernel. ``unacked_bytes`` reads from SIOCOUTQ how much the
-peer's kernel has not acked.
+The system's default buffers take megabytes at once, and no policy can drop messages in them. TCP_NOTSENT_LOWAT limits
+only bytes that the kernel has not sent: the socket becomes writable when they fall below it, whatever is still in
+flight. So the next message is chosen late, and the link never waits for an ack. A small send buffer (SO_SNDBUF) would
+limit bytes in flight instead, to one buffer a round trip.
+
+SIOCOUTQ counts bytes that the peer's kernel has not acked, SIOCOUTQNSD those of them that were not sent.
 """
 
 import asyncio
+import select
 import socket
 import struct
 import sys
-from typing import Final
+from typing import Any, Final
 
-SEND_BUFFER_BYTES: Final = 32_768
 UNSENT_BYTES: Final = 16_384  # TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel
 DEAD_AFTER_S: Final = 20.0  # Time without acks after which a connection is given up, where the system can tell
+_SIOCOUTQNSD: Final = 0x894B  # of linux/sockios.h; Python's termios lacks it
 
 
-def unacked_bytes(connection: socket.socket) -> int | None:
-    """Bytes in the kernel's send queue, sent or not; None where the system lacks SIOCOUTQ."""
+def unsent_bytes(connection: socket.socket) -> int | None:
+    """Bytes in the kernel that were not sent yet; None where the system does not tell."""
+    return _counted(connection, _SIOCOUTQNSD)
+
+
+def in_flight_bytes(connection: socket.socket) -> int | None:
+    """Bytes that were sent and that the peer's kernel has not acked; None where the system does not tell."""
+    import termios
+
+    unsent, unacked = unsent_bytes(connection), _counted(connection, getattr(termios, "TIOCOUTQ", 0))
+    return None if unsent is None or unacked is None else unacked - unsent
+
+
+def _counted(connection: socket.socket, request: int) -> int | None:
     if not sys.platform.startswith("linux"):
         return None
     import fcntl
-    import termios
 
     try:
-        return int(struct.unpack("i", fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0"))[0])
+        return int(struct.unpack("i", fcntl.ioctl(connection.fileno(), request, b"\0\0\0\0"))[0])
     except (OSError, ValueError):  # it is closed
         return None
 
 
-def small_buffers(connection: socket.socket) -> None:
-    """Set a sender's socket so that little waits in the system."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+def little_unsent(connection: socket.socket) -> None:
+    """Set a sender's socket so that little waits unsent in the system, and small packets go at once."""
     set_option(connection, "TCP_NOTSENT_LOWAT", UNSENT_BYTES)
+    set_option(connection, "TCP_NODELAY", 1)
+
+
+async def until_writable(connection: Any) -> None:
+    """Wait until the kernel wants more: less than ``UNSENT_BYTES`` are unsent, or the connection has ended."""
+    loop = asyncio.get_running_loop()
+    writable = asyncio.Event()
+    with connection.dup() as same:  # a transport of asyncio watches the other descriptor
+        loop.add_writer(same, writable.set)
+        try:
+            await writable.wait()
+        finally:
+            loop.remove_writer(same)
+
+
+def is_writable(connection: socket.socket, patience_s: float) -> bool:
+    """Do ``until_writable`` in a thread, for so long at most; return whether the kernel wants more."""
+    poll = select.poll()
+    poll.register(connection, select.POLLOUT)
+    return bool(poll.poll(patience_s * 1000))
 
 
 def set_option(connection: socket.socket, option: str, number: int) -> None:
@@ -48,9 +82,8 @@ async def connected(host: str, port: int, small: bool = True) -> socket.socket:
     connection = socket.socket(family, kind, protocol)
     try:
         connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if small:
-            small_buffers(connection)
+            little_unsent(connection)
             set_option(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
         await loop.sock_connect(connection, address)
     except BaseException:

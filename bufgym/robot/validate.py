@@ -3,8 +3,9 @@
 import asyncio
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
-from bufgym.robot.channels import TRANSPORTS
+from bufgym.robot.channels import TRANSPORTS, Channel
 from bufgym.robot.log import Record
 from bufgym.robot.queue import PolicyQueue
 from bufgym.robot.receiver import Received, Receiver
@@ -34,7 +35,7 @@ async def play(
     *,
     topics: Sequence[Topic] = (),
     transport: str = "tcp",
-    leaves: Leaves = "acked",
+    leaves: Leaves = "sent",
     small: bool = True,
     speed: float = 1.0,
     seed: int = 0,
@@ -59,28 +60,57 @@ async def play(
     """
     if transport not in TRANSPORTS:
         raise BufgymError(f"transport {transport!r}: must be one of {', '.join(TRANSPORTS)}")
-    rules: dict[str, Any] = {"value": value, "topics": topics, "window": episode.window}
-    warm(PolicyQueue(policy, capacity, **rules))
+    warm(PolicyQueue(policy, capacity, value=value, topics=topics, window=episode.window))
     came: list[Received] = []
-
-    def take(message: Received) -> None:
-        came.append(message._replace(body=b"", received_ns=time.monotonic_ns() - round(began_s * 1e9)))
-
-    receiver = Receiver(take)
+    receiver = Receiver(partial(take, came))
     link = ShapedLink(episode.link, ("127.0.0.1", await receiver.listen(port, transport=transport)), speed=speed)
     port = await link.listen()
+
+    async def begin() -> float:
+        link.begin()
+        return time.monotonic()
+
+    settings: dict[str, Any] = {"topics": topics, "leaves": leaves, "seed": seed, "log": log}
+    connect = partial(TRANSPORTS[transport], "127.0.0.1", port, small=small)
+    try:
+        began_s = await send(policy, episode, capacity, value, connect, begin, speed=speed, until_s=until_s, **settings)
+    finally:
+        await link.close()
+        await receiver.close()
+    return since(began_s, came)
+
+
+async def send(
+    policy: Policy,
+    episode: Episode,
+    capacity: int,
+    value: Value,
+    connect: Callable[[], Awaitable[Channel]],
+    begin: Callable[[], Awaitable[float]],
+    *,
+    topics: Sequence[Topic] = (),
+    leaves: Leaves = "sent",
+    speed: float = 1.0,
+    seed: int = 0,
+    log: list[Record] | None = None,
+    until_s: float = math.inf,
+) -> float:
+    """Send the messages of ``episode`` as they arrive; return its beginning by this system's monotonic clock, s.
+
+    ``begin`` is awaited once there is a connection, and returns the beginning. Others as for ``play``.
+    """
     messages = episode.arrivals
     bodies = memoryview(bytes(int(messages["size_bytes"].max())))
     began_s = time.monotonic()
-    rules |= {"duration_s": None if episode.ends_us is None else episode.ends_us / 1e6, "seed": seed}
+    rules: dict[str, Any] = {"value": value, "topics": topics, "window": episode.window, "seed": seed}
+    rules |= {"duration_s": None if episode.ends_us is None else episode.ends_us / 1e6}
     rules |= {"log": None if log is None else log.append, "clock": lambda: (time.monotonic() - began_s) * speed}
     queue = PolicyQueue(policy, capacity, **rules)
-    sender = Sender(queue, lambda: TRANSPORTS[transport]("127.0.0.1", port, small=small), leaves)
+    sender = Sender(queue, connect, leaves)
     sending = asyncio.create_task(sender.run())
     try:
         await asyncio.wait_for(sender.connected.wait(), 30)
-        began_s = time.monotonic()
-        link.begin()
+        began_s = await begin()
         for message in messages:
             wait_s = began_s + float(message["arrival_us"]) / 1e6 / speed - time.monotonic()
             await asyncio.sleep(max(0.0, wait_s))
@@ -94,9 +124,17 @@ async def play(
     finally:
         sending.cancel()
         await asyncio.gather(sending, return_exceptions=True)
-        await link.close()
-        await receiver.close()
-    return came
+    return began_s
+
+
+def take(came: list[Received], message: Received) -> None:
+    """Keep a message without its body, with its time of receipt by the monotonic clock."""
+    came.append(message._replace(body=b"", received_ns=time.monotonic_ns()))
+
+
+def since(began_s: float, came: Sequence[Received]) -> list[Received]:
+    """The messages, with ``received_ns`` since the episode's beginning."""
+    return [message._replace(received_ns=message.received_ns - round(began_s * 1e9)) for message in came]
 
 
 def warm(queue: PolicyQueue) -> None:

@@ -8,7 +8,6 @@ from contextlib import nullcontext, suppress
 from time import perf_counter
 from typing import Any, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +22,9 @@ from bufgym.sim.socket import credit
 from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type
 from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
+
+if JIT:
+    import numba
 
 _SHORT = 200_000  # Arrivals times numbers read at each, for a rollout that takes at most some milliseconds
 
@@ -68,6 +70,8 @@ def compiled_rollout(shared: bool, several: bool) -> Any:
 
     ``shared``: the cells of a shared link, or senders with a link each. ``several``: several topics, or one queue.
     """
+    if not JIT:
+        return rollout
     functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     shares = shares_type() if shared else numba.types.none
@@ -75,7 +79,7 @@ def compiled_rollout(shared: bool, several: bool) -> Any:
 
 
 _view = getattr(view, "py_func", view)
-_inlined: Any = numba.njit(inline="always")(rollout)
+_inlined: Any = numba.njit(inline="always")(rollout) if JIT else rollout
 
 
 @functools.cache

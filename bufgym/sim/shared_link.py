@@ -6,7 +6,6 @@ See docs/methods.md, "A cell's link".
 import functools
 from typing import Any, NamedTuple, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,6 +62,8 @@ def new_shares(cells: int, robots: int) -> Shares:
 @functools.cache
 def shares_type() -> Any:
     """Numba's type of ``Shares``."""
+    import numba
+
     return cast(Any, numba).typeof(new_shares(1, 1))
 
 

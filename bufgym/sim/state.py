@@ -3,7 +3,6 @@
 import functools
 from typing import Any, NamedTuple, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -177,6 +176,8 @@ def place_of(batch: Batch, i: int, message: Any) -> int:
 @functools.cache
 def batch_type(several: bool) -> Any:
     """Numba's type of a ``Batch`` of one queue each, or of several topics."""
+    import numba
+
     return cast(Any, numba).typeof(new_batch(1, 1, 1, 2 if several else 1, exponential().array))
 
 

@@ -240,6 +240,9 @@ async def test_a_receiver_that_hangs_up_before_the_goodbye_is_known_as_sent_is_n
                 raise ConnectionResetError("the peer has gone")
             return answer
 
+        async def until_wanted(self) -> bool:
+            return False
+
         def left_bytes(self) -> int | None:
             return None
 

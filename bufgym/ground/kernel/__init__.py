@@ -1,13 +1,12 @@
 """Compiled functions.
 
 A *kernel* is a plain Python function over arrays that the caller owns. Numba compiles it on its first call and keeps
-the machine code on disk; with ``NUMBA_DISABLE_JIT=1`` the same source runs as ordinary Python, which is how the tests
-check the compiled code against its own text.
+the machine code on disk; with ``NUMBA_DISABLE_JIT=1`` the same source runs as ordinary Python, and Numba is not even
+imported. That is how the tests check the compiled code against its own text, and how a small robot runs a policy.
 """
 
 import sys
 
-from bufgym.ground.kernel.announce import compile_silently
 from bufgym.ground.kernel.arrays import JIT, Floats, Ints, at, item, named, prefetch, records, stretch, table
 from bufgym.ground.kernel.interrupt import interruptible
 
@@ -17,6 +16,7 @@ if JIT:
 try:
     if not JIT:
         raise ImportError
+    from bufgym.ground.kernel.announce import compile_silently
     from bufgym.ground.kernel.cache import FOLDER, NotKeptError, only_kept
     from bufgym.ground.kernel.compile import (
         code_for,
@@ -40,6 +40,7 @@ except Exception as error:  # whatever another Numba may raise
         code_for,
         compile_for,
         compile_here,
+        compile_silently,
         direct,
         entry,
         kernel,

@@ -7,15 +7,32 @@ import contextlib
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-import numba
-from numba.core import options
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-
 from bufgym.ground.kernel.arrays import JIT
-from bufgym.ground.kernel.none_fields import with_none_fields
+
+if JIT:
+    import numba
+    from numba.core import options
+    from numba.core.compiler import CompilerBase, DefaultPassBuilder
+
+    from bufgym.ground.kernel.announce import compile_silently as compile_silently
+    from bufgym.ground.kernel.none_fields import with_none_fields
+
+    _Compiler: Any = CompilerBase
+
+    class _PlainCompiler(_Compiler):  # type: ignore[misc]
+        def define_pipelines(self) -> list[Any]:
+            return [with_none_fields(cast(Any, DefaultPassBuilder).define_nopython_pipeline(self.state))]
+
+    _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "pipeline_class": _PlainCompiler}
+    if hasattr(options.DefaultOptions, "_nrt"):
+        _OPTIONS["_nrt"] = False  # no counting of references: a step is ten times as fast
+else:
+
+    def compile_silently() -> None:
+        """Do nothing: nothing is compiled."""
+
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_Compiler: Any = CompilerBase
 
 FOLDER = ""
 """No code is kept."""
@@ -28,19 +45,9 @@ class NotKeptError(Exception):
 only_kept = contextlib.nullcontext
 
 
-class _PlainCompiler(_Compiler):  # type: ignore[misc]
-    def define_pipelines(self) -> list[Any]:
-        return [with_none_fields(cast(Any, DefaultPassBuilder).define_nopython_pipeline(self.state))]
-
-
-_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "pipeline_class": _PlainCompiler}
-if hasattr(options.DefaultOptions, "_nrt"):
-    _OPTIONS["_nrt"] = False  # no counting of references: a step is ten times as fast
-
-
 def kernel(function: Function) -> Function:
     """Compile ``function`` on its first call, for the types of its arguments."""
-    return cast(Function, cast(Any, numba).njit(**_OPTIONS)(function))
+    return cast(Function, cast(Any, numba).njit(**_OPTIONS)(function) if JIT else function)
 
 
 def compile_for(signature: Any, function: Function) -> Function:

@@ -6,23 +6,23 @@
 ``publish``, and ``queue_size=0`` is unbounded. Both, and the topics of ``UNTOUCHED``, stay rospy's.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from bufgym.ground.errors import BufgymError
-from bufgym.model import qoi
-from bufgym.model.buffer import MAX_CAPACITY
-from bufgym.model.qoi import Value
-from bufgym.policies.registry import Policy
-from bufgym.robot import LogFile, PolicyQueue
-from bufgym.robot.odometry import Odometry
-from bufgym.robot.ros1.connection import PolicyConnection
-from bufgym.traces import MotionSettings
+
+if TYPE_CHECKING:  # the command says first whether policies run compiled, and these would import the compiler
+    from bufgym.model.qoi import Value
+    from bufgym.policies.registry import Policy
+    from bufgym.robot.odometry import Odometry
+    from bufgym.traces import MotionSettings
 
 __all__ = ["UNTOUCHED", "install"]
 
@@ -69,6 +69,11 @@ def install(
     with needs_rospy():
         from rospy import topics as rospy_topics
         from rospy.impl.tcpros_pubsub import QueuedConnection
+    from bufgym.model import qoi
+    from bufgym.model.buffer import MAX_CAPACITY
+    from bufgym.robot import LogFile, Odometry, PolicyQueue
+    from bufgym.robot.ros1.connection import PolicyConnection
+
     if value is None:
         value = qoi.exponential() if odometry is None else qoi.exponential(math.exp(-1))
     if log is not None:
@@ -100,6 +105,8 @@ def install(
 
 def _warm_up(policy: Any, value: Value) -> None:
     """Check and compile now instead of at the first subscriber."""
+    from bufgym.robot import PolicyQueue
+
     queue = PolicyQueue(policy, 1, value=value, room=_ROOM)
     for _ in range(3):
         queue.put(None, 1)

@@ -6,10 +6,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from bufgym.benchmark import sources
 from bufgym.ground.errors import BufgymError
-from bufgym.model import qoi
 from bufgym.robot import ros1
+from bufgym.robot.decided_in import decide_in_python
 
 RULES = "also mine.safetensors or module:function, whose code is run; 'rospy': rospy's own queue"
 
@@ -23,9 +22,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--odom", metavar="TOPIC", help="poses that x is summed from (default: x counts messages)")
     parser.add_argument("--value", metavar="V", help="as in bench: exponential:0.618")
     parser.add_argument("--log", metavar="FOLDER", help="log every decision there")
+    parser.add_argument("--compiled", action="store_true", help="decide in 0.05 ms, after some seconds of compiling")
     parser.add_argument("node", metavar="NODE.py", help="the node")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGS", help="its arguments")
     options = parser.parse_args(arguments)
+    decide_in_python(unless=options.compiled)
+    from bufgym.model import qoi
+
     try:
         if not Path(options.node).is_file():
             raise BufgymError(f"{options.node}: no such file")
@@ -46,6 +49,8 @@ def _choice(text: str) -> tuple[str, str | None]:
     topic, _, name = text.partition("=") if text.startswith("/") else ("", "", text)
     if name == "rospy":
         return topic, None
+    from bufgym.benchmark import sources
+
     return topic, sources.load(name) if sources.is_source(name) else name
 
 

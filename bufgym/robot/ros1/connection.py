@@ -2,21 +2,19 @@
 
 rospy's own sender takes its whole queue at once and writes it into a socket whose buffers grow to megabytes, where
 nothing can be dropped any more. This one takes one message at a time from a ``PolicyQueue``, and the next when the
-subscriber's system has acked nearly all of it.
+system has sent nearly all of it, whatever is still in flight.
 """
 
 import contextlib
-import socket
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, Final
 
 from bufgym.robot import LogFile, PolicyQueue
 from bufgym.robot.channels import PIECE_BYTES
-from bufgym.robot.sockets import UNSENT_BYTES, small_buffers, unacked_bytes
+from bufgym.robot.sockets import is_writable, little_unsent, unsent_bytes
 
-_POLL_S: Final = 0.001
+_LOOK_S: Final = 0.1  # Time between two looks at whether the connection was closed
 
 
 class PolicyConnection:
@@ -38,8 +36,7 @@ class PolicyConnection:
         self._unwritten_bytes = 0
         queue.left_bytes = self._left_bytes
         with contextlib.suppress(OSError):  # it may be closed by now
-            small_buffers(connection.socket)
-            connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            little_unsent(connection.socket)
         connection.set_cleanup_callback(lambda _: queue.close())
         self._thread = threading.Thread(target=self._run, name=f"{connection.name} to {connection.endpoint_id}")
         self._thread.start()
@@ -76,11 +73,7 @@ class PolicyConnection:
                 self._log.close()
 
     def _send(self, message: memoryview) -> None:
-        """Send a message and wait until nearly all of it is acked.
-
-        Its last ack is not awaited, because the subscriber's system delays it by up to 40 ms, too long for small
-        messages.
-        """
+        """Send a message and wait until the system wants more."""
         connection = self._connection
         messages = connection.stat_num_msg
         self._unwritten_bytes = len(message)
@@ -93,9 +86,10 @@ class PolicyConnection:
             connection.stat_num_msg = messages + 1
         finally:
             self._unwritten_bytes = 0
-        while not connection.done and (unacked_bytes(connection.socket) or 0) > UNSENT_BYTES:
-            time.sleep(_POLL_S)
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # it is closed by now
+            while not connection.done and not is_writable(connection.socket, _LOOK_S):
+                pass
 
     def _left_bytes(self) -> int | None:
-        unacked = unacked_bytes(self._connection.socket)
-        return None if unacked is None else self._unwritten_bytes + unacked
+        unsent = unsent_bytes(self._connection.socket)
+        return None if unsent is None else self._unwritten_bytes + unsent

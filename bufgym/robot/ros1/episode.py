@@ -23,12 +23,13 @@ from bufgym.policies.registry import Policy
 from bufgym.robot import PolicyQueue, programs, ros1
 from bufgym.robot.receiver import Received
 from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.tunnel import End, Tunnel
 from bufgym.robot.validate import Play, warm
 from bufgym.scenario import Episode
 
 
-def player() -> Play:
-    """Plays episodes through ROS 1.
+def player(tunnel: Tunnel | None = None) -> Play:
+    """Plays episodes through ROS 1, through the tunnel if there is one.
 
     Raises:
         BufgymError: ROS 1 is not installed.
@@ -37,52 +38,72 @@ def player() -> Play:
         for module in ("rospy", "rosmaster.master"):
             importlib.import_module(module)
         programs.check_messages("_md5sum")
-    return play
+    return partial(play, tunnel=tunnel)
 
 
 def play(
-    policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
+    policy: Policy,
+    episode: Episode,
+    capacity: int,
+    value: Value,
+    *,
+    speed: float = 1.0,
+    seed: int = 0,
+    tunnel: Tunnel | None = None,
 ) -> list[Received]:
     """Play the episode; return the messages that a rospy subscriber got. Randomised policies use their own draws."""
     programs.check_speed(speed)
     warm(PolicyQueue(policy, capacity, value=value))
     with tempfile.TemporaryDirectory() as logs:
-        camera = partial(_publish, logs, policy, episode, capacity, value)
-        with programs.running(viewer=partial(_view, logs), camera=camera) as workers:
+        near, far = (None, None) if tunnel is None else (tunnel.near, tunnel.far)
+        camera = partial(_publish, logs, near, policy, episode, capacity, value)
+        works = {"viewer": partial(_view, logs, far), "camera": camera}
+        if tunnel is not None:
+            works["link"] = partial(tunnel.carry, episode.link)
+        with programs.running(**works) as workers:
             return asyncio.run(_play(workers, episode))
 
 
 async def _play(workers: Sequence[programs.Worker], episode: Episode) -> list[Received]:
-    viewer, camera = workers
+    viewer, camera, *carrier = workers
     camera.tell(await viewer.told())  # where the master is
-    link = ShapedLink(episode.link, await viewer.told(), back=True)
+    link = None
     try:
-        viewer.tell(await link.listen())
+        if not carrier:
+            link = ShapedLink(episode.link, await viewer.told(), back=True)
+            viewer.tell(await link.listen())
         await camera.told()
         began_s = time.monotonic() + programs.START_S
-        asyncio.get_running_loop().call_at(began_s, link.begin)
-        camera.tell(began_s)
+        if link is not None:
+            asyncio.get_running_loop().call_at(began_s, link.begin)
+        for worker in (*carrier, camera):
+            worker.tell(began_s)
         viewer.tell(await camera.told(patience_s=math.inf))
         return programs.received(await viewer.told(patience_s=math.inf), episode, began_s)
     finally:
-        await link.close()
+        if link is not None:
+            await link.close()
 
 
-def _in_ros(uri: str, logs: str, node: str) -> None:
+def _in_ros(uri: str, logs: str, node: str, end: End | None) -> None:
     """Make this process a node of that name."""
-    os.environ.update(ROS_MASTER_URI=uri, ROS_IP="127.0.0.1", ROS_LOG_DIR=logs)
+    address = "127.0.0.1" if end is None else end.address
+    os.environ.update(ROS_MASTER_URI=uri, ROS_IP=address, ROS_LOG_DIR=logs)
     import rospy
 
     rospy.init_node(node, disable_signals=True, disable_rosout=True, disable_rostime=True)
 
 
-def _view(logs: str, parent: Connection) -> None:
-    """Run the master, and a subscriber that connects through the link."""
+def _view(logs: str, end: End | None, parent: Connection) -> None:
+    """Run the master, and a subscriber that connects through the link: by a proxy, or at the tunnel's far end."""
+    if end is not None:
+        end.enter()
     from rosmaster.master import Master
 
     master = Master(0)
     master.start()
-    uri = f"http://127.0.0.1:{master.master_node.server.socket.getsockname()[1]}"
+    address = "127.0.0.1" if end is None else end.address
+    uri = f"http://{address}:{master.master_node.server.socket.getsockname()[1]}"
 
     import rospy
     from rospy.impl.tcpros_pubsub import TCPROSHandler
@@ -96,8 +117,11 @@ def _view(logs: str, parent: Connection) -> None:
         connected.set()
         return create(handler, name, uri, [protocol[0], "127.0.0.1", port])
 
-    TCPROSHandler.create_transport = through_the_link
-    _in_ros(uri, logs, "viewer")
+    if end is None:
+        TCPROSHandler.create_transport = through_the_link
+    else:
+        connected.set()
+    _in_ros(uri, logs, "viewer", end)
     seen = programs.Seen()
     rospy.Subscriber(programs.CAMERA, CompressedImage, seen.take, tcp_nodelay=True)
     parent.send(uri)
@@ -107,8 +131,12 @@ def _view(logs: str, parent: Connection) -> None:
     parent.recv()
 
 
-def _publish(logs: str, policy: Policy, episode: Episode, capacity: int, value: Value, parent: Connection) -> None:
+def _publish(
+    logs: str, end: End | None, policy: Policy, episode: Episode, capacity: int, value: Value, parent: Connection
+) -> None:
     """Run the node, and report its progress to the other programs."""
+    if end is not None:
+        end.enter()
     uri = parent.recv()
     ros1.install(policy, topics={programs.ODOMETRY: None}, odometry=programs.ODOMETRY, value=value)
 
@@ -116,7 +144,7 @@ def _publish(logs: str, policy: Policy, episode: Episode, capacity: int, value: 
     from geometry_msgs.msg import PoseStamped
     from sensor_msgs.msg import CompressedImage
 
-    _in_ros(uri, logs, "camera")
+    _in_ros(uri, logs, "camera", end)
     camera = rospy.Publisher(programs.CAMERA, CompressedImage, queue_size=capacity)
     odometry = rospy.Publisher(programs.ODOMETRY, PoseStamped, queue_size=100)
 

@@ -3,7 +3,8 @@
 import contextlib
 
 from bufgym.cli.options import Count, PolicyFile, one_policy
-from bufgym.robot.commands import PORT, RECEIVER, Host, Port, Transport, address, say
+from bufgym.robot.commands import PORT, RECEIVER, Host, Port, Transport, Window, address, listens_at, say
+from bufgym.robot.decided_in import Compiled, decide_in_python
 
 
 async def send(
@@ -15,6 +16,8 @@ async def send(
     capacity: Count = 32,
     odom: str | None = None,
     transport: Transport = "tcp",
+    window: Window = None,
+    compiled: Compiled = False,
     log: str | None = None,
 ) -> None:
     """On the robot: subscribe, and send over one uplink; Ctrl-C ends it.
@@ -27,6 +30,7 @@ async def send(
         odom: Topic with poses, which give x to the topics that move.
         log: Log every decision to this file (.mcap), for live replay.
     """
+    decide_in_python(unless=compiled)
     from bufgym.robot import LogFile
     from bufgym.robot.ros2.relay import RosSender
     from bufgym.scenario import read_client
@@ -37,13 +41,30 @@ async def send(
     with contextlib.ExitStack() as stack:
         file = None if log is None else stack.enter_context(LogFile(log))
         robot = RosSender(
-            client, host, port, policy=policy, capacity=capacity, odometry=odom, transport=transport, log=file, say=say
+            client,
+            host,
+            port,
+            policy=policy,
+            capacity=capacity,
+            odometry=odom,
+            transport=transport,
+            window=window,
+            log=file,
+            say=say,
         )
         await robot.run()
 
 
-async def receive(*, port: Port = PORT, host: Host = "127.0.0.1", transport: Transport = "tcp") -> None:
-    """At the other end: receive and republish; Ctrl-C ends it."""
+async def receive(
+    at: str | None = None, /, *, port: Port = PORT, host: Host = "127.0.0.1", transport: Transport = "tcp"
+) -> None:
+    """At the other end: receive and republish; Ctrl-C ends it.
+
+    Args:
+        at: HOST:PORT to listen on, in place of --host and --port.
+    """
+    decide_in_python()
     from bufgym.robot.ros2 import relay
 
+    host, port = listens_at(at, host, port)
     await relay.receive(port, host, transport, say)

@@ -27,6 +27,7 @@ from bufgym.robot.receiver import Received
 from bufgym.robot.ros2.names import needs_rclpy
 from bufgym.robot.ros2.relay import RosSender, receive
 from bufgym.robot.shaped import ShapedLink
+from bufgym.robot.tunnel import End, Tunnel
 from bufgym.robot.validate import Play, warm
 from bufgym.scenario import Client, Episode, Stream
 from bufgym.traces import Trace, load_motion
@@ -38,8 +39,8 @@ _DEPTH = 100  # history depth of each topic in DDS; on one machine nothing waits
 _SETTLED_S = 1.0  # time after which published messages have arrived
 
 
-def player() -> Play:
-    """Plays episodes through ROS 2.
+def player(tunnel: Tunnel | None = None) -> Play:
+    """Plays episodes through ROS 2, through the tunnel if there is one.
 
     Raises:
         BufgymError: ROS 2 is not installed.
@@ -47,66 +48,86 @@ def player() -> Play:
     with needs_rclpy():
         importlib.import_module("rclpy")
         programs.check_messages("get_fields_and_field_types")
-    return play
+    return partial(play, tunnel=tunnel)
 
 
 def play(
-    policy: Policy, episode: Episode, capacity: int, value: Value, *, speed: float = 1.0, seed: int = 0
+    policy: Policy,
+    episode: Episode,
+    capacity: int,
+    value: Value,
+    *,
+    speed: float = 1.0,
+    seed: int = 0,
+    tunnel: Tunnel | None = None,
 ) -> list[Received]:
     """Play the episode; return the messages that a viewer got. Randomised policies use their own draws."""
     programs.check_speed(speed)
     warm(PolicyQueue(policy, capacity, value=value))
-    with programs.running(
-        receive=_receive, send=partial(_send, policy, capacity, value), viewer=_view, camera=partial(_publish, episode)
-    ) as workers:
-        return asyncio.run(_play(workers, episode))
+    near, far = (None, None) if tunnel is None else (tunnel.near, tunnel.far)
+    works = {
+        "receive": partial(_receive, far),
+        "send": partial(_send, near, policy, capacity, value),
+        "viewer": partial(_view, far),
+        "camera": partial(_publish, near, episode),
+    }
+    if tunnel is not None:
+        works["link"] = partial(tunnel.carry, episode.link)
+    with programs.running(**works) as workers:
+        return asyncio.run(_play(workers, episode, "127.0.0.1" if far is None else far.address))
 
 
-async def _play(workers: Sequence[programs.Worker], episode: Episode) -> list[Received]:
-    receiving, sending, viewer, camera = workers
-    link = ShapedLink(episode.link, ("127.0.0.1", await receiving.told()))
+async def _play(workers: Sequence[programs.Worker], episode: Episode, address: str) -> list[Received]:
+    receiving, sending, viewer, camera, *carrier = workers
+    to = address, await receiving.told()
+    link = None if carrier else ShapedLink(episode.link, to)
     try:
-        sending.tell(await link.listen())
+        sending.tell(to if link is None else (address, await link.listen()))
         await viewer.told()  # of a frame before the first
         began_s = time.monotonic() + programs.START_S
-        asyncio.get_running_loop().call_at(began_s, link.begin)
-        camera.tell(began_s)
+        if link is not None:
+            asyncio.get_running_loop().call_at(began_s, link.begin)
+        for worker in (*carrier, camera):
+            worker.tell(began_s)
         sending.tell(await camera.told(patience_s=math.inf))
         viewer.tell(await sending.told(patience_s=math.inf))
         return programs.received(await viewer.told(), episode, began_s)
     finally:
-        await link.close()
+        if link is not None:
+            await link.close()
 
 
-def _on(domain: int) -> None:
-    """Put this process into a domain limited to this machine."""
+def _on(domain: int, end: End | None) -> None:
+    """Put this process into a domain limited to this machine, at one end of the tunnel if there is one."""
+    if end is not None:
+        end.enter()
     os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
 
 
-def _node(domain: int, name: str) -> Any:
-    _on(domain)
+def _node(domain: int, name: str, end: End | None) -> Any:
+    _on(domain, end)
     import rclpy
 
     rclpy.init(args=[])
     return rclpy.create_node(name, enable_rosout=False, start_parameter_services=False)
 
 
-def _receive(parent: Connection) -> None:
+def _receive(end: End | None, parent: Connection) -> None:
     def say(text: str) -> None:
         if text.startswith("listening on "):
             parent.send(int(text.rpartition(":")[2]))
 
-    _on(_DOMAIN + 1)
-    asyncio.run(receive(0, say=say))
+    _on(_DOMAIN + 1, end)
+    asyncio.run(receive(0, "127.0.0.1" if end is None else end.address, say=say))
 
 
-def _send(policy: Policy, capacity: int, value: Value, parent: Connection) -> None:
+def _send(end: End | None, policy: Policy, capacity: int, value: Value, parent: Connection) -> None:
     records: list[Record] = []
     stream = Stream(Topic(programs.CAMERA), rate_hz=30.0, size_bytes=1, moves=True)
     # Where a client is simulated, it needs a link and a motion as well.
     client = Client((stream,), (Trace.steps([(1.0, 1e6)]),), (load_motion("drive-0"),), value=value)
-    _on(_DOMAIN)
-    to, odometry = ("127.0.0.1", parent.recv()), programs.ODOMETRY
+    _on(_DOMAIN, end)
+    to, odometry = parent.recv(), programs.ODOMETRY
     robot = RosSender(client, *to, policy=policy, capacity=capacity, odometry=odometry, log=records.append)
 
     def all_sent() -> None:
@@ -120,8 +141,8 @@ def _send(policy: Policy, capacity: int, value: Value, parent: Connection) -> No
     asyncio.run(relay())
 
 
-def _view(parent: Connection) -> None:
-    node, seen = _node(_DOMAIN + 1, "viewer"), programs.Seen()
+def _view(end: End | None, parent: Connection) -> None:
+    node, seen = _node(_DOMAIN + 1, "viewer", end), programs.Seen()
 
     import rclpy
     from sensor_msgs.msg import CompressedImage
@@ -135,8 +156,8 @@ def _view(parent: Connection) -> None:
     parent.recv()
 
 
-def _publish(episode: Episode, parent: Connection) -> None:
-    node = _node(_DOMAIN, "camera")
+def _publish(end: End | None, episode: Episode, parent: Connection) -> None:
+    node = _node(_DOMAIN, "camera", end)
 
     from geometry_msgs.msg import PoseStamped
     from sensor_msgs.msg import CompressedImage

@@ -21,7 +21,7 @@ from bufgym.robot.log import Record
 from bufgym.robot.odometry import Odometry
 from bufgym.robot.receiver import Received, Receiver
 from bufgym.robot.ros2.names import Published, needs_rclpy, parse, published
-from bufgym.robot.sender import Sender
+from bufgym.robot.sender import Leaves, Sender
 from bufgym.robot.tasks import until_one_ends
 from bufgym.scenario import Client
 
@@ -109,24 +109,27 @@ class RosSender:
         capacity: int = 32,
         odometry: str | None = None,
         transport: str = "tcp",
+        window: int | None = None,
         log: LogFile | Callable[[Record], None] | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """
         Args:
-            client: topics with their rules, and n_T; ``bufgym.scenario.read_client`` reads one.
+            client: topics with their rules; ``bufgym.scenario.read_client`` reads one.
             policy: a drop rule for one topic, a scheduler for several.
             capacity: L, messages of all topics together.
             odometry: a topic with poses, which gives x to topics that move; x of other topics is time.
+            window: n_T, messages sent and not yet acked by the receiver, at most; None: as many as fill the link.
             say: called with a line for each topic found.
         """
         moving = [stream.topic.name for stream in client.streams if stream.moves]
         if moving and odometry is None:
             raise BufgymError(f"topic {moving[0]!r}: moves, which needs a topic with odometry")
         self.queue = PolicyQueue(
-            policy, capacity, value=client.value, topics=client.topics, window=client.window, log=log
+            policy, capacity, value=client.value, topics=client.topics, window=window or 1, log=log
         )
-        self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port))
+        leaves: Leaves = "sent" if window is None else "acked"
+        self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port), leaves)
         self._streams = client.streams
         self._numbers = {resolved(stream.topic.name): number for number, stream in enumerate(client.streams)}
         self._odometry_topic = None if odometry is None else resolved(odometry)
