@@ -1,1 +1,1 @@
-"""Studies of ours around the papers: each answered one question, and is run again only to check the answer."""
+"""Studies: each answered one question or made some numbers, and is run again only to check them. See README.md."""

@@ -1,4 +1,4 @@
-"""Choices of ``python -m agents.tune`` in ``tuned.json``: ``bufgym bench --suite`` uses them as variants."""
+"""Choices of ``python -m studies.tune`` in ``tuned.json``: ``bufgym bench --suite`` uses them as variants."""
 
 from pathlib import Path
 from typing import Any

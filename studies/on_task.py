@@ -1,6 +1,6 @@
 """Does an agent do a robot's own task better if that task is its reward? An experiment on `bufgym/Mapping-v0`.
 
-    python -m agents.on_task
+    python -m studies.on_task
 
 Evolution finds the numbers of a rule under each of three rewards. The first is the information that arrives, by the
 motion of the camera, which is every environment's default. The others are `covered` and `followed`, which stands in for
