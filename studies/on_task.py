@@ -33,7 +33,7 @@ TEST_LINKS = 2
 PARTS, PART_EPISODES = 8, 24
 """Parts of the training episodes, one a generation in turn, and episodes in each."""
 RIVALS = ("afr", "drop-oldest", "min-motion-gap", "gap-price", "learned")
-RESAMPLES, CONFIDENCE = 2000, 0.95
+RESAMPLES = 2000
 
 Frames = NDArray[np.int64]
 
@@ -135,7 +135,7 @@ def main(
         """Gain in tracking over the other policy, paired over episodes."""
         if name == base:
             return ""
-        more = percentile_interval(weights @ (tracked[name] - tracked[base]), CONFIDENCE)
+        more = percentile_interval(weights @ (tracked[name] - tracked[base]))
         return f"{more.value:+.3f} [{more.low:+.3f}, {more.high:+.3f}]"
 
     bases = {"AFR's": RIVALS[0], "the agent's by information": f"agent by {next(iter(REWARDS))}"}

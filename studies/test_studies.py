@@ -8,7 +8,7 @@ import pytest
 from bufgym.papers import figure
 from bufgym.sim import NEVER
 from bufgym.traces import Trace, write_csv
-from studies import afr_overlap, afr_vs_random
+from studies import afr_overlap, afr_qoi_task, afr_vs_random
 from studies.afr_frame_size import full
 
 
@@ -66,3 +66,9 @@ def test_the_best_frames_in_hindsight_and_rules_at_a_distance() -> None:
     assert found is not None and found["broken_6"] == 0.5  # at frame 0; frame 1 sees nothing new
     assert found["excess_6"] == pytest.approx(0.2) and found["broken_5"] == 0
     assert afr_overlap._rules(v, np.arange(4.0), 2) is None  # 4 frames on is beyond the end
+
+
+def test_a_correlation_draws_whole_groups() -> None:
+    """Within each group b falls with a; whichever groups are drawn, it is -1."""
+    a, group = np.array([1.0, 2, 1, 2, 1, 2]), np.repeat([0, 1, 2], 2)
+    assert afr_qoi_task.spearman_over(a, -a, group, "falls") == pytest.approx((-1, -1, -1))

@@ -20,7 +20,7 @@ from bufgym.ground.kernel import JIT
 from bufgym.ground.libraries import library
 from bufgym.papers import FIGURES, afr_fig5, afr_fig7, afr_fig8, frame_tasks, page, run
 from bufgym.papers.figure import UNDECIDED, of_all, statements, tens, within
-from bufgym.papers.frame_runs import spearman, spearman_over
+from bufgym.papers.frame_runs import spearman
 from bufgym.papers.frame_tasks import FrameTask, carry_out
 from bufgym.papers.page import claim_rows
 from bufgym.papers.perception.frames import Camera, encoded_bytes
@@ -279,9 +279,6 @@ def test_spearman() -> None:
     assert spearman(a, np.exp(a)) == pytest.approx(1)
     assert spearman(a, np.array([4.0, 3, 1, 2])) == pytest.approx(-0.8)  # 1 - 6 (9 + 1 + 4 + 4) / (4 x 15)
     assert np.isnan(spearman(a, np.ones(4)))
-    # Within each group b falls with a; whichever groups are drawn, it is -1.
-    a, group = np.array([1.0, 2, 1, 2, 1, 2]), np.repeat([0, 1, 2], 2)
-    assert spearman_over(a, -a, group, "falls") == pytest.approx((-1, -1, -1))
     # AFR is 10 % below at every place of the fade, however much these differ: the interval has no width.
     pairs = [("drop-oldest", 10.0), ("afr", 9.0)]
     rows = FigureRows({"k": k, "L": 5, "policy": p, "rmse_mm": mm * (1 + k)} for k in range(4) for p, mm in pairs)
