@@ -86,7 +86,7 @@ format: $(READY)
 
 clean:
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find bufgym agents tests -name __pycache__ -prune -exec rm -rf {} +
+	find bufgym agents studies tests -name __pycache__ -prune -exec rm -rf {} +
 
 # Byte code is made when a module is first imported: making it for all takes half the time of an installation.
 $(READY): pyproject.toml constraints.txt

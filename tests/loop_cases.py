@@ -1,37 +1,15 @@
-"""Tests that are coroutines: a module has one event loop, and what a test begins in it ends with the test."""
+"""What the tests of sockets share. pytest-asyncio runs those that are coroutines, in one loop for each module."""
 
 import asyncio
 import contextlib
-import inspect
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 import pytest
 
 from bufgym.ground.kernel import JIT
 
-PATIENCE_S = 600
-"""Ends a test that hangs. No test waits for it."""
 compiled = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as long as messages do")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def runner() -> Iterator[asyncio.Runner]:
-    with asyncio.Runner() as one:
-        yield one
-
-
-def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    if not inspect.iscoroutinefunction(pyfuncitem.obj):
-        return None
-    given = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
-
-    async def test() -> None:
-        async with asyncio.timeout(PATIENCE_S):
-            await pyfuncitem.obj(**given)
-
-    pyfuncitem.funcargs["runner"].run(test())
-    return True
 
 
 @contextlib.asynccontextmanager

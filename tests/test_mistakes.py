@@ -159,12 +159,6 @@ def test_paths_rates_and_parameters_wherever_text_is_taken(tmp_path: Path) -> No
     refuse(r"unknown parameter 'rate'; did you mean 'rate_hz'", scenario.get, "lte:rate=5")
 
 
-def test_masks_of_an_environment_as_it_is_made() -> None:
-    env: Any = gym.make("bufgym/Uplink-v0", capacity=2)
-    _, info = env.reset(seed=0)
-    assert env.action_masks().tolist() == (info["action_mask"] == 1).tolist()
-
-
 def test_results_without_bare_nan(tmp_path: Path) -> None:
     """JSON has no NaN: no regret is null."""
     run: Any = SimpleNamespace(seed=0, seconds=1.0, merit=1.0)

@@ -11,8 +11,7 @@ import pytest
 from cli_cases import Capsys, fails, shown
 from refusal_cases import refuse
 
-from agents import tune
-from bufgym.benchmark import leaderboard, tuned
+from bufgym.benchmark import leaderboard
 from bufgym.cli import main
 from bufgym.ground.errors import BufgymError, printable
 from bufgym.scenario import read_client
@@ -88,20 +87,6 @@ def test_a_leaderboard_that_was_tampered_with(tmp_path: Path, data: Any, rule: s
         with path.open("w", newline="") as file:
             csv.writer(file).writerows([leaderboard.COLUMNS, (ROW | data).values()])
     fails(["validate", "lte-v1/afr", "--file", path], rule, capsys)
-
-
-def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tuned, "FILE", tmp_path / "tuned.json")
-    tune.keep("lte-v1", [], split="validation", again="")
-    before = tuned.FILE.read_bytes()
-
-    def half(path: Path, text: str, **_: object) -> None:
-        path.write_bytes(text.encode()[:20])
-        raise OSError(28, "No space left on device", str(path))
-
-    monkeypatch.setattr(Path, "write_text", half)
-    refuse("No space", tune.keep, "lte-v1", [], split="validation", again="", kind=OSError)
-    assert tuned.FILE.read_bytes() == before and list(tmp_path.iterdir()) == [tuned.FILE]
 
 
 def test_what_is_printable_stays_and_all_else_is_written_out() -> None:

@@ -1,11 +1,11 @@
 """Reader of untrusted JSON files; its errors name the file, the field and the rule."""
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+from bufgym.ground import strict_json
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8
 
@@ -16,7 +16,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """Read the object in a file; numbers must be finite."""
     text = read_utf8(path, MAX_JSON_BYTES)
     try:
-        content = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        content = strict_json.loads(text)
     except RecursionError:
         raise BufgymError(f"{path}: nested too deep") from None
     except json.JSONDecodeError as error:
@@ -26,15 +26,6 @@ def read_object(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise BufgymError(f"{path}: must be a JSON object")
     return content
-
-
-def _finite(digits: str) -> float:
-    number = float(digits)
-    return number if math.isfinite(number) else _refuse(digits)
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant}: numbers must be finite")
 
 
 def check(path: Path, place: str, content: Any, kinds: Mapping[str, Any]) -> None:

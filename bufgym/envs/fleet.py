@@ -13,15 +13,12 @@ from numpy.typing import NDArray
 from bufgym.envs.fleet_rows import FleetRows
 from bufgym.envs.observation import Observation
 from bufgym.envs.rows import OPTIONS, check_render_mode
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import needs
 from bufgym.scenario import FleetScenario, Uplink
 
-try:
+with needs("pettingzoo", "fleet", "FleetEnv"):
     from pettingzoo import ParallelEnv
-except ModuleNotFoundError as error:
-    if error.name != "pettingzoo":
-        raise
-    raise BufgymError(f"FleetEnv needs pettingzoo: {install('fleet')}") from None
 
 Infos = dict[str, dict[str, Any]]
 Spaces = dict[str, spaces.Space[Any]]

@@ -1,16 +1,25 @@
 """Libraries of the extras, imported where they are used."""
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from bufgym.ground.errors import BufgymError, install
 
 
-def library(name: str, extra: str = "perception", user: str = "bufgym") -> Any:
-    """Import the module of that name; the error where it is missing says that ``user`` needs the extra."""
+@contextmanager
+def needs(libraries: str | tuple[str, ...], extra: str = "live", user: str = "bufgym") -> Iterator[None]:
+    """Raise an error that says that ``user`` needs the extra if the block can't import one of its libraries."""
     try:
-        return importlib.import_module(name)
+        yield
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] != name.split(".")[0]:
+        if (error.name or "").split(".")[0] not in ((libraries,) if isinstance(libraries, str) else libraries):
             raise
         raise BufgymError(f"{user} needs {error.name}: {install(extra)}") from None
+
+
+def library(name: str, extra: str = "perception", user: str = "bufgym") -> Any:
+    """Import the module of that name, which comes with the extra; see ``needs``."""
+    with needs(name.split(".")[0], extra, user):
+        return importlib.import_module(name)

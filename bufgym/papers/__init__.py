@@ -51,7 +51,7 @@ def figure(name: str, out: Path | None = None, **options: Any) -> Figure:
 def _kind(name: str) -> Any:
     if name not in FIGURES:
         raise unknown("figure", name, FIGURES)
-    return importlib.import_module(f"bufgym.papers.{name.replace('-', '_')}").Reproduction
+    return importlib.import_module(f"{statements()[name]['package']}.{name.replace('-', '_')}").Reproduction
 
 
 def run(name: str, out: Path | None = None, **options: Any) -> str:

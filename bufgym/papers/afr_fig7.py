@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.papers.figure import heat_table, of_all, tens, within
-from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, FrameFigure, FrameRun, spearman
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun, spearman
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
 
@@ -41,7 +41,7 @@ def _quotient(above: list[float], below: list[float], label: str) -> Interval:
     The interval comes from a paired bootstrap over offsets: a drawn offset brings all its runs of both.
     """
     weights = times_drawn(len(above), RESAMPLES, stream(0, label))
-    return percentile_interval((weights @ above) / (weights @ below) - 1, CONFIDENCE)
+    return percentile_interval((weights @ above) / (weights @ below) - 1)
 
 
 def spelled(interval: Interval) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.benchmark.table import aligned
 from bufgym.papers.figure import finish, heat_table, of_all, within
-from bufgym.papers.frame_runs import CONFIDENCE, POLICIES, RESAMPLES, FrameFigure
+from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure
 from bufgym.papers.perception.stage import IMAGES
 from bufgym.papers.rows import FigureRows
 
@@ -106,7 +106,7 @@ class Reproduction(FrameFigure):
             [(failures(rows, k=k, L=large) - failures(rows, k=k, L=small)) / runs for k in rows.distinct("k")]
         )
         drawn = times_drawn(len(changes), RESAMPLES, stream(0, "sizes"))
-        return percentile_interval(drawn @ changes / len(changes), CONFIDENCE)
+        return percentile_interval(drawn @ changes / len(changes))
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return 13.0, (0.4 + 1.7 * math.ceil(len(self.policies) / COLUMNS)) * len(self.recordings)
@@ -153,7 +153,7 @@ def rate(rows: FigureRows) -> Interval:
     """Share of the runs that fail; the interval draws offsets of the fade, each with all its runs."""
     shares = np.array([failures(rows, k=k) / len(rows.where(k=k)) for k in rows.distinct("k")])
     drawn = times_drawn(len(shares), RESAMPLES, stream(0, "failures"))
-    return percentile_interval(drawn @ shares / len(shares), CONFIDENCE)
+    return percentile_interval(drawn @ shares / len(shares))
 
 
 def failures(rows: FigureRows, **where: object) -> int:

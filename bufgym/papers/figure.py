@@ -11,7 +11,6 @@ import functools
 import math
 import sys
 import textwrap
-import tomllib
 from abc import ABC, abstractmethod
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,6 +20,7 @@ from typing import Any, ClassVar, get_type_hints
 
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import read_toml
 from bufgym.ground.libraries import library
 from bufgym.model import checks
 from bufgym.model.checks import above_0
@@ -117,11 +117,15 @@ class Figure(ABC):
 
 @functools.cache
 def statements() -> dict[str, dict[str, Any]]:
-    """Map each figure's name to its texts: title, setup, notes, and the paper's sentences under claims."""
-    texts: dict[str, dict[str, Any]] = {}
-    for part in ("afr", "robofleet"):
-        with (Path(__file__).parent / f"{part}.toml").open("rb") as file:
-            texts |= tomllib.load(file)
+    """Map each figure's name to its texts: title, setup, notes, and the paper's sentences under claims.
+
+    ``package`` says where the figure's module is: a checkout has more of them in its folder ``studies``.
+    """
+    here, texts = Path(__file__).parent, dict[str, dict[str, Any]]()
+    for file in (here / "afr.toml", here.parents[1] / "studies" / "afr.toml", here / "robofleet.toml"):
+        if file.exists():
+            package = __package__ if file.parent == here else file.parent.name
+            texts |= {name: {"package": package, **told} for name, told in read_toml(file).items()}
     return texts
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import traces
-from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
 from bufgym.benchmark.rows import Row
 from bufgym.ground.libraries import library
 from bufgym.papers.figure import COLOURS, Figure, whole
@@ -44,7 +43,7 @@ POLICIES = {
     "clairvoyant": ("clairvoyant", COLOURS["oracle-ideal"]),
 }
 """Policy -> label, colour. The clairvoyant plans for motion QoI."""
-RESAMPLES, CONFIDENCE = 1000, 0.95  # Bootstrap of a rank correlation
+RESAMPLES = 1000  # Of the bootstrap over the places of the fade
 
 
 class FrameRun(NamedTuple):
@@ -161,14 +160,3 @@ def spearman(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return math.nan
     return float(library("scipy.stats").spearmanr(a, b).statistic)
-
-
-def spearman_over(a: NDArray[np.float64], b: NDArray[np.float64], group: NDArray[np.int64], label: str) -> Interval:
-    """Correlate with a bootstrap interval that draws whole groups, because members of a group are dependent."""
-    members = [np.flatnonzero(group == g) for g in np.unique(group)]
-    rng = stream(0, label)
-    numbers = [spearman(a, b)]
-    for _ in range(RESAMPLES):
-        drawn = np.concatenate([members[k] for k in rng.integers(0, len(members), len(members))])
-        numbers.append(spearman(a[drawn], b[drawn]))
-    return percentile_interval(np.array(numbers), CONFIDENCE)

@@ -15,7 +15,7 @@ import safetensors
 from numpy.typing import NDArray
 from safetensors.numpy import save as serialized
 
-from bufgym.ground import __version__
+from bufgym.ground import __version__, strict_json
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_whole, replaced
 from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS
@@ -188,7 +188,7 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     if text is None:
         raise BufgymError(f"{path}: has no metadata of bufgym's; no file of a learned policy")
     try:
-        metadata = json.loads(text, parse_constant=_no_number)
+        metadata = strict_json.loads(text)
     except (ValueError, RecursionError) as error:
         raise BufgymError(f"{path}: metadata that are no JSON: {error}") from None
     if not isinstance(metadata, dict):
@@ -219,10 +219,6 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
         if fields.count(field) > 1:
             raise BufgymError(where(path, None, field, "given more than once", field="field"))
     return metadata
-
-
-def _no_number(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number of JSON's")
 
 
 def _refuse(path: StrPath, name: str, rule: str, *, what: str = "", value: object = None) -> NoReturn:

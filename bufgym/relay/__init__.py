@@ -7,8 +7,8 @@ it, and ``wire`` defines the protocol on its WebSockets.
 
 from typing import TYPE_CHECKING
 
+from bufgym.ground.libraries import needs
 from bufgym.ground.modules import on_demand
-from bufgym.robot.extra import needs
 
 with needs("msgspec", "relay", "bufgym.relay"):  # the other libraries of the extra come with it
     import msgspec  # noqa: F401

@@ -14,9 +14,9 @@ from urllib.parse import unquote, urlsplit
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
+from bufgym.ground.libraries import needs
 from bufgym.relay.config import Nats, StoreLimits
 from bufgym.relay.wire import RefusedError
-from bufgym.robot.extra import needs
 
 MESSAGE: Final = "bufgym.relay.message"
 HOLD: Final = "bufgym.relay.hold"

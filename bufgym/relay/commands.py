@@ -41,8 +41,8 @@ async def serve(*, config: str, check: bool = False) -> None:
         config: As examples/relay.toml.
         check: Only read it and print its permissions.
     """
+    from bufgym.ground.libraries import needs
     from bufgym.relay import config as configurations
-    from bufgym.robot.extra import needs
 
     settings = configurations.load(config)
     with needs("websockets"):

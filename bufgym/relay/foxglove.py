@@ -10,13 +10,13 @@ from contextlib import suppress
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import needs
 from bufgym.relay import ros_messages, wire
 from bufgym.relay.config import Config, Foxglove
 from bufgym.relay.gate import Gate, hidden_host
 from bufgym.relay.recorder import SCHEMAS
 from bufgym.relay.rules import FOXGLOVE, Permissions
 from bufgym.relay.session import Session
-from bufgym.robot.extra import needs
 
 OWN_PAGES: Final = ("https://app.foxglove.dev", "file://")  # The web page, and programs that are pages of their own
 MAX_CHANNELS: Final = 10_000  # Limit on channels, which clients open by topic and type; further channels are not shown

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from bufgym.ground import strict_json
 from bufgym.model.checks import whole
 from bufgym.relay import wire
 from bufgym.relay.config import DEFAULT_CAPACITY, Config, Rule
@@ -128,7 +129,7 @@ def check_json(message: wire.Message) -> None:
         if len(message.payload) > wire.MAX_JSON_BYTES:
             raise RefusedError("too_large", f"topic {topic}: JSON must be at most {wire.MAX_JSON_BYTES} bytes")
         try:
-            wire.loads(bytes(message.payload))
+            strict_json.loads(bytes(message.payload))
         except (ValueError, RecursionError) as error:
             raise RefusedError("wrong", f"topic {topic}: payload must be JSON: {error}") from None
 

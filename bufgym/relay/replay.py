@@ -17,8 +17,8 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 
+from bufgym.ground import strict_json
 from bufgym.ground.errors import BufgymError
-from bufgym.relay import wire
 
 MOST_BYTES: Final = 4 * 2**20  # Limit on the payloads of a piece
 _MAGIC: Final = b"\x89MCAP0\r\n"
@@ -55,7 +55,7 @@ def piece(
         if not may_receive(topic):
             continue
         try:
-            data = wire.loads(record.data) if encoding == "json" else base64.b64encode(record.data).decode()
+            data = strict_json.loads(record.data) if encoding == "json" else base64.b64encode(record.data).decode()
         except ValueError:
             continue
         left_bytes -= len(record.data)

@@ -20,6 +20,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import needs
 from bufgym.relay import connection, pages, policies, wire
 from bufgym.relay.caller import Caller
 from bufgym.relay.config import POLICIES, Config
@@ -29,7 +30,6 @@ from bufgym.relay.identity import Verifier, server_context
 from bufgym.relay.robofleet import RobofleetConnection
 from bufgym.relay.rules import Identity, Permissions, plain_address
 from bufgym.relay.wire import RefusedError
-from bufgym.robot.extra import needs
 from bufgym.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
 from bufgym.robot.tasks import until_one_ends
 

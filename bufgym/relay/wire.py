@@ -8,14 +8,14 @@ where the encoding is ``json``, and base64 of the payload where it is not.
 import base64
 import binascii
 import json
-import math
 import struct
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, NamedTuple, NoReturn
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
+from bufgym.ground import strict_json
 from bufgym.ground.errors import BufgymError
 
 PATH: Final = "/relay"
@@ -186,7 +186,7 @@ def heard(text: str) -> dict[str, Any]:
     Raises WireError: it is none of this protocol.
     """
     try:
-        said = loads(text)
+        said = strict_json.loads(text)
     except (ValueError, RecursionError) as error:
         raise WireError(f"text {text[:60]!r}: must be JSON: {error}") from None
     if not isinstance(said, dict) or not isinstance(said.get("op"), str) or said["op"] not in FIELDS:
@@ -198,26 +198,12 @@ def heard(text: str) -> dict[str, Any]:
     return said
 
 
-def no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    return value if math.isfinite(value) else no_constant(f"the number {text[:20]}")
-
-
-def loads(text: str | bytes) -> Any:
-    """Parse JSON; raise ValueError for a number that is infinite as a float, also ``1e400``."""
-    return json.loads(text, parse_constant=no_constant, parse_float=_finite)
-
-
 def to_json(message: Message) -> str:
     """The message as a text frame from the relay."""
     data: Any
     if message.encoding == "json":
         try:
-            data = loads(bytes(message.payload))
+            data = strict_json.loads(bytes(message.payload))
         except (ValueError, RecursionError) as error:
             raise WireError(f"topic {message.topic}: payload must be JSON, as its encoding says: {error}") from None
     else:

@@ -14,8 +14,8 @@ import threading
 import time
 from typing import Any, Final
 
+from bufgym.ground.libraries import needs
 from bufgym.robot.bus_channel import Hear, Open, Peer
-from bufgym.robot.extra import needs
 from bufgym.robot.sockets import DEAD_AFTER_S, little_unsent
 
 ROOT: Final = "bufgym"

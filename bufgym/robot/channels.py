@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final, Protocol
 
+from bufgym.ground.libraries import needs
 from bufgym.robot.bus_channel import BusChannel
 from bufgym.robot.buses import BUSES
-from bufgym.robot.extra import needs
 from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, parse, whole
 from bufgym.robot.sockets import connected, unsent_bytes, until_writable
 

@@ -12,10 +12,10 @@ from typing import Any, Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import needs
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
-from bufgym.robot.extra import needs
 from bufgym.robot.mcap_file import McapFile
 
 Record = dict[str, Any]

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
-from bufgym.robot.extra import needs
+from bufgym.ground.libraries import needs
 
 MAX_CHANNELS: Final = 30_000  # Channels of a file. MCAP itself numbers at most 65,535.
 MAX_FORMS: Final = 16  # Channels of one topic, which differ in encoding or schema

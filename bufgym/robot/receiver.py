@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import needs
 from bufgym.model.checks import whole
 from bufgym.robot.bus_channel import BusServer
 from bufgym.robot.buses import BUSES, MQTT_PORT
 from bufgym.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
-from bufgym.robot.extra import needs
 from bufgym.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, Room
 from bufgym.robot.mcap_file import McapFile
 from bufgym.robot.sockets import free_port

@@ -9,17 +9,13 @@
 ``export`` (or ``bufgym export``) writes a slot network to a file that bufgym runs without torch.
 """
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.libraries import needs
 
-try:
+with needs(("stable_baselines3", "sb3_contrib", "torch"), "train", "bufgym.sb3"):
     from bufgym.sb3.export import export, weights_of
     from bufgym.sb3.networks import SlotExtractor, SlotPolicy, SlotScorer
     from bufgym.sb3.policies import as_policy, takes_masks
     from bufgym.sb3.vec_env import GymVecEnv, make_vec_env
-except ModuleNotFoundError as error:
-    if (error.name or "").split(".")[0] not in ("stable_baselines3", "sb3_contrib", "torch"):
-        raise
-    raise BufgymError(f"bufgym.sb3 needs {error.name}: {install('train')}") from None
 
 __all__ = [
     "GymVecEnv", "SlotExtractor", "SlotPolicy", "SlotScorer", "as_policy", "export", "make_vec_env", "takes_masks",

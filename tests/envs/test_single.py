@@ -71,9 +71,9 @@ def test_a_mask_as_gymnasium_and_as_sb3_contrib_take_it(env_id: str) -> None:
     _, info = env.reset(seed=0)
     for _ in range(20):
         assert info["action_mask"].dtype == np.int8
-        assert env.unwrapped.action_masks().dtype == np.bool_
+        assert env.action_masks().dtype == np.bool_ and env.action_masks().tolist() == info["action_mask"].tolist()
         action = env.action_space.sample(info["action_mask"])  # as README has it
-        assert env.unwrapped.action_masks()[action]
+        assert env.action_masks()[action]
         _, _, ended, _, info = env.step(action)
         assert info["invalid"] == 0
         if ended:

@@ -16,10 +16,8 @@ from bufgym.cli import main
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.papers import NEEDS_DATA, afr_fig4, afr_fig5, afr_fig9, afr_theorems, afr_vs_random, figure, run
-from bufgym.papers.afr_frame_size import full
+from bufgym.papers import NEEDS_DATA, afr_fig4, afr_fig5, afr_fig9, afr_theorems, figure, run
 from bufgym.scenario import Interruption
-from bufgym.sim import NEVER
 from bufgym.traces import Trace, write_csv
 
 # Typed from the paper's figure: (T, dropped, r, c, p) with L = 8, the state after the decision. At T = 16 the pass is
@@ -104,32 +102,6 @@ def test_theorems_can_fail() -> None:
         assert afr_theorems.worst_ratio(oldest) < afr_theorems.bound(L)
 
 
-def all_outcomes(L: int, T: int) -> dict[tuple[int, ...], float]:
-    """Messages kept by Random -> probability, by trying every drop."""
-    outcomes = {tuple(range(1, min(L, T) + 1)): 1.0}
-    for t in range(L + 1, T + 1):
-        grown: dict[tuple[int, ...], float] = {}
-        for kept, probability in outcomes.items():
-            candidates = (*kept, t)
-            for k in range(L + 1):
-                left = candidates[:k] + candidates[k + 1 :]
-                grown[left] = grown.get(left, 0.0) + probability / (L + 1)
-        outcomes = grown
-    return outcomes
-
-
-@pytest.mark.parametrize(("L", "T"), [(1, 1), (1, 4), (2, 5), (3, 8), (4, 3)])
-def test_expected_gaps_are_those_of_every_outcome(L: int, T: int) -> None:
-    counts = np.zeros(14)
-    for kept, probability in all_outcomes(L, T).items():
-        for gap in np.diff((0, *kept, T + 1)):
-            counts[gap] += probability
-    assert afr_vs_random.expected_gaps(L, 12)[T] == pytest.approx(counts, abs=1e-12)
-    sums, lengths = afr_vs_random.expected_gaps(8, 60), np.arange(1, 61)
-    assert sums.sum(axis=1)[1:] == pytest.approx(np.minimum(lengths, 8) + 1)
-    assert (sums @ np.arange(62))[1:] == pytest.approx(lengths + 1)
-
-
 @pytest.mark.parametrize("name", ["afr", "drop-oldest", "random", "orbbuf"])
 def test_the_timed_loop_makes_the_policys_own_decisions(name: str) -> None:
     policy = policies.get(name)
@@ -142,7 +114,7 @@ def test_the_timed_loop_makes_the_policys_own_decisions(name: str) -> None:
     assert looped == 2 * sum(policy.compiled[0](buffer, arrivals[k], memory) for k in range(30))
 
 
-# Fig. 6 of the AFR paper and the size of a frame: facts of the recorded link, and recordings that are missing.
+# Fig. 6 of the AFR paper: facts of the recorded link, and recordings that are missing.
 
 
 def test_fig6_names_the_seconds_under_500_KB_per_s(tmp_path: Path) -> None:
@@ -158,11 +130,6 @@ def test_fig6_names_the_seconds_under_500_KB_per_s(tmp_path: Path) -> None:
     assert fig6.tables(rows) == ["Second 1: 400.0 KB/s, from 1.00 to 2.00 s of the trace."]
     assert (facts["under"], facts["seconds"], facts["overload"]) == (1, 3, False)  # under the demand of 6 MB/s
     assert facts["carried"] == pytest.approx(18.4 / 18)
-    # Frames kept are counted by the second of their arrival.
-    write_csv(Trace.constant(1e8, 30.0, name="wide"), path)
-    rows = figure("afr-frame-size", trace=str(path), frames=750, capacities=(5,), runs=1, sweep_kb=(300,)).simulate()
-    assert set(rows.column("dropped")) == {0}
-    assert all(abs(row[f"kept_in_second_{s}"] - 30) <= 1 for row in rows for s in (21, 23))
 
 
 def test_recordings_that_are_missing_are_named(tmp_path: Path) -> None:
@@ -187,10 +154,3 @@ def test_all_leaves_them_out_without_data(tmp_path: Path, monkeypatch: Patch, ca
         assert says in "".join(capsys.readouterr())
     with (tmp_path / "out" / "afr-fig6.csv").open(newline="") as file:
         assert [row["under_500KBps"] for row in csv.DictReader(file)][:2] == ["False", "True"]
-
-
-def test_the_share_of_the_time_in_which_a_queue_is_full() -> None:
-    """L = 2: messages come at 0, 1 and 3 s, the second leaves at 1.5 s, the first is dropped at 2 s: two for .5 s."""
-    kinds = [("dropped_us", np.int64), ("dequeued_us", np.int64)]
-    log = np.array([(2_000_000, NEVER), (NEVER, 1_500_000), (NEVER, NEVER)], kinds)
-    assert full(log, np.array([0.0, 1.0, 3.0]), 2) == pytest.approx(0.5 / 3)

@@ -18,9 +18,9 @@ from bufgym.cli import main
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.ground.libraries import library
-from bufgym.papers import FIGURES, afr_fig5, afr_fig7, afr_fig8, afr_overlap, frame_tasks, page, run
+from bufgym.papers import FIGURES, afr_fig5, afr_fig7, afr_fig8, frame_tasks, page, run
 from bufgym.papers.figure import UNDECIDED, of_all, statements, tens, within
-from bufgym.papers.frame_runs import spearman, spearman_over
+from bufgym.papers.frame_runs import spearman
 from bufgym.papers.frame_tasks import FrameTask, carry_out
 from bufgym.papers.page import claim_rows
 from bufgym.papers.perception.frames import Camera, encoded_bytes
@@ -279,9 +279,6 @@ def test_spearman() -> None:
     assert spearman(a, np.exp(a)) == pytest.approx(1)
     assert spearman(a, np.array([4.0, 3, 1, 2])) == pytest.approx(-0.8)  # 1 - 6 (9 + 1 + 4 + 4) / (4 x 15)
     assert np.isnan(spearman(a, np.ones(4)))
-    # Within each group b falls with a; whichever groups are drawn, it is -1.
-    a, group = np.array([1.0, 2, 1, 2, 1, 2]), np.repeat([0, 1, 2], 2)
-    assert spearman_over(a, -a, group, "falls") == pytest.approx((-1, -1, -1))
     # AFR is 10 % below at every place of the fade, however much these differ: the interval has no width.
     pairs = [("drop-oldest", 10.0), ("afr", 9.0)]
     rows = FigureRows({"k": k, "L": 5, "policy": p, "rmse_mm": mm * (1 + k)} for k in range(4) for p, mm in pairs)
@@ -326,18 +323,3 @@ def test_a_claim_holds_where_its_interval_lies_within_it() -> None:
     assert [of_all(v) for v in ([True, True], [True, UNDECIDED], [UNDECIDED, False], [True, None])] == [
         True, UNDECIDED, False, None,
     ]  # fmt: skip
-
-
-def test_the_best_frames_in_hindsight_and_rules_at_a_distance() -> None:
-    # Four frames: 0 to 1 and 1 to 3 are new by 0.5 each, all else by 0.1; one frame between may be kept.
-    v = np.full((4, 4), 0.1)
-    v[0, 1] = v[1, 3] = 0.5
-    assert afr_overlap.best_gain(v, 1) == 1.0
-    assert afr_overlap.best_gain(v, 0) == pytest.approx(0.1)
-    # V = 0, 0.1, 0.4, 0.3 at distance 0..3 from frame 0: from 1 to 2 it more than doubles.
-    v = np.zeros((4, 4))
-    v[0] = [0, 0.1, 0.4, 0.3]
-    found = afr_overlap._rules(v, np.arange(4.0), 1)
-    assert found is not None and found["broken_6"] == 0.5  # at frame 0; frame 1 sees nothing new
-    assert found["excess_6"] == pytest.approx(0.2) and found["broken_5"] == 0
-    assert afr_overlap._rules(v, np.arange(4.0), 2) is None  # 4 frames on is beyond the end

@@ -1,14 +1,12 @@
 """One relay for each module of tests, and for each test a corner of it that no other test uses."""
 
-import asyncio
 import itertools
 import sys
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from loop_cases import pytest_pyfunc_call, runner  # noqa: F401
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "fuzz"))  # mutations lie beside the fuzzing of files
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))  # the made-up robots
@@ -27,14 +25,14 @@ def _compiled() -> None:
 
 
 @pytest.fixture(scope="module")
-def server(request: pytest.FixtureRequest, runner: asyncio.Runner) -> Iterator[Any]:  # noqa: F811
+async def server(request: pytest.FixtureRequest) -> AsyncIterator[Any]:
     """The module's relay, with the settings in the module's ``CONFIG``."""
     from relay_cases import Server, settings, wait
 
     one = Server(getattr(request.module, "CONFIG", None) or settings())
-    runner.run(wait("the module's relay", one.start()))
+    await wait("the module's relay", one.start())
     yield one
-    runner.run(wait("its end", one.close()))
+    await wait("its end", one.close())
 
 
 @pytest.fixture

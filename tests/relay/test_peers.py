@@ -1,10 +1,8 @@
 """Relays that share topics over NATS: robots at one, viewers at another; commands arrive once."""
 
-import asyncio
-import contextlib
 import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 
 import pytest
 from nats_cases import SHARED, nats, nats_server, needs_server, shared
@@ -20,22 +18,17 @@ _NUMBERS = itertools.count()
 
 
 @pytest.fixture(scope="module")
-def relays(runner: asyncio.Runner, tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Server]]:
+async def relays(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[list[Server]]:
     """The second has little room, the third few rights."""
-    stack, port, folder = contextlib.AsyncExitStack(), free_port("127.0.0.1"), tmp_path_factory.mktemp("nats")
+    port, folder = free_port("127.0.0.1"), tmp_path_factory.mktemp("nats")
     narrow = (Rule(address="127.0.0.1", send=True, receive=True, topic="/robots/[^/]*/odom"), SHARED)
-
-    async def start() -> list[Server]:
-        await stack.enter_async_context(nats_server(port, folder / "nats"))
-        servers = [
-            shared(port, "a", folder=folder / "a"),
-            shared(port, "b", folder=folder / "b", store=StoreLimits(bytes=400)),
-            shared(port, "c", rules=narrow),
-        ]
-        return [await stack.enter_async_context(one) for one in servers]
-
-    yield runner.run(start())
-    runner.run(stack.aclose())
+    async with (
+        nats_server(port, folder / "nats"),
+        shared(port, "a", folder=folder / "a") as a,
+        shared(port, "b", folder=folder / "b", store=StoreLimits(bytes=400)) as b,
+        shared(port, "c", rules=narrow) as c,
+    ):
+        yield [a, b, c]
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from loop_cases import pytest_pyfunc_call, runner  # noqa: F401
 
 from bufgym.robot import sender
 from bufgym.robot.sockets import free_port

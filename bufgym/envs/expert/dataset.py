@@ -11,7 +11,8 @@ import gymnasium as gym
 
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.expert.record import KINDS, ROWS, record
-from bufgym.ground.errors import BufgymError, install, unknown
+from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.libraries import needs
 
 VARIABLE = "MINARI_DATASETS_PATH"
 """Environment variable for the folder of Minari's data sets; unset, ``~/.minari/datasets``."""
@@ -46,13 +47,11 @@ def make(
     """
     from unittest.mock import patch  # here, as it is slow to import
 
-    try:
+    with needs(("minari", "pyarrow"), "dataset", "a data set"):
         import minari
         import pyarrow  # noqa: F401  (Minari's storage format here)
         from minari import namespace as namespaces
         from minari.data_collector import EpisodeBuffer
-    except ImportError as error:
-        raise BufgymError(f"data sets need {error.name}: {install('dataset')}") from None
     env = env if "/" in env else f"bufgym/{env}"
     known = [id for id in gym.registry if id.startswith("bufgym/")]
     if env not in known:

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.table import NONE, aligned
 from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.frame_runs import POLICIES, FrameFigure, spearman_over
+from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure, spearman
 from bufgym.papers.rows import FigureRows, listed
 
 MEASURES = {
@@ -138,3 +139,14 @@ def _spelled(row: Row) -> str:
     if np.isnan(row["spearman"]):
         return NONE
     return f"{row['spearman']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"
+
+
+def spearman_over(a: NDArray[np.float64], b: NDArray[np.float64], group: NDArray[np.int64], label: str) -> Interval:
+    """Correlate with a bootstrap interval that draws whole groups, because members of a group are dependent."""
+    members = [np.flatnonzero(group == g) for g in np.unique(group)]
+    rng = stream(0, label)
+    numbers = [spearman(a, b)]
+    for _ in range(RESAMPLES):
+        drawn = np.concatenate([members[k] for k in rng.integers(0, len(members), len(members))])
+        numbers.append(spearman(a[drawn], b[drawn]))
+    return percentile_interval(np.array(numbers))

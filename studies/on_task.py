@@ -1,6 +1,6 @@
 """Does an agent do a robot's own task better if that task is its reward? An experiment on `bufgym/Mapping-v0`.
 
-    python -m agents.on_task
+    python -m studies.on_task
 
 Evolution finds the numbers of a rule under each of three rewards. The first is the information that arrives, by the
 motion of the camera, which is every environment's default. The others are `covered` and `followed`, which stands in for
@@ -33,7 +33,7 @@ TEST_LINKS = 2
 PARTS, PART_EPISODES = 8, 24
 """Parts of the training episodes, one a generation in turn, and episodes in each."""
 RIVALS = ("afr", "drop-oldest", "min-motion-gap", "gap-price", "learned")
-RESAMPLES, CONFIDENCE = 2000, 0.95
+RESAMPLES = 2000
 
 Frames = NDArray[np.int64]
 
@@ -135,7 +135,7 @@ def main(
         """Gain in tracking over the other policy, paired over episodes."""
         if name == base:
             return ""
-        more = percentile_interval(weights @ (tracked[name] - tracked[base]), CONFIDENCE)
+        more = percentile_interval(weights @ (tracked[name] - tracked[base]))
         return f"{more.value:+.3f} [{more.low:+.3f}, {more.high:+.3f}]"
 
     bases = {"AFR's": RIVALS[0], "the agent's by information": f"agent by {next(iter(REWARDS))}"}

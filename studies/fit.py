@@ -1,6 +1,6 @@
 """The page that compares recordings with generated links, mode by mode, and its pictures.
 
-``python -m website.fit LINKS.json PAGE.md FILE ...`` or ``... --suite A,B --data DIR``, with what `bufgym trace fit`
+``python -m studies.fit LINKS.json PAGE.md FILE ...`` or ``... --suite A,B --data DIR``, with what `bufgym trace fit`
 fitted to these recordings.
 """
 
@@ -21,7 +21,7 @@ from bufgym.traces.fit import Rates, autocorrelation, outage_gaps, outage_length
 from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.parameters import SHOULDER_S, LinkParameters, read_links
 from bufgym.traces.trace import Float64Array
-from website.compare_links import KS_DISTANCE, SETS, HeldOut, Row, compare, generated_sets, held_out
+from studies.compare_links import KS_DISTANCE, SETS, HeldOut, Row, compare, generated_sets, held_out
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -246,7 +246,7 @@ def _survival(axis: Axes, values: Float64Array, colour: str) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write the page that the command line asks for."""
-    parser = argparse.ArgumentParser(prog="python -m website.fit", description="Compare links with recordings.")
+    parser = argparse.ArgumentParser(prog="python -m studies.fit", description="Compare links with recordings.")
     parser.add_argument("links", type=Path, metavar="LINKS.json")
     parser.add_argument("page", type=Path, metavar="PAGE.md")
     parser.add_argument("files", nargs="*", metavar="FILE", help="recordings that the links were fitted to")
@@ -256,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--held-out", type=int, metavar="N", help="most recordings of a mode held out, a fit each")
     options = parser.parse_args(arguments)
     rows, words = recordings_of(options.files, None, options.suite, options.data)
-    command = f"python -m website.fit {options.links.name} {options.page.name} {words}"
+    command = f"python -m studies.fit {options.links.name} {options.page.name} {words}"
     if options.held_out is not None:
         command += f" --held-out {options.held_out}"
     links = read_links(options.links)

@@ -1,11 +1,11 @@
-"""Search for a policy's best setting on a suite's validation episodes: ``python -m agents.tune SUITE``.
+"""Search for a policy's best setting on a suite's validation episodes: ``python -m studies.tune SUITE``.
 
 Many policies have a parameter that their source chose for another stream than a robot's. To judge them fairly, each
 meets a suite twice: with its source's parameters, and with parameters from a grid search on the validation split. The
 test split is never used here.
 
 A rule of our own has too many parameters to cross. Each of them is tried alone around its default (``AROUND``), on the
-train split: ``python -m agents.tune SUITE --policies target-gap,gap-price --split train`` finds the constants again.
+train split: ``python -m studies.tune SUITE --policies target-gap,gap-price --split train`` finds the constants again.
 
 A setting replaces the default only if its score is higher by more than chance. The test is that the paired bootstrap
 interval of the difference, see ``score``, lies above 0. The choices are kept in ``tuned.json``, see ``tuned``.
@@ -306,7 +306,7 @@ def main(
     if write:
         # Another machine has its own folder of recordings.
         again = command_line(
-            f"python -m agents.tune {suite}",
+            f"python -m studies.tune {suite}",
             policies=tuple(policies or ()) or None,
             split=None if split == "validation" else split,
             seeds=seeds,

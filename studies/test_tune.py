@@ -9,14 +9,14 @@ from cli_cases import Capsys, Patch
 from cyclopts import App
 from refusal_cases import refuse
 
-from agents import tune
-from agents.tune import Choice
 from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.tasks import TASKS
 from bufgym.cli.options import OPTIONS
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, suites
+from studies import tune
+from studies.tune import Choice
 
 LENGTHS = {"tiny-twelve": 12, "tiny-nine": 9}
 """T of each suite, L = 2. Of messages 1..T, `decimate:every=k` accepts 1, 1 + k, 1 + 2k, ... and keeps the last two.
@@ -114,7 +114,7 @@ def test_the_command_writes_what_bench_then_reads(capsys: Capsys) -> None:
     entry = tuned.read()["tiny-twelve"]["decimate"]
     assert entry["setting"] == "decimate:every=4" and entry["split"] == "validation"
     assert entry["score"] == pytest.approx(1) and entry["score"] > entry["default_score"]
-    assert entry["command"] == "python -m agents.tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
+    assert entry["command"] == "python -m studies.tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
     # A second suite leaves the first alone; lifespan stays at its default.
     cli("tiny-nine --policies decimate --write", capsys)
     assert [tuned.tuned(name) for name in (*LENGTHS, "lte-v1")] == [["decimate:every=4"], [], []]
@@ -131,6 +131,20 @@ def test_what_is_shipped(monkeypatch: Patch) -> None:
         for policy, entry in entries.items():
             assert entry["setting"] in tune.settings(policy) and entry["split"] == "validation"
             command = entry["command"]
-            assert command.startswith(f"python -m agents.tune {suite}") and command.endswith("--write")
+            assert command.startswith(f"python -m studies.tune {suite}") and command.endswith("--write")
             assert (entry["setting"] == policy) == (entry["setting"] not in tuned.tuned(suite))
     assert json.dumps(shipped, indent=1, sort_keys=True) + "\n" == tuned.FILE.read_text(encoding="utf-8")
+
+
+def test_settings_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tuned, "FILE", tmp_path / "tuned.json")
+    tune.keep("lte-v1", [], split="validation", again="")
+    before = tuned.FILE.read_bytes()
+
+    def half(path: Path, text: str, **_: object) -> None:
+        path.write_bytes(text.encode()[:20])
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", half)
+    refuse("No space", tune.keep, "lte-v1", [], split="validation", again="", kind=OSError)
+    assert tuned.FILE.read_bytes() == before and list(tmp_path.iterdir()) == [tuned.FILE]

@@ -1,4 +1,4 @@
-"""The page about a run's schedulers: ``python -m agents.scheduling runs/NAME --out docs/topics.md``."""
+"""The page about a run's schedulers: ``python -m studies.scheduling runs/NAME --out docs/topics.md``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Training rewards QoI over Robofleet's QoI. It subtracts the age of the topics of
 under Robofleet, and QoI that is missing to 1.02 times the best rule's. `learned-scheduler` is seed {best}, the best on
 validation by this measure.
 
-The agents are made by `{command}`. This page is made by `python -m agents.scheduling runs/NAME --out docs/topics.md`.
+The agents are made by `{command}`. This page is made by `python -m studies.scheduling runs/NAME --out docs/topics.md`.
 Without training, run `bufgym topics --suite topics-v1`.
 
 The figures are means over the {settings} settings of the test split, with {episodes} episodes each. QoI is the weighted

@@ -1,0 +1,1 @@
+"""Studies: each answered one question or made some numbers, and is run again only to check them. See README.md."""
