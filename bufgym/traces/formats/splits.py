@@ -92,7 +92,8 @@ def _sound(split: Split, types: dict[str, str], unpacked: Unpacked) -> Generator
 
     def sound() -> str:
         first = f"its first {count:,} messages ({abs(last_ns - first_ns) / 1e9:.3f} s) are sound; " if count else ""
-        return f"; {first}{_MENDS[split.kind].format(split.path.name)} saves what is sound"
+        mend = _MENDS[split.kind].format(split.path.name.removesuffix(".zstd"))
+        return f"; {first}{mend} saves what is sound" + ", once `zstd -d` has unpacked it" * split.packed
 
     with damage_errors(split.path, after=sound):
         for message in _messages(split, types, unpacked):
