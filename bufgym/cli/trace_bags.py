@@ -95,7 +95,7 @@ def from_bag(
     """Take messages and motion from a robot's recording (extra 'ros').
 
     Args:
-        file: MCAP, ROS 1 bag, rosbag2 folder or .db3; alone: its topics are listed.
+        file: MCAP, ROS 1 bag, rosbag2 folder or .db3, also in zstd; alone: its topics are listed.
         out: Write the workload to this CSV file (time_s,bytes,topic[,x]).
     """
     from bufgym.traces import read_bag, workload_from_bag, write_workload_csv

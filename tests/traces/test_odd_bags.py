@@ -251,7 +251,7 @@ def test_damage_is_named_with_what_is_sound(tmp_path: Path) -> None:
     base = write(tmp_path / "b.db3", [(k, bytes(5_000)) for k in range(20)])
     base.write_bytes(base.read_bytes()[:60_000])
     refuse(r"b\.db3: cut off or damaged: DatabaseError: .* `sqlite3 b\.db3 \.recover \| sqlite3", read_bag, base)
-    odometry = [(k, "/odom", "nav_msgs/msg/Odometry", cases.odometry(k, 0)[: 700 - 600 * (k == 2)]) for k in range(4)]
+    odometry = [(k, "/odom", "nav_msgs/msg/Odometry", cases.odometry(k, 0)[: 900 - 800 * (k == 2)]) for k in range(4)]
     refuse(
         r"o\.mcap: message 2 on /odom is cut off", read_bag, cases.write_mcap(tmp_path / "o.mcap", odometry), "/odom"
     )

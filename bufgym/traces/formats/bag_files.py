@@ -57,7 +57,7 @@ class _Bounded(io.BufferedReader):
     ends_early = False  # whether a read beyond the end is the file's end, and not a part of what was asked for
 
     def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(_regular(path)))
+        super().__init__(io.FileIO(path))
         self._left = self.size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1) -> bytes:
@@ -66,12 +66,6 @@ class _Bounded(io.BufferedReader):
         data = super().read(self._left if size is None or size < 0 else min(size, self._left))
         self._left -= len(data)
         return data
-
-
-def _regular(path: Path) -> Path:
-    if not path.is_file():
-        raise ValueError(f"{path.name}: must be a regular file")
-    return path
 
 
 def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
