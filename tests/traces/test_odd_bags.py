@@ -200,8 +200,13 @@ def test_without_metadata_files_come_in_order_of_time(tmp_path: Path, storage: s
     says = rf"order of time: z\.{e}, c\.{e}, a\.{e}, b\.{e}, without copies of them \(d\.{e}\)$"
     with pytest.warns(TraceWarning, match=says):
         holds_all(tmp_path / "bag")
-    (tmp_path / "bag" / "more.mcap").write_text("text")
-    refuse(r"more\.mcap: must be a recording of the same storage as", read_bag, tmp_path / "bag")
+    more = tmp_path / "bag" / "more.mcap"
+    more.write_bytes(b"")
+    refuse(r"more\.mcap: holds no recording: must be mended, or left out", read_bag, tmp_path / "bag")
+    cases.write_ros1(tmp_path / "one.bag", [(0, "/t", STRING, cases.text("x", cases.ROS1))]).rename(more)
+    refuse(r"more\.mcap: holds no recording", read_bag, tmp_path / "bag")
+    write(tmp_path / ("one.db3" if storage == "mcap" else "one.mcap"), rows(0)).rename(more)
+    refuse(r"\.\w+: must be a recording of the same storage as", read_bag, tmp_path / "bag")
 
 
 @pytest.mark.parametrize("journal", ["wal", "journal"])

@@ -36,6 +36,7 @@ _METADATA: Final = "metadata.yaml"
 _ENDINGS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _STORAGES: Final = {"sqlite3": "rosbag2", "mcap": "mcap"}
 _STORAGE: Final = re.compile(r"\s*(storage_identifier|compression_format|compression_mode):(.*)")
+_LISTED_FILES: Final = 20  # A warning names no more
 _MENDS: Final = {
     "mcap": "`mcap recover {0} -o sound.mcap`",
     "ros1": "`rosbag reindex {0}`",
@@ -197,20 +198,25 @@ def _unlisted(folder: Path) -> list[Split]:
     """All files of the folder in order of time, each once."""
     files = sorted(path for path in folder.iterdir() if path.name.endswith(_ENDINGS))
     files = [path for path in files if path.suffix != ".zstd" or path.with_suffix("") not in files]
-    copies = {b for k, b in enumerate(files) if any(_same(a, b) for a in files[:k])}
-    found = [_split(path) for path in files if path not in copies]
+    by_size: dict[int, list[Path]] = {}
+    copies: list[str] = []
+    for path in files:
+        alike = by_size.setdefault(path.stat().st_size, [])
+        if any(filecmp.cmp(path, other, shallow=False) for other in alike):
+            copies.append(path.name)
+        else:
+            alike.append(path)
+    found = [_split(path) for alike in by_size.values() for path in alike]
     for split in found:
-        if split.kind not in ("mcap", "rosbag2") or split.kind != found[0].kind:
+        if split.kind not in _STORAGES.values():
+            raise fault(split.path, "holds no recording: must be mended, or left out of the folder")
+        if split.kind != found[0].kind:
             raise fault(split.path, f"must be a recording of the same storage as {found[0].path.name}")
     found.sort(key=_begins_ns)
-    names = ", ".join(split.path.name for split in found)
-    left_out = f", without copies of them ({', '.join(sorted(path.name for path in copies))})" if copies else ""
+    names = ", ".join(split.path.name for split in found[:_LISTED_FILES]) + ", ..." * (len(found) > _LISTED_FILES)
+    left_out = f", without copies of them ({', '.join(copies)})" if copies else ""
     warn(folder, f"has no {_METADATA}, so its files are read in order of time: {names}{left_out}")
     return found
-
-
-def _same(a: Path, b: Path) -> bool:
-    return a.stat().st_size == b.stat().st_size and filecmp.cmp(a, b, shallow=False)
 
 
 def _begins_ns(split: Split) -> int:
