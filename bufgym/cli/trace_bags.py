@@ -95,7 +95,7 @@ def from_bag(
     """Take messages and motion from a robot's recording (extra 'ros').
 
     Args:
-        file: MCAP, ROS 1 bag, rosbag2 folder or .db3; alone: its topics are listed.
+        file: MCAP, ROS 1 bag, rosbag2 folder or .db3, also in zstd; alone: its topics are listed.
         out: Write the workload to this CSV file (time_s,bytes,topic[,x]).
     """
     from bufgym.traces import read_bag, workload_from_bag, write_workload_csv
@@ -156,12 +156,14 @@ def from_poses(
 def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     """List every topic of a recording with its type, topics without messages last."""
     from bufgym.benchmark.table import aligned
+    from bufgym.traces.formats.bag_files import BETWEEN_TYPES
     from bufgym.traces.formats.bag_poses import carries_poses
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "share", "for --odom", "type"]]
     for topic in summary:
         type = bag.topics[topic.topic]
-        cells.append([topic.topic, *_summary_cells(topic), "yes" if carries_poses(type) else "", type])
+        poses = any(map(carries_poses, type.split(BETWEEN_TYPES)))
+        cells.append([topic.topic, *_summary_cells(topic), "yes" if poses else "", type])
     with_messages = {topic.topic for topic in summary}
     cells += [[name, "0", "-", "0", "-", "", type] for name, type in bag.topics.items() if name not in with_messages]
     return aligned(cells)

@@ -32,7 +32,7 @@ class BagSource:
             seconds = max(1.0, float(bag.time_ns[-1] - bag.time_ns[0]) / 1e9)
             rates_hz = {name.lstrip("/"): count / seconds for name, count in counts.items() if count}
             streams = tuple(Stream(Topic(name), rate_hz, 1000) for name, rate_hz in rates_hz.items())
-        self.path, self.streams, self._loops = path, streams, loops
+        self._bag, self.streams, self._loops = bag, streams, loops
         self._names = {f"/{stream.topic.name.lstrip('/')}": stream.topic.name for stream in streams}
         for name in self._names:
             if not counts.get(name):
@@ -47,7 +47,7 @@ class BagSource:
     async def _play(self, robot: Robot) -> None:
         loop = asyncio.get_running_loop()
         offset_s: float | None = None
-        for channel, logged_ns, payload in messages(self.path):
+        for channel, logged_ns, payload in messages(self._bag):
             name = self._names.get(channel.topic)
             if name is None:
                 continue
@@ -58,7 +58,7 @@ class BagSource:
             robot.publish(name, payload, encoding, channel.type)
 
     def status(self) -> dict[str, Any]:
-        return {"recording": Path(self.path).name}
+        return {"recording": Path(self._bag.path).name}
 
     async def on_command(self, command: Any) -> None:
         """Ignore the command, because a recording cannot change."""

@@ -214,7 +214,7 @@ def test_the_metadata_of_a_rosbag2_is_bounded(tmp_path: Path) -> None:
     for old, new, says in (
         ("storage_identifier: sqlite3", "storage_identifier: pickle", "must be sqlite3 or mcap"),
         ("storage_identifier: sqlite3", "storage_identifier: [sqlite3]", "must be sqlite3 or mcap"),
-        ("- drive.db3", "- ../../../dev/zero", "zero: must be a regular file"),
+        ("- drive.db3", "- ../../../dev/zero", "zero: no such file, which metadata.yaml names"),
     ):
         file.write_text(text.replace(old, new))
         refused(path, says)

@@ -1,9 +1,8 @@
-"""The files of recordings: every message in an MCAP file, a ROS 1 bag or a rosbag2, in the order of the file.
+"""The files of recordings: every message in an MCAP file, a ROS 1 bag or a SQLite file, in the order of the file.
 
 A recording may be a stranger's, so none of its own figures is trusted. A record is no longer than the file, a chunk
 unpacks to no more than MAX_CHUNK_BYTES, and the whole to no more than `files.unpacked_limit` of its size. SQLite views
-and YAML can make a small file endless. So rosbag2's SQLite files are read by two plain queries, and four entries of its
-`metadata.yaml` line by line.
+can make a small file endless. So rosbag2's SQLite files are read by two plain queries.
 """
 
 from __future__ import annotations
@@ -11,33 +10,35 @@ from __future__ import annotations
 import bz2
 import io
 import os
-import re
 import sqlite3
 import struct
-import tempfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import IO, Any, Final
 
-from bufgym.ground.files import read_utf8, unpacked_limit
+from bufgym.ground.files import unpacked_limit
 from bufgym.traces.formats.bag_poses import BagTopic
 
 # A chunk of a recording has some MB, a robot some hundred topics; more is a mistake, or a bomb.
 MAX_CHUNK_BYTES: Final = 2**28
 MAX_TOPICS: Final = 10_000
-MAX_METADATA_BYTES: Final = 2**23
+BETWEEN_TYPES: Final = " and "
 
 _RECORD: Final = struct.Struct("<BQ")  # an MCAP record's kind and length
 _MESSAGE: Final = struct.Struct("<HIQQ")  # bagTopic, sequence number, when it was logged and when it was published, ns
-_STORAGE: Final = re.compile(r"\s*(storage_identifier|compression_format|compression_mode):(.*)")
 _PIECE_BYTES: Final = 2**20
 
 Message = tuple[BagTopic, int, bytes]
 """Its channel, when it was logged in ns, and its serialised form."""
 
 
-class _Unpacked:
+class RefusedError(ValueError):
+    """A rule that a sound file may break too: a limit, or a form that is not read."""
+
+
+class Unpacked:
     """Counts what comes out of a recording."""
 
     def __init__(self, packed_bytes: int) -> None:
@@ -47,7 +48,7 @@ class _Unpacked:
     def add(self, count: int) -> None:
         self._left -= count
         if self._left < 0:
-            raise ValueError(f"unpacks to more than {self.most_bytes} bytes: must be less, or be unpacked before")
+            raise RefusedError(f"unpacks to more than {self.most_bytes} bytes: must be less, or be unpacked before")
 
 
 class _Bounded(io.BufferedReader):
@@ -56,7 +57,7 @@ class _Bounded(io.BufferedReader):
     ends_early = False  # whether a read beyond the end is the file's end, and not a part of what was asked for
 
     def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(_regular(path)))
+        super().__init__(io.FileIO(path))
         self._left = self.size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1) -> bytes:
@@ -67,19 +68,8 @@ class _Bounded(io.BufferedReader):
         return data
 
 
-def _regular(path: Path) -> Path:
-    if not path.is_file():
-        raise ValueError(f"{path.name}: must be a regular file")
-    return path
-
-
 def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
-    """Every message of an MCAP file, or of all in a folder; adds every topic to ``types``, even without messages."""
-    for file_path in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
-        yield from _mcap(file_path, types)
-
-
-def _mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
+    """Every message of an MCAP file; adds every topic to ``types``, even without messages."""
     from mcap import records
     from mcap.data_stream import ReadDataStream
     from mcap.opcode import Opcode
@@ -92,11 +82,12 @@ def _mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
         if isinstance(record, records.Schema):
             schemas[record.id] = record.name
         elif isinstance(record, records.Channel):
-            types[record.topic] = _type(schemas.get(record.schema_id, ""))
-            channels[record.id] = BagTopic(record.topic, types[record.topic], record.message_encoding)
+            type = _type(schemas.get(record.schema_id, ""))
+            _add(types, record.topic, type)
+            channels[record.id] = BagTopic(record.topic, type, record.message_encoding)
 
     with _Bounded(path) as file:
-        unpacked = _Unpacked(file.size)
+        unpacked = Unpacked(file.size)
         reader = StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK_BYTES)
         for record in _ours_may_end(reader.records, file):
             declared(record)
@@ -135,14 +126,14 @@ def _records(chunk: bytes) -> Iterator[tuple[int, memoryview]]:
         at += length
 
 
-def _chunk(chunk: Any, unpacked: _Unpacked) -> bytes:
+def _chunk(chunk: Any, unpacked: Unpacked) -> bytes:
     """The chunk's records; it must hold as much as it says."""
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk of {size} bytes: must be at most {MAX_CHUNK_BYTES}")
+        raise RefusedError(f"a chunk of {size} bytes: must be at most {MAX_CHUNK_BYTES}")
     unpacked.add(size)
     if chunk.compression == "zstd":
-        data = _unzstd(chunk.data, size)
+        data = unzstd(chunk.data, size)
     elif chunk.compression == "lz4":
         import lz4.frame
 
@@ -150,25 +141,42 @@ def _chunk(chunk: Any, unpacked: _Unpacked) -> bytes:
     elif chunk.compression == "":
         data = chunk.data
     else:
-        raise ValueError(f"compression {chunk.compression!r}: must be zstd, lz4 or none")
+        raise RefusedError(f"compression {chunk.compression!r}: must be zstd, lz4 or none")
     if len(data) != size:
         raise ValueError(f"a chunk of {len(data)} bytes that says {size}")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("a chunk whose checksum is wrong")
     return data
 
 
-def _unzstd(packed: bytes, most_bytes: int) -> bytes:
-    """Decompress to at most one byte more than ``most_bytes``."""
-    with _zstd(io.BytesIO(packed)) as reader:
-        data = bytearray()
-        while len(data) <= most_bytes and (piece := reader.read(min(_PIECE_BYTES, most_bytes + 1 - len(data)))):
-            data += piece
+def unzstd(packed: bytes, most_bytes: int) -> bytes:
+    """Decompress to at most a piece more than ``most_bytes``."""
+    data = bytearray()
+    for piece in unzstd_pieces(io.BytesIO(packed)):
+        data += piece
+        if len(data) > most_bytes:
+            break
     return bytes(data)
 
 
-def _zstd(packed: IO[bytes]) -> Any:
+def unzstd_pieces(packed: IO[bytes]) -> Iterator[bytes]:
+    """Decompress in pieces; EOFError where less comes out than the data say."""
     import zstandard
 
-    return zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed, read_across_frames=True)
+    says = zstandard.frame_content_size(packed.read(18))  # a frame's header is no longer; -1 where it does not say
+    packed.seek(0)
+    with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed, read_across_frames=True) as reader:
+        while piece := reader.read(_PIECE_BYTES):
+            says -= len(piece)
+            yield piece
+    if says > 0:
+        raise EOFError(f"zstd data end {says} bytes early")
+
+
+def _add(types: dict[str, str], topic: str, type: str) -> None:
+    """Note a topic's type; two publishers may send different types on one topic, which then has both."""
+    known = [name for name in types.get(topic, "").split(BETWEEN_TYPES) if name]
+    types[topic] = BETWEEN_TYPES.join(known if type in known or not type else [*known, type])
 
 
 def _type(schema: str) -> str:
@@ -177,88 +185,33 @@ def _type(schema: str) -> str:
     return f"{package}/msg/{name}" if name and "/" not in name else schema
 
 
-def rosbag2(path: Path, types: dict[str, str]) -> Iterator[Message]:
-    """Every message of a rosbag2's folder, or of one of its SQLite files, which may have any name."""
-    if not path.is_dir():
-        yield from _sqlite(path, types)
-        return
-    storage, names = _metadata(path / "metadata.yaml")
-    compression = storage.get("compression_mode", "").lower()
-    form = storage.get("compression_format", "")
-    if compression not in ("", "none") and form != "zstd":
-        raise ValueError(f"compression {form!r}: must be zstd")
-    read = {"sqlite3": _sqlite, "mcap": _mcap}.get(storage.get("storage_identifier", ""))
-    if read is None:
-        raise ValueError(f"storage {storage.get('storage_identifier')!r}: must be sqlite3 or mcap")
-    files = [_regular(path / name) for name in names]
-    unpacked = _Unpacked(sum(file.stat().st_size for file in files))
-    with tempfile.TemporaryDirectory() as scratch:
-        for file in files:
-            if compression != "file":
-                messages = read(file, types)
-            else:
-                # One at a time, as each may be large.
-                plain = Path(scratch) / "plain"
-                _unpack(file, plain, unpacked)
-                messages = read(plain, types)
-            for channel, logged_ns, data in messages:
-                if compression == "message":
-                    data = _unzstd(data, MAX_CHUNK_BYTES)
-                    if len(data) > MAX_CHUNK_BYTES:
-                        raise ValueError(f"a message of more than {MAX_CHUNK_BYTES} bytes: must be at most that")
-                    unpacked.add(len(data))
-                yield channel, logged_ns, data
-
-
-def _metadata(path: Path) -> tuple[dict[str, str], list[str]]:
-    """How its files are stored, and their names, as ROS 2 writes them: a line each."""
-    storage: dict[str, str] = {}
-    names: list[str] = []
-    listing = False
-    for line in read_utf8(path, MAX_METADATA_BYTES).splitlines():
-        text = line.strip()
-        if listing and text.startswith("- "):
-            names.append(Path(_scalar(text[2:])).name)
-            continue
-        listing = text == "relative_file_paths:"
-        if (match := _STORAGE.fullmatch(line)) is not None:
-            storage.setdefault(match[1], _scalar(match[2]))
-    return storage, names
-
-
-def _scalar(text: str) -> str:
-    """A YAML scalar of one line, without its quotes."""
-    text = text.strip()
-    quoted = len(text) >= 2 and text[0] == text[-1] and text[0] in "'\""
-    return text[1:-1] if quoted else text
-
-
-def _unpack(packed: Path, plain: Path, unpacked: _Unpacked) -> None:
-    with packed.open("rb") as file, _zstd(file) as reader, plain.open("wb") as out:
-        while piece := reader.read(_PIECE_BYTES):
-            unpacked.add(len(piece))
-            out.write(piece)
-
-
-def _sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
-    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
+def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
+    """Every message of one of rosbag2's SQLite files; one with a journal must be a copy, because SQLite changes it."""
+    mode = "mode=rw" if journals(path) else "mode=ro&immutable=1"
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as base:
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
         base.execute("PRAGMA trusted_schema = OFF")
         kinds = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
         if base.execute(kinds).fetchone() != (2,):
-            raise ValueError("no table of messages and topics")
+            raise RefusedError("no table of messages and topics")
         channels: dict[int, BagTopic] = {}
         for number, topic, type, encoding in base.execute("SELECT id, name, type, serialization_format FROM topics"):
             if encoding != "cdr" or not isinstance(topic, str) or not isinstance(type, str):
-                raise ValueError(f"topic {topic!r} of type {type!r} in {encoding!r}: must be text, in cdr")
+                raise RefusedError(f"topic {topic!r} of type {type!r} in {encoding!r}: must be text, in cdr")
             if len(channels) > MAX_TOPICS:
                 break  # who reads on says so
-            types[topic] = type
+            _add(types, topic, type)
             channels[number] = BagTopic(topic, type, "cdr")
         for number, logged_ns, data in base.execute("SELECT topic_id, timestamp, data FROM messages"):
             if not isinstance(logged_ns, int) or not isinstance(data, bytes):
-                raise ValueError("a message's time must be a whole number, and its data bytes")
+                raise RefusedError("a message's time must be a whole number, and its data bytes")
             yield channels[number], logged_ns, data
+
+
+def journals(path: Path) -> list[str]:
+    """Endings of the files beside a SQLite file that hold a part of its messages."""
+    files = {ending: Path(f"{path}{ending}") for ending in ("-wal", "-journal")}
+    return [ending for ending, file in files.items() if file.is_file() and file.stat().st_size]
 
 
 def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
@@ -266,18 +219,18 @@ def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
     from rosbags.rosbag1 import Reader
 
     with Reader(path) as reader:
-        unpacked = _Unpacked(path.stat().st_size)
+        unpacked = Unpacked(path.stat().st_size)
         for place, chunk in reader.chunks.items():
             reader.chunks[place] = chunk._replace(decompressor=_limited(chunk.decompressor, unpacked))
         channels: dict[int, BagTopic] = {}
         for connection in reader.connections:
-            types[connection.topic] = connection.msgtype
+            _add(types, connection.topic, connection.msgtype)
             channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1")
         for connection, logged_ns, data in reader.messages(list(reader.connections)):
             yield channels[connection.id], logged_ns, data
 
 
-def _limited(decompress: Callable[[bytes], bytes], unpacked: _Unpacked) -> Callable[[bytes], bytes]:
+def _limited(decompress: Callable[[bytes], bytes], unpacked: Unpacked) -> Callable[[bytes], bytes]:
     """The decompression of a ROS 1 chunk, limited to MAX_CHUNK_BYTES of output."""
     import lz4.frame
 
@@ -291,11 +244,11 @@ def _limited(decompress: Callable[[bytes], bytes], unpacked: _Unpacked) -> Calla
     def limited(data: bytes) -> bytes:
         content: bytes = decompressors[decompress]().decompress(data, max_length=MAX_CHUNK_BYTES + 1)
         if len(content) > MAX_CHUNK_BYTES:
-            raise ValueError(f"a chunk of more than {MAX_CHUNK_BYTES} bytes: must be at most that")
+            raise RefusedError(f"a chunk of more than {MAX_CHUNK_BYTES} bytes: must be at most that")
         unpacked.add(len(content))
         return content
 
     return limited
 
 
-SOURCES: Final = {"mcap": mcap, "ros1": ros1, "rosbag2": rosbag2}  # Reader of each kind of recording
+SOURCES: Final = {"mcap": mcap, "ros1": ros1, "rosbag2": sqlite}  # Reader of each kind of file

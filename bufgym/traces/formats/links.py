@@ -16,6 +16,7 @@ from typing import Final
 
 from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces.formats import tables
+from bufgym.traces.formats.bags import refuse_bag
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
@@ -80,6 +81,7 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         BufgymError: an unknown `format`, `after` or `column`.
     """
     origin = "requested"
+    refuse_bag(path, "must be a bandwidth trace")
     if format is None:
         format, origin = detect_format(path), "detected"
     elif format not in FORMATS:

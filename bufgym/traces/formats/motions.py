@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from bufgym.traces.formats.bags import refuse_bag
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.text import Line, is_header, open_text, write_text
@@ -30,6 +31,7 @@ def read_motion(
         format: of a trajectory, see `trajectories.read_poses`.
         times: of a trajectory, likewise.
     """
+    refuse_bag(path, "must be a trajectory (motion in it is taken with --odom)")
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
     if first is None:

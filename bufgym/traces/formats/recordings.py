@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -73,7 +74,7 @@ def workload_from_bag(
     if len(names) < len(bag.topics):
         others = ", ".join(name for name in bag.topics if name not in names)
         source += f"; {np.count_nonzero(~chosen):,} messages left out, on topics not chosen: {others}"
-    name = trace_name(str(bag.path).removesuffix(".mcap").removesuffix(".bag").removesuffix(".db3"))
+    name = trace_name(re.sub(r"(\.mcap|\.bag|\.db3)?(\.zstd)?$", "", bag.path))
     return Workload(name, (time_ns - time_ns[0]) // 1000, bag.size_bytes[chosen], topic, names, x, source, gaps)
 
 

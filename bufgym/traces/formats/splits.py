@@ -1,0 +1,248 @@
+"""Which files a recording has, in which order and how they are packed.
+
+A recording is one file, or a rosbag2 folder. A folder has the files that its ``metadata.yaml`` names, in that order,
+and no others. A folder without it, as a recorder leaves it that was killed, has all its ``.mcap`` and ``.db3`` files in
+order of time, which a warning says. A stranger's YAML can be endless, so four of its entries are read line by line.
+
+What a file holds is told from its first bytes. One that zstd packed as a whole (``.zstd``) is read from an unpacked
+copy. A SQLite file with a journal beside it (``-wal``, ``-journal``) is read from a copy of both, because SQLite
+changes both when it reads them, and without the journal messages would be missing.
+"""
+
+from __future__ import annotations
+
+import filecmp
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.files import read_utf8
+from bufgym.traces.formats import bag_files
+from bufgym.traces.formats.bag_files import SOURCES, Message, RefusedError, Unpacked, journals, unzstd, unzstd_pieces
+from bufgym.traces.formats.faults import fault, os_errors, warn
+
+MAX_METADATA_BYTES: Final = 2**23
+
+_RULE: Final = "must be an MCAP file, a ROS 1 bag, or a rosbag2 folder or .db3 file"
+_MAGICS: Final = {b"\x89MCAP0\r\n": "mcap", b"#ROSBAG V": "ros1", b"SQLite format 3\0": "rosbag2"}
+_ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+_METADATA: Final = "metadata.yaml"
+_ENDINGS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_STORAGES: Final = {"sqlite3": "rosbag2", "mcap": "mcap"}
+_STORAGE: Final = re.compile(r"\s*(storage_identifier|compression_format|compression_mode):(.*)")
+_LISTED_FILES: Final = 20  # A warning names no more
+_MENDS: Final = {
+    "mcap": "`mcap recover {0} -o sound.mcap`",
+    "ros1": "`rosbag reindex {0}`",
+    "rosbag2": "`sqlite3 {0} .recover | sqlite3 sound.db3`",
+}
+
+
+@dataclass(frozen=True)
+class Split:
+    """One file of a recording."""
+
+    path: Path
+    kind: str  # "mcap", "ros1", "rosbag2", or "" for anything else
+    packed: bool = False  # as a whole, in zstd
+    by_message: bool = False  # each of its messages is packed in zstd, as the folder's metadata says
+
+
+def is_recording(path: Path) -> bool:
+    """Whether this is a recording, by its first bytes (a folder: by its content), whatever its name."""
+    with os_errors(path, "opened"):
+        if path.is_dir():
+            return (path / _METADATA).is_file() or any(file.name.endswith(_ENDINGS) for file in path.iterdir())
+        return path.is_file() and _split(path).kind != ""
+
+
+def splits(path: Path) -> list[Split]:
+    """The files of a recording, all of one kind, in the order in which they are read.
+
+    Raises TraceError: no recording; a file that the metadata names is missing or of another kind.
+    """
+    if not path.exists() or not is_recording(path):
+        raise fault(path, _RULE if path.exists() else "no such file")
+    if not path.is_dir():
+        return [_split(path)]
+    with os_errors(path, "read"):
+        return _listed(path) if (path / _METADATA).is_file() else _unlisted(path)
+
+
+def split_messages(files: list[Split], types: dict[str, str]) -> Iterator[tuple[Path, Message]]:
+    """Every message of a recording's files, with the file that it is in; adds every topic to ``types``.
+
+    Raises TraceError: a file that is damaged, with how much of it is sound.
+    """
+    with os_errors(files[0].path, "read"):
+        unpacked = Unpacked(sum(split.path.stat().st_size for split in files))
+    for split in files:
+        for message in _sound(split, types, unpacked):
+            yield split.path, message
+
+
+def _sound(split: Split, types: dict[str, str], unpacked: Unpacked) -> Generator[Message]:
+    """Every message of a file; an error about damage says how many are sound."""
+    count, first_ns, last_ns = 0, 0, 0
+
+    def sound() -> str:
+        first = f"its first {count:,} messages ({abs(last_ns - first_ns) / 1e9:.3f} s) are sound; " if count else ""
+        mend = _MENDS[split.kind].format(split.path.name.removesuffix(".zstd"))
+        return f"; {first}{mend} saves what is sound" + ", once `zstd -d` has unpacked it" * split.packed
+
+    with damage_errors(split.path, after=sound):
+        for message in _messages(split, types, unpacked):
+            last_ns = message[1]
+            first_ns = first_ns if count else last_ns
+            count += 1
+            yield message
+
+
+@contextmanager
+def damage_errors(path: Path, before: str = "", after: Callable[[], str] = str) -> Iterator[None]:
+    """Turn whatever the libraries raise on a damaged file into one error that names the file."""
+    try:
+        yield
+    except BufgymError:
+        raise
+    except ModuleNotFoundError as error:
+        raise BufgymError(f"{path}: reading recordings needs {error.name}: {install('ros')}") from None
+    except RefusedError as error:
+        raise fault(path, str(error)) from error
+    except Exception as error:
+        # Parsers of binary formats raise nearly anything on bytes that are not what they should be.
+        words = " ".join(str(error).split()) or "no more data"
+        raise fault(path, f"{before}cut off or damaged: {type(error).__name__}: {words[:160]}{after()}") from error
+
+
+def _messages(split: Split, types: dict[str, str], unpacked: Unpacked) -> Iterator[Message]:
+    with tempfile.TemporaryDirectory() as scratch:
+        for channel, logged_ns, data in SOURCES[split.kind](_readable(split, Path(scratch), unpacked), types):
+            is_packed = data.startswith(_ZSTD_MAGIC)
+            # CDR begins with a zero, so a message in it is told from a packed one without metadata.
+            if channel.encoding == "cdr" and split.by_message and not is_packed and data[:1] != b"\0":
+                raise ValueError(f"a message on {channel.topic} that is neither CDR nor packed in zstd")
+            if is_packed and (split.by_message or channel.encoding == "cdr"):
+                most = bag_files.MAX_CHUNK_BYTES
+                data = unzstd(data, most)
+                if len(data) > most:
+                    raise RefusedError(f"a message of more than {most} bytes: must be at most that")
+                unpacked.add(len(data))
+            yield channel, logged_ns, data
+
+
+def _readable(split: Split, scratch: Path, unpacked: Unpacked) -> Path:
+    """The file itself, or a copy in ``scratch`` where it is packed or has a journal."""
+    copy = scratch / "copy"
+    if split.packed:
+        with split.path.open("rb") as file, copy.open("wb") as out:
+            for piece in unzstd_pieces(file):
+                unpacked.add(len(piece))
+                out.write(piece)
+        return copy
+    real = split.path.resolve()  # SQLite looks for the journal there
+    endings = journals(real) if split.kind == "rosbag2" else []
+    if not endings:
+        return split.path
+    with os_errors(split.path, f"copied for reading together with its {' and '.join(endings)}"):
+        for ending in ("", *endings):
+            shutil.copyfile(f"{real}{ending}", f"{copy}{ending}")
+    return copy
+
+
+def _split(path: Path) -> Split:
+    if not path.is_file():
+        raise fault(path, "must be a regular file")
+    with path.open("rb") as file:
+        head = file.read(16)
+        packed = head.startswith(_ZSTD_MAGIC)
+        if packed:
+            file.seek(0)
+            with damage_errors(path):
+                head = next(unzstd_pieces(file), b"")
+    return Split(path, next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), ""), packed)
+
+
+def _listed(folder: Path) -> list[Split]:
+    """The files that the folder's metadata names."""
+    storage, names = _metadata(folder / _METADATA)
+    mode, form = storage.get("compression_mode", "").lower(), storage.get("compression_format", "")
+    if mode not in ("", "none") and form != "zstd":
+        raise fault(folder / _METADATA, f"compression {form!r}: must be zstd")
+    identifier = storage.get("storage_identifier", "")
+    if identifier not in _STORAGES:
+        raise fault(folder / _METADATA, f"storage {identifier!r}: must be {' or '.join(_STORAGES)}")
+    if not names:
+        raise fault(folder / _METADATA, "names no file: must list them as relative_file_paths (see `ros2 bag reindex`)")
+    files = []
+    for name in names:
+        # Recorders pack a file when it is full, and people unpack it: it may lie there in either form.
+        other = name.removesuffix(".zstd") if name.endswith(".zstd") else f"{name}.zstd"
+        path = next((folder / one for one in (name, other) if (folder / one).exists()), None)
+        if path is None:
+            raise fault(folder / name, f"no such file, which {_METADATA} names: must be there, or left out of it")
+        split = _split(path)
+        if split.kind != _STORAGES[identifier]:
+            raise fault(path, f"must be a file of {identifier}, as {_METADATA} says")
+        files.append(Split(path, split.kind, split.packed, mode == "message"))
+    return files
+
+
+def _unlisted(folder: Path) -> list[Split]:
+    """All files of the folder in order of time, each once."""
+    files = sorted(path for path in folder.iterdir() if path.name.endswith(_ENDINGS))
+    files = [path for path in files if path.suffix != ".zstd" or path.with_suffix("") not in files]
+    by_size: dict[int, list[Path]] = {}
+    copies: list[str] = []
+    for path in files:
+        alike = by_size.setdefault(path.stat().st_size, [])
+        if any(filecmp.cmp(path, other, shallow=False) for other in alike):
+            copies.append(path.name)
+        else:
+            alike.append(path)
+    found = [_split(path) for alike in by_size.values() for path in alike]
+    for split in found:
+        if split.kind not in _STORAGES.values():
+            raise fault(split.path, "holds no recording: must be mended, or left out of the folder")
+        if split.kind != found[0].kind:
+            raise fault(split.path, f"must be a recording of the same storage as {found[0].path.name}")
+    found.sort(key=_begins_ns)
+    names = ", ".join(split.path.name for split in found[:_LISTED_FILES]) + ", ..." * (len(found) > _LISTED_FILES)
+    left_out = f", without copies of them ({', '.join(copies)})" if copies else ""
+    warn(folder, f"has no {_METADATA}, so its files are read in order of time: {names}{left_out}")
+    return found
+
+
+def _begins_ns(split: Split) -> int:
+    """Time of the file's first message, 0 if it has none."""
+    with closing(_sound(split, {}, Unpacked(split.path.stat().st_size))) as messages:
+        return next((logged_ns for _, logged_ns, _ in messages), 0)
+
+
+def _metadata(path: Path) -> tuple[dict[str, str], list[str]]:
+    """How the files are stored, and their names, as ROS 2 writes them: a line each."""
+    storage: dict[str, str] = {}
+    names: list[str] = []
+    listing = False
+    for line in read_utf8(path, MAX_METADATA_BYTES).splitlines():
+        text = line.strip()
+        if listing and text.startswith("- "):
+            names.append(Path(_scalar(text[2:])).name)
+            continue
+        listing = text == "relative_file_paths:"
+        if (match := _STORAGE.fullmatch(line)) is not None:
+            storage.setdefault(match[1], _scalar(match[2]))
+    return storage, list(dict.fromkeys(names))
+
+
+def _scalar(text: str) -> str:
+    """A YAML scalar of one line, without its quotes."""
+    text = text.strip()
+    quoted = len(text) >= 2 and text[0] == text[-1] and text[0] in "'\""
+    return text[1:-1] if quoted else text
