@@ -10,6 +10,7 @@ import io
 import os
 import re
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,9 +18,11 @@ from cyclopts import App, CycloptsError, MissingArgumentError
 
 from bufgym.cli.options import OPTIONS
 from bufgym.ground import __version__, modules
-from bufgym.ground.errors import BufgymError, printable
+from bufgym.ground.errors import BufgymError, TraceWarning, printable
 
 __all__ = ["app", "main"]
+
+_formatwarning = warnings.formatwarning
 
 COMMANDS: dict[str, Any] = {
     "list": "cli.listing:listing",
@@ -111,6 +114,7 @@ def _shown(root: App, words: Sequence[str]) -> App:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code."""
     _open_output()
+    warnings.formatwarning = _warning
     try:
         words = sys.argv[1:] if arguments is None else arguments
         code: int | None = _shown(app(), words)(words)
@@ -155,6 +159,15 @@ def _drop_output() -> None:
     """Discard output that the interpreter flushes at its exit."""
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
+
+
+def _warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Write a doubt about a file as one line, and any other warning as Python does."""
+    if category is TraceWarning:
+        return f"bufgym: warning: {message}\n"
+    return _formatwarning(message, category, filename, lineno, line)
 
 
 def _failed(message: str, code: int = 2) -> int:

@@ -36,6 +36,13 @@ class TraceError(BufgymError):
     """A trace or motion file that cannot be read or written; the message names file and line."""
 
 
+class TraceWarning(UserWarning):
+    """A doubt about a file that is read nevertheless; the message names the file, the place and the value."""
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(printable(message))
+
+
 def unknown(what: str, name: object, known: Iterable[str], also: str = "", place: str = "") -> BufgymError:
     """The error for a name that is not among those ``known``: names the one that was meant, or all of them."""
     names = list(known)

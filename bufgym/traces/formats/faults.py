@@ -1,10 +1,11 @@
 """Errors about files, in the form that all readers and writers share."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 
-from bufgym.ground.errors import TraceError, where
+from bufgym.ground.errors import TraceError, TraceWarning, where
 
 StrPath = str | PathLike[str]
 
@@ -14,6 +15,11 @@ def fault(
 ) -> TraceError:
     """Make the error about a file; arguments are as in `bufgym.ground.errors.where`."""
     return TraceError(where(path, line, value, rule, field=field))
+
+
+def warn(path: StrPath, doubt: str, *, line: int | None = None) -> None:
+    """Warn of what a file says that may be wrong, though it breaks no rule."""
+    warnings.warn(TraceWarning(where(path, line, None, doubt)), stacklevel=2)
 
 
 @contextmanager
