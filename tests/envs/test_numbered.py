@@ -112,11 +112,22 @@ def suite_env(**arguments: Any) -> Any:
         (lambda suite: suite.reset(options={"scenario": "no", "seed": 0}), "'no': must be one of time"),
         (lambda suite: suite.reset(options={"seed": 0}), "scenario: missing; a suite's row has one"),
         (lambda suite: suite.reset(options={"scenario": "time", "seed": 2_000}), "trace = 2: must be 0..1"),
-        (lambda suite: suite.reset(options={"scenario": "time", "seed": 0, "trace": "b"}), "trace = 'b': must be 0..1"),
+        (
+            lambda suite: suite.reset(options={"scenario": "time", "seed": 0, "trace": "b"}),
+            "unknown trace 'b'; known: .*, or their numbers 0..1",
+        ),
         (lambda suite: suite.reset(options={"episode": None, "seed": 0}), "options: an episode, or its scenario"),
         (lambda suite: suite.reset(options={"number": 3}), "known: episode, scenario, trace, seed"),
         (lambda _: SenderEnv("lte", L).reset(options={"scenario": "lte", "seed": 0}), "only the episodes of a suite"),
         (lambda _: SenderEnv("lte", L).reset(options={"seed": 0}), r"trace = None: must be 0..7 or one of lte"),
+        (
+            lambda _: SenderEnv("lte", L).reset(options={"trace": "lte-synth-3"}),
+            "'lte-synth-3'; did you mean 'lte-synthetic-3'",
+        ),
+        (
+            lambda _: SenderEnv("lte", L).reset(options={"trace": "nope"}),
+            "unknown trace 'nope'; known: lte-synthetic-0, .* 0..7",
+        ),
         (lambda _: SenderVectorEnv(1, "lte").reset(options={"episodes": [{"k": 1}]}), "unknown entry .k.; known"),
         (lambda _: suite_env(suite="topics-v1"), "suite topics-v1 is one of topics"),
         (lambda _: suite_env(split="all"), "split = 'all': must be one of train, validation, test"),
