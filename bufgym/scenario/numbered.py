@@ -55,6 +55,9 @@ def numbered(family: Any, seed: Any = None, trace: str | int | None = None, scen
         part = _part(family, trace)
         return draw(part, whole("seed", seed))
     if scenario is None:
+        labels = dict.fromkeys(label for member in members.values() for label, _ in by_trace(member))
+        if isinstance(trace, str) and trace not in labels:
+            raise unknown("trace", trace, labels)
         raise BufgymError(f"scenario: missing; a suite's row has one besides its seed: one of {', '.join(members)}")
     if scenario not in members:
         raise BufgymError(f"scenario = {scenario!r}: must be one of {', '.join(members)}")

@@ -116,6 +116,7 @@ def suite_env(**arguments: Any) -> Any:
             lambda suite: suite.reset(options={"scenario": "time", "seed": 0, "trace": "b"}),
             "unknown trace 'b'; known: .*, or their numbers 0..1",
         ),
+        (lambda suite: suite.reset(options={"trace": "nope"}), "unknown trace 'nope'"),
         (lambda suite: suite.reset(options={"episode": None, "seed": 0}), "options: an episode, or its scenario"),
         (lambda suite: suite.reset(options={"number": 3}), "known: episode, scenario, trace, seed"),
         (lambda _: SenderEnv("lte", L).reset(options={"scenario": "lte", "seed": 0}), "only the episodes of a suite"),

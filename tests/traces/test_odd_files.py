@@ -10,6 +10,7 @@ import pytest
 from link_files import SAMPLES, written
 from refusal_cases import refuse
 
+from bufgym.cli import main
 from bufgym.ground.errors import TraceError, TraceWarning
 from bufgym.traces import Trace, read_motion, read_trace, read_workload
 
@@ -120,6 +121,17 @@ def test_a_jump_in_a_trajectory_is_warned_of(tmp_path: Path) -> None:
                 assert read_motion(path).total == step_m / 2
         else:
             assert read_motion(path).total == step_m / 2
+
+
+def test_the_command_says_a_warning_in_a_line(tmp_path: Path) -> None:
+    path = written(tmp_path, "0 1\n1 1\n3601 1\n3602 1\n")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert main(["trace", "info", str(path)]) == 0
+    line = (
+        f"bufgym: warning: {path}, line 3: 3601 is 3600 s after the line above, where 1 s is usual: the rate is held\n"
+    )
+    assert warnings.formatwarning(caught[0].message, caught[0].category, caught[0].filename, caught[0].lineno) == line
 
 
 def test_rates_are_held_for_a_day_at_any_rate_and_holes_are_named(tmp_path: Path) -> None:

@@ -77,28 +77,23 @@ def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], ob
         raise fault(path, _RULE if Path(path).exists() else "no such file")
     collector = None if odom is None else PoseCollector(path, odom)
     types: dict[str, str] = {}  # of every topic, also of those without messages
-    numbers: dict[str, int] = {}
-    times, columns = LogTimes(path), (array("q"), array("q"), array("q"))
+    times, sizes = LogTimes(path), array("q")
     with _damage_errors(path):
         for channel, logged_ns, data in SOURCES[kind](Path(path), types):
             if len(types) > MAX_TOPICS:
                 raise fault(path, f"more than {MAX_TOPICS} topics: must be fewer")
-            if len(columns[0]) >= MAX_BAG_MESSAGES:
+            if len(sizes) >= MAX_BAG_MESSAGES:
                 raise fault(path, f"more than {MAX_BAG_MESSAGES} messages: must be fewer")
             times.add(channel, logged_ns, data)
-            row = (logged_ns, max(1, len(data)), numbers.setdefault(channel.topic, len(numbers)))
-            for column, value in zip(columns, row, strict=True):
-                column.append(value)
+            sizes.append(max(1, len(data)))
             advance(1)
             if collector is not None and channel.topic == collector.topic:
                 collector.add(channel, logged_ns, data)
-        time_ns, size_bytes, number = (np.array(column, np.int64) for column in columns)
-    order = times.order()
-    topics = {name: types.get(name, "") for name in sorted(set(types) | set(numbers))}
+    order, size_bytes = times.order(), np.array(sizes, np.int64)
+    topics = {name: types.get(name, "") for name in sorted({*types, *times.topics})}
     places = {name: k for k, name in enumerate(topics)}
-    place = np.array([places[name] for name in numbers], np.int64)
-    topic = place[number[order]] if len(numbers) else number
-    bag = Bag(str(path), kind, topics, time_ns[order], size_bytes[order], topic)
+    place = np.array([places[name] for name in times.topics], np.int64)
+    bag = Bag(str(path), kind, topics, times.time_ns[order], size_bytes[order], place[times.topic[order]])
     if collector is None:
         return bag
     from_ns, poses = collector.poses(topics)

@@ -37,7 +37,8 @@ class LogTimes:
         self.path = path
         self._time_ns, self._topic, self._ahead_ns = array("q"), array("q"), array("q")
         self._stamped = bytearray()
-        self._numbers: dict[str, int] = {}
+        self.topics: dict[str, int] = {}
+        """Topic -> its number, in order of their first messages."""
 
     def add(self, channel: BagTopic, logged_ns: int, data: bytes) -> None:
         """Add a message.
@@ -50,9 +51,19 @@ class LogTimes:
             raise fault(self.path, "must be from 0 to 2**63 - 1 ns", value=logged_ns, field=f"{place}, log time in ns")
         stamp_ns = _stamp_ns(channel, data)
         self._time_ns.append(logged_ns)
-        self._topic.append(self._numbers.setdefault(channel.topic, len(self._numbers)))
+        self._topic.append(self.topics.setdefault(channel.topic, len(self.topics)))
         self._ahead_ns.append(logged_ns - (stamp_ns or logged_ns))
         self._stamped.append(stamp_ns is not None)
+
+    @property
+    def time_ns(self) -> Int64Array:
+        """Log times, int64[n]."""
+        return np.array(self._time_ns, np.int64)
+
+    @property
+    def topic(self) -> Int64Array:
+        """Which of `topics`, int64[n]."""
+        return np.array(self._topic, np.int64)
 
     def order(self) -> Int64Array:
         """The messages in order of log time, int64[n].
@@ -61,7 +72,7 @@ class LogTimes:
             TraceError: a log time that is 0 among others that are not, or too far from the others; a clock that went
                 back.
         """
-        time_ns = np.array(self._time_ns, np.int64)
+        time_ns = self.time_ns
         self._check_range(time_ns)
         self._check_steps(time_ns)
         order = np.argsort(time_ns, kind="stable")
@@ -92,10 +103,10 @@ class LogTimes:
 
     def _check_steps(self, time_ns: Int64Array) -> None:
         """Refuse a clock that went back: by the log times of a topic, or by their distance from its header stamps."""
-        by_topic = np.argsort(np.array(self._topic, np.int64), kind="stable")
+        by_topic = np.argsort(self.topic, kind="stable")
         back_above = np.append(0, np.cumsum(time_ns[1:] < time_ns[:-1])) if len(time_ns) else time_ns
         ahead_ns, stamped = np.array(self._ahead_ns, np.int64), np.frombuffer(self._stamped, np.bool_)
-        ends = np.cumsum(np.bincount(np.array(self._topic, np.int64)))
+        ends = np.cumsum(np.bincount(self.topic))
         steps: list[tuple[int, int, int]] = []  # message, message above on its topic, size in ns
         for places in np.split(by_topic, ends[:-1]):
             for k in np.flatnonzero(_goes_back(time_ns[places])):
@@ -120,7 +131,7 @@ class LogTimes:
         )
 
     def _place(self, k: int) -> str:
-        topic = list(self._numbers)[self._topic[k]]
+        topic = list(self.topics)[self._topic[k]]
         return f"message {k + 1} ({topic}, logged at {_seconds(self._time_ns[k])} s)"
 
 
@@ -158,12 +169,13 @@ def _has_stamp(type: str, encoding: str) -> bool:
 
 
 def _stamp_ns(channel: BagTopic, data: bytes) -> int | None:
-    """The header stamp of a message, ns; None where it has none, or one of 0."""
+    """The header stamp of a message, ns; None where it has none, or none above 0."""
     if len(data) < 12 or not _has_stamp(channel.type, channel.encoding):
         return None
     # Before it stand 4 bytes: of CDR its encoding, of ROS 1 a sequence number.
     seconds, ns = _HEADER[channel.encoding == "ros1" or bool(data[1] & 1)].unpack_from(data)
-    return (seconds * NS_PER_S + ns) or None
+    stamp_ns: int = seconds * NS_PER_S + ns
+    return stamp_ns if stamp_ns > 0 else None
 
 
 def _seconds(ns: int) -> str:
