@@ -203,8 +203,12 @@ class Policy:
 
 @functools.lru_cache(maxsize=256)
 def _compiled(*functions: Any) -> Functions:
-    """Compile once for all policies that share these functions, whatever their parameters or weights."""
-    return cast(Functions, tuple(map(compile_for, signatures(), functions)) if JIT else functions)
+    """Compile once for all policies that share these functions, whatever their parameters or weights.
+
+    A function that is a kernel already is compiled again from its text, for the one signature.
+    """
+    plain = [getattr(function, "py_func", function) for function in functions]
+    return cast(Functions, tuple(map(compile_for, signatures(), plain)) if JIT else functions)
 
 
 @functools.cache

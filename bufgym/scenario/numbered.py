@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.checks import whole
 from bufgym.scenario.episode import Streams
 
@@ -48,16 +48,20 @@ def numbered(family: Any, seed: Any = None, trace: str | int | None = None, scen
     Raises:
         BufgymError: there is no such episode.
     """
-    seed, members = whole("seed", seed), getattr(family, "members", None)
+    members = getattr(family, "members", None)
     if members is None:
         if scenario is not None:
             raise BufgymError(f"scenario = {scenario!r}: only the episodes of a suite have one")
-        return draw(_part(family, trace), seed)
+        part = _part(family, trace)
+        return draw(part, whole("seed", seed))
     if scenario is None:
+        labels = dict.fromkeys(label for member in members.values() for label, _ in by_trace(member))
+        if isinstance(trace, str) and trace not in labels:
+            raise unknown("trace", trace, labels)
         raise BufgymError(f"scenario: missing; a suite's row has one besides its seed: one of {', '.join(members)}")
     if scenario not in members:
         raise BufgymError(f"scenario = {scenario!r}: must be one of {', '.join(members)}")
-    member = members[scenario]
+    member, seed = members[scenario], whole("seed", seed)
     return draw(_part(member, seed // SEEDS_PER_TRACE if trace is None else trace), seed).valued(member.value)
 
 
@@ -69,6 +73,8 @@ def _part(scenario: Any, trace: str | int | None) -> Any:
         trace = 0
     if isinstance(trace, str) and trace in labels:
         trace = labels.index(trace)
+    if isinstance(trace, str):
+        raise unknown("trace", trace, labels, also=f", or their numbers 0..{len(parts) - 1}")
     if not isinstance(trace, int) or not 0 <= trace < len(parts):
         raise BufgymError(f"trace = {trace!r}: must be 0..{len(parts) - 1} or one of {', '.join(labels)}")
     return parts[trace][1]

@@ -30,6 +30,8 @@ PRODUCT_LIMIT: Final = 2**62
 # Four months. A longer trace is a unit mistake (ns or ms read as s), not a recording.
 MAX_DURATION_S: Final = 10**7
 
+_MAX_ADDED_KNOTS: Final = 10**7
+
 # Traces with knots closer than this (mahimahi: 1 ms) hold single packets; their rates are taken over whole seconds.
 _FINE_SEGMENT_US: Final = 100_000
 
@@ -40,14 +42,14 @@ class Trace:
 
     Raises:
         BufgymError: an array is not whole numbers (NaN included), too short, negative, out of order, or does not start
-            at 0; a segment has (bytes x microseconds) >= 2**62, which integer interpolation could not hold; a trace
-            that loops has no capacity at all (a message would never leave).
+            at 0; a trace that loops has no capacity at all (a message would never leave).
     """
 
     name: str
     """What to call it in tables, for example "report_car_0002"."""
     time_us: Int64Array
-    """int64[K], K >= 2, microseconds, strictly increasing from 0."""
+    """int64[K], K >= 2, microseconds, strictly increasing from 0. Knots are added inside a segment in which
+    (bytes x microseconds) >= 2**62, which integer interpolation could not hold."""
     cumulative_bytes: Int64Array
     """int64[K], bytes that the link could have carried by then, non-decreasing from 0; the rate between knots is
     constant."""
@@ -61,6 +63,7 @@ class Trace:
         time_us = _whole_numbers(self.time_us, "time_us")
         freeze(self, time_us=time_us, cumulative_bytes=_whole_numbers(self.cumulative_bytes, "cumulative_bytes"))
         self._check()
+        self._add_knots()
 
     def _check(self) -> None:
         time_us, cumulative = self.time_us, self.cumulative_bytes
@@ -80,14 +83,30 @@ class Trace:
             raise self._broken(f"cumulative_bytes[{k + 1}] = {value} after {previous}: must not decrease")
         if self.duration_us >= PRODUCT_LIMIT or self.total_bytes >= PRODUCT_LIMIT:
             raise self._broken(f"ends at ({self.duration_us} us, {self.total_bytes} bytes): both must be below 2**62")
-        segment_us, segment_bytes = np.diff(time_us), np.diff(cumulative)
-        if (k := first_true(segment_bytes > (PRODUCT_LIMIT - 1) // segment_us)) is not None:
-            raise self._broken(
-                f"segment {k} carries {segment_bytes[k]} bytes in {segment_us[k]} us: bytes x microseconds must be "
-                "below 2**62, so that integer interpolation cannot overflow (add more knots)"
-            )
         if self.after == "loop" and self.total_bytes == 0:
             raise self._broken('no capacity at all: with after = "loop" a message would never leave')
+
+    def _add_knots(self) -> None:
+        """Cut each segment in which (bytes x microseconds) reaches PRODUCT_LIMIT into pieces of whole bytes."""
+        lengths_us, counts = np.diff(self.time_us), np.diff(self.cumulative_bytes)
+        large = np.flatnonzero(counts > (PRODUCT_LIMIT - 1) // lengths_us)
+        places: list[int] = []
+        times: list[int] = []
+        sums: list[int] = []
+        for k in large.tolist():
+            # As Python's integers, which do not overflow.
+            length, count = int(lengths_us[k]), int(counts[k])
+            pieces = min(length, 2 * math.isqrt(length * count // PRODUCT_LIMIT) + 1)
+            if len(times) + pieces > _MAX_ADDED_KNOTS:
+                raise self._broken(f"segment {k} carries {count} bytes in {length} us: too much for one (add knots)")
+            inner = [length * j // pieces for j in range(1, pieces)]
+            places += [k + 1] * len(inner)
+            times += [int(self.time_us[k]) + t for t in inner]
+            sums += [int(self.cumulative_bytes[k]) + t * count // length for t in inner]
+        if places:
+            added = ((self.time_us, times), (self.cumulative_bytes, sums))
+            time_us, cumulative = (np.insert(knots, places, np.array(new, np.int64)) for knots, new in added)
+            freeze(self, time_us=time_us, cumulative_bytes=cumulative)
 
     def _broken(self, what: str) -> BufgymError:
         return BufgymError(f"trace {self.name!r}: {what}")

@@ -12,6 +12,7 @@ from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import kernel
 from bufgym.model import qoi
 from bufgym.policies import ACCEPT, REJECT, register, registry
 from bufgym.sim.metrics import outcome
@@ -107,10 +108,11 @@ def test_a_policy_of_your_own():
     layout = {"memory": {"count": 0}, "parameters": {"by": 1}}
     assert register("keep-even", **layout)(keep_even) is keep_even
     register("keep-even-compiled", compile=True, **layout)(keep_even)
-    assert list(policies.names())[-2:] == ["keep-even", "keep-even-compiled"]
+    register("keep-even-kernel", compile=True, **layout)(kernel(keep_even))  # a kernel already
+    assert list(policies.names())[-3:] == ["keep-even", "keep-even-compiled", "keep-even-kernel"]
     assert policies.get("keep-even").summary == keep_even.__doc__
     # L = 2: 3 drops 1, 4 is rejected, 5 drops 2, 6 is rejected. With steps of 2 every newcomer is rejected.
-    for name in ("keep-even", "keep-even-compiled"):
+    for name in ("keep-even", "keep-even-compiled", "keep-even-kernel"):
         assert kept(name, 2, 6) == [3, 5]
         assert kept(f"{name}:by=2", 2, 6) == [1, 2]
     assert policies.get("keep-even-compiled").compile and not policies.get("keep-even").compile

@@ -153,6 +153,7 @@ def links(folder: Path) -> Kind:
     return files, read
 
 
+@pytest.mark.filterwarnings("ignore::bufgym.ground.errors.TraceWarning")
 @pytest.mark.parametrize("kind", [weights, poses, bags, toml, results, archives, links])
 def test_broken_files(tmp_path: Path, kind: Callable[[Path], Kind]) -> None:
     files, read = kind(tmp_path)

@@ -25,14 +25,15 @@ def _bytes(message: Any, type: str, store: Any) -> bytes:
     return bytes(store.serialize_ros1(message, type) if store is ROS1 else store.serialize_cdr(message, type))
 
 
-def odometry(x_m: float, yaw_deg: float, store: Any = ROS2, scale: float = 1.0) -> bytes:
-    """nav_msgs/Odometry at (x, 0, 0), turned about z; ``scale``: length of the quaternion."""
+def odometry(x_m: float, yaw_deg: float, store: Any = ROS2, scale: float = 1.0, stamp_ms: int = -1) -> bytes:
+    """nav_msgs/Odometry at (x, 0, 0), turned about z; ``scale``: length of the quaternion; a negative stamp is none."""
     t, half = store.types, math.radians(yaw_deg) / 2
     vector, seq = t["geometry_msgs/msg/Vector3"], {"seq": 0} if store is ROS1 else {}
     turn = t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=scale * math.sin(half), w=scale * math.cos(half))
     pose = t["geometry_msgs/msg/Pose"](position=t["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0), orientation=turn)
     twist = t["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
-    stamp = t["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    sec, nanosec = (0, 0) if stamp_ms < 0 else divmod(START_NS + stamp_ms * MS, 10**9)
+    stamp = t["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
     message = t["nav_msgs/msg/Odometry"](
         header=t["std_msgs/msg/Header"](stamp=stamp, frame_id="odom", **seq),
         child_frame_id="base",
@@ -56,7 +57,7 @@ def drive(store: Any = ROS2) -> list[Entry]:
     for k in range(5):
         entries.append((500 * k, "/camera/left", "std_msgs/msg/String", text("x" * (100 * k + 100), store)))
     entries.append((700, "/status", "std_msgs/msg/String", text("ok", store)))
-    return entries
+    return sorted(entries)
 
 
 def write_mcap(
@@ -99,6 +100,6 @@ def _written(writer: Any, path: Path, entries: list[Entry], store: Any) -> Path:
     with writer:
         types = {topic: type for _, topic, type, _ in entries}
         connections = {t: writer.add_connection(t, type, typestore=store) for t, type in types.items()}
-        for ms, topic, _, data in sorted(entries):
+        for ms, topic, _, data in entries:
             writer.write(connections[topic], START_NS + ms * MS, data)
     return path

@@ -40,7 +40,6 @@ BROKEN = [
     (HEADER + "1000,1000000000001,1000\n", "line 2: bytes = 1000000000001: must be at most 1000000000000"),
     (HEADER + "1000,1,1000\n3000,1,1000\n", "line 3: start in ms = 2000: must begin where the line above ended"),
     (HEADER + "1000,1,0\n", "line 2: interval in ms = 0: must be above 0"),
-    (HEADER + "9000000,1000000000000,9000000\n", r"line 2: bytes x microseconds .*: must be below 2\*\*62"),
     (HEADER + "1000,0,1000\n", "no capacity at all"),
     ("t,bytes\n1,2\n", "line 1: t,bytes: must fit a known format"),
     ("0 1\n1 nan\n", "line 2: Mbit/s = nan: must be a finite number"),

@@ -78,7 +78,7 @@ test_broken_traces_and_arguments = refused(
     (bad([0.0, float("nan")], [0, 1]), r"time_us\[1\] = nan: must be a whole number"),
     (bad([0, 1], [0, 2**63]), "below 2"),
     (bad([0, 2**62], [0, 1]), "both must be below"),
-    (bad([0, 2**31], [0, 2**31]), "bytes x microseconds must be below 2"),
+    (bad([0, 2**61], [0, 2**61]), "segment 0 carries .*: too much for one .add knots."),
     (bad([0, 1], [0, 0]), "no capacity at all"),
     (lambda: Trace("a", STORY.time_us, STORY.time_us, "again"), "after = 'again': must be one of loop"),  # type: ignore[arg-type]
     (lambda: STORY.scaled(float("nan")), "factor = nan"),

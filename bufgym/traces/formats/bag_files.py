@@ -217,6 +217,13 @@ def journals(path: Path) -> list[str]:
 def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
     """Every message of a ROS 1 bag."""
     from rosbags.rosbag1 import Reader
+    from rosbags.rosbag1.reader import IndexData
+
+    class _InFile(IndexData):
+        """An entry of a bag's index, which compares by its place in the file."""
+
+        def __lt__(self, other: Any) -> bool:
+            return (self.chunk_pos, self.offset) < (other.chunk_pos, other.offset)
 
     with Reader(path) as reader:
         unpacked = Unpacked(path.stat().st_size)
@@ -226,6 +233,8 @@ def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
         for connection in reader.connections:
             _add(types, connection.topic, connection.msgtype)
             channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1")
+        # The reader merges by time. In order of the file, a clock that went back shows.
+        reader.indexes = {number: sorted(map(_InFile._make, index)) for number, index in reader.indexes.items()}
         for connection, logged_ns, data in reader.messages(list(reader.connections)):
             yield channels[connection.id], logged_ns, data
 

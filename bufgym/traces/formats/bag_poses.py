@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -52,7 +53,6 @@ class PoseCollector:
             raise BufgymError(f"odom = {spec!r}: must be a topic, or TOPIC:PARENT:CHILD for one transform of tf")
         self._frames = tuple(frames)
         self._poses: dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]] = {}
-        self._stores: dict[str, Any] = {}
 
     def add(self, channel: BagTopic, time_ns: int, data: bytes) -> None:
         """Keep the poses of a message that was logged at `time_ns`."""
@@ -94,9 +94,7 @@ class PoseCollector:
             raise BufgymError(f"{self.path}: {self.topic} carries {channel.type or 'no known type'}: {rule}")
         if channel.encoding not in ("cdr", "ros1"):
             raise BufgymError(f"{self.path}: {self.topic} is encoded in {channel.encoding!r}: must be cdr or ros1")
-        if channel.encoding not in self._stores:
-            self._stores[channel.encoding] = _typestore(channel.encoding)
-        store = self._stores[channel.encoding]
+        store = typestore(channel.encoding)
         decode = store.deserialize_cdr if channel.encoding == "cdr" else store.deserialize_ros1
         return decode(data, channel.type)
 
@@ -114,7 +112,9 @@ class PoseCollector:
         poses.append((time_ns, values))
 
 
-def _typestore(encoding: str) -> Any:
+@cache
+def typestore(encoding: str) -> Any:
+    """The message types that rosbags knows in this encoding, "cdr" or "ros1"."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE if encoding == "cdr" else Stores.ROS1_NOETIC)

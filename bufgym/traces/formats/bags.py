@@ -17,10 +17,12 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.bag_files import MAX_TOPICS, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
+from bufgym.traces.formats.clocks import LogTimes
 from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.jumps import warn_of_jumps
 from bufgym.traces.formats.splits import damage_errors, is_recording, split_messages, splits
 from bufgym.traces.poses import Poses
-from bufgym.traces.trace import MAX_DURATION_S, Int64Array
+from bufgym.traces.trace import Int64Array
 
 MAX_BAG_MESSAGES: Final = 10**7
 
@@ -70,40 +72,35 @@ def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], ob
         advance: called with 1 for each message read, as a progress bar's update.
 
     Raises:
-        TraceError: missing, not a recording, cut off, damaged, more than 10**7 messages or 10**4 topics, longer than
-            10**7 s, unpacking to too much (see `bag_files`).
+        TraceError: missing, not a recording, cut off, damaged, more than 10**7 messages or 10**4 topics, unpacking to
+            too much (see `bag_files`), of log times that cannot be true (see `clocks`).
         BufgymError: the extra ``ros`` is not installed; ``odom`` is no topic or carries no poses.
     """
     files = splits(Path(path))
     collector = None if odom is None else PoseCollector(path, odom)
     types: dict[str, str] = {}  # of every topic, also of those without messages
-    numbers: dict[str, int] = {}
-    columns = (array("q"), array("q"), array("q"))
+    times, sizes = LogTimes(path), array("q")
     for file, (channel, logged_ns, data) in split_messages(files, types):
         if len(types) > MAX_TOPICS:
             raise fault(path, f"more than {MAX_TOPICS} topics: must be fewer")
-        if len(columns[0]) >= MAX_BAG_MESSAGES:
+        if len(sizes) >= MAX_BAG_MESSAGES:
             raise fault(path, f"more than {MAX_BAG_MESSAGES} messages: must be fewer")
-        with damage_errors(file, f"message {len(columns[0])} on {channel.topic} is "):
-            row = (logged_ns, max(1, len(data)), numbers.setdefault(channel.topic, len(numbers)))
-            for column, value in zip(columns, row, strict=True):
-                column.append(value)
+        with damage_errors(file, f"message {len(sizes)} on {channel.topic} is "):
+            times.add(channel, logged_ns, data)
+            sizes.append(max(1, len(data)))
             if collector is not None and channel.topic == collector.topic:
                 collector.add(channel, logged_ns, data)
         advance(1)
-    time_ns, size_bytes, number = (np.array(column, np.int64) for column in columns)
-    if len(time_ns) and int(time_ns.max()) - int(time_ns.min()) > MAX_DURATION_S * 10**9:
-        raise fault(path, f"spans more than {MAX_DURATION_S} s: must be at most that")
-    # Recorders with several threads do not log in order of time.
-    order = np.argsort(time_ns, kind="stable")
-    topics = {name: types.get(name, "") for name in sorted(set(types) | set(numbers))}
+    order, size_bytes = times.order(), np.array(sizes, np.int64)
+    topics = {name: types.get(name, "") for name in sorted({*types, *times.topics})}
     places = {name: k for k, name in enumerate(topics)}
-    place = np.array([places[name] for name in numbers], np.int64)
-    topic = place[number[order]] if len(numbers) else number
-    bag = Bag(str(path), files[0].kind, topics, time_ns[order], size_bytes[order], topic, order)
+    place = np.array([places[name] for name in times.topics], np.int64)
+    topic = place[times.topic[order]]
+    bag = Bag(str(path), files[0].kind, topics, times.time_ns[order], size_bytes[order], topic, order)
     if collector is None:
         return bag
     from_ns, poses = collector.poses(topics)
+    warn_of_jumps(path, poses)
     return replace(bag, poses=poses, poses_from_ns=from_ns)
 
 

@@ -6,14 +6,18 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.faults import StrPath, fault, warn
 from bufgym.traces.formats.text import Line
-from bufgym.traces.trace import MAX_DURATION_S, PRODUCT_LIMIT, US_PER_S, Int64Array
+from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array
 
 MAX_INTERVAL_BYTES: Final = 10**12
 
 # A rate that would have to hold for longer is a gap in the recording, across which nothing is known.
 MAX_HOLD_S: Final = 86_400
+
+# A rate held for longer than this and for so many usual steps is a hole in the recording, of which we warn.
+HOLE_S: Final = 60
+HOLE_STEPS: Final = 3
 
 
 class Knots(NamedTuple):
@@ -32,12 +36,8 @@ class Intervals:
         self._bytes = array("q")
         self._end_us: int | None = None
 
-    def add(self, line: Line, length_us: int, count: int) -> None:
+    def add(self, length_us: int, count: int) -> None:
         """Add an interval of `length_us` > 0 in which `count` >= 0 bytes were transmitted."""
-        if count > MAX_INTERVAL_BYTES:
-            raise line.error(count, f"must be at most {MAX_INTERVAL_BYTES} in an interval", "bytes")
-        if length_us * count >= PRODUCT_LIMIT:
-            raise line.error(length_us * count, "must be below 2**62", "bytes x microseconds of the interval")
         self.us.append(length_us)
         self._bytes.append(count)
 
@@ -58,7 +58,7 @@ class Intervals:
             rule = f"must begin where the line above ended ({self._end_us / 1000:.10g} ms)"
             raise line.error(f"{start_us / 1000:.10g}", rule, "start in ms")
         self._end_us = end_us
-        self.add(line, length_us, bytes_in_interval)
+        self.add(length_us, bytes_in_interval)
 
     def __len__(self) -> int:
         return len(self.us)
@@ -92,6 +92,7 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     """
     intervals = Intervals()
     previous: Rate | None = None
+    steps: list[Rate] = []  # the rate at the end of each interval
     for rate in rates:
         if previous is not None:
             length_us = rate.start_us - previous.start_us
@@ -101,7 +102,8 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
             if length_us > MAX_HOLD_S * US_PER_S:
                 raise rate.line.error(rate.time, f"must be at most {MAX_HOLD_S} s after {above}", "time in s")
             if length_us > 0:
-                intervals.add(previous.line, length_us, round(previous.bytes_per_us * length_us))
+                intervals.add(length_us, round(previous.bytes_per_us * length_us))
+                steps.append(rate)
         previous = rate
     if previous is None:
         raise fault(path, "is empty: must hold a line for each sample")
@@ -109,5 +111,19 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
         line = previous.line
         raise line.error(line.text, "must have a second line: how long a single rate holds is unknown")
     length_us = round(float(np.median(np.asarray(intervals.us))))
-    intervals.add(previous.line, length_us, round(previous.bytes_per_us * length_us))
+    _warn_of_holes(path, np.array(intervals.us, np.int64), length_us, steps)
+    intervals.add(length_us, round(previous.bytes_per_us * length_us))
     return intervals.knots(path)
+
+
+def _warn_of_holes(path: StrPath, lengths_us: Int64Array, usual_us: int, steps: list[Rate]) -> None:
+    """Warn of rates held much longer than usual; ``steps`` end the intervals."""
+    holes = np.flatnonzero((lengths_us > HOLE_S * US_PER_S) & (lengths_us > HOLE_STEPS * usual_us))
+    if not len(holes):
+        return
+    longest = int(holes[np.argmax(lengths_us[holes])])
+    hole_s, usual_s = lengths_us[longest] / US_PER_S, usual_us / US_PER_S
+    count = f", the longest of {len(holes)} holes" if len(holes) > 1 else ""
+    line, time = steps[longest].line, steps[longest].time
+    doubt = f"{time} is {hole_s:.10g} s after the line above{count}, where {usual_s:g} s is usual: the rate is held"
+    warn(path, doubt, line=line.number)

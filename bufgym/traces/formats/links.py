@@ -52,12 +52,12 @@ FORMATS: Final[dict[str, Format]] = {
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
     "nyu": Format(
         "number,unit with a unit such as Mbits/sec",
-        _cells(NUMBER, f"(?:{'|'.join(NYU_BITS)})", between=r"\s*,\s*"),
+        _cells(NUMBER, f"(?:{'|'.join(NYU_BITS)}),?", between=r"\s*,\s*"),
         read_nyu,
     ),
     "sabre": Format("JSON list", _cells(r"\["), read_sabre),
     "nuttcp": Format("nuttcp's log", lambda text: INTERVAL.fullmatch(text) or REMARK.fullmatch(text), read_nuttcp),
-    "iperf3": Format("JSON object", _cells(r"\{"), read_iperf3),
+    "iperf3": Format("JSON object, or one a line", _cells(r"\{"), read_iperf3),
     "runs": Format("Run 1, or ###", lambda text: RUN.fullmatch(text) or RULER.fullmatch(text), read_runs, RUNS),
 }
 

@@ -6,6 +6,7 @@ Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018
 """
 
 import json
+import re
 from collections.abc import Iterator
 from datetime import datetime
 from typing import Any, Final, NoReturn
@@ -27,6 +28,7 @@ _UCC_TIME: Final = "Timestamp"
 _UCC_TIME_FORMAT: Final = "%Y.%m.%d_%H.%M.%S"
 NYU_BITS: Final = {"bits/sec": 1, "Kbits/sec": 10**3, "Mbits/sec": 10**6, "Gbits/sec": 10**9}
 _SHOWN_CHARACTERS: Final = 40
+_BLANKS: Final = re.compile(r"\s*")
 
 
 def fits_ucc(text: str) -> bool:
@@ -64,7 +66,7 @@ def read_ucc(path: StrPath, column: str = "DL_bitrate") -> Knots:
                     raise line.error(cells[time_at], rule, _UCC_TIME)
             first, previous, latest = first or time, time, max(latest or time, time)
             kbit_per_s = line.decimal(column, cells[rate_at], 0, _MAX_KBIT_PER_S)
-            intervals.add(line, US_PER_S, round(kbit_per_s * 125))
+            intervals.add(US_PER_S, round(kbit_per_s * 125))
     if first is not None and previous is not None and previous < first:
         raise fault(path, "ends before it begins: must be in order of time", field=_UCC_TIME)
     clock_s = 0 if first is None or previous is None else (previous - first).total_seconds()
@@ -87,7 +89,7 @@ def read_nyu(path: StrPath) -> Knots:
             if unit not in NYU_BITS:
                 raise line.error(unit, f"must be one of {', '.join(NYU_BITS)}", "unit")
             most = MAX_MBIT_PER_S * 10**6 / NYU_BITS[unit]
-            intervals.add(line, US_PER_S, round(line.decimal(unit, value, 0, most) * NYU_BITS[unit] / 8))
+            intervals.add(US_PER_S, round(line.decimal(unit, value, 0, most) * NYU_BITS[unit] / 8))
     return intervals.knots(path)
 
 
@@ -103,16 +105,30 @@ def read_sabre(path: StrPath) -> Knots:
         if length_us == 0:
             raise line.error(0, "must be above 0", "duration_ms")
         # kbit/s times microseconds is thousandths of a bit.
-        intervals.add(line, length_us, round(kbit_per_s * length_us / 8000))
+        intervals.add(length_us, round(kbit_per_s * length_us / 8000))
     return intervals.knots(path)
 
 
 def read_json(path: StrPath) -> Any:
     """The file's JSON, whose numbers are finite."""
+    values = read_json_values(path)
+    if len(values) != 1:
+        raise fault(path, f"must be JSON (holds {len(values)} values: must hold one)")
+    return values[0]
+
+
+def read_json_values(path: StrPath) -> list[Any]:
+    """The values of JSON that follow each other in the file, whose numbers are finite."""
     with open_text(path) as file:
         text = file.text()
+    decoder, values = json.JSONDecoder(parse_constant=_no_constant), []
+    at = len(text) - len(text.lstrip())
     try:
-        return json.loads(text, parse_constant=_no_constant)
+        while at < len(text):
+            value, end = decoder.raw_decode(text, at)
+            values.append(value)
+            at = _BLANKS.match(text, end).end()  # type: ignore[union-attr]  # matches anywhere
+        return values
     except json.JSONDecodeError as error:
         value = text[error.pos : error.pos + _SHOWN_CHARACTERS] or None
         raise fault(path, f"must be JSON ({error.msg})", line=error.lineno, value=value) from error

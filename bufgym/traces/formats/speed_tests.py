@@ -8,11 +8,11 @@ of 5G mmWave Networks", 5G-MeMU 2022 (lists).
 
 import re
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.logs import json_items, json_number, read_json
+from bufgym.traces.formats.logs import json_items, json_number, read_json_values
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
@@ -49,7 +49,7 @@ def read_nuttcp(path: StrPath) -> Knots:
             computed = megabytes * _MBIT_PER_MB / length_s
             if abs(stated - computed) > _LENGTH_ERROR * computed + 0.01:
                 raise line.error(match[3], f"must be MB / sec, {computed:.4g}", "Mbps")
-            intervals.add(line, round(length_s * US_PER_S), round(megabytes * 2**20))
+            intervals.add(round(length_s * US_PER_S), round(megabytes * 2**20))
     return intervals.knots(path, f"{len(intervals)} intervals")
 
 
@@ -58,11 +58,11 @@ _MAX_STEP_S: Final = 1e-3
 
 
 def read_iperf3(path: StrPath) -> Knots:
-    """The JSON of `iperf3 --json`: `intervals[].sum` with `start`, `end`, `bytes`. Intervals that iperf3 omitted from
-    its own result are left out. The note says on which side it was measured: the sender counts what went into its
-    socket, the receiver what came out.
+    """The JSON of `iperf3 --json`: `intervals[].sum` with `start`, `end`, `bytes`; or of `--json-stream`, where each
+    interval is an event on a line of its own. Intervals that iperf3 omitted from its own result are left out. The note
+    says on which side it was measured: the sender counts what went into its socket, the receiver what came out.
     """
-    report = read_json(path)
+    report = _report(path)
     if not isinstance(report, dict) or not isinstance(report.get("intervals"), list):
         raise fault(path, "must be an object with a list of intervals, as iperf3 --json writes it")
     if report.get("error"):
@@ -83,10 +83,22 @@ def read_iperf3(path: StrPath) -> Knots:
         length_us = round(end_s * US_PER_S) - round((start_s if previous_s is None else previous_s) * US_PER_S)
         if length_us <= 0:
             raise line.error(end_s, f"must be after its start ({start_s:g} s)", "end")
-        intervals.add(line, length_us, count)
+        intervals.add(length_us, count)
         sides.add("sender" if measured.get("sender") else "receiver")
         previous_s = end_s
     return intervals.knots(path, f"measured by the {' and the '.join(sorted(sides)) or 'nobody'}")
+
+
+def _report(path: StrPath) -> Any:
+    """The object that `iperf3 --json` writes, also from the events of `--json-stream`."""
+    values = read_json_values(path)
+    if not any(isinstance(value, dict) and "event" in value for value in values):
+        return values[0] if len(values) == 1 else values
+    by_event: dict[Any, list[Any]] = {}
+    for value in values:
+        if isinstance(value, dict):
+            by_event.setdefault(str(value.get("event")), []).append(value.get("data"))
+    return {"intervals": by_event.get("interval", []), "error": (by_event.get("error") or [None])[0]}
 
 
 MAX_RUNS: Final = 16

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, Literal
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
 from bufgym.traces.formats.text import Line, TextFile, is_header, open_text, split_cells
-from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
+from bufgym.traces.trace import US_PER_S
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
@@ -45,9 +45,9 @@ def read_belgium(path: StrPath) -> Knots:
 
 
 def read_mbit(path: StrPath) -> Knots:
-    """Seconds and Mbit/s separated by white space, by the rules of `held_rates`."""
+    """Seconds, since any time, and Mbit/s separated by white space, by the rules of `held_rates`."""
     with open_text(path) as file:
-        return held_rates(path, (_rate(line, None, "Mbit/s", 0.125, MAX_DURATION_S) for line in file.lines()))
+        return held_rates(path, (_rate(line, None, "Mbit/s", 0.125) for line in file.lines()))
 
 
 def fits_rates(text: str) -> bool:
@@ -61,7 +61,7 @@ def read_rates(path: StrPath) -> Knots:
     with open_text(path) as file:
         header, lines = below_header(file, f"{RATES_HEADER} or time,mbps", fits_rates)
         column = split_cells(header.lower())[1]
-        return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column], _MAX_EPOCH_S) for line in lines))
+        return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column]) for line in lines))
 
 
 def below_header(file: TextFile, header: str, fits: Callable[[str], bool]) -> tuple[str, Iterator[Line]]:
@@ -75,12 +75,12 @@ def below_header(file: TextFile, header: str, fits: Callable[[str], bool]) -> tu
     return first.text, lines
 
 
-def _rate(line: Line, separator: str | None, field: str, unit: float, most_s: int) -> Rate:
+def _rate(line: Line, separator: Literal[","] | None, field: str, unit: float) -> Rate:
     """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
     time, rate = line.columns(2, separator)
     start_us = _date_us(time) if separator else None
     if start_us is None:
-        start_us = round(line.decimal("time in s", time, 0, most_s) * US_PER_S)
+        start_us = round(line.decimal("time in s", time, 0, _MAX_EPOCH_S) * US_PER_S)
     return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit)
 
 

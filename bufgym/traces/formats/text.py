@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Final, NamedTuple
+from typing import IO, Final, Literal, NamedTuple
 
 from bufgym.ground.errors import TraceError
 from bufgym.ground.files import replaced, unpacked_limit
@@ -39,8 +39,8 @@ _MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
 
 
 def split_cells(text: str) -> list[str]:
-    """The cells between commas, without white space around them."""
-    return [cell.strip() for cell in text.split(",")]
+    """The cells between commas, without white space around them; a comma at the end of the line begins no cell."""
+    return [cell.strip() for cell in text.strip().removesuffix(",").split(",")]
 
 
 def is_header(text: str, header: str) -> bool:
@@ -62,9 +62,14 @@ class Line(NamedTuple):
         """The error to raise about this line."""
         return fault(self.path, rule, line=self.number or None, value=value, field=field)
 
-    def columns(self, count: int, separator: str | None = None) -> list[str]:
-        """The line's cells; there must be `count`; separated by white space unless a separator is given."""
+    def columns(self, count: int, separator: Literal[","] | None = None) -> list[str]:
+        """The line's cells; there must be `count`; separated by white space unless by commas.
+
+        One more comma at the end of the line begins no cell.
+        """
         cells = [cell.strip() for cell in self.text.split(separator)]
+        if separator and len(cells) == count + 1 and not cells[-1]:
+            cells.pop()
         if len(cells) != count:
             raise self.error(self.text, f"must have {count} columns, has {len(cells)}")
         return cells

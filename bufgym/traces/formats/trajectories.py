@@ -3,11 +3,13 @@
 | format | a line | used by |
 |---|---|---|
 | `tum` | `t tx ty tz qx qy qz qw`: s, m, unit quaternion | TUM RGB-D [sturm2012tum]; any odometry |
-| `euroc` | `t px py pz qw qx qy qz`: ns, m; blanks or commas | EuRoC [burri2016euroc] |
+| `euroc` | `t px py pz qw qx qy qz`: ns, m; a state estimate has 11 or 17 columns | EuRoC [burri2016euroc], VINS |
 | `kitti` | a 3x4 matrix row by row, m; the times (s, one a line) in another file | KITTI [geiger2012kitti] |
 
-The format is recognised by the first line: 12 numbers are KITTI's; a header with `timestamp [ns]`, or commas, EuRoC's;
-anything else must be TUM's.
+Columns of TUM and EuRoC are separated by blanks or commas. The format is recognised by the first lines: 12 numbers are
+KITTI's; a header such as `#timestamp [ns]`, or more than 8 columns, EuRoC's. Without such a header `_unit` finds the
+unit of the times. Then 8 columns in seconds, or between blanks, are TUM's, and other 8 are EuRoC's. x does not depend
+on the order of a quaternion's four.
 """
 
 from __future__ import annotations
@@ -24,8 +26,10 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.text import Line, open_text, split_cells
-from bufgym.traces.poses import Poses, quaternions, unit
+from bufgym.traces.formats.jumps import warn_of_jumps
+from bufgym.traces.formats.text import NUMBER, Line, open_text, split_cells
+from bufgym.traces.poses import Poses, quaternions
+from bufgym.traces.poses import unit as normalized
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array
 
 POSE_FORMATS: Final = ("tum", "euroc", "kitti")
@@ -34,9 +38,18 @@ MAX_POSITION_M: Final = 1e7
 NORM_TOLERANCE: Final = 0.01
 # Seconds since 1970 until the year 5138; a time in ns exceeds it.
 _MAX_EPOCH_S: Final = 1e11
-_EUROC_HEADER: Final = re.compile(r"#\s*timestamp\s*\[ns\]")
-# The state estimates of EuRoC's own CSV files continue with velocity and biases.
-_EUROC_COLUMNS: Final = (8, 17)
+_MIN_EPOCH_S: Final = 6e8  # A clock that counts from 1970 shows more, and less than the next
+_NEAR_EPOCH_S: Final = 4.2e9
+_EUROC_HEADER: Final = re.compile(r"#\s*timestamp\s*\[(s|ms|us|ns)\]")
+# State estimates continue with the velocity, those of EuRoC's own CSV files also with biases.
+_COLUMNS: Final = {"tum": (8,), "euroc": (8, 11, 17)}
+_NAMES: Final = {"tum": ("tx", "ty", "tz", "qx", "qy", "qz", "qw"), "euroc": ("px", "py", "pz", "qw", "qx", "qy", "qz")}
+_OWN_UNIT: Final = {"tum": "s", "euroc": "ns"}
+_UNIT_S: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_USUAL_STEPS_S: Final = (1e-3, 10.0)  # From one pose to the next, where only the steps tell the unit
+_LONGEST_STEP_S: Final = 3600  # The same where the times count from 1970
+_LEAST_STEP_S: Final = 1e-4  # No camera or robot tells its pose more often
+_TIMES_READ: Final = 1000  # Lines by which the unit is found
 
 RowReader = Callable[[Line, list[float] | None], tuple[str, int, list[float]]]
 """Parses a line, given the values of the previous one, into the time as it is written, the time in us, and values."""
@@ -47,38 +60,89 @@ def read_poses(path: StrPath, *, format: str | None = None, times: StrPath | Non
 
     Args:
         path: the file.
-        format: one of `POSE_FORMATS`; by default recognised by the first line.
+        format: one of `POSE_FORMATS`, with times in its own unit; by default both are found (see above).
         times: KITTI's file of times; by default the file of the same name with ``_times`` beside it.
 
     Raises:
         TraceError: the file cannot be read, or a line breaks a rule: as many finite numbers as the format has,
             positions within 10**7 m, a quaternion of unit norm (a rotation matrix) within 1 %, times that never
-            decrease and span at most 10**7 s, at least two lines. The message names file, line, value and rule.
+            decrease and span at most 10**7 s, at least two lines, most poses 0.1 ms apart or more. The message names
+            file, line, value and rule.
         BufgymError: an unknown format, or `times` with another format than KITTI's.
     """
-    format = format or detect_pose_format(path)
+    unit = _OWN_UNIT.get(format or "", "s")
+    if format is None:
+        format, unit = _detected(path)
     if format not in POSE_FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(POSE_FORMATS)}")
     if format == "kitti":
-        return _read_kitti(path, times)
+        poses = _read_kitti(path, times)
+        warn_of_jumps(path, poses)
+        return poses
     if times is not None:
         raise BufgymError(f"times = {str(times)!r}: goes with KITTI matrices only, and {path} is in format {format}")
-    time_us, values = read_rows(path, _tum_row if format == "tum" else _euroc_row)
-    return Poses(time_us, values[:, :3], unit(values[:, 3:]), format)
+    time_us, values = read_rows(path, _pose_row(format, unit))
+    note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
+    poses = Poses(time_us, values[:, :3], normalized(values[:, 3:]), f"{format}{note}")
+    warn_of_jumps(path, poses)
+    return poses
 
 
 def detect_pose_format(path: StrPath) -> str:
     """The format that the file's first lines fit (see above)."""
+    return _detected(path)[0]
+
+
+def _detected(path: StrPath) -> tuple[str, str]:
+    """The format and the unit of the times that the file's first lines fit."""
+    times: list[float] = []
+    columns, blanks = 0, False
     with open_text(path) as file:
         for line in file.lines():
             if line.text.startswith("#"):
-                if _EUROC_HEADER.match(line.text):
-                    return "euroc"
-            elif "," in line.text:
-                return "euroc"
-            else:
-                return "kitti" if len(line.text.split()) == 12 else "tum"
-    raise fault(path, "is empty: must hold a trajectory or a motion recording")
+                if not columns and (header := _EUROC_HEADER.match(line.text)):
+                    return "euroc", header[1]
+                continue
+            cells = _cells(line)
+            if not columns:
+                columns, blanks = len(cells), "," not in line.text
+            if (columns == 12 and blanks) or len(times) == _TIMES_READ or not re.fullmatch(NUMBER, cells[0]):
+                break
+            times.append(float(cells[0]))
+    if not columns:
+        raise fault(path, "is empty: must hold a trajectory or a motion recording")
+    if columns == 12 and blanks:
+        return "kitti", "s"
+    likely = "tum" if blanks and columns <= 8 else "euroc"
+    unit = _unit(path, np.array(times), _OWN_UNIT[likely])
+    return ("tum" if unit == "s" and columns <= 8 else likely), unit
+
+
+def _unit(path: StrPath, times: Float64Array, own: str) -> str:
+    """The unit of a trajectory's times: that in which they are dates, else that in which poses follow each other.
+
+    Args:
+        path: the file, for the error.
+        times: of its first lines.
+        own: the unit of the format that the columns suggest. It goes before another that is as likely.
+    """
+    with np.errstate(invalid="ignore"):
+        steps = np.diff(times)
+    steps = steps[(steps > 0) & np.isfinite(steps)]
+    if not len(steps):
+        return own
+    step = float(np.median(steps))
+    for unit, unit_s in _UNIT_S.items():
+        if _MIN_EPOCH_S <= times[0] * unit_s < _NEAR_EPOCH_S and _LEAST_STEP_S <= step * unit_s <= _LONGEST_STEP_S:
+            return unit
+    least_s, most_s = _USUAL_STEPS_S
+    likely = [unit for unit, unit_s in _UNIT_S.items() if least_s <= step * unit_s <= most_s]
+    if own in likely or not likely:
+        return own
+    if len(likely) > 1:
+        rule = f"may be {' or '.join(likely)}: say format='tum' (s) or 'euroc' (ns), and write others in one of these"
+        raise fault(path, rule, value=f"{step:g}", field="median step of the times")
+    return likely[0]
 
 
 def read_rows(path: StrPath, read_row: RowReader, skip: int = 0) -> tuple[Int64Array, Float64Array]:
@@ -106,6 +170,10 @@ def read_rows(path: StrPath, read_row: RowReader, skip: int = 0) -> tuple[Int64A
     if len(times) < 2:
         raise fault(path, f"holds {len(times)} samples: must hold at least 2")
     time_array = np.asarray(times, np.int64)
+    step_s = float(np.median(np.diff(time_array))) / US_PER_S
+    if step_s < _LEAST_STEP_S:
+        rule = f"must be at least {_LEAST_STEP_S:g} s (are the times in another unit?)"
+        raise fault(path, rule, value=f"{step_s:g} s", field="median step of the times")
     return time_array - time_array[0], np.array(rows, np.float64)
 
 
@@ -114,20 +182,30 @@ def seconds(line: Line, text: str) -> int:
     return round(line.decimal("time in s", text, 0, _MAX_EPOCH_S) * US_PER_S)
 
 
-def _tum_row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
-    cells = line.columns(8)
-    values = _pose(line, cells[1:], ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
-    return cells[0], seconds(line, cells[0]), values
+def _pose_row(format: str, unit: str) -> RowReader:
+    """The reader of a line of TUM or EuRoC with times in this unit."""
+    columns, names = _COLUMNS[format], _NAMES[format]
+    more = f" (or {' or '.join(map(str, columns[1:]))} of a state estimate)" if columns[1:] else ""
+    unit_us = Decimal(str(_UNIT_S[unit])) * US_PER_S
+
+    def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
+        cells = _cells(line)
+        if len(cells) not in columns:
+            raise line.error(line.text, f"must have 8 columns{more}, has {len(cells)}")
+        if unit == "s":
+            time_us = seconds(line, cells[0])
+        else:
+            line.decimal(f"time in {unit}", cells[0], 0, _MAX_EPOCH_S / _UNIT_S[unit])
+            # A float holds such a time to 256 ns only.
+            time_us = int(Decimal(cells[0]) * unit_us)
+        return cells[0], time_us, _pose(line, cells[1:8], names)
+
+    return row
 
 
-def _euroc_row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
-    cells = split_cells(line.text) if "," in line.text else line.text.split()
-    if len(cells) not in _EUROC_COLUMNS:
-        raise line.error(line.text, f"must have 8 columns (or the 17 of a state estimate), has {len(cells)}")
-    line.decimal("time in ns", cells[0], 0, _MAX_EPOCH_S * 1e9)
-    # A float holds such a time to 256 ns only.
-    time_us = int(Decimal(cells[0])) // 1000
-    return cells[0], time_us, _pose(line, cells[1:8], ("px", "py", "pz", "qw", "qx", "qy", "qz"))
+def _cells(line: Line) -> list[str]:
+    """The cells of a line, which are separated by commas if it has any."""
+    return split_cells(line.text) if "," in line.text else line.text.split()
 
 
 def _pose(line: Line, cells: list[str], names: tuple[str, ...]) -> list[float]:

@@ -1,0 +1,182 @@
+"""Log times of a recording's messages, and whether the recorder's clock can have shown them.
+
+Arrival times are log times, so a clock that was set back would shuffle the messages. docs/methods.md, "Clocks, jumps
+and units", says what is refused and what is warned of.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from functools import cache
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from bufgym.traces.formats.bag_poses import BagTopic, typestore
+from bufgym.traces.formats.faults import StrPath, fault, warn
+from bufgym.traces.trace import MAX_DURATION_S, Int64Array, first_true
+
+NS_PER_S: Final = 10**9
+MAX_LOG_NS: Final = 2**63 - 1  # in the year 2262
+
+# Threads of a recorder may log two messages of one topic in either order; what is further apart is a step of the clock.
+_THREADS_NS: Final = NS_PER_S // 100
+_ALONE_NS: Final = NS_PER_S  # A single message may be out of order by this much
+_AROUND: Final = 3  # Messages before and after a step whose header stamps must agree on it
+
+_HEADER: Final = {True: struct.Struct("<4xiI"), False: struct.Struct(">4xiI")}  # seconds and ns, by little-endian
+
+
+class LogTimes:
+    """Log time, topic and header stamp of each message of a recording, in the order of the file."""
+
+    def __init__(self, path: StrPath) -> None:
+        """Take the recording's name, for messages about it."""
+        self.path = path
+        self._time_ns, self._topic, self._ahead_ns = array("q"), array("q"), array("q")
+        self._stamped = bytearray()
+        self.topics: dict[str, int] = {}
+        """Topic -> its number, in order of their first messages."""
+
+    def add(self, channel: BagTopic, logged_ns: int, data: bytes) -> None:
+        """Add a message.
+
+        Raises:
+            TraceError: its log time does not fit 63 bits.
+        """
+        if not 0 <= logged_ns <= MAX_LOG_NS:
+            place = f"message {len(self._time_ns) + 1} ({channel.topic})"
+            raise fault(self.path, "must be from 0 to 2**63 - 1 ns", value=logged_ns, field=f"{place}, log time in ns")
+        stamp_ns = _stamp_ns(channel, data)
+        self._time_ns.append(logged_ns)
+        self._topic.append(self.topics.setdefault(channel.topic, len(self.topics)))
+        self._ahead_ns.append(logged_ns - (stamp_ns or logged_ns))
+        self._stamped.append(stamp_ns is not None)
+
+    @property
+    def time_ns(self) -> Int64Array:
+        """Log times, int64[n]."""
+        return np.array(self._time_ns, np.int64)
+
+    @property
+    def topic(self) -> Int64Array:
+        """Which of `topics`, int64[n]."""
+        return np.array(self._topic, np.int64)
+
+    def order(self) -> Int64Array:
+        """The messages in order of log time, int64[n].
+
+        Raises:
+            TraceError: a log time that is 0 among others that are not, or too far from the others; a clock that went
+                back.
+        """
+        time_ns = self.time_ns
+        self._check_range(time_ns)
+        self._check_steps(time_ns)
+        order = np.argsort(time_ns, kind="stable")
+        behind_ns = np.maximum.accumulate(time_ns) - time_ns if len(time_ns) else time_ns
+        if behind_ns.any():
+            k, count = int(np.argmax(behind_ns)), int(np.count_nonzero(behind_ns))
+            warn(
+                self.path,
+                f"{count} of {len(time_ns)} messages logged before a message above them, at most "
+                f"{behind_ns[k] / NS_PER_S:.6g} s ({self._place(k)}): taken in order of log time",
+            )
+        return order
+
+    def _check_range(self, time_ns: Int64Array) -> None:
+        zero = first_true(time_ns == 0)
+        if zero is not None and time_ns[time_ns > 0].min(initial=MAX_LOG_NS) > NS_PER_S and time_ns.any():
+            raise fault(self.path, f"{self._place(zero)} has no log time, others have: must all have one")
+        most_ns = MAX_DURATION_S * NS_PER_S
+        if len(time_ns) == 0 or int(np.ptp(time_ns)) <= most_ns:
+            return
+        step = first_true(np.abs(np.diff(time_ns)) > most_ns)
+        far = first_true(np.abs(time_ns - time_ns[0]) > most_ns) if step is None else step + 1
+        assert far is not None
+        other = 0 if step is None else step
+        apart_s = abs(int(time_ns[far] - time_ns[other])) // NS_PER_S
+        rule = f"is {apart_s} s from {self._place(other)}: a recording spans at most {MAX_DURATION_S} s"
+        raise fault(self.path, f"{self._place(far)} {rule}")
+
+    def _check_steps(self, time_ns: Int64Array) -> None:
+        """Refuse a clock that went back: by the log times of a topic, or by their distance from its header stamps."""
+        by_topic = np.argsort(self.topic, kind="stable")
+        back_above = np.append(0, np.cumsum(time_ns[1:] < time_ns[:-1])) if len(time_ns) else time_ns
+        ahead_ns, stamped = np.array(self._ahead_ns, np.int64), np.frombuffer(self._stamped, np.bool_)
+        ends = np.cumsum(np.bincount(self.topic))
+        steps: list[tuple[int, int, int]] = []  # message, message above on its topic, size in ns
+        for places in np.split(by_topic, ends[:-1]):
+            for k in np.flatnonzero(_goes_back(time_ns[places])):
+                steps.append((int(places[k + 1]), int(places[k]), 0))
+            places = places[stamped[places]]
+            fell_ns = _falls(ahead_ns[places])
+            for k in np.flatnonzero(fell_ns > _THREADS_NS):
+                if back_above[places[k + 1]] > back_above[places[k]]:
+                    steps.append((int(places[k + 1]), int(places[k]), int(fell_ns[k])))
+        if not steps:
+            return
+        message, above, _ = min(steps)
+        size_ns = max(fell_ns for last, first, fell_ns in steps if first < message <= last)
+        least = "" if size_ns else "at least "
+        size_ns = max(size_ns, int(time_ns[above] - time_ns[message]))
+        size = f"{least}{size_ns / NS_PER_S:.6g} s"
+        times = f"after {_seconds(int(time_ns[above]))} s in message {above + 1} of the same topic"
+        raise fault(
+            self.path,
+            f"the recorder's clock goes back by {size} before {self._place(message)}, {times}"
+            ": must not, as log times say when messages arrived (split the recording there)",
+        )
+
+    def _place(self, k: int) -> str:
+        topic = list(self.topics)[self._topic[k]]
+        return f"message {k + 1} ({topic}, logged at {_seconds(self._time_ns[k])} s)"
+
+
+def _goes_back(time_ns: Int64Array) -> npt.NDArray[np.bool_]:
+    """Whether the clock went back before each message of a topic but the first, bool[n-1].
+
+    A single message that comes too late or too early by at most a second is no step of the clock.
+    """
+    back_ns = time_ns[:-1] - time_ns[1:]
+    stays, was_before = np.zeros((2, len(back_ns)), np.bool_)
+    stays[:-1] = time_ns[2:] < time_ns[:-2]  # so is the next message, below the one above the step
+    was_before[1:] = time_ns[2:] < time_ns[:-2]  # below the one before that, too
+    return np.asarray((back_ns > _ALONE_NS) | ((back_ns > _THREADS_NS) & stays & was_before))
+
+
+def _falls(ahead_ns: Int64Array) -> Int64Array:
+    """By how much log times less header stamps fell for good before each message but the first, int64[n-1]."""
+    fell_ns = np.zeros(max(0, len(ahead_ns) - 1), np.int64)
+    if len(ahead_ns) >= 2 * _AROUND:
+        windows = np.lib.stride_tricks.sliding_window_view(ahead_ns, _AROUND)
+        least, most = windows.min(axis=1)[:-_AROUND], windows.max(axis=1)[_AROUND:]
+        middle = np.median(windows, axis=1).astype(np.int64)
+        fell = middle[:-_AROUND] - middle[_AROUND:]
+        fell_ns[_AROUND - 1 : _AROUND - 1 + len(fell)] = np.where(least - most > _THREADS_NS, fell, 0)
+    return fell_ns
+
+
+@cache
+def _has_stamp(type: str, encoding: str) -> bool:
+    """Whether messages of this type begin with a std_msgs/Header."""
+    if encoding not in ("cdr", "ros1"):
+        return False
+    _, fields = typestore(encoding).fielddefs.get(type, ((), ()))
+    return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+
+
+def _stamp_ns(channel: BagTopic, data: bytes) -> int | None:
+    """The header stamp of a message, ns; None where it has none, or none above 0."""
+    if len(data) < 12 or not _has_stamp(channel.type, channel.encoding):
+        return None
+    # Before it stand 4 bytes: of CDR its encoding, of ROS 1 a sequence number.
+    seconds, ns = _HEADER[channel.encoding == "ros1" or bool(data[1] & 1)].unpack_from(data)
+    stamp_ns: int = seconds * NS_PER_S + ns
+    return stamp_ns if stamp_ns > 0 else None
+
+
+def _seconds(ns: int) -> str:
+    return f"{ns // NS_PER_S}.{ns % NS_PER_S // 10**6:03d}"
