@@ -50,7 +50,8 @@ class RecordingOptions(MotionOptions):
     topics: list[str] | None = None
     """Topics, by name or pattern ('/camera/*'); default: all."""
     odom: str | None = None
-    """Take x from the motion on this topic, of tf: TOPIC:PARENT:CHILD (default: x is the message's index)."""
+    """Take x from the motion on this topic, of several frames: TOPIC:FRAME, of tf: TOPIC:PARENT:CHILD (default: x is
+    the message's index)."""
     bridge_gaps: bool = False
     """Take motion across gaps in it as even."""
 
@@ -161,7 +162,7 @@ def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     cells = [["topic", "messages", "rate (1/s)", "bytes", "share", "for --odom", "type"]]
     for topic in summary:
         type = bag.topics[topic.topic]
-        cells.append([topic.topic, *_summary_cells(topic), "yes" if carries_poses(type) else "", type])
+        cells.append([topic.topic, *_summary_cells(topic), "yes" if carries_poses(topic.topic, type) else "", type])
     with_messages = {topic.topic for topic in summary}
     cells += [[name, "0", "-", "0", "-", "", type] for name, type in bag.topics.items() if name not in with_messages]
     return aligned(cells)

@@ -20,7 +20,7 @@ from bufgym.model.buffer import MAX_CAPACITY
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.robot import LogFile, PolicyQueue
-from bufgym.robot.odometry import Odometry
+from bufgym.robot.odometry import Odometry, followed
 from bufgym.robot.ros1.connection import PolicyConnection
 from bufgym.traces import MotionSettings
 
@@ -57,8 +57,8 @@ def install(
     Args:
         policy: name of a registered policy, or a ``Policy``; None keeps rospy's own queue.
         topics: other policies for single topics by resolved name, such as "/camera/image".
-        odometry: a topic with poses, such as Odometry or PoseStamped, which gives x, the scene's motion. None: x counts
-            messages.
+        odometry: a topic with poses, such as Odometry or PoseStamped, which gives x, the scene's motion. The poses of
+            one frame count (TOPIC:FRAME, of tf TOPIC:PARENT:CHILD, else that of the first). None: x counts messages.
         motion: the camera's field of view and the scene's scale, for ``odometry``.
         value: V (default: 1 - 0.618^d over messages, 1 - e^-d over motion).
         log: folder for a log of each queue, ``TOPIC-K.mcap``.
@@ -79,7 +79,7 @@ def install(
         if one is not None and one not in warmed:
             _warm_up(one, value)
             warmed.append(one)
-    moved = None if odometry is None else _Subscribed(odometry, Odometry(motion))
+    moved = None if odometry is None else _Subscribed(*followed(odometry, motion))
     numbers = itertools.count()
 
     def queued(connection: Any, queue_size: int) -> Any:
