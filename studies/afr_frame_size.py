@@ -29,7 +29,7 @@ from bufgym.scenario.suites import CAPACITIES, RATE_HZ, time_value
 
 SECONDS = (21, 23)
 PAPER_RECALCULATIONS, PAPER_HZ = 400, 8.0
-NEAR = 0.05  # Recalculations within this fraction of the paper's, at every L, count as "about" the paper's
+NEAR = 0.05  # Recalculations within this fraction of the paper's, at every L, fit the paper's
 WITHIN_HZ = 1.0  # A rate this near to the paper's 8 Hz counts as the same
 JITTER = 0.1  # Largest delay of a frame, as a fraction of its period
 

@@ -180,9 +180,9 @@ ANGLES = np.radians(np.arange(0, 360, 2.0))
 async def robot(port: int, number: int) -> None:
     """One that drives its first four seconds again and again, with its status and a queue that fills and empties."""
     name, drive = f"robot-{number}", [pose_at(number, k / RATE_HZ) for k in range(POSES)]
-    odometry = [odometry(0, name, pose, 1.0) for pose in drive]
+    places = [odometry(0, name, pose, 1.0) for pose in drive]
     scans = [scan(0, name, ANGLES, cast(pose, ANGLES)[0]) for pose in drive]
-    senses = list(zip(odometry, scans, [jpeg(picture(drive[0]))] * POSES, strict=True))
+    senses = list(zip(places, scans, [jpeg(picture(drive[0]))] * POSES, strict=True))
     kinds = {topic: {"encoding": encoding, "type": type} for topic, (encoding, type) in SENSES.items()}
     async with client(port, name=name) as one:
 

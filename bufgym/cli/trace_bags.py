@@ -50,7 +50,8 @@ class RecordingOptions(MotionOptions):
     topics: list[str] | None = None
     """Topics, by name or pattern ('/camera/*'); default: all."""
     odom: str | None = None
-    """Take x from the motion on this topic, of tf: TOPIC:PARENT:CHILD (default: x is the message's index)."""
+    """Take x from the motion on this topic, of several frames: TOPIC:FRAME, of tf: TOPIC:PARENT:CHILD (default: x is
+    the message's index)."""
     bridge_gaps: bool = False
     """Take motion across gaps in it as even."""
 
@@ -162,7 +163,7 @@ def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     cells = [["topic", "messages", "rate (1/s)", "bytes", "share", "for --odom", "type"]]
     for topic in summary:
         type = bag.topics[topic.topic]
-        poses = any(map(carries_poses, type.split(BETWEEN_TYPES)))
+        poses = any(carries_poses(topic.topic, one) for one in type.split(BETWEEN_TYPES))
         cells.append([topic.topic, *_summary_cells(topic), "yes" if poses else "", type])
     with_messages = {topic.topic for topic in summary}
     cells += [[name, "0", "-", "0", "-", "", type] for name, type in bag.topics.items() if name not in with_messages]

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from bufgym.papers.afr_fig7 import plan_of, some_of
+from bufgym.papers.figure import about
 from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
 
 PAPER_S = {"drop-oldest": 23.0, "random": 7.0}  # Policy -> second at which tracking fails in the paper
-NEAR_S = 2.0  # As near to it counts as about it
 LIMIT_MM = 50.0  # Distance from the reference that is drawn darkest
 
 
@@ -40,7 +40,8 @@ class Reproduction(FrameFigure):
             ends_s = (ends[name, policy] for name in self.recordings)
             told = ("to the end" if s == np.inf else f"breaks at second {s:.1f}" for s in ends_s)
             facts[f"{policy.removeprefix('drop-')}_end"] = self.of_each(told)
-        near = {policy: abs(ends[main, policy] - at_s) <= NEAR_S for policy, at_s in PAPER_S.items()}
+        limits = {policy: about(at_s) for policy, at_s in PAPER_S.items()}
+        near = {policy: low <= ends[main, policy] <= high for policy, (low, high) in limits.items()}
         return facts | {"afr": ends[main, "afr"] == np.inf, "oldest": near["drop-oldest"], "random": near["random"]}
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:

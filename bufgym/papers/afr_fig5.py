@@ -21,7 +21,7 @@ from bufgym.benchmark.rows import Row
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.oracle import interruption as oracle
-from bufgym.papers.figure import COLOURS, Figure, finish, whole
+from bufgym.papers.figure import COLOURS, Figure, about, finish, whole
 from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario import Episode, Interruption
 
@@ -116,7 +116,7 @@ class Reproduction(Figure):
         return {
             "never": bool((np.diff(best) > 0).all() and best.max() < PAPER_L + 1),
             "best": best.max(),
-            "within": bool(0.63 <= near.mean() <= 0.73) if len(near) else None,
+            "within": bool(about(0.68)[0] <= near.mean() <= about(0.68)[1]) if len(near) else None,
             "near": f"{near.mean():.1%} on average, from {near.min():.0%} to {near.max():.0%} at single T"
             if len(near)
             else "not run",

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
-from bufgym.papers.figure import heat_table, of_all, tens, within
+from bufgym.papers.figure import about, heat_table, of_all, within
 from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun, spearman
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
@@ -76,7 +76,7 @@ class Reproduction(FrameFigure):
             columns = {"change": ONE_WAY, "both": BOTH_WAYS, "slam": "slam_rmse_mm", "lack": "slam_uncovered"}
             facts |= {f"{key}_{what}": "not run" for what in (*columns, "paper")}
             if {"afr", other} <= set(self.policies):
-                facts[key] = within(change(rows.where(recording=main), ONE_WAY, "afr", other), *tens(paper))
+                facts[key] = within(change(rows.where(recording=main), ONE_WAY, "afr", other), *about(paper))
                 for what, column in columns.items():
                     told = (spelled(change(rows.where(recording=r), column, "afr", other)) for r in self.recordings)
                     facts[f"{key}_{what}"] = self.of_each(told)

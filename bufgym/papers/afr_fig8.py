@@ -15,7 +15,7 @@ import numpy as np
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.benchmark.table import aligned
-from bufgym.papers.figure import finish, heat_table, of_all, within
+from bufgym.papers.figure import about, finish, heat_table, of_all, within
 from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure
 from bufgym.papers.perception.stage import IMAGES
 from bufgym.papers.rows import FigureRows
@@ -81,7 +81,9 @@ class Reproduction(FrameFigure):
                 for policy in ("drop-oldest", "afr", "random")
                 if policy in self.policies
             }
-            facts["oldest"] = of_all(within(found, 0.35, 0.65) for found in rates["drop-oldest"].values())
+            facts["oldest"] = of_all(
+                within(found, about(0.4)[0], about(0.6)[1]) for found in rates["drop-oldest"].values()
+            )
             if IMAGES in self.policies:
                 pairs = [(counts[IMAGES], counts["drop-oldest"]) for counts in broken.values()]
                 facts["orbbuf"] = all(ours <= HALF * theirs for ours, theirs in pairs)

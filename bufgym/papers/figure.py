@@ -154,9 +154,10 @@ def either(cases: Sequence[bool]) -> bool | str:
     return all(cases) if len(set(cases)) == 1 else UNDECIDED
 
 
-def tens(share: float) -> tuple[float, float]:
-    """What rounds to this number of whole tens of per cent, as in "about 20 %"."""
-    return share - 0.05, share + 0.05
+def about(number: float) -> tuple[float, float]:
+    """What a paper's "about" means on the page of claims: up to a quarter less, up to a quarter more."""
+    low, high = sorted((0.75 * number, 1.25 * number))
+    return low, high
 
 
 def report(name: str, figure: Figure, rows: FigureRows) -> list[str]:

@@ -30,7 +30,8 @@ marks sentences that the papers do not have. Where a paper leaves a parameter op
 command's figure.
 
 A claim about a number *holds* where our interval lies within it, *differs* where the interval lies outside, and is
-*undecided* where the interval is too wide to say. "About 20 %" is from 15 to 25 %.
+*undecided* where the interval is too wide to say. "About" is up to a quarter
+less or more, wherever a paper says it: about 20 % is from 15 to 25 %, about 10 ms from 7.5 to 12.5 ms.
 
 This page is made by
 

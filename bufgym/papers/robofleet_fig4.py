@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.figure import COLOURS, UNDECIDED, at_least_0, finish, legend_below
+from bufgym.papers.figure import COLOURS, UNDECIDED, about, at_least_0, finish, legend_below
 from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, SHORT, CloudFigure, Sent, played_once, stream
 from bufgym.papers.rows import FigureRows
 from bufgym.traces import Trace
@@ -23,7 +23,7 @@ SENDERS = ("robofleet", "rosbridge", "ros-native")
 RATES_HZ = {"PointCloud2": 5.0, "CompressedImage": 2.0, "LaserScan": 10.0}
 KIND_COLOURS = dict(zip(RATES_HZ, (COLOURS["afr"], COLOURS["drop-oldest"], COLOURS["random"]), strict=True))
 PAPER_RATIO = 5.0
-ABOUT = (4.0, 6.0)  # Range of ratios that we accept as "about 5 times"
+ABOUT = about(PAPER_RATIO)
 FACTOR = 2.0  # Ratio to the nominal latency up to which a latency counts as nominal
 BEFORE_S = 10.0
 WATCHED = 12.0  # Time watched after the link's return, in dropout lengths; at least ``LEAST_WATCHED_S``
@@ -74,11 +74,11 @@ class Reproduction(CloudFigure):
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         cells = by_cell(rows)
         ratios = {key: ratio(cell) for key, cell in cells.items()}
-        about = [key for key, r in ratios.items() if ABOUT[0] <= r <= ABOUT[1]]
+        accepted = [key for key, r in ratios.items() if ABOUT[0] <= r <= ABOUT[1]]
         less = sum(r < ABOUT[0] for r in ratios.values())
         lengths = {
-            group: ", ".join(f"{d:g} s" for *g, d in about if (*g,) == group)
-            for group in dict.fromkeys((kind, mbit) for kind, mbit, _ in about)
+            group: ", ".join(f"{d:g} s" for *g, d in accepted if (*g,) == group)
+            for group in dict.fromkeys((kind, mbit) for kind, mbit, _ in accepted)
         }
         trios = [dict(zip(SENDERS, cell, strict=True)) for cell in cells.values()]
         known = [trio for trio in trios if 0 < trio["robofleet"] < math.inf and 0 < trio["ros-native"] < math.inf]
@@ -90,9 +90,9 @@ class Reproduction(CloudFigure):
             "sooner": UNDECIDED,  # the length of the paper's dropout is open
             "cells": len(cells),
             "sooner_cells": sum(r > 1 for r in ratios.values()),
-            "about_cells": len(about),
+            "about_cells": len(accepted),
             "less": less,
-            "more": len(cells) - less - len(about),
+            "more": len(cells) - less - len(accepted),
             "about": "; ".join(f"{kind} at {mbit:g} Mbit/s {shown}" for (kind, mbit), shown in lengths.items()),
         }
 

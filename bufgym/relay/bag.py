@@ -34,11 +34,17 @@ class BagSource:
             streams = tuple(Stream(Topic(name), rate_hz, 1000) for name, rate_hz in rates_hz.items())
         self._bag, self.streams, self._loops = bag, streams, loops
         self._names = {f"/{stream.topic.name.lstrip('/')}": stream.topic.name for stream in streams}
+        self._counts = counts
         for name in self._names:
-            if not counts.get(name):
-                raise BufgymError(f"{path}: no messages of topic {name!r}; it has: {', '.join(bag.topics)}")
+            self._has(name)
+
+    def _has(self, name: str) -> None:
+        if not self._counts.get(name):
+            raise BufgymError(f"{self._bag.path}: no messages of topic {name!r}; it has: {', '.join(self._counts)}")
 
     async def run(self, robot: Robot) -> None:
+        if robot.place.topic:
+            self._has(f"/{robot.place.topic}")
         while True:
             await self._play(robot)
             if not self._loops:
@@ -48,14 +54,17 @@ class BagSource:
         loop = asyncio.get_running_loop()
         offset_s: float | None = None
         for channel, logged_ns, payload in messages(self._bag):
-            name = self._names.get(channel.topic)
-            if name is None:
+            name, odometry = self._names.get(channel.topic), robot.place.topic
+            if name is None and channel.topic.lstrip("/") != odometry:
                 continue
             if offset_s is None or loop.time() - logged_ns / 1e9 - offset_s > _LATE_S:
                 offset_s = loop.time() - logged_ns / 1e9
             await asyncio.sleep(offset_s + logged_ns / 1e9 - loop.time())
             encoding, payload = ros_messages.modern(payload, channel.type, channel.encoding or "json")
-            robot.publish(name, payload, encoding, channel.type)
+            if name is None:
+                robot.place.take(odometry, payload, channel.type, encoding)
+            else:
+                robot.publish(name, payload, encoding, channel.type)
 
     def status(self) -> dict[str, Any]:
         return {"recording": Path(self._bag.path).name}

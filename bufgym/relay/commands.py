@@ -76,7 +76,8 @@ async def robot(
         config: Its topics, as in examples/client.toml.
         bag: A recording as a robot, again and again.
         ros: The topics of this version of ROS, as in --config.
-        odom: With --ros: topic with poses, which give x to the topics that move.
+        odom: Topic that says where it is and gives x to the topics that move (default: its first Odometry; of tf:
+            TOPIC:PARENT:CHILD).
         receive: With --ros: topics published here if they come.
         policies: The policy, as in bench.
         capacity: L, messages.
@@ -101,11 +102,11 @@ async def robot(
             raise BufgymError("--ros needs --config: which topics, and the rules for each")
         from bufgym.relay.ros import SOURCES
 
-        source = SOURCES[ros](streams, odom, receive or [])
+        source = SOURCES[ros](streams, receive or [])
     else:
         raise BufgymError("needs --bag or --ros; examples/made_up_robot.py is a robot without either")
     settings |= session.settings()
-    one = Robot(session.to, name, source, policy=policy, capacity=capacity, say=say, **settings)
+    one = Robot(session.to, name, source, policy=policy, capacity=capacity, odometry=odom, say=say, **settings)
     live.say(f"{name} -> {session.to}; Ctrl-C ends it")
     await one.run()
 

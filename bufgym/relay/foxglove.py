@@ -14,9 +14,11 @@ from bufgym.ground.libraries import needs
 from bufgym.relay import ros_messages, wire
 from bufgym.relay.config import Config, Foxglove
 from bufgym.relay.gate import Gate, hidden_host
+from bufgym.relay.place import Place
 from bufgym.relay.recorder import SCHEMAS
 from bufgym.relay.rules import FOXGLOVE, Permissions
 from bufgym.relay.session import Session
+from bufgym.traces.formats.bag_poses import Frames
 
 OWN_PAGES: Final = ("https://app.foxglove.dev", "file://")  # The web page, and programs that are pages of their own
 MAX_CHANNELS: Final = 10_000  # Limit on channels, which clients open by topic and type; further channels are not shown
@@ -44,6 +46,7 @@ class Screen:
         self.address = f"{host}:{self._gate.port}"
         """Address where it listens."""
         self._channels: dict[tuple[str, str, str], Any] = {}
+        self._places: dict[str, Place] = {}
 
     def close(self) -> None:
         """Disconnect everybody and stop."""
@@ -67,9 +70,10 @@ class Screen:
             self._channels[key].log(picture, log_time=time_ns)
             return
         self._channels[key].log(payload, log_time=time_ns)
-        if message.encoding == "cdr" and message.type in ros_messages.POSES:
-            with suppress(BufgymError):  # its type and its content differ
-                self._transform(ros_messages.read(payload, message.type), message.topic, time_ns)
+        place = self._places.setdefault(_frame(message.topic), Place())
+        with suppress(BufgymError):  # its type and its content differ
+            if (pose := place.take(message.topic, payload, message.type, message.encoding)) and place.frames:
+                self._transform(*pose, place.frames, message.topic, time_ns)
 
     def _channel(self, message: wire.Message) -> Any:
         if message.encoding in _PICTURES:
@@ -83,19 +87,17 @@ class Screen:
         schema = self._foxglove.Schema(name=name, encoding=SCHEMAS.get(encoding, ""), data=definition)
         return self._foxglove.Channel(message.topic, schema=schema, message_encoding=encoding, context=self._context)
 
-    def _transform(self, message: Any, topic: str, time_ns: int) -> None:
+    def _transform(self, place: Any, turn: Any, frames: Frames, topic: str, time_ns: int) -> None:
         from foxglove.channels import FrameTransformChannel
         from foxglove.messages import FrameTransform, Quaternion, Vector3
 
         if _TRANSFORMS not in self._channels:
             self._channels[_TRANSFORMS] = FrameTransformChannel("/tf", context=self._context)
-        pose = ros_messages.pose(message)
-        place, turn = pose.position, pose.orientation
         self._channels[_TRANSFORMS].log(
             FrameTransform(
                 timestamp=_timestamp(time_ns),
-                parent_frame_id=message.header.frame_id or "map",
-                child_frame_id=getattr(message, "child_frame_id", "") or _frame(topic),
+                parent_frame_id=frames[0] or "map",
+                child_frame_id=frames[1] or _frame(topic),
                 translation=Vector3(x=place.x, y=place.y, z=place.z),
                 rotation=Quaternion(x=turn.x, y=turn.y, z=turn.z, w=turn.w),
             ),

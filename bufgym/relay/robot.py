@@ -18,10 +18,10 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
-from bufgym.relay import ros_messages, wire
+from bufgym.relay import wire
 from bufgym.relay.client import RobotClient
 from bufgym.relay.monitor import Monitor
-from bufgym.robot.odometry import Odometry
+from bufgym.relay.place import Place
 from bufgym.robot.tasks import until_one_ends
 from bufgym.scenario import Stream
 
@@ -62,9 +62,13 @@ class Robot:
         policy: str | Policy = "robofleet",
         value: Value | None = None,
         policies: Sequence[str] = POLICIES,
+        odometry: str | None = None,
         **session: Any,
     ) -> None:
-        """Arguments as for ``RobotClient``; a command may choose one of ``policies``."""
+        """Arguments as for ``RobotClient``; a command may choose one of ``policies``.
+
+        ``odometry`` names the source's topic that says where the robot is and gives x, as ``bufgym.relay.place`` says.
+        """
         if not name or "/" in name:
             raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
         self.name, self.source = name, source
@@ -75,8 +79,7 @@ class Robot:
         self.monitor = Monitor([stream.topic for stream in streams], value)
         self._policies = tuple(dict.fromkeys([get(policy).name, *policies]))
         self._kinds: dict[str, dict[str, str]] = {}
-        self._odometry = Odometry()
-        self._location: dict[str, float] | None = None
+        self.place = Place(odometry)
         self._began_s = time.monotonic()
         settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
         self.client = RobotClient(url, name, **settings)
@@ -90,16 +93,9 @@ class Robot:
         """Put a message of the source's topic into the queue, from any thread."""
         stream = self._streams[topic]
         self._kinds[topic] = {"type": type, "encoding": encoding}
-        if type in ros_messages.POSES and encoding in ("cdr", "ros1"):
-            self.locate(payload, type, encoding)
-        x = self._odometry.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
+        self.place.take(topic, payload, type, encoding)
+        x = self.place.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
         self.client.publish(self.topic(topic), payload, encoding, type, x, stamp_us)
-
-    def locate(self, payload: bytes, type: str, encoding: str = "cdr") -> None:
-        """Take a pose, which gives the robot's location and x of the topics that move."""
-        message = ros_messages.read(payload, type, encoding)
-        self._odometry.take(message)
-        self._location = ros_messages.planar(ros_messages.pose(message))
 
     def say(self, topic: str, data: Any) -> None:
         """Publish ``data`` as JSON."""
@@ -111,7 +107,7 @@ class Robot:
         round_trip_s = self.client.round_trip_s
         return {
             "battery": None,
-            "location": self._location,
+            "location": self.place.location,
             "network": {
                 "rate_bps": queue["rate_bps"],
                 "rtt_ms": None if round_trip_s is None else round(1000 * round_trip_s, 1),

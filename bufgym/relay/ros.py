@@ -23,23 +23,23 @@ Outlet = Callable[[bytes], None]
 class _RosSource:
     """Code shared by both versions of ROS."""
 
-    def __init__(self, streams: Sequence[Stream], odometry: str | None = None, receive: Sequence[str] = ()) -> None:
-        """``odometry`` is a topic of poses, in the streams or not; ``receive`` lists topics to publish here."""
+    def __init__(self, streams: Sequence[Stream], receive: Sequence[str] = ()) -> None:
+        """``receive`` lists topics to publish here."""
         self.streams = tuple(streams)
         self._names = {resolved(stream.topic.name): stream.topic.name for stream in streams}
-        self._odometry = None if odometry is None else resolved(odometry)
         self._receive = tuple(map(resolved, receive))
 
-    @property
-    def _wanted(self) -> set[str]:
-        return {*self._names, *([] if self._odometry is None else [self._odometry])}
+    def _wanted(self, robot: Robot) -> list[str]:
+        """Its topics, and the one that is named as the robot's odometry, which need not be one of them."""
+        odometry = robot.place.topic
+        return sorted({*self._names, *([resolved(odometry)] if odometry else [])})
 
     def _take(self, robot: Robot, name: str, payload: bytes, encoding: str, type: str) -> None:
         """Publish a message of this ROS at the relay, from any thread."""
         if name in self._names:
             robot.publish(self._names[name], payload, encoding, type)
-        elif type in ros_messages.POSES:
-            robot.locate(payload, type, encoding)
+        else:
+            robot.place.take(name, payload, type, encoding)
 
     def _listen(self, robot: Robot, advertise: Callable[[Published], Awaitable[Outlet]]) -> None:
         """Publish messages for the topics that this robot receives; note messages that fail."""
@@ -94,7 +94,7 @@ class Ros2(_RosSource):
 
             self._listen(robot, advertise)
             async with spinning(here):
-                await look(here, sorted(self._wanted), subscribe, NODE, robot.client.note)
+                await look(here, self._wanted(robot), subscribe, NODE, robot.client.note)
 
 
 class Ros1(_RosSource):
@@ -117,7 +117,7 @@ class Ros1(_RosSource):
             return publish
 
         self._listen(robot, advertise)
-        subscribers = [rospy.Subscriber(name, rospy.AnyMsg, self._taker(robot, name)) for name in self._wanted]
+        subscribers = [rospy.Subscriber(name, rospy.AnyMsg, self._taker(robot, name)) for name in self._wanted(robot)]
         try:
             await asyncio.Event().wait()
         finally:

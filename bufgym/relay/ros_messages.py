@@ -4,51 +4,34 @@ import contextlib
 import functools
 import math
 from dataclasses import fields, is_dataclass
-from typing import Any, Final
+from typing import Any
 
 from bufgym.ground.errors import BufgymError
-
-ODOMETRY: Final = "nav_msgs/msg/Odometry"
-POSES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-"""Types that contain a robot's pose."""
-
-
-@functools.cache
-def _types(version: int = 2) -> Any:
-    """Load the types of a version of ROS."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_JAZZY)
+from bufgym.traces.formats.bag_poses import typestore
 
 
 def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
     """Decode a message; raise a BufgymError if it is not of this type."""
     try:
         if encoding == "ros1":
-            return _types(1).deserialize_ros1(payload, type)
-        return _types().deserialize_cdr(payload, type)
+            return typestore("ros1").deserialize_ros1(payload, type)
+        return typestore("cdr").deserialize_cdr(payload, type)
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type} in {encoding}: {error}") from None
 
 
-def pose(message: Any) -> Any:
-    """Find the ``geometry_msgs/msg/Pose`` in a message of one of ``POSES``."""
-    return pose(message.pose) if hasattr(message, "pose") else message
-
-
-def planar(pose: Any) -> dict[str, float]:
-    """Project a ``geometry_msgs/msg/Pose`` to the plane."""
-    place, turn = pose.position, pose.orientation
+def planar(place: Any, turn: Any) -> dict[str, float]:
+    """Project a position and an orientation to the plane."""
     yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
     return {"x": round(place.x, 3), "y": round(place.y, 3), "yaw": round(yaw, 4)}
 
 
 def modern(payload: bytes, type: str, encoding: str) -> tuple[str, bytes]:
     """Convert a ROS 1 payload of a type common to both versions to CDR; return (encoding, payload)."""
-    if encoding == "ros1" and type in _types().types:
+    if encoding == "ros1" and type in typestore("cdr").types:
         with contextlib.suppress(Exception):  # same type name, but another definition
-            message = _moulded(_types(1).deserialize_ros1(payload, type), _types())
-            return "cdr", bytes(_types().serialize_cdr(message, type))
+            message = _moulded(typestore("ros1").deserialize_ros1(payload, type), typestore("cdr"))
+            return "cdr", bytes(typestore("cdr").serialize_cdr(message, type))
     return encoding, payload
 
 
@@ -65,8 +48,8 @@ def _moulded(value: Any, types: Any) -> Any:
 def as_ros1(payload: bytes, type: str) -> bytes:
     """Convert a message from CDR to ROS 1."""
     try:
-        message = _moulded(_types().deserialize_cdr(payload, type), _types(1))
-        return bytes(_types(1).serialize_ros1(message, type))
+        message = _moulded(typestore("cdr").deserialize_cdr(payload, type), typestore("ros1"))
+        return bytes(typestore("ros1").serialize_ros1(message, type))
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type}: {error}") from None
 
@@ -75,6 +58,6 @@ def as_ros1(payload: bytes, type: str) -> bytes:
 def definition(type: str, encoding: str = "cdr") -> bytes:
     """Write the type's definition with all types that it uses, as in recordings; empty for an unknown type."""
     version = 1 if encoding == "ros1" else 2
-    if encoding not in ("cdr", "ros1") or type not in _types(version).types:
+    if encoding not in ("cdr", "ros1") or type not in typestore(encoding).types:
         return b""
-    return str(_types(version).generate_msgdef(type, ros_version=version)[0]).encode()
+    return str(typestore(encoding).generate_msgdef(type, ros_version=version)[0]).encode()

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from bufgym.ground.errors import BufgymError
 from bufgym.traces import MotionSettings
+from bufgym.traces.formats.bag_poses import Frames, named_source, placed
 from bufgym.traces.poses import angles
 
 _NORM = 0.9, 1.1  # norms of a valid quaternion; some drivers send zeros at first
@@ -18,8 +20,12 @@ _NORM = 0.9, 1.1  # norms of a valid quaternion; some drivers send zeros at firs
 class Odometry:
     """Call it with each pose; ``x`` is the sum so far."""
 
-    def __init__(self, settings: MotionSettings | None = None) -> None:
+    def __init__(self, settings: MotionSettings | None = None, frames: Sequence[str] = ()) -> None:
+        """``frames`` are those that ``take`` follows: a pose's frame, and of tf also the frame whose pose it is."""
         self.settings = settings or MotionSettings()
+        self.frames: Frames | None = None
+        """Frames of the poses taken: those of the first that fits. Poses in other frames are ignored."""
+        self._wanted = tuple(frames)
         self.x = 0.0
         """Motion so far in fields of view; it starts at 0 and never falls."""
         self._last: tuple[float, Any, Any] | None = None
@@ -46,11 +52,26 @@ class Odometry:
             self.x += turned_rad / math.radians(self.settings.fov_deg) + moved_m / self.settings.scene_scale_m
         self._last = time_s, position, turn
 
-    def take(self, message: Any) -> None:
-        """Take an Odometry, PoseStamped or PoseWithCovarianceStamped of ROS 1 or 2."""
-        stamp, pose = message.header.stamp, message.pose
-        while hasattr(pose, "pose"):
-            pose = pose.pose
-        time_s = stamp.to_sec() if hasattr(stamp, "to_sec") else stamp.sec + stamp.nanosec / 1e9
-        place, turn = pose.position, pose.orientation
-        self(time_s, (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+    def take(self, message: Any) -> tuple[Any, Any] | None:
+        """Take an Odometry, PoseStamped, PoseWithCovarianceStamped or TFMessage of ROS 1 or 2.
+
+        Returns: position and orientation; None if the message has no pose in the frames that are followed.
+        """
+        found = None
+        for header, frames, place, turn in placed(message):
+            if self.frames is None and frames[: len(self._wanted)] == self._wanted:
+                self.frames = frames
+            if frames == self.frames:
+                stamp = header.stamp
+                time_s = stamp.to_sec() if hasattr(stamp, "to_sec") else stamp.sec + stamp.nanosec / 1e9
+                self(time_s, (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+                found = place, turn
+        return found
+
+
+def followed(spec: str, settings: MotionSettings | None = None) -> tuple[str, Odometry]:
+    """The topic of ``TOPIC``, ``TOPIC:FRAME`` or ``TOPIC:PARENT:CHILD``, and the sum over its poses in these frames."""
+    topic, frames = named_source(spec)
+    if topic.endswith(("tf", "tf_static")) and len(frames) < 2:
+        raise BufgymError(f"odom = {spec!r}: say which transform, as {topic}:odom:base_link")
+    return topic, Odometry(settings, frames)

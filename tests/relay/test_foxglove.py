@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from loop_cases import beside, compiled
-from made_up_robot import SCAN, MadeUp
+from made_up_robot import ODOMETRY, SCAN, MadeUp
 from relay_cases import ALL, Corner, client, relay, settings, until, within
 
 pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
@@ -86,7 +86,7 @@ async def test_a_relay_shows_what_its_rules_allow() -> None:
                 seq += 1
                 await robot.put("/robots/r/private", b"secret")
                 # What says that it is a pose and is none, and a time that no clock of Foxglove's has, stop nothing.
-                await robot.put("/robots/r/odom", b"12", encoding="cdr", type=ros_messages.ODOMETRY)
+                await robot.put("/robots/r/odom", b"12", encoding="cdr", type=ODOMETRY)
                 await robot.put("/robots/r/camera", b"jpeg", encoding="jpeg", stamp_us=MAX_STAMP_US)
                 await robot.put("/robots/r/text", b"hello")
                 await robot.command(seq, "/robots/r/stop")

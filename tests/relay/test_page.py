@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import queue
 import struct
 import threading
@@ -17,6 +18,7 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
 import fleet_demo as demo  # noqa: E402
+from pose_cases import ESTIMATE, ODOMETRY, POSE, TF, message  # noqa: E402
 from relay_cases import client  # noqa: E402
 
 pytestmark = compiled
@@ -128,6 +130,56 @@ def test_no_number_freezes_the_page(browser: Any, port: int, number: Any) -> Non
         until(page, "window.frames_drawn > 30")
         page.evaluate("[...document.querySelectorAll('.card')].find(c => c.textContent.includes('robot-2')).click()")
         until(page, f"({SEES})(document.querySelector('#scan')) >= 3")
+
+
+def test_a_robot_has_one_place_in_one_frame(browser: Any, port: int) -> None:
+    """By tf it is 3 m along an odom that lies at x = 100 in the map and is turned to the left: at (100, 3).
+
+    Neither its odometry nor its goal is its place. Robots of another frame are on another map. One with odometry alone
+    is in the frame of its first.
+    """
+    odom = message(TF, 0, 100.0, "map", "odom", yaw=math.pi / 2), TF
+    base = message(TF, 0, 3.0, "odom", "base_link"), TF
+    wheel, goal = (message(TF, 0, 9.0, "base_link", "wheel"), TF), (message(POSE, 0, 50.0, "map"), POSE)
+    wheels = message(ODOMETRY, 0, 3.0, "odom", "base_link"), ODOMETRY
+    away = message(ODOMETRY, 0, 7.0, "hall"), ODOMETRY
+    tree = [("tf", odom), ("tf", base), ("tf", wheel)]
+    poses = [("odom", wheels), ("goal_pose", goal), ("amcl_pose", (message(ESTIMATE, 0, 90.0, "map"), ESTIMATE))]
+    said = {
+        "by-tf": tree,
+        "nav": [*poses, *tree, *poses],
+        "wheels": [("odom", away), ("goal_pose", goal), ("odom", (message(ODOMETRY, 0, 1.0, "map"), ODOMETRY))],
+        "stray": poses[1:2],
+    }
+
+    async def drive() -> None:
+        async with client(port, name="fleet") as fleet:
+            for name, messages in said.items():
+                kinds = {topic: {"type": type, "encoding": "cdr"} for topic, (_, type) in messages}
+                status = json.dumps({"publishes": kinds}).encode()
+                await fleet.put(f"/robots/{name}/status", status, encoding="json")
+            await fleet.rest()
+            await asyncio.sleep(1.0)  # until the page has asked for their topics
+            for _ in range(3):  # the page takes none that comes before its time by the robot's clock
+                for name, messages in said.items():
+                    for topic, (payload, type) in messages:
+                        await fleet.put(f"/robots/{name}/{topic}", payload, encoding="cdr", type=type)
+                        await asyncio.sleep(0.01)
+            assert await fleet.rest() == []
+
+    with shows(browser, f"http://127.0.0.1:{port}/") as page:
+        until(page, "document.querySelectorAll('.card').length >= 2")
+        threading_run(drive())
+        for name, facts in (("nav", "at 100.0, 3.0 m in map"), ("by-tf", "at 100.0, 3.0 m in map"), ("stray", "")):
+            page.evaluate(
+                f"[...document.querySelectorAll('.card')].find(c => c.textContent.includes('{name}')).click()"
+            )
+            until(page, f"document.querySelector('#name').textContent === '{name}'")
+            until(page, f"document.querySelector('#facts').textContent === '{facts}'")
+            until(page, "document.querySelector('#frame').textContent === 'in map, 1 in other frames'")
+        page.evaluate("[...document.querySelectorAll('.card')].find(c => c.textContent.includes('wheels')).click()")
+        until(page, "document.querySelector('#facts').textContent === 'at 7.0, 0.0 m in hall'")
+        until(page, "document.querySelector('#frame').textContent === 'in hall, 4 in other frames'")
 
 
 def threading_run(work: Any) -> None:

@@ -91,7 +91,7 @@ def test_messages_read_as_they_were_made() -> None:
     made = odometry(1_500_000, "r", Pose(1.0, -2.0, 0.5), 0.25)
     read = ros_messages.read(made, ODOMETRY)
     assert (read.header.stamp.sec, read.header.stamp.nanosec, read.child_frame_id) == (1, 500_000_000, "r/base")
-    assert ros_messages.planar(read.pose.pose) == {"x": 1.0, "y": -2.0, "yaw": 0.5}
+    assert ros_messages.planar(read.pose.pose.position, read.pose.pose.orientation) == {"x": 1.0, "y": -2.0, "yaw": 0.5}
     angles = np.radians([-90.0, 0.0, 90.0])
     laser = ros_messages.read(scan(0, "r", angles, np.array([1.0, 2.0, 3.0])), SCAN)
     assert laser.ranges.tolist() == [1, 2, 3] and laser.angle_increment == pytest.approx(math.pi / 2)
@@ -217,7 +217,7 @@ SEEN = {
     "exact": True,
     "kinds": [["cdr", "std_msgs/msg/String"]],
     "heard": [str(k) for k in range(8)],
-    "location": {"x": 3.0, "y": 0.0, "yaw": 0.0},
+    "location": {"x": 3.0, "y": 0.0, "yaw": 0.0, "frame": "map"},
 }
 """Each command once and in order; nothing of what was broken, or meant for other topics."""
 

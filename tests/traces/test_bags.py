@@ -126,13 +126,20 @@ def test_odometry_that_is_none(tmp_path: Path) -> None:
     for path, odom, says in (
         (drive, "/nope", "no topic '/nope'; it has: /camera/left, /odom, /status"),
         (drive, "/status", "/status carries std_msgs/msg/String: must be one of nav_msgs/msg/Odometry"),
-        (drive, "/odom:a:b", "odom = '/odom:a:b': has no pose"),
+        (drive, "/odom:a:b", "odom = '/odom:a:b': say which frames: /odom:odom:base"),
+        (drive, "/goal_pose", "odom = '/goal_pose': /goal_pose is a goal, no place where the robot is"),
         (odometry(good, cases.odometry(0, 0, scale=0.5)), "/odom", "/odom, pose 1, norm = 0.5: must be 1 within 1 %"),
         (odometry(good, cases.odometry(math.nan, 0)), "/odom", "pose 1, position = .*nan.*: must be finite and wit"),
         (odometry(good, good[:40]), "/odom", "cut off or damaged: "),
         (odometry(good, good, encoding="json"), "/odom", "/odom is encoded in 'json': must be cdr or ros1"),
     ):
         refuse(says, read_bag, path, odom)
+    # One topic in two frames: 1 m in one, and a place in the other that is 90 m off.
+    moved, other = cases.odometry(1, 0), cases.odometry(90, 0).replace(b"odom", b"mapa")
+    mixed = odometry(good, other, moved, other)
+    refuse("odom = '/odom': say which frames: /odom:mapa:base, /odom:odom:base", read_bag, mixed, "/odom")
+    one = read_workload(mixed, odom="/odom:odom")
+    assert one.x is not None and one.x[-1] == 0.5
     # For arrivals and sizes alone, the encoding does not matter.
     assert len(read_bag(odometry(good, good, encoding="json")).time_ns) == 2
 

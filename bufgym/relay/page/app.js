@@ -2,13 +2,14 @@
 // everything is drawn once for each frame of the screen.
 
 import {bits, drawHistory, drawPicture, drawScan, drawSlots, hue, percent, seconds, whenColoursChange} from "./draw.js";
+import {Place} from "./frames.js";
 import {Map2D} from "./map.js";
-import {json, kindOf, picture, pose, queue, scan, status} from "./messages.js";
+import {json, kindOf, picture, queue, scan, status} from "./messages.js";
 import {Relay} from "./relay.js";
 import {Replay} from "./replay.js";
 
 const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, AWAY_MS = 5000, TEXT_MS = 250;
-const USUAL_POSES = ["odom", "odometry", "localization"];   // asked for before a robot's status, which comes once a second, names its own
+const USUAL_POSES = ["odom", "odometry", "localization", "tf", "tf_static"];   // asked for before a robot's status, which comes once a second, names its own
 const POSES = 100, NEAR_MS = 20, GAP_MS = 400;
 const ROBOT = /^\/robots\/([^/]+)\/(.+)$/;
 
@@ -50,7 +51,7 @@ const nowMs = () => replay ? replay.nowMs : Date.now();
 
 function robotOf(name) {
   if (!robots.has(name)) {
-    const robot = {name, number: robots.size, trail: [], poses: [], history: [], kinds: {}, skewMs: Infinity, heardMs: 0, frames: []};
+    const robot = {name, number: robots.size, trail: [], poses: [], history: [], kinds: {}, skewMs: Infinity, heardMs: 0, frames: [], place: new Place(name)};
     robot.tint = hue(robot.number);
     robots.set(name, robot);
     addCard(robot);
@@ -79,7 +80,8 @@ function take(message) {
   if (topic === "status") return takeStatus(robot, status(json(message)), message.stampMs + robot.skewMs);
   if (topic === "queue") return takeQueue(robot, queue(json(message)), message.stampMs + robot.skewMs);
   robot.kinds[topic] ??= kindOf(topic, message);
-  if (robot.kinds[topic] === "pose") takePose(robot, pose(message), message.stampMs + robot.skewMs);
+  const kind = robot.kinds[topic], ms = message.stampMs + robot.skewMs;
+  if (kind === "pose" || kind === "tf") takePose(robot, robot.place.take(topic, kind, message, ms), ms);
   else if (robot.kinds[topic] === "scan" && name === chosen) {
     robot.scan = scan(message);
     robot.scanMs = message.stampMs + robot.skewMs;
@@ -95,7 +97,7 @@ function take(message) {
 function takeStatus(robot, status, ms) {
   robot.status = status;
   for (const [topic, what] of Object.entries(status.publishes ?? {})) robot.kinds[topic] ??= kindOf(topic, what);
-  if (status.location && !(robot.poseMs > ms - 3000)) takePose(robot, status.location, ms);
+  takePose(robot, robot.place.takeStatus(status.location, ms), ms);
   if (status.queue && !(robot.queueMs > ms - 3000)) takeQueue(robot, status.queue, ms, false);
   subscribe();
   if (robot.name === chosen) offerPolicies();
@@ -117,6 +119,11 @@ function takeQueue(robot, queue, ms, own = true) {
 
 function takePose(robot, at, ms) {
   if (!at || robot.poseMs > ms) return;
+  if (robot.pose && robot.pose.frame !== at.frame) {  // what was drawn lies in another frame
+    robot.trail = [];
+    robot.poses = [];
+    if (robot.name === chosen) map.forget();
+  }
   robot.pose = at;
   robot.poseMs = ms;
   robot.poses.push({...at, ms});
@@ -138,7 +145,7 @@ function poseAt(robot, ms) {
 function subscribe() {
   if (replay) return;                               // what is drawn now comes from the file
   const poses = new Set(USUAL_POSES);
-  for (const robot of robots.values()) for (const [topic, kind] of Object.entries(robot.kinds)) if (kind === "pose") poses.add(topic);
+  for (const robot of robots.values()) for (const [topic, kind] of Object.entries(robot.kinds)) if (kind === "pose" || kind === "tf") poses.add(topic);
   relay.subscribe("poses", `^/robots/[^/]+/(${[...poses].sort().map(escaped).join("|")})$`);
   const robot = robots.get(chosen);
   if (!robot) return;
@@ -223,10 +230,18 @@ function sayRobots() {
   }
 }
 
+// A map has one frame: the chosen robot's. A place without a frame is shown on each.
+function shown() {
+  const all = [...robots.values()], frame = robots.get(chosen)?.pose?.frame || all.find(robot => robot.pose?.frame)?.pose.frame;
+  const here = all.filter(robot => !robot.pose?.frame || robot.pose.frame === frame), away = all.length - here.length;
+  say($("frame"), [frame && `in ${frame}`, away && `${away} in other frames`].filter(Boolean).join(", "));
+  return here;
+}
+
 function sayChosen(robot) {
   const {queue, status} = robot, agoS = Math.max(0, nowMs() - (robot.saidMs ?? nowMs())) / 1000;
-  const {x, y} = robot.pose ?? {}, rtt = status?.network?.rtt_ms;
-  say($("facts"), [x === undefined ? "" : `at ${x.toFixed(1)}, ${y.toFixed(1)} m`, rtt == null ? "" : `answers in ${Math.round(rtt)} ms`,
+  const {x, y, frame} = robot.pose ?? {}, rtt = status?.network?.rtt_ms;
+  say($("facts"), [x === undefined ? "" : `at ${x.toFixed(1)}, ${y.toFixed(1)} m${frame && " in " + frame}`, rtt == null ? "" : `answers in ${Math.round(rtt)} ms`,
     status?.battery == null ? "" : `battery ${percent(status.battery)}`, status?.recording ?? ""].filter(Boolean).join(" · "));
   say($("scan-says"), robot.scan ? `laser, ${seconds((nowMs() - robot.scanMs) / 1000)} old` : "no laser");
   while (robot.frames.length && robot.frames[0] < nowMs() - 2000) robot.frames.shift();
@@ -279,7 +294,10 @@ function play(file) {
   forget();
   for (const id of ["status", "poses", "chosen"]) relay.unsubscribe(id);
   replay = new Replay(relay, file, tried, () => {
-    for (const robot of robots.values()) Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0});
+    for (const robot of robots.values()) {
+      Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0});
+      robot.place.forget();
+    }
     map.forget();
   });
   $("player").hidden = false;
@@ -328,7 +346,7 @@ function showPicture(robot) {
 function frame(clockMs) {
   requestAnimationFrame(frame);
   replay?.frame(clockMs);
-  map.draw([...robots.values()], chosen, nowMs());
+  map.draw(shown(), chosen, nowMs());
   const robot = robots.get(chosen);
   if (robot) {
     showPicture(robot);

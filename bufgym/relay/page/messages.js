@@ -1,7 +1,7 @@
 // What goes over the wire, and what is in it: the relay's binary frames, and ROS 2 messages in CDR.
 
 const text = new TextDecoder();
-const FAR_M = 1e6, MOST = 1e12, MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64;
+const FAR_M = 1e6, MOST = 1e12, MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64, MOST_TRANSFORMS = 1000;
 
 // A number from outside as it may be drawn: finite, from -most to most. Nothing else is a number.
 function number(value, most = MOST) {
@@ -58,13 +58,14 @@ class Cdr {
   double() { return this.number("Float64", 8); }
   bytes(length) { return new Uint8Array(this.view.buffer, this.view.byteOffset + (this.at += length) - length, length); }
   string() { const length = this.uint(); return text.decode(this.bytes(length).subarray(0, Math.max(0, length - 1))); }
-  header() { this.uint(); this.uint(); this.string(); }
+  frame() { return this.string().replace(/^\/+/, ""); }
+  header() { this.uint(); this.uint(); return this.frame(); }
+  doubles(count) { return Array.from({length: count}, () => this.double()); }
   pose() {
-    const [x, y] = [this.double(), this.double()];
-    this.double();
-    const [qx, qy, qz, qw] = [this.double(), this.double(), this.double(), this.double()];
+    const [x, y, , qx, qy, qz, qw] = this.doubles(7);
     return {x, y, yaw: Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))};
   }
+  transform() { return {frame: this.header(), child: this.frame(), at: this.doubles(3), turn: this.doubles(4)}; }
   scan() {
     const [angle_min, , angle_increment] = [this.float(), this.float(), this.float()];
     this.float(); this.float(); this.float(); this.float();
@@ -76,28 +77,40 @@ class Cdr {
 
 const KINDS = {
   "nav_msgs/msg/Odometry": "pose", "geometry_msgs/msg/PoseStamped": "pose", "geometry_msgs/msg/PoseWithCovarianceStamped": "pose",
+  "tf2_msgs/msg/TFMessage": "tf", "tf/msg/tfMessage": "tf",
   "sensor_msgs/msg/LaserScan": "scan", "sensor_msgs/msg/CompressedImage": "picture", "sensor_msgs/msg/Image": "picture",
 };
 
-// What a topic shows: "pose", "scan", "picture", or nothing that the page can draw.
+// Poses where a robot shall go, or that a person says; bag_poses.py has them too.
+const GOAL = new RegExp("(^|[/_])(goals?|targets?|(way|set)_?points?|clicked|desired|cmd|command|(goal|target|set|initial)_?pose)" +
+  "([^a-z/][^/]*)?(/(pose|local|global))?$");
+
+// What a topic shows: "pose", "tf", "scan", "picture", or nothing that the page can draw.
 export function kindOf(name, {type, encoding}) {
+  if (KINDS[type] === "pose" && type !== "nav_msgs/msg/Odometry" && GOAL.test(name.toLowerCase())) return;
   if (KINDS[type] && encoding === "cdr") return KINDS[type];
   if (encoding === "jpeg" || encoding === "png") return "picture";
   if (encoding === "json") return {odom: "pose", scan: "scan"}[name];
 }
 
-// A place on the map, or undefined if this is none.
+// A place on the map, or undefined if this is none. Without a frame it is taken to be in the one that is shown.
 export function place(said) {
-  const {x, y, yaw} = object(said), at = {x: number(x, FAR_M), y: number(y, FAR_M), yaw: number(yaw) ?? 0};
+  const {x, y, yaw, frame} = object(said), at = {x: number(x, FAR_M), y: number(y, FAR_M), yaw: number(yaw) ?? 0, frame: String(frame ?? "").slice(0, 100)};
   return at.x === undefined || at.y === undefined ? undefined : at;
 }
 
 export function pose(message) {
   if (message.encoding === "json") return place(json(message));
   const cdr = new Cdr(message.payload);
-  cdr.header();
-  if (message.type === "nav_msgs/msg/Odometry") cdr.string();
-  return place(cdr.pose());
+  const frame = cdr.header(), child = message.type === "nav_msgs/msg/Odometry" ? cdr.frame() : "";
+  const at = place({...cdr.pose(), frame});
+  return at && {...at, child};
+}
+
+// The transforms of a message of tf: the frame, the child in it, where that is and how it is turned.
+export function transforms(message) {
+  const cdr = new Cdr(message.payload);
+  return Array.from({length: Math.min(MOST_TRANSFORMS, cdr.uint())}, () => cdr.transform());
 }
 
 // Distances in metres; NaN where a ray met nothing.

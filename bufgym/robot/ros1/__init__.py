@@ -57,8 +57,8 @@ def install(
     Args:
         policy: name of a registered policy, or a ``Policy``; None keeps rospy's own queue.
         topics: other policies for single topics by resolved name, such as "/camera/image".
-        odometry: a topic with poses, such as Odometry or PoseStamped, which gives x, the scene's motion. None: x counts
-            messages.
+        odometry: a topic with poses, such as Odometry or PoseStamped, which gives x, the scene's motion. The poses of
+            one frame count (TOPIC:FRAME, of tf TOPIC:PARENT:CHILD, else that of the first). None: x counts messages.
         motion: the camera's field of view and the scene's scale, for ``odometry``.
         value: V (default: 1 - 0.618^d over messages, 1 - e^-d over motion).
         log: folder for a log of each queue, ``TOPIC-K.mcap``.
@@ -71,7 +71,8 @@ def install(
         from rospy.impl.tcpros_pubsub import QueuedConnection
     from bufgym.model import qoi
     from bufgym.model.buffer import MAX_CAPACITY
-    from bufgym.robot import LogFile, Odometry, PolicyQueue
+    from bufgym.robot import LogFile, PolicyQueue
+    from bufgym.robot.odometry import followed
     from bufgym.robot.ros1.connection import PolicyConnection
 
     if value is None:
@@ -84,7 +85,7 @@ def install(
         if one is not None and one not in warmed:
             _warm_up(one, value)
             warmed.append(one)
-    moved = None if odometry is None else _Subscribed(odometry, Odometry(motion))
+    moved = None if odometry is None else _Subscribed(*followed(odometry, motion))
     numbers = itertools.count()
 
     def queued(connection: Any, queue_size: int) -> Any:

@@ -18,7 +18,7 @@ from bufgym.policies.registry import Policy
 from bufgym.robot import LogFile, PolicyQueue
 from bufgym.robot.channels import TRANSPORTS
 from bufgym.robot.log import Record
-from bufgym.robot.odometry import Odometry
+from bufgym.robot.odometry import Odometry, followed
 from bufgym.robot.receiver import Received, Receiver
 from bufgym.robot.ros2.names import Published, needs_rclpy, parse, published
 from bufgym.robot.sender import Leaves, Sender
@@ -118,7 +118,8 @@ class RosSender:
             client: topics with their rules; ``bufgym.scenario.read_client`` reads one.
             policy: a drop rule for one topic, a scheduler for several.
             capacity: L, messages of all topics together.
-            odometry: a topic with poses, which gives x to topics that move; x of other topics is time.
+            odometry: a topic with poses, which gives x to topics that move; x of other topics is time. The poses of one
+                frame count (TOPIC:FRAME, of tf TOPIC:PARENT:CHILD, else that of the first).
             window: n_T, messages sent and not yet acked by the receiver, at most; None: as many as fill the link.
             say: called with a line for each topic found.
         """
@@ -132,8 +133,8 @@ class RosSender:
         self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port), leaves)
         self._streams = client.streams
         self._numbers = {resolved(stream.topic.name): number for number, stream in enumerate(client.streams)}
-        self._odometry_topic = None if odometry is None else resolved(odometry)
-        self._odometry = Odometry()
+        topic, self._odometry = ("", Odometry()) if odometry is None else followed(odometry)
+        self._odometry_topic = resolved(topic) if topic else None
         self._began_s = time.monotonic()
         self._say = say
 

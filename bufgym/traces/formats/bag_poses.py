@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -14,14 +16,19 @@ from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE
 from bufgym.traces.poses import Poses, unit
 
-_POSE_TYPES: Final = {
-    "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
-    "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
-}
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+_POSE_TYPES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TF_TYPES: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+# Names of topics on which a pose is where a robot shall go, or what a person says. The page's frames.js has them too.
+_GOAL: Final = re.compile(
+    r"(^|[/_])(goals?|targets?|(way|set)_?points?|clicked|desired|cmd|command|(goal|target|set|initial)_?pose)"
+    r"([^a-z/][^/]*)?(/(pose|local|global))?$"
+)
 # Robots have dozens of transforms; an error message lists no more than these.
 _LISTED_FRAMES: Final = 8
+
+Frames = tuple[str, str]
+"""The frame in which a pose is, and the frame whose pose it is (empty where the message does not say)."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +40,40 @@ class BagTopic:
     encoding: str  # "cdr", "ros1" or what the MCAP file says
 
 
-def carries_poses(type: str) -> bool:
-    """Whether poses can be taken from messages of this type."""
-    return type in _POSE_TYPES or type in _TF_TYPES
+def carries_poses(topic: str, type: str) -> bool:
+    """Whether the messages of this topic say where a robot is; a goal does not."""
+    return type in _TF_TYPES or type == ODOMETRY or (type in _POSE_TYPES and not is_goal(topic))
+
+
+def is_goal(topic: str) -> bool:
+    """Whether a topic's name, such as ``/goal_pose`` or ``/initialpose``, says that its poses are no places."""
+    return _GOAL.search(topic.lower()) is not None
+
+
+def named_source(spec: str) -> tuple[str, tuple[str, ...]]:
+    """Split ``TOPIC``, ``TOPIC:FRAME`` or ``TOPIC:PARENT:CHILD`` into the topic and its frames."""
+    topic, *frames = spec.split(":")
+    if len(frames) > 2:
+        raise BufgymError(f"odom = {spec!r}: must be a topic, TOPIC:FRAME, or TOPIC:PARENT:CHILD for a transform of tf")
+    if is_goal(topic):
+        raise BufgymError(f"odom = {spec!r}: {topic} is a goal, no place where the robot is: name its odometry")
+    return topic, tuple(name.lstrip("/") for name in frames)
+
+
+def placed(message: Any) -> Iterator[tuple[Any, Frames, Any, Any]]:
+    """Header, frames, position and orientation of each pose in a message of ROS 1 or 2."""
+    for stamped in getattr(message, "transforms", ()):
+        pose = stamped.transform
+        yield stamped.header, _frames(stamped), pose.translation, pose.rotation
+    if hasattr(message, "pose"):
+        pose = message.pose
+        while hasattr(pose, "pose"):
+            pose = pose.pose
+        yield message.header, _frames(message), pose.position, pose.orientation
+
+
+def _frames(stamped: Any) -> Frames:
+    return stamped.header.frame_id.lstrip("/"), getattr(stamped, "child_frame_id", "").lstrip("/")
 
 
 class PoseCollector:
@@ -45,41 +83,28 @@ class PoseCollector:
         """
         Args:
             path: the recording, for error messages.
-            spec: a topic, or ``TOPIC:PARENT:CHILD``.
+            spec: as ``named_source`` takes it.
         """
-        self.path = path
-        self.topic, *frames = spec.split(":")
-        if len(frames) not in (0, 2):
-            raise BufgymError(f"odom = {spec!r}: must be a topic, or TOPIC:PARENT:CHILD for one transform of tf")
-        self._frames = tuple(frames)
-        self._poses: dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]] = {}
+        self.path, self._spec = path, spec
+        self.topic, self._frames = named_source(spec)
+        self._poses: dict[Frames, list[tuple[int, tuple[float, ...]]]] = {}
 
     def add(self, channel: BagTopic, time_ns: int, data: bytes) -> None:
         """Keep the poses of a message that was logged at `time_ns`."""
-        message = self._decoded(channel, data)
-        if channel.type in _POSE_TYPES:
-            pose = _POSE_TYPES[channel.type](message)
-            self._keep((), time_ns, pose.position, pose.orientation)
-            return
-        for stamped in message.transforms:
-            frames = (stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/"))
-            self._keep(frames, time_ns, stamped.transform.translation, stamped.transform.rotation)
+        for _, frames, position, orientation in placed(self._decoded(channel, data)):
+            self._keep(frames, time_ns, position, orientation)
 
     def poses(self, topics: dict[str, str]) -> tuple[int, Poses]:
         """Time of the first (ns), and the poses with times from there; of poses at the same time the last counts."""
         if self.topic not in topics:
             raise BufgymError(f"{self.path}: no topic {self.topic!r}; it has: {', '.join(topics) or 'none'}")
-        if self._frames:
-            frames = tuple(name.lstrip("/") for name in self._frames)
-        else:
-            frames = next(iter(self._poses)) if len(self._poses) == 1 else ()
-        if frames not in self._poses:
-            known = [f"{self.topic}:{':'.join(pair)}" for pair in sorted(self._poses) if pair]
+        fitting = [frames for frames in self._poses if frames[: len(self._frames)] == self._frames]
+        if len(fitting) != 1:
+            known = [f"{self.topic}:{':'.join(filter(None, frames))}" for frames in sorted(self._poses)]
             more = f" and {len(known) - _LISTED_FRAMES} more" if len(known) > _LISTED_FRAMES else ""
-            pairs = ", ".join(known[:_LISTED_FRAMES]) + more
-            rule = f"say which transform: {pairs}" if pairs else "has no pose"
-            raise BufgymError(f"{self.path}: odom = {':'.join((self.topic, *self._frames))!r}: {rule}")
-        by_ns = dict(sorted(self._poses[frames], key=lambda pose: pose[0]))
+            what = "has no pose" if not known else f"say which frames: {', '.join(known[:_LISTED_FRAMES])}{more}"
+            raise BufgymError(f"{self.path}: odom = {self._spec!r}: {what}")
+        by_ns = dict(sorted(self._poses[fitting[0]], key=lambda pose: pose[0]))
         from_ns = min(by_ns)
         # Two within a microsecond are one.
         by_us = {(time_ns - from_ns) // 1000: values for time_ns, values in by_ns.items()}
@@ -89,7 +114,7 @@ class PoseCollector:
         return from_ns, Poses(np.array(list(by_us), np.int64), values[:, :3], unit(values[:, 3:]), self.topic)
 
     def _decoded(self, channel: BagTopic, data: bytes) -> Any:
-        if not carries_poses(channel.type):
+        if not carries_poses(channel.topic, channel.type):
             rule = f"must be one of {', '.join(_POSE_TYPES)}, {', '.join(_TF_TYPES)}"
             raise BufgymError(f"{self.path}: {self.topic} carries {channel.type or 'no known type'}: {rule}")
         if channel.encoding not in ("cdr", "ros1"):
@@ -98,7 +123,7 @@ class PoseCollector:
         decode = store.deserialize_cdr if channel.encoding == "cdr" else store.deserialize_ros1
         return decode(data, channel.type)
 
-    def _keep(self, frames: tuple[str, ...], time_ns: int, position: Any, quaternion: Any) -> None:
+    def _keep(self, frames: Frames, time_ns: int, position: Any, quaternion: Any) -> None:
         poses = self._poses.setdefault(frames, [])
         field = f"{self.topic}, pose {len(poses)}"
         values = (position.x, position.y, position.z, quaternion.x, quaternion.y, quaternion.z, quaternion.w)
@@ -112,12 +137,12 @@ class PoseCollector:
         poses.append((time_ns, values))
 
 
-@cache
+@functools.cache
 def typestore(encoding: str) -> Any:
-    """The message types that rosbags knows in this encoding, "cdr" or "ros1"."""
+    """The types of ROS 2 (``cdr``) or ROS 1 (``ros1``), with those of tf in both."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE if encoding == "cdr" else Stores.ROS1_NOETIC)
+    store = get_typestore(Stores.ROS2_JAZZY if encoding == "cdr" else Stores.ROS1_NOETIC)
     for name in _TF_TYPES:
         if name not in store.fielddefs:
             store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))

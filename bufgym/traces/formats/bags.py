@@ -68,7 +68,7 @@ def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], ob
 
     Args:
         path: an MCAP file, a ROS 1 bag, a rosbag2 folder or ``.db3`` file (see `splits`).
-        odom: topic to take poses from; for tf, which holds many, ``TOPIC:PARENT:CHILD``.
+        odom: topic to take poses from, of one frame alone (``TOPIC:FRAME``; for tf, ``TOPIC:PARENT:CHILD``).
         advance: called with 1 for each message read, as a progress bar's update.
 
     Raises:
