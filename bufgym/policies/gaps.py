@@ -11,6 +11,10 @@ from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, gaps, has_
 from bufgym.model.qoi import value
 from bufgym.policies.registry import Arrival, Memory, built_in
 
+TIE = 1e-12
+"""QoI up to which two messages count as equal, so that rounding never decides. Structural: above the rounding of sums
+of V."""
+
 
 @kernel
 def gap_left(buffer: Buffer, arrival: Arrival, victim: int) -> float:
@@ -147,6 +151,6 @@ def greedy_qoi(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     for k in range(len(buffer.slots)):
         # The tail's loss counts its gap to the newcomer too: together V(a + b) - V(a).
         added = arrival_gain(buffer, arrival) - loss(buffer, arrival, k)
-        if added > most:
+        if added > most + TIE:
             decision, most = k, added
     return decision

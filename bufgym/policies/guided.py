@@ -11,8 +11,9 @@ residual policy learning does [silver2018residual; johannink2019residual]. ``OUT
     come <- x_new - x_dequeued;  g <- the target gap, or come / (s + 1) where it is unknown
 
 ``linear`` is the policy whose outputs are linear in the inputs, by one set of weights under a light load and by another
-under a heavy one, mixed by h. They are multiplied by 1 - ``plain``: the plain rule stays on a measured steady link, and
-until the link has carried anything.
+under a heavy one, mixed by h. They are multiplied by 1 - ``plain``. So the plain rule stays on a measured steady link,
+until the link has carried anything, and in bursts, where no target guides the outputs. A queue with one place is apart:
+there the plain rule keeps an early message of each burst, which most outputs mend.
 
     h <- (log(size / (mean rate over 20 s x arrival period)) - 0.7) / 1.5, at least 0 and at most 1
     outputs <- (1 - plain) (W_light + h W_heavy) inputs
@@ -34,8 +35,8 @@ from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.gaps import gap_left
 from bufgym.policies.price_dp import VARIANCE, remember_sizes, share
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.target_gap import SEEN_US, Numbers, last_chance, link_rate, needless, remember, target
-from bufgym.policies.thinning import steady
+from bufgym.policies.target_gap import SEEN_US, Numbers, bursty, last_chance, link_rate, needless, remember, target
+from bufgym.policies.thinning import places, steady
 
 
 class Output(NamedTuple):
@@ -79,7 +80,7 @@ INPUTS = {
     "one": "always 1",
     "head_gap": "lg(the gap left if the head goes, g); 0 for an empty queue",
     "share": "a, the share of price-dp in the plain rule",
-    "plain": "1 on a measured steady link, and until the link has carried anything; otherwise 0",
+    "plain": "1 on a measured steady link, in bursts if there are two places, and until the link has carried anything",
 }
 """Names and meanings of the inputs, in their order."""
 MOST = 3.0  # Largest input and output, either way
@@ -154,7 +155,7 @@ def inputs(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, o
     out[12] = 1.0
     out[13] = lg(gap_left(buffer, arrival, 0), g) if s > 0 else 0.0
     out[14] = share(rule, numbers)
-    out[15] = 1.0 if steady(buffer) or rate <= 0 else 0.0
+    out[15] = 1.0 if steady(buffer) or (bursty(rule) and places(buffer, arrival) > 1) or rate <= 0 else 0.0
 
 
 @kernel

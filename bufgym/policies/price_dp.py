@@ -23,9 +23,12 @@ follows the spread of sizes, which is 0 for equal ones:
     sd <- standard deviation of the logarithm of bytes, over the last arrivals
     a  <- 1 / (1 + exp(share_low - share_steep sd)), but 0 below ``LEAST_SHARE``
 
+Where V is straight at g, a message between two gaps g adds nothing, so bytes have no price: a is 0, and gaps decide.
+
 Each candidate is then worth (1 - a) (threshold g - its discounted gap) / g, as target-gap has it, plus a (its advantage
-in units - price_threshold); the best candidate goes. The head is asked likewise, with target-gap's wish for it. A share
-that also follows the load was better on random links, and worse in outages and on light links.
+in units - price_threshold); the best candidate goes, the oldest of equal ones. The head is asked likewise, with
+target-gap's wish for it. A share that also follows the load was better on random links, and worse in outages and on
+light links.
 
 Under B a newcomer that takes the place of several messages goes itself, unless better candidates make
 room for it.
@@ -42,7 +45,7 @@ from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import merging_loss, value
 from bufgym.policies import chains, target_gap
-from bufgym.policies.gaps import discounted, gap_left
+from bufgym.policies.gaps import TIE, discounted, gap_left
 from bufgym.policies.registry import Arrival, Memory, built_in
 from bufgym.policies.target_gap import DISCOUNT, NEAR, Numbers, bursty, free_soon, needless, remember, target
 from bufgym.policies.thinning import spare_us, steady
@@ -69,6 +72,8 @@ THRESHOLD, HEAD, BIAS, KAPPA, TAIL, PRICE_THRESHOLD, PRICE_NEAR, SHARE_LOW, SHAR
 PRICE_DISCOUNT, SPARE, SPARE_DISCOUNT = range(23, 26)
 LEAST_SHARE = 0.06
 """Smallest a that is not 0. Structural: equal sizes have 0.007, and are to be ``target-gap`` exactly."""
+UNPRICED = 1e-6
+"""V is straight at g if a unit is at most so much of V(g). Structural: above rounding, below what a bent V has."""
 
 LOG_BYTES, VARIANCE, SIZES = range(6, 9)
 REMEMBERED = {**target_gap.REMEMBERED, "log_bytes": 0.0, "variance": 0.0, "sizes": 0.0}
@@ -111,25 +116,27 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
     known = g > 0 and not steady(buffer)
     if g <= 0:
         g = (arrival.x - buffer.dequeued_x) / (s + 1)
+    even = value(buffer.v, g)
+    unit = numbers[KAPPA] * merging_loss(buffer.v, g, even, g, even)
+    if unit <= UNPRICED * even:
+        a = 0.0
     longest, discount = numbers[THRESHOLD] * g, numbers[DISCOUNT]
     if not known:
         longest, discount = -g if a > 0 else -max(g, TINY), numbers[SPARE_DISCOUNT]
         each_us, elapsed_us = spare_us(buffer, arrival), arrival.arrival_us - buffer.dequeued_arrival_us
         if each_us > 0 and not bursty(memory):
             longest = numbers[SPARE] * ((arrival.x - buffer.dequeued_x) * each_us / elapsed_us)
-    per_unit, per_gap = 0.0, (1 - a) / max(g, TINY)
+    per_unit, tie, per_gap = 0.0, 0.0, (1 - a) / max(g, TINY)
     if a > 0:
-        even = value(buffer.v, g)
-        unit = numbers[KAPPA] * merging_loss(buffer.v, g, even, g, even)
         chains.weigh(buffer, arrival, unit / mean_bytes(buffer, arrival), arrival.x + numbers[TAIL] * g, scratch)
-        per_unit = a / max(unit, TINY)
+        per_unit, tie = a / unit, a * TIE / unit
     if s > 0 and free_soon(buffer, numbers[NEAR] + a * (numbers[PRICE_NEAR] - numbers[NEAR])):
         gain = per_unit * chains.advantage(scratch, 0) if a > 0 else 0.0
         if known:
             head, after = motion_gaps(buffer, arrival, 0)
             wish = numbers[HEAD] * g
             gain += per_gap / numbers[HEAD] * (abs(head - wish) - numbers[BIAS] * abs(head + after - wish))
-        if gain > 0:
+        if gain > tie:
             return 0
     own = per_gap * (longest - discounted(buffer, arrival, False, s, discount))
     if a > 0:
@@ -139,17 +146,17 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
         gain = per_gap * (longest - discounted(buffer, arrival, False, k, discount))
         if a > 0:
             gain += per_unit * chains.advantage(scratch, k) + a * numbers[PRICE_DISCOUNT] * (1 - k / s)
-        if gain >= own:
+        if gain >= own - tie:
             freed_bytes += buffer.slots[k].size_bytes
-        if gain > best:
+        if gain > best + tie:
             victim, best = k, gain
     if room:
-        if a == 0 and gap_left(buffer, arrival, victim if best >= own else REJECT) > longest:  # not discounted
+        if a == 0 and gap_left(buffer, arrival, victim if best >= own - tie else REJECT) > longest:  # not discounted
             return ACCEPT
         if max(own, best) < a * numbers[PRICE_THRESHOLD]:
             return ACCEPT
-        return victim if best >= own else REJECT
-    return victim if stays(buffer, arrival, best >= own, freed_bytes) else REJECT
+        return victim if best >= own - tie else REJECT
+    return victim if stays(buffer, arrival, best >= own - tie, freed_bytes) else REJECT
 
 
 BOTH: Any = {"parameters": PARAMETERS, "memory": REMEMBERED, "work": chains.SCRATCH, "reads_rate": True}

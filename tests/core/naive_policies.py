@@ -139,7 +139,7 @@ def spread(key, share, discount):
 
 
 def greedy_qoi(v):
-    """The first of the slots whose eviction for the newcomer adds most; reject if none adds anything."""
+    """The first of the slots whose eviction for the newcomer adds most; reject if none adds more than rounding."""
 
     def loss(a, b):
         if "exponential" in v.name:
@@ -150,7 +150,11 @@ def greedy_qoi(v):
         x = [m["x"] for m in [sender.last_dequeued, *queue, newcomer]]
         gain = v(x[-1] - x[-2])
         added = [gain - loss(b - a, c - b) for a, b, c in zip(x, x[1:], x[2:], strict=False)]
-        return added.index(max(added)) if max(added) > 0 else queues.REJECT
+        victim, most = queues.REJECT, 0.0
+        for k, gain in enumerate(added):
+            if gain > most + 1e-12:
+                victim, most = k, gain
+        return victim
 
     return queues.Policy(full)
 

@@ -15,7 +15,7 @@ from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
-from bufgym.policies import Policy, chains, guided, learned, price_dp, target_gap, thinning
+from bufgym.policies import Policy, chains, gaps, guided, learned, price_dp, target_gap, thinning
 from bufgym.policies.scoring import unpack
 from bufgym.policies.target_gap import straight
 from bufgym.robot.c.calls import random_episode, recorded
@@ -38,8 +38,9 @@ _LEARNED = ("features.h", "scorer.h")  # Parts of a learned agent
 _CONSTANTS = {
     thinning: "WAITING SOON_US STEADY",
     target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
-    price_dp: "LEAST_SHARE SIZES_WEIGHT",
+    price_dp: "LEAST_SHARE SIZES_WEIGHT UNPRICED",
     chains: "SPAN",
+    gaps: "TIE",
     guided: "MOST SPREAD_US SLOW_US HEAVY HEAVIER",
 }
 """Constants that the parts name, by the module that has them."""

@@ -71,7 +71,7 @@ static inline void bufgym_look(const struct bufgym_queue *q, const struct bufgym
     seen[BUFGYM_IN_ONE] = 1.0;
     seen[BUFGYM_IN_HEAD_GAP] = s > 0 ? bufgym_lg(bufgym_gap_left(q, arrival, 0), g) : 0.0;
     seen[BUFGYM_IN_SHARE] = bufgym_share(q, &bufgym_plain);
-    seen[BUFGYM_IN_PLAIN] = bufgym_steady(q) || rate <= 0.0;
+    seen[BUFGYM_IN_PLAIN] = bufgym_steady(q) || (bufgym_bursty(q) && bufgym_places(q, arrival) > 1) || rate <= 0.0;
 }
 
 /* The numbers of gap-price, changed by the outputs; whether any output is not 0. */

@@ -39,7 +39,7 @@ static inline int bufgym_priced(
     const int s = q->occupancy, room = bufgym_has_space(q, arrival);
     const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
     const double come = arrival->x - q->dequeued_x;
-    double g, longest, discount, per_gap, own, per_unit = 0.0, best = -HUGE_VAL;
+    double g, even, unit, longest, discount, per_gap, own, per_unit = 0.0, tie = 0.0, best = -HUGE_VAL;
     int64_t freed_bytes = 0;
     int k, known, victim = bufgym_needless(q, arrival);
     if (victim >= 0)
@@ -50,6 +50,10 @@ static inline int bufgym_priced(
     known = g > 0.0 && !bufgym_steady(q);
     if (g <= 0.0)
         g = come / (s + 1);
+    even = bufgym_value(g);
+    unit = numbers->kappa * bufgym_merging_loss(g, even, g, even);
+    if (unit <= @UNPRICED@ * even)
+        a = 0.0;
     per_gap = (1.0 - a) / (g > @TINY@ ? g : @TINY@);
     longest = numbers->threshold * g;
     discount = numbers->discount;
@@ -61,9 +65,9 @@ static inline int bufgym_priced(
             longest = numbers->spare * (come * each_us / elapsed_us);
     }
     if (a > 0.0) {
-        const double even = bufgym_value(g), unit = numbers->kappa * bufgym_merging_loss(g, even, g, even);
         bufgym_weigh(q, arrival, unit / bufgym_mean_bytes(q, arrival), arrival->x + numbers->tail * g);
-        per_unit = a / (unit > @TINY@ ? unit : @TINY@);
+        per_unit = a / unit;
+        tie = a * @TIE@ / unit;
     }
     if (s > 0 && bufgym_free_soon(q, numbers->near_soon + a * (numbers->price_near - numbers->near_soon))) {
         double gain = a > 0.0 ? per_unit * bufgym_advantage(q, 0) : 0.0;
@@ -72,7 +76,7 @@ static inline int bufgym_priced(
             const double wish = numbers->head * g, left = fabs(head.before_x + head.after_x - wish);
             gain += per_gap / numbers->head * (fabs(head.before_x - wish) - numbers->bias * left);
         }
-        if (gain > 0.0)
+        if (gain > tie)
             return 0;
     }
     own = per_gap * (longest - bufgym_discounted(q, arrival, 0, s, discount));
@@ -82,15 +86,15 @@ static inline int bufgym_priced(
         double gain = per_gap * (longest - bufgym_discounted(q, arrival, 0, k, discount));
         if (a > 0.0)
             gain += per_unit * bufgym_advantage(q, k) + a * numbers->price_discount * (1.0 - (double)k / s);
-        if (gain >= own)
+        if (gain >= own - tie)
             freed_bytes += q->slots[k].size_bytes;
-        if (gain > best) {
+        if (gain > best + tie) {
             best = gain;
             victim = k;
         }
     }
     if (room) {
-        const int goes = best >= own ? victim : BUFGYM_REJECT;
+        const int goes = best >= own - tie ? victim : BUFGYM_REJECT;
         if (a <= 0.0 && bufgym_gap_left(q, arrival, goes) > longest) /* not discounted */
             return BUFGYM_ACCEPT;
         return (best > own ? best : own) < a * numbers->price_threshold ? BUFGYM_ACCEPT : goes;
@@ -98,7 +102,7 @@ static inline int bufgym_priced(
     /* The newcomer stays once a message has gone for it. */
     if (q->evictions > 0)
         return victim;
-    return best >= own && q->backlog_bytes - freed_bytes + arrival->size_bytes <= BUFGYM_MAX_BYTES ? victim
+    return best >= own - tie && q->backlog_bytes - freed_bytes + arrival->size_bytes <= BUFGYM_MAX_BYTES ? victim
                                                                                                    : BUFGYM_REJECT;
 }
 

@@ -11,7 +11,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
         const struct bufgym_gaps gaps = bufgym_gaps_of(q, arrival, k);
         const double a = gaps.before_x, b = gaps.after_x;
         const double added = newcomer_gain - bufgym_merging_loss(a, bufgym_value(a), b, bufgym_value(b));
-        if (added > most) {
+        if (added > most + @TIE@) {
             most = added;
             decision = k;
         }
