@@ -13,12 +13,13 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import Floats, Ints, interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
-from bufgym.oracle import labels, unequal
+from bufgym.oracle import labels, pieces, unequal
 from bufgym.oracle.interruption import evenly_kept
 from bufgym.oracle.programme import NEVER, Messages
 from bufgym.policies.registry import built_in
 from bufgym.scenario import Episode
 
+LONG = 1 << 16  # Messages from which on an episode is worked on in pieces
 _SHORT = 2_000  # messages of an episode whose plan takes a fraction of a second on any link
 
 
@@ -58,7 +59,8 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
     if (size == size[0]).all():
         room = min(capacity, most_bytes // int(size[0]))
         limit = np.full(n, room * size[0] if room else NEVER)
-        sent, gain = labels.best(Messages(c, size, limit, x, v.array, ends))
+        messages = Messages(c, size, limit, x, v.array, ends)
+        sent, gain = labels.best(messages) if n < LONG else pieces.best(messages, limit, capacity, most_bytes)
     elif _fits(c, size, capacity, most_bytes, ends, np.empty(n, np.int64)):
         sent, gain = np.arange(n), v.information(x) - 1.0  # V is concave, so no plan beats sending all messages
     else:
@@ -66,7 +68,8 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
         _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
         # While no more bytes wait than in the L smallest messages, fewer than L messages wait.
         certain = np.minimum(np.minimum(limit, np.sort(size)[:capacity].sum()), most_bytes - size)
-        sent, gain = unequal.best(Messages(c, size, limit, x, v.array, ends), certain, capacity, most_bytes)
+        find = unequal.best if n < LONG else pieces.best
+        sent, gain = find(Messages(c, size, limit, x, v.array, ends), certain, capacity, most_bytes)
     kept = np.zeros(n, np.bool_)
     kept[sent] = True
     qoi = 1.0 + gain if len(sent) else 0.0
