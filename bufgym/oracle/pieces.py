@@ -10,15 +10,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bufgym.ground.kernel import Floats, Ints, kernel
+from bufgym.ground.kernel import Ints, kernel
 from bufgym.ground.progress import bar
 from bufgym.model.qoi import value
-from bufgym.oracle.programme import MAX_CELLS, Messages, Problem, find_idle
+from bufgym.oracle.programme import Messages, Problem, find_idle
 from bufgym.oracle.unequal import priced, without_idle
 
-STEPS = 16  # Grid steps to a mean message
+CELLS = 128  # Grid steps within a message's reach: the more, the closer the bound
+MOST_CELLS = 512  # The same at most where even a step a message makes more of them
 PIECE = 1 << 14  # Most messages of a piece
 MARGIN = 1 << 11  # Least messages after a piece that its programme looks at as well
 
@@ -37,7 +37,8 @@ def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tu
 
     ``certain``, int64[messages], is explained at ``new_problem``.
     """
-    n, grid = len(messages.c), messages.grid(STEPS, PIECE)
+    n, mean = len(messages.c), int(messages.size.mean())
+    grid = max(1, mean // max(1, CELLS * mean // max(1, messages.reach)), messages.reach // MOST_CELLS)
     messages = without_idle(messages, grid)
     between, idle = np.empty((2, n), np.int64)
     find_idle(*messages[:3], certain, between, idle)
@@ -69,7 +70,7 @@ def cut(messages: Messages, between: Ints, idle: Ints, grid: int, length: int, m
         # From here on, a message between could be sent before every further one (see ``find_priced_future``).
         beyond = (between[stop:] >= stop) & (idle[stop:] >= (latest // grid + 1) * grid)
         reached = stop + int(beyond.argmax()) if beyond.any() else n
-        pieces.append(Piece(begin, stop, reached, min(n, max(reached, stop + margin))))
+        pieces.append(Piece(begin, stop, reached, min(n, stop + max(margin, 2 * (reached - stop)))))
     return pieces
 
 
@@ -80,13 +81,10 @@ def _solved(
 
     def solve(piece: Piece) -> Problem:
         part, base = slice(piece.begin, piece.end), int(messages.c[piece.begin]) // grid * grid
-        c, size, limit, x = (np.ascontiguousarray(array[part]) for array in messages[:4])
+        c, size, limit = messages.c[part] - base, messages.size[part], messages.limit[part]
+        sliced = Messages(c, size, limit, messages.x[part], messages.v, messages.ends - base)
         cells = np.zeros((len(c), messages.reach // grid + 2))
-        ends = messages.ends - base
-        p = Problem(
-            *(c - base, size, limit, x, messages.v, ends),
-            *(between[part] - piece.begin, idle[part] - base, grid, cells),
-        )
+        p = Problem(*sliced, between[part] - piece.begin, idle[part] - base, grid, cells)
         priced(p, np.zeros((2, len(c))), 1, 1)
         return p
 

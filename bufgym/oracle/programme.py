@@ -33,10 +33,9 @@ class Messages(NamedTuple):
         """Bytes after its arrival by which every message has ended."""
         return max(0, int((self.limit + self.size).max()))
 
-    def grid(self, steps: int, at_once: int | None = None) -> int:
-        """Bytes to a grid step, see ``new_problem``, for all messages or so many ``at_once``."""
-        held = len(self.c) if at_once is None else at_once
-        return max(1, int(self.size.mean()) // steps, self.reach * held // MAX_CELLS)
+    def grid(self, steps: int) -> int:
+        """Bytes to a grid step, see ``new_problem``."""
+        return max(1, int(self.size.mean()) // steps, self.reach * len(self.c) // MAX_CELLS)
 
 
 class Problem(NamedTuple):

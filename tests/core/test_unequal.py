@@ -138,12 +138,12 @@ def test_a_fast_link_costs_no_work_where_no_message_reaches():
     size, limit, x = np.random.default_rng(7).integers(100, 900, 30), np.full(30, 2_000), np.arange(30) / 4
     c = np.repeat([500, 10**8, 2 * 10**8], 10) + np.tile(np.arange(10) * 90, 3)
     sent = Messages(c, size, limit, x, qoi.exponential(0.5).array, 10**8 + 5_000)
-    short, *_, ends = unequal.without_idle(sent)
+    short, *_, ends = unequal.without_idle(sent, 96)
     assert (np.diff(short)[[9, 19]] < 4_000).all() and (np.diff(short)[:9] == 90).all()
     assert short[0] == 500 and ends - short[10] in (5_000, short[20] - short[10])
     plan, bound = unequal.best(sent, np.full(30, 100), 3, UNLIMITED_BYTES)
     assert 0 < len(plan) < 20 and plan.max() < 20
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(unequal, "without_idle", lambda messages: messages)
+        patch.setattr(unequal, "without_idle", lambda messages, step: messages)
         again, same = unequal.best(sent, np.full(30, 100), 3, UNLIMITED_BYTES)
     assert again.tolist() == plan.tolist() and same == bound
