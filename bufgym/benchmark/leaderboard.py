@@ -77,9 +77,9 @@ def made_of(spec: str) -> str:
 def stale(board: Mapping[str, Entry]) -> list[str]:
     """Names of the rows whose policy is made of something else today, as far as they say what it was made of here."""
     here = f"{sys.implementation.cache_tag}-"
-    told = {entry.policy for entry in board.values() if entry.made_of.startswith(here)}
-    now = {policy: made_of(policy) for policy in told}
-    return [name for name, entry in board.items() if entry.policy in now and entry.made_of != now[entry.policy]]
+    told = {name: entry for name, entry in board.items() if entry.made_of.startswith(here)}
+    now = {policy: made_of(policy) for policy in {entry.policy for entry in told.values()}}
+    return [name for name, entry in told.items() if entry.made_of != now[entry.policy]]
 
 
 def task_of(suite: str) -> Task:
