@@ -29,7 +29,8 @@ def in_pieces(patch: Any, length: int, margin: int, episode: Episode, L: int, v:
     return clairvoyant(episode, L, v, **limits)
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.kernels
+@pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize(("length", "margin"), [(7, 0), (50, 40)])
 def test_pieces_bound_what_is_exact_in_one(monkeypatch, seed, length, margin):
     """Messages of ten bytes, links that rest, scenes that stand: the exact optimum lies below the bound, and the plan,
