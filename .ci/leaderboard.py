@@ -1,6 +1,7 @@
-"""Run each row of docs/leaderboard.csv that differs from a commit's: ``leaderboard.py COMMIT``; 1 if one does not hold.
+"""Check docs/leaderboard.csv: ``leaderboard.py stale`` or ``leaderboard.py COMMIT``; 1 if a row does not hold.
 
-A row whose suite needs recordings is named and left out.
+``stale`` runs nothing. It names the rows whose policy has changed since they were made. COMMIT runs each row that
+differs from that commit's; a row whose suite needs recordings is named and left out.
 """
 
 import subprocess
@@ -11,6 +12,17 @@ from bufgym.benchmark import leaderboard
 from bufgym.scenario.suites import SUITES
 
 FILE = Path("docs/leaderboard.csv")
+
+
+def name_stale() -> int:
+    """Name each stale row and the command that makes it again."""
+    board = leaderboard.read(FILE)
+    stale = leaderboard.stale(board)
+    for name in stale:
+        print(f"{name}: its policy has changed since; again: {board[name].command} --out FOLDER, then website.row")
+    unknown = sum(entry.made_of == leaderboard.UNKNOWN for entry in board.values())
+    print(f"{len(board)} rows, {len(stale)} stale, {unknown} do not say what their policy was made of")
+    return int(bool(stale))
 
 
 def main(commit: str) -> int:
@@ -31,4 +43,4 @@ def main(commit: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(name_stale() if sys.argv[1] == "stale" else main(sys.argv[1]))

@@ -84,7 +84,7 @@ def files_that_run_uncompiled() -> list[str]:
 
 
 def check() -> list[Stage]:
-    """Format, lint, types, layers, weight, workflows."""
+    """Format, lint, types, layers, weight, stale rows, workflows."""
     actionlint = BIN / "actionlint"
     return [
         Stage("format", [str(BIN / "ruff"), "format", "--check", "."]),
@@ -92,6 +92,7 @@ def check() -> list[Stage]:
         Stage("types", [str(BIN / "mypy")]),
         Stage("imports", [str(BIN / "lint-imports")]),
         Stage("weight", [PYTHON, ".ci/weight.py"]),
+        Stage("leaderboard", [PYTHON, ".ci/leaderboard.py", "stale"]),
         Stage("workflows", [str(actionlint)], unless="" if actionlint.exists() else "actionlint is not here"),
     ]
 

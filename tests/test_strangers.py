@@ -64,7 +64,7 @@ def test_a_row_is_not_believed_its_interval(monkeypatch: pytest.MonkeyPatch) -> 
         refuse(r"score is 0.500000 \[0.400000, 0.600000\], but the file states", leaderboard.validate, forged)
 
 
-CELLS = ["lte-v1", "afr", "1", "3", "score", "0.5", "0.4", "0.6", "0.1", "x"]
+CELLS = ["lte-v1", "afr", "1", "3", "score", "0.5", "0.4", "0.6", "0.1", "unknown", "x"]
 ROW = dict(zip(leaderboard.COLUMNS, CELLS, strict=True))
 
 

@@ -28,7 +28,7 @@ from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
 
 KEYWORDS = ("capacity", "seeds", "progress", "about", "against")
-QUEUE = ("max_bytes", "decide_at")  # Settings of a queue
+QUEUE = ("max_bytes", "decide_at", "bound")  # Settings of a queue
 PolicyLike = Policy | str | Path | OnArrival
 
 
@@ -136,7 +136,8 @@ def compare(
         about: lines that stand above the table and explain it; by default what ``on`` is.
         against: a policy that every other is compared with, by the paired difference of their shares of AFR's regret
             (of QoI over Robofleet's with topics, of the gain over AFR with a fleet). It and AFR run too.
-        settings: of a queue, ``max_bytes`` and ``decide_at``; the others are parameters of a scenario that is named.
+        settings: of a queue, ``max_bytes``, ``decide_at`` and ``bound`` (False leaves out the clairvoyant and all that
+            is measured against it); the others are parameters of a scenario that is named.
 
     Raises:
         BufgymError: an argument is out of its range, or there is no such policy, scenario or suite.

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import math
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bufgym import policies
 from bufgym.benchmark import folder
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
@@ -20,13 +23,18 @@ from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8, replaced
+from bufgym.ground.kernel.closure import closure
 from bufgym.scenario import suites
 
 COLUMNS: Layout = {
     **{"suite": str, "policy": str, "rank": int, "cells": int, "quantity": str},
-    **{"value": float, "low": float, "high": float, "bufgym": str, "command": str},
+    **{"value": float, "low": float, "high": float, "bufgym": str, "made_of": str},
+    "command": str,
 }
 """Columns of the file, which has one line for each quantity of an entry."""
+
+UNKNOWN = "unknown"
+"""What a row says that was made before rows said what their policy is made of."""
 
 MAX_BYTES = 16 * 2**20  # Size limit of the file; each line has some 200 bytes
 
@@ -41,6 +49,7 @@ class Entry:
     cells: int  # number of cells that the values are over; for one queue only discriminative cells count
     values: Mapping[str, Interval]  # the quantities that the suite's task lists, by key
     bufgym: str  # version that made it
+    made_of: str = UNKNOWN  # what the policy was made of, see ``made_of``
 
     @property
     def name(self) -> str:
@@ -50,6 +59,27 @@ class Entry:
     def command(self) -> str:
         needs = " --data DIR" if suites.get(self.suite).needs else ""
         return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
+
+
+def made_of(spec: str) -> str:
+    """Hash of what a policy decides by: its functions with all that they call and read, and its settings.
+
+    The version of Python comes first, as its bytecode is part of the hash: only hashes of the same version compare.
+    """
+    policy = policies.get(spec)
+    functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send, policy.privileged
+    closures = [closure(getattr(function, "py_func", function)) for function in functions if function is not None]
+    numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client
+    digest = hashlib.sha256(repr((closures, numbers)).encode()).hexdigest()
+    return f"{sys.implementation.cache_tag}-{digest[:12]}"
+
+
+def stale(board: Mapping[str, Entry]) -> list[str]:
+    """Names of the rows whose policy is made of something else today, as far as they say what it was made of here."""
+    here = f"{sys.implementation.cache_tag}-"
+    told = {name: entry for name, entry in board.items() if entry.made_of.startswith(here)}
+    now = {policy: made_of(policy) for policy in {entry.policy for entry in told.values()}}
+    return [name for name, entry in told.items() if entry.made_of != now[entry.policy]]
 
 
 def task_of(suite: str) -> Task:
@@ -62,7 +92,10 @@ def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> lis
     summary = task.summary(rows, unranked)
     cells = len(summary.cells) if summary.scores is None else summary.scores.counted
     return [
-        Entry(suite, s.policy, place.rank or 0, cells, {key: s[key] for key in task.listed}, __version__)
+        Entry(
+            *(suite, s.policy, place.rank or 0, cells, {key: s[key] for key in task.listed}, __version__),
+            made_of(s.policy),
+        )
         for place, s in zip(places(summary), summary.overall, strict=True)
     ]
 
@@ -123,7 +156,17 @@ def write(board: Sequence[Entry], path: Path) -> None:
     lines = []
     for entry in board:
         for key, interval in entry.values.items():
-            cells = entry.suite, entry.policy, entry.rank, entry.cells, key, *interval, entry.bufgym, entry.command
+            cells = (
+                entry.suite,
+                entry.policy,
+                entry.rank,
+                entry.cells,
+                key,
+                *interval,
+                entry.bufgym,
+                entry.made_of,
+                entry.command,
+            )
             lines.append(dict(zip(COLUMNS, cells, strict=True)))
     write_rows(lines, path, COLUMNS)
     with replaced(path.with_suffix(".md")) as temporary:
@@ -144,7 +187,7 @@ def read(path: Path) -> dict[str, Entry]:
         if row["quantity"] not in (listed := task_of(row["suite"]).listed):
             rule = f"must be one of {', '.join(listed)}"
             raise BufgymError(where(path, number, row["quantity"], rule, field="quantity"))
-        entry = Entry(row["suite"], row["policy"], row["rank"], row["cells"], {}, row["bufgym"])
+        entry = Entry(row["suite"], row["policy"], row["rank"], row["cells"], {}, row["bufgym"], row["made_of"])
         values = board.get(entry.name, entry).values
         interval = Interval(row["value"], row["low"], row["high"])
         board[entry.name] = replace(entry, values={**values, row["quantity"]: interval})

@@ -52,6 +52,8 @@ class BufferOptions:
     """Also at most so many bytes queued, as in 9.2MB (default: no limit)."""
     decide_at: Literal["arrival", "overflow"] | None = None
     """Ask at every arrival (default), or when full."""
+    no_bound: Annotated[bool, Parameter(negative="")] = False
+    """Leave out the clairvoyant, whose time it saves; regret and score are measured against it."""
 
 
 def bench(
@@ -118,14 +120,17 @@ def _bench(
     file, folder, page = out.file(), out.folder(), out.page()
     capacity = who.capacity or (task.capacity,)
     seeds = who.seeds or (1 if made.recorded else task.seeds)
-    queue: dict[str, Any] = given(buffer)
+    queue: dict[str, Any] = given(buffer, "max_bytes", "decide_at")
+    bound: dict[str, Any] = {"bound": False} if buffer.no_bound else {}
     about = _about(made, task, None if made.recorded and who.seeds is None else seeds)
     if made.recorded:  # what was read is of use before the long work
         print(about, flush=True)
         plans = f"{len(stream.traces) * seeds * len(capacity)} x {stream.max_messages:,} messages"
-        print(f"bufgym: finding the clairvoyant's plans for {plans}, then playing every policy", file=sys.stderr)
-    done = beside(chosen, stream, capacity, seeds, label=made.label, about=about, rival=rival, **queue)
-    bounds = _bound_notes(done.rows, stream, buffer.decide_at or "arrival") if made.recorded else []
+        what = "" if buffer.no_bound else f"finding the clairvoyant's plans for {plans}, then "
+        print(f"bufgym: {what}playing every policy", file=sys.stderr)
+    done = beside(chosen, stream, capacity, seeds, label=made.label, about=about, rival=rival, **queue, **bound)
+    bounded = made.recorded and not buffer.no_bound
+    bounds = _bound_notes(done.rows, stream, buffer.decide_at or "arrival") if bounded else []
     print("\n".join([f"\n{done.plain}" if made.recorded else str(done), *bounds]))
     if made.recorded:
         order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows, alone=done.unranked)))

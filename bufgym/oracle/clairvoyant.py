@@ -13,13 +13,16 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import Floats, Ints, interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
-from bufgym.oracle import labels, unequal
+from bufgym.oracle import labels, pieces, unequal
 from bufgym.oracle.interruption import evenly_kept
+from bufgym.oracle.kept import Found, kept
 from bufgym.oracle.programme import NEVER, Messages
 from bufgym.policies.registry import built_in
 from bufgym.scenario import Episode
 
+LONG = 1 << 16  # Messages from which on an episode is worked on in pieces
 _SHORT = 2_000  # messages of an episode whose plan takes a fraction of a second on any link
+_QUICK = 200  # messages of unequal sizes whose plan takes less
 
 
 @dataclass(frozen=True)
@@ -37,28 +40,36 @@ class Plan:
 def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | None = None) -> Plan:
     """The best plan for one episode under L = ``capacity`` messages and B = ``max_bytes`` bytes.
 
-    Exact for equal sizes where every arrival asks for a decision; an upper bound otherwise (see ``Plan.certified``).
+    Exact for equal sizes where every arrival asks for a decision, up to ``LONG`` messages; an upper bound otherwise
+    (see ``Plan.certified``). Plans that take long are kept on disk (see ``kept``).
     """
     check_limits(capacity, max_bytes)
     episode.check_one_queue()
-    if len(episode.arrivals) < _SHORT:
-        return _plan(episode, capacity, v, max_bytes)
-    return interruptible(lambda: _plan(episode, capacity, v, max_bytes))
-
-
-def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> Plan:
-    """Compute the plan for ``clairvoyant``."""
     arrivals = np.asarray(episode.arrivals)
     n = len(arrivals)
-    capacity = min(capacity, n)
     c = episode.link.carried_by(arrivals["arrival_us"])
     size, x = np.ascontiguousarray(arrivals["size_bytes"]), np.ascontiguousarray(arrivals["x"])
     most_bytes = UNLIMITED_BYTES if max_bytes is None else max_bytes
-    ends = episode.link.carries_bytes
+    stream = c, size, x, episode.link.carries_bytes
+    asked = slice(episode.first_decision, episode.last_decision + 1)
+
+    def find() -> Found:
+        return _plan(*stream, asked, min(capacity, n), most_bytes, v)
+
+    if n < _QUICK or (n < _SHORT and (size == size[0]).all()):
+        return Plan(*find())
+    inputs = *stream, asked, min(capacity, n), most_bytes, v.array
+    return Plan(*kept(inputs, n, lambda: interruptible(find)))
+
+
+def _plan(c: Ints, size: Ints, x: Floats, ends: int, asked: slice, capacity: int, most_bytes: int, v: Value) -> Found:
+    """Compute the plan for ``clairvoyant``; messages of ``asked`` ask for a decision."""
+    n = len(c)
     if (size == size[0]).all():
         room = min(capacity, most_bytes // int(size[0]))
         limit = np.full(n, room * size[0] if room else NEVER)
-        sent, gain = labels.best(Messages(c, size, limit, x, v.array, ends))
+        messages = Messages(c, size, limit, x, v.array, ends)
+        sent, gain = labels.best(messages) if n < LONG else pieces.best(messages, limit, capacity, most_bytes)
     elif _fits(c, size, capacity, most_bytes, ends, np.empty(n, np.int64)):
         sent, gain = np.arange(n), v.information(x) - 1.0  # V is concave, so no plan beats sending all messages
     else:
@@ -66,16 +77,17 @@ def _plan(episode: Episode, capacity: int, v: Value, max_bytes: int | None) -> P
         _relaxed_limits(c, size, capacity, most_bytes, np.empty(n, np.int64), np.empty(capacity, np.int64), limit)
         # While no more bytes wait than in the L smallest messages, fewer than L messages wait.
         certain = np.minimum(np.minimum(limit, np.sort(size)[:capacity].sum()), most_bytes - size)
-        sent, gain = unequal.best(Messages(c, size, limit, x, v.array, ends), certain, capacity, most_bytes)
-    kept = np.zeros(n, np.bool_)
-    kept[sent] = True
+        find = unequal.best if n < LONG else pieces.best
+        sent, gain = find(Messages(c, size, limit, x, v.array, ends), certain, capacity, most_bytes)
+    plan = np.zeros(n, np.bool_)
+    plan[sent] = True
     qoi = 1.0 + gain if len(sent) else 0.0
     reached = v.information(x[sent]) >= qoi - 1e-9
     fits = bool(_fits(c[sent], size[sent], capacity, most_bytes, ends, np.empty(len(sent), np.int64)))
     # Arrivals without a decision are accepted if there is room.
-    undecided = ~kept
-    undecided[episode.first_decision : episode.last_decision + 1] = False
-    return Plan(qoi, kept, reached and fits and not undecided.any())
+    undecided = ~plan
+    undecided[asked] = False
+    return qoi, plan, bool(reached and fits and not undecided.any())
 
 
 @kernel

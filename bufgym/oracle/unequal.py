@@ -25,7 +25,7 @@ def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tu
 
     ``certain``, int64[messages], is explained at ``new_problem``.
     """
-    messages = without_idle(messages)
+    messages = without_idle(messages, math.lcm(messages.grid(GRID), messages.grid(FINE_GRID)))
     n = len(messages.c)
     byte_limit = max_bytes < UNLIMITED_BYTES
     rooms = np.array([[capacity], [max_bytes if byte_limit else 0]], np.float64)
@@ -38,7 +38,7 @@ def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tu
     p = new_problem(messages, certain, GRID)
     states = beam.new_states(n, WIDTH)
     for _ in range(ROUNDS):
-        room = _priced(p, prices, capacity, max_bytes)
+        room = priced(p, prices, capacity, max_bytes)
         length, gain = beam.search(p, room, states, work)
         if gain > plan_gain or not len(plan):
             plan, plan_gain = work[:length][::-1].copy(), gain
@@ -59,7 +59,7 @@ def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tu
             break
         prices = np.maximum(0.0, prices + step * (total - plan_gain) / squares * slope * scale)
     p = new_problem(messages, certain, FINE_GRID)
-    room = _priced(p, kept_prices, capacity, max_bytes)
+    room = priced(p, kept_prices, capacity, max_bytes)
     length, gain = beam.search(p, room, beam.new_states(n, LAST_WIDTH), work)
     if gain > plan_gain:
         plan, plan_gain = work[:length][::-1].copy(), gain
@@ -67,14 +67,13 @@ def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tu
     return plan, max(plan_gain, min(bound, gain + float((rooms * kept_prices).sum())))
 
 
-def without_idle(messages: Messages) -> Messages:
-    """Shorten the stretches of link, by whole steps of both grids, that no message reaches.
+def without_idle(messages: Messages, step: int) -> Messages:
+    """Shorten the stretches of link, by whole ``step`` bytes, that no message reaches.
 
     On a fast link they are nearly all of it, and work space grows with the link's bytes. Nothing else changes: all
     rules compare bytes within the reach of one message.
     """
     c, ends = messages.c, messages.ends
-    step = math.lcm(messages.grid(GRID), messages.grid(FINE_GRID))
     spare = np.diff(c, prepend=0) - messages.reach - int(messages.size.max())
     shorter = np.cumsum(np.maximum(0, spare) // step * step)
     before = int(np.searchsorted(c, ends, side="right"))  # messages that arrive while the link still carries bytes
@@ -83,7 +82,7 @@ def without_idle(messages: Messages) -> Messages:
     return messages._replace(c=short, ends=min(until, int(short[before])) if before < len(c) else until)
 
 
-def _priced(p: Problem, prices: Floats, capacity: int, max_bytes: int) -> Room:
+def priced(p: Problem, prices: Floats, capacity: int, max_bytes: int) -> Room:
     """Make room at these prices [2, messages], and fill the programme's ``future`` under them."""
     before = np.concatenate([np.zeros((2, 1)), np.cumsum(prices, axis=1)], axis=1)
     positions = np.arange(int(p.c[-1]) // p.grid + p.future.shape[1] + 1) * p.grid

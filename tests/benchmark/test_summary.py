@@ -23,6 +23,8 @@ from bufgym.benchmark.table import score
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.stress import ratios
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import closure as closures
+from bufgym.policies import target_gap
 from bufgym.robot.margins import margins
 from bufgym.robot.runs import LiveRun
 from bufgym.scenario import Uplink, suites
@@ -188,6 +190,20 @@ def test_a_row_is_run_again(small: Sweep, tmp_path: Path, capsys: Any) -> None:
     entry = leaderboard.find(path, "small-v1/afr")
     again = leaderboard.validate(entry, jobs=1)
     assert replace(again, rank=entry.rank) == entry  # the very same numbers, in smaller company
+
+
+def test_a_row_whose_policy_changed_is_stale(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A constant that target-gap reads is planted: its row is named, in each suite; AFR's, which reads none, is not."""
+    known = {
+        f"{suite}/{policy}": Entry(suite, policy, 1, 1, {}, "0", leaderboard.made_of(policy))
+        for suite, policy in (("lte-v1", "target-gap"), ("outage-v1", "target-gap"), ("lte-v1", "afr"))
+    }
+    known["lte-v1/old"] = Entry("lte-v1", "min-gap", 1, 1, {}, "0")  # it does not say
+    assert leaderboard.stale(known) == []
+    closures._of_one.cache_clear()
+    monkeypatch.setattr(target_gap, "SHORT_QUEUE", target_gap.SHORT_QUEUE + 1)
+    assert leaderboard.stale(known) == ["lte-v1/target-gap", "outage-v1/target-gap"]
+    closures._of_one.cache_clear()
 
 
 def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:

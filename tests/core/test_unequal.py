@@ -50,7 +50,7 @@ def test_the_best_plan_under_prices_is_that_of_a_search(messages, ends, v):
                 found.append(gain - cost(j, begin) + best(j, begin + size[j]))
         return max(found)
 
-    room = unequal._priced(p, prices, 1, 1)
+    room = unequal.priced(p, prices, 1, 1)
     message, begin, queued = np.empty(len(c), np.int64), np.empty(len(c), np.int64), np.empty((2, len(c)))
     length, total = unequal.follow(p, room, message, begin)
     assert total == pytest.approx(best(-1, 0), abs=1e-12)
@@ -113,7 +113,7 @@ def test_nothing_is_lost_by_looking_only_at_successors_that_can_still_be_best(se
     c, x = np.cumsum(rng.integers(0, 25, n)), np.cumsum(rng.choice([0.0, 0.125, 0.5, 2.0], n))
     sent = Messages(c, size, limit, x, v.array, int(c[-1]) + 80)
     p = new_problem(sent, np.full(n, -(10**6)), int(size.mean()) // grid + 1)
-    room = unequal._priced(p, rng.choice([0.0, 0.0, 0.02, 0.2], (2, n)) * [[1.0], [0.02]], n, 10**6)
+    room = unequal.priced(p, rng.choice([0.0, 0.0, 0.02, 0.2], (2, n)) * [[1.0], [0.02]], n, 10**6)
     for i in np.flatnonzero((limit >= 0) & (c + size <= p.ends)):
         for step in range((c[i] + size[i]) // p.grid, min(c[i] + limit[i] + size[i], p.ends) // p.grid + 1):
             assert p.future[i, step - c[i] // p.grid] == pytest.approx(every_successor(p, room, i, step), abs=1e-12)
@@ -128,7 +128,7 @@ def test_leaving_messages_out_while_the_link_is_idle_is_never_worth_it(seed, v):
     totals = []
     for certain in (limit, np.full(n, -(10**6))):
         p = new_problem(Messages(c, size, limit, x, v.array, int(c[-1]) + 30), certain, 10**6)
-        room = unequal._priced(p, np.zeros((2, n)), n, 10**6)
+        room = unequal.priced(p, np.zeros((2, n)), n, 10**6)
         totals.append(unequal.follow(p, room, np.empty(n, np.int64), np.empty(n, np.int64))[1])
     assert totals[0] == pytest.approx(totals[1], abs=1e-12)
 
@@ -138,12 +138,12 @@ def test_a_fast_link_costs_no_work_where_no_message_reaches():
     size, limit, x = np.random.default_rng(7).integers(100, 900, 30), np.full(30, 2_000), np.arange(30) / 4
     c = np.repeat([500, 10**8, 2 * 10**8], 10) + np.tile(np.arange(10) * 90, 3)
     sent = Messages(c, size, limit, x, qoi.exponential(0.5).array, 10**8 + 5_000)
-    short, *_, ends = unequal.without_idle(sent)
+    short, *_, ends = unequal.without_idle(sent, 96)
     assert (np.diff(short)[[9, 19]] < 4_000).all() and (np.diff(short)[:9] == 90).all()
     assert short[0] == 500 and ends - short[10] in (5_000, short[20] - short[10])
     plan, bound = unequal.best(sent, np.full(30, 100), 3, UNLIMITED_BYTES)
     assert 0 < len(plan) < 20 and plan.max() < 20
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(unequal, "without_idle", lambda messages: messages)
+        patch.setattr(unequal, "without_idle", lambda messages, step: messages)
         again, same = unequal.best(sent, np.full(30, 100), 3, UNLIMITED_BYTES)
     assert again.tolist() == plan.tolist() and same == bound
