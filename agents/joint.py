@@ -97,8 +97,8 @@ seeds. Seeds that lie more than 0.02 above the rule on a family were left out.
   chains' end, the price's threshold and discount, and the share of `price-dp` (`OUTPUTS`). They are linear in the
   inputs, by one set of weights under a light load and by another under a heavy one.
 - *Keeps the plain rule* on a measured steady link, and until the link has carried anything: outputs learned on other
-  links made steady ones worse by 0.10. So in interruptions it is the rule. It also is in bursts, where the target gap is
-  unknown, unless the queue has one place.
+  links made steady ones worse by 0.10. So in interruptions it is the rule. It also is in bursts, where the target gap
+  is unknown, unless the queue has one place.
 - *Falls short* of a rule, by the intervals below: {short}.
 - *Trained* on twelve families of links and streams at once, by CMA-ES from zero weights, which are the rule. A search
   takes five minutes of one core, the bounds of the families another twelve at first.

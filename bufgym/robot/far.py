@@ -35,16 +35,17 @@ def play(
     capacity: int,
     value: Value,
     *,
+    small: bool = True,
     speed: float = 1.0,
     **settings: Any,
 ) -> list[Received]:
-    """Play the episode; return the messages received. ``settings`` as for ``validate.send``."""
+    """Play the episode; return the messages received. ``small`` and ``settings`` as for ``validate.play``."""
     programs.check_speed(speed)
     warm(PolicyQueue(policy, capacity, value=value, window=episode.window))
     with programs.running(
         link=partial(tunnel.carry, episode.link),
         receiver=partial(_receive, tunnel, transport, port),
-        sender=partial(_send, tunnel, transport, partial(send, policy, episode, capacity, value, **settings)),
+        sender=partial(_send, tunnel, transport, small, partial(send, policy, episode, capacity, value, **settings)),
     ) as workers:
         return asyncio.run(_play(workers))
 
@@ -76,9 +77,9 @@ def _receive(tunnel: Tunnel, transport: str, port: int, parent: Connection) -> N
     parent.recv()
 
 
-def _send(tunnel: Tunnel, transport: str, sending: Callable[..., Any], parent: Connection) -> None:
+def _send(tunnel: Tunnel, transport: str, small: bool, sending: Callable[..., Any], parent: Connection) -> None:
     tunnel.near.enter()
-    connect = partial(TRANSPORTS[transport], tunnel.far.address, parent.recv())
+    connect = partial(TRANSPORTS[transport], tunnel.far.address, parent.recv(), small=small)
 
     async def begin() -> float:
         parent.send("connected")

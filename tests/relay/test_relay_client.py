@@ -172,6 +172,29 @@ async def test_a_message_is_on_its_way_until_the_relay_answers_the_ping_behind_i
 
 
 @compiled
+async def test_the_next_message_goes_when_the_system_wants_more(corner: Corner) -> None:
+    """Without a window no PONG is awaited; messages whose PONG has not come would be sent again after a break."""
+    came: list[int] = []
+    topic = corner.topic("camera")
+    robot = RobotClient(corner.url, "a", topics=(Topic(topic),), policy="drop-newest", capacity=8)
+    viewer = Session(corner.url, "v")
+    viewer.subscribe(f"^{topic}$", lambda message: came.append(message.seq))
+
+    async def ping() -> asyncio.Future[float]:
+        return asyncio.get_running_loop().create_future()  # never answered
+
+    async with within("messages"), beside(viewer.run(), robot.run()):
+        await viewer.ready.wait()
+        await robot.ready.wait()
+        robot._connection.ping = ping
+        for _ in range(4):
+            robot.publish(topic, b"1")
+        await until("all to arrive", lambda: came == [1, 2, 3, 4])
+        await until("an empty socket", lambda: robot.queue.in_flight == 0)
+        assert len(robot._away) == 4
+
+
+@compiled
 async def test_another_relay_stands_in_while_home_is_away(tmp_path: Path) -> None:
     """Pictures and ordinary subscriptions go over it. Commands wait for home, and arrive there once."""
     ours, camera, command = (

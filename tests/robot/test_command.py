@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -27,7 +29,7 @@ FAST = ["--size", "1000", "--rate", "300", "--duration", "0.1", "--capacity", "6
 def receiver(capsys: pytest.CaptureFixture[str], *words: str) -> Iterator[str]:
     """Where ``bufgym live receive`` listens, in a thread, for 30 messages."""
     port = str(free_port("127.0.0.1"))
-    arguments = ["live", "receive", "--port", port, "--messages", "30", *words]
+    arguments = ["live", "receive", f"127.0.0.1:{port}", "--messages", "30", *words]
     thread = threading.Thread(target=main, args=(arguments,), daemon=True)
     thread.start()
     while "listening" not in capsys.readouterr().out:
@@ -53,6 +55,18 @@ def test_send_shows_what_the_queue_does(capsys: pytest.CaptureFixture[str]) -> N
         assert main(["live", "send", place, *FAST, "--view"]) == 0
     out = capsys.readouterr().out
     assert out.count("afr, L = 64") == 2 and "left         30" in out
+
+
+def test_send_to_nobody_says_so() -> None:
+    """And why, every second; at the end it waits for a receiver until it is stopped."""
+    place = f"127.0.0.1:{free_port('127.0.0.1')}"
+    code = f"from bufgym.cli import main; main(['live', 'send', '{place}', '--size', '10', '--duration', '0.5'])"
+    with subprocess.Popen([sys.executable, "-uc", code], stdout=subprocess.PIPE, text=True) as sending:
+        assert sending.stdout is not None
+        told = [sending.stdout.readline(), sending.stdout.readline()]
+        sending.kill()
+    assert told[0].startswith("   0 s: 1 put") and told[0].endswith(f"nobody answers at {place}\n")
+    assert told[1].startswith("9 messages wait for the receiver") and "ConnectionRefusedError" in told[1]
 
 
 def test_validate_keeps_its_runs(tmp_path: Path) -> None:
