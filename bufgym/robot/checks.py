@@ -70,17 +70,17 @@ def validate(
         f"{duration:g} s, {size} bytes at 30 Hz, L = {capacity}, V = {scenario.value.name}, round trip {rtt:g} ms, "
         f"over {', '.join(transport)} and in the simulator"
     )
-    print(f"{about}\n")
+    played = [get(name) for name in names]
     with contextlib.ExitStack() as stack:
         tunnel = stack.enter_context(tunnels.opened()) if rtt and not tunnels.impossible() else None
+        plays: dict[str, Play] = {name: _play_over(name, tunnel) for name in transport}
+        print(f"{about}\n")
         if rtt and tunnel is None:
             print(
                 f"note: {tunnels.impossible()}. Instead a proxy delays all bytes. It ends TCP, so it cannot show what"
             )
             print("TCP's own acks and its growing window cost over the round trip.\n")
-        plays: dict[str, Play] = {name: _play_over(name, tunnel) for name in transport}
-        policies_of = [get(name) for name in names]
-        runs = sockets.validate(policies_of, scenario, capacity, seeds=seeds, plays=plays, speed=speed)
+        runs = sockets.validate(played, scenario, capacity, seeds=seeds, plays=plays, speed=speed)
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if out is not None:
         again = command_line(
