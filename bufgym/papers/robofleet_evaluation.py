@@ -30,7 +30,7 @@ BYTES = {
     "PoseStamped": (75, 240, 281),
 }
 """Bytes as ROS binary, Robofleet flatbuffer and JSON, from the paper's Table I. PoseStamped is not in it and comes from
-robofleet-table1 with ``ros1``, ``robofleet`` and ``json-numbers``, the JSON of the paper's images."""
+the study robofleet-table1 with ``ros1``, ``robofleet`` and ``json-numbers``, the JSON of the paper's images."""
 _CLOUD_EXTRA = (111, 344)
 _CLOUD_JSON = 562_376 / POINTS
 """Bytes of a PointCloud2 besides its points, and its JSON bytes per point, both from robofleet-table1."""
