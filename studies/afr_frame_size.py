@@ -20,7 +20,7 @@ from bufgym import policies, sim
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.table import aligned
-from bufgym.papers.afr_evaluation import LinkFigure
+from bufgym.papers.afr_fig6 import LinkFigure
 from bufgym.papers.figure import COLOURS, finish
 from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario import Uplink

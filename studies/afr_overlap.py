@@ -5,7 +5,7 @@ See docs/methods.md, "The assumptions on V, on real frames".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,6 @@ from bufgym.benchmark.rows import Row
 from bufgym.papers.afr_theorems import gaps_of
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import FrameFigure
-from bufgym.papers.perception.views import overlap_information
 from bufgym.papers.rows import FigureRows
 
 NOISE = 0.05  # Violation of a rule that still counts as keeping it, because depth has noise and edges
@@ -158,3 +157,11 @@ def best_gain(v: NDArray[np.float64], L: int) -> float:
     for _ in range(L):
         reached = np.maximum(reached, (reached[:, None] + step).max(axis=0))
     return float(reached[-1])
+
+
+def overlap_information(seen: NDArray[np.float32], frames: Iterable[int]) -> float:
+    """H of these frames by the measured V, 1 + the sum of V(before, frame) in order; 0 without frames."""
+    kept = np.fromiter(frames, np.int64)
+    if not len(kept):
+        return 0.0
+    return 1.0 + float((1.0 - seen[kept[:-1], kept[1:]].astype(np.float64)).sum())

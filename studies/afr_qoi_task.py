@@ -20,8 +20,11 @@ from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.table import NONE, aligned
 from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure, spearman
+from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure, FrameRun, spearman
+from bufgym.papers.perception import views
 from bufgym.papers.rows import FigureRows, listed
+from bufgym.scenario.suites import motion_value, time_value
+from studies.afr_overlap import overlap_information
 
 MEASURES = {
     "H_time": "time",
@@ -47,10 +50,24 @@ class Reproduction(FrameFigure):
 
     @cached_property
     def runs(self) -> FigureRows:
-        return self.play("map", "track")
+        """The runs of Fig. 7 and 8, each with its information by each measure."""
+        played = zip(self.settings(), self.play("map", "track"), strict=True)
+        return FigureRows(row | self.information(setting) for setting, row in played)
+
+    def information(self, setting: FrameRun) -> Row:
+        """Compute H of the run's frames by time, motion and measured overlap, and their coverage of the scene."""
+        kept, on = self.kept(setting), self.stage(setting.recording)
+        x = on.episode(self.link, 0).arrivals["x"][list(kept)]
+        return {
+            "H_time": time_value().information(np.array(kept, np.float64)),
+            "H_motion": motion_value().information(x),
+            "H_overlap": overlap_information(on.seen, kept),
+            "least_overlap": views.least_overlap(on.seen, kept),
+            "coverage": on.coverage.share(kept),
+        }
 
     def simulate(self) -> FigureRows:
-        """Return a row for each recording, measure and task; the runs themselves are saved with Fig. 7 and 8."""
+        """Return a row for each recording, measure and task."""
         rows = FigureRows()
         for recording in self.recordings:
             shown = self.runs.where(recording=recording)

@@ -68,6 +68,12 @@ def test_the_best_frames_in_hindsight_and_rules_at_a_distance() -> None:
     assert afr_overlap._rules(v, np.arange(4.0), 2) is None  # 4 frames on is beyond the end
 
 
+def test_information_by_overlap_is_what_is_new() -> None:
+    """A quarter of frame 1 is new after frame 0, a quarter of frame 2 after frame 1, and nothing of it after 0."""
+    seen = np.array([[1, 0.75, 1], [0, 1, 0.75], [0, 0, 1]], np.float32)
+    assert [afr_overlap.overlap_information(seen, kept) for kept in ([], [1], [0, 1, 2], [0, 2])] == [0, 1, 1.5, 1]
+
+
 def test_a_correlation_draws_whole_groups() -> None:
     """Within each group b falls with a; whichever groups are drawn, it is -1."""
     a, group = np.array([1.0, 2, 1, 2, 1, 2]), np.repeat([0, 1, 2], 2)

@@ -2,9 +2,8 @@
 
 ``run("afr-fig5", Path("out"))`` returns a text with our numbers beside the paper's, and saves a CSV and a PNG under
 ``out``. Each figure is one module with a class ``Reproduction``, imported only when the figure is asked for. Most
-numbers need bufgym alone. The figure robofleet-table1 needs the extra ``robofleet``, and the figures on frames need
-``perception`` and ``bench``. Pictures need ``bufgym[plot]``. Keys in brackets, such as [wang2022afr], refer to
-docs/references.bib.
+numbers need bufgym alone. The figures on frames need the extras ``perception`` and ``bench``. Pictures need
+``bufgym[plot]``. Keys in brackets, such as [wang2022afr], refer to docs/references.bib.
 """
 
 from __future__ import annotations

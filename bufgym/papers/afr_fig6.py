@@ -1,4 +1,4 @@
-"""Fig. 6 of the AFR paper: bandwidth of the Belgium 4G log car_0002 against the camera's demand.
+"""Fig. 6 of the AFR paper: bandwidth of the 4G log car_0002 [vanderhooft2016http2] against the camera's demand.
 
 Samples are numbered from 0, as the paper counts seconds. The paper's "about 15 MB/s" describes 4G in general. It is no
 claim about this trace.
@@ -7,17 +7,51 @@ claim about this trace.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bufgym.papers.afr_evaluation import LinkFigure
-from bufgym.papers.figure import COLOURS, finish, legend_below
+from bufgym import traces
+from bufgym.ground.errors import BufgymError
+from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
 from bufgym.papers.rows import FigureRows, listed
-from bufgym.scenario.suites import RATE_HZ
+from bufgym.scenario.afr_evaluation import FRAME_BYTES, LINK, PAPER_FRAMES, RATE_HZ
+from bufgym.traces import Trace
 
 PAPER_LOW = [21, 23]  # Seconds under 500 KB/s according to the paper, counted from 0
 LOW = 500e3  # Bytes/s
+
+
+@dataclass(frozen=True)
+class LinkFigure(Figure):
+    """A figure in which ``frames`` frames of ``size_bytes`` are sent over the link."""
+
+    data: Path | None = None  # folder of recordings, with belgium_4g/csv/report_car_0002.csv
+    trace: str | None = None  # trace to use in place of car_0002: a shipped name or a file
+    frames: int = PAPER_FRAMES
+    size_bytes: int = FRAME_BYTES
+
+    RULES = {"frames": whole(2)}
+
+    @cached_property
+    def link(self) -> Trace:
+        if self.trace is not None:
+            return traces.load(self.trace)
+        if self.data is None:
+            raise BufgymError(f"the AFR paper's evaluation needs a folder of recordings (--data DIR) with {LINK}")
+        if not (self.data / LINK).is_file():
+            raise BufgymError(f"{self.data / LINK}: no such file; the AFR paper's evaluation needs it")
+        return traces.read_trace(self.data / LINK)
+
+    @property
+    def streamed(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Lengths in us and rates in bytes/s of the link samples that begin while frames arrive."""
+        lengths_us, rates = self.link.samples()
+        during = np.cumsum(lengths_us) - lengths_us < self.frames / RATE_HZ * 1e6
+        return lengths_us[during], rates[during]
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.papers.figure import about, heat_table, of_all, within
-from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun, spearman
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, FrameRun, over_places, spearman
 from bufgym.papers.perception import mapping
 from bufgym.papers.rows import FigureRows
 
@@ -31,17 +31,10 @@ SLICE = 30_000  # Number of points drawn of a map
 
 def change(rows: FigureRows, column: str, policy: str, other: str) -> Interval:
     """Divide the column's mean under ``policy`` by its mean under ``other`` and subtract 1."""
-    ours, theirs = ([rows.mean(column, k=k, policy=name) for k in rows.distinct("k")] for name in (policy, other))
-    return _quotient(ours, theirs, f"{column} {policy} {other}")
-
-
-def _quotient(above: list[float], below: list[float], label: str) -> Interval:
-    """Divide the means of numbers by offset and subtract 1.
-
-    The interval comes from a paired bootstrap over offsets: a drawn offset brings all its runs of both.
-    """
-    weights = times_drawn(len(above), RESAMPLES, stream(0, label))
-    return percentile_interval((weights @ above) / (weights @ below) - 1)
+    ours, theirs = (
+        np.array([rows.mean(column, k=k, policy=name) for k in rows.distinct("k")]) for name in (policy, other)
+    )
+    return over_places(ours - theirs, f"{column} {policy} {other}", theirs)
 
 
 def spelled(interval: Interval) -> str:
@@ -97,8 +90,8 @@ class Reproduction(FrameFigure):
     def by_size(self, rows: FigureRows) -> Interval:
         """The mean error at the largest L relative to that at the smallest, less 1, over the places of the fade."""
         sizes = (max(self.capacities), min(self.capacities))
-        large, small = ([rows.mean(ONE_WAY, k=k, L=L) for k in rows.distinct("k")] for L in sizes)
-        return _quotient(large, small, "sizes")
+        large, small = (np.array([rows.mean(ONE_WAY, k=k, L=L) for k in rows.distinct("k")]) for L in sizes)
+        return over_places(large - small, "sizes", small)
 
     def where_it_moves(self, rows: FigureRows) -> str:
         """Correlate camera motion in Drop Oldest's longest gap with AFR's change of the error, over the offsets."""

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
+from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.table import aligned
 from bufgym.papers.figure import about, finish, heat_table, of_all, within
-from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure
+from bufgym.papers.frame_runs import POLICIES, FrameFigure, over_places
 from bufgym.papers.perception.stage import IMAGES
 from bufgym.papers.rows import FigureRows
 
@@ -104,11 +104,8 @@ class Reproduction(FrameFigure):
     def by_size(self, rows: FigureRows, small: int, large: int) -> Interval:
         """Share of runs that fail at the largest L less that at the smallest, over the places of the fade."""
         runs = len(self.recordings)
-        changes = np.array(
-            [(failures(rows, k=k, L=large) - failures(rows, k=k, L=small)) / runs for k in rows.distinct("k")]
-        )
-        drawn = times_drawn(len(changes), RESAMPLES, stream(0, "sizes"))
-        return percentile_interval(drawn @ changes / len(changes))
+        fails = [[failures(rows, k=k, L=L) for L in (large, small)] for k in rows.distinct("k")]
+        return over_places([(with_large - with_small) / runs for with_large, with_small in fails], "sizes")
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:
         return 13.0, (0.4 + 1.7 * math.ceil(len(self.policies) / COLUMNS)) * len(self.recordings)
@@ -153,9 +150,7 @@ class Reproduction(FrameFigure):
 
 def rate(rows: FigureRows) -> Interval:
     """Share of the runs that fail; the interval draws offsets of the fade, each with all its runs."""
-    shares = np.array([failures(rows, k=k) / len(rows.where(k=k)) for k in rows.distinct("k")])
-    drawn = times_drawn(len(shares), RESAMPLES, stream(0, "failures"))
-    return percentile_interval(drawn @ shares / len(shares))
+    return over_places([failures(rows, k=k) / len(rows.where(k=k)) for k in rows.distinct("k")], "failures")
 
 
 def failures(rows: FigureRows, **where: object) -> int:

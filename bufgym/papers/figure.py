@@ -39,6 +39,9 @@ COLOURS = {
 }
 """Colour of each policy in every figure, from Okabe and Ito's palette for colour-blind readers."""
 
+PAPERS = {"afr": "AFR [wang2022afr]", "robofleet": "Robofleet [sikand2021robofleet]"}
+"""Prefix of a figure's name -> its paper with the key in references.bib; a TOML file of that name has the sentences."""
+
 UNDECIDED = "undecided"
 VERDICTS = {True: "holds", False: "DIFFERS", None: "not tested here", UNDECIDED: UNDECIDED}
 WIDTH = 120  # Width of the printed text in letters
@@ -122,7 +125,7 @@ def statements() -> dict[str, dict[str, Any]]:
     ``package`` says where the figure's module is: a checkout has more of them in its folder ``studies``.
     """
     here, texts = Path(__file__).parent, dict[str, dict[str, Any]]()
-    for file in (here / "afr.toml", here.parents[1] / "studies" / "afr.toml", here / "robofleet.toml"):
+    for file in (folder / f"{paper}.toml" for paper in PAPERS for folder in (here, here.parents[1] / "studies")):
         if file.exists():
             package = __package__ if file.parent == here else file.parent.name
             texts |= {name: {"package": package, **told} for name, told in read_toml(file).items()}

@@ -19,15 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import traces
+from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
 from bufgym.benchmark.rows import Row
 from bufgym.ground.libraries import library
 from bufgym.papers.figure import COLOURS, Figure, whole
 from bufgym.papers.frame_tasks import FOLDERS, FrameTask, Kind, carry_out, stage
-from bufgym.papers.perception import streams, views
+from bufgym.papers.perception import streams
 from bufgym.papers.perception.stage import IMAGES, OFFSETS, Stage
 from bufgym.papers.rows import FigureRows
 from bufgym.scenario.afr_evaluation import LINK, PAPER_FRAMES, fade
-from bufgym.scenario.suites import CAPACITIES, motion_value, time_value
+from bufgym.scenario.suites import CAPACITIES
 from bufgym.traces import Trace
 
 RECORDINGS = {"room": "a made-up room", "7-scenes": "7-Scenes, Kinect", "tum": "TUM RGB-D freiburg1_desk, Kinect"}
@@ -119,27 +120,15 @@ class FrameFigure(Figure):
         return cast(tuple[int, ...], row["kept"])
 
     def play(self, *kinds: Kind) -> FigureRows:
-        """Return a row for each run: its frame count, its information by each V and its results of these tasks."""
+        """Return a row for each run: its frame count and its results of these tasks."""
         settings = self.settings()
         self.done(*(self.task("kept", setting) for setting in settings))
         parts = [self.done(*(self.task(kind, setting) for setting in settings)) for kind in kinds]
         rows = FigureRows()
         for setting, *found in zip(settings, *parts, strict=True):
-            row: Row = setting._asdict() | {"received": len(self.kept(setting))} | self.information(setting)
+            row: Row = setting._asdict() | {"received": len(self.kept(setting))}
             rows.append(functools.reduce(operator.or_, found, row))
         return rows
-
-    def information(self, setting: FrameRun) -> Row:
-        """Compute H of the run's frames by time, motion and measured overlap, and their coverage of the scene."""
-        kept, on = self.kept(setting), self.stage(setting.recording)
-        x = on.episode(self.link, 0).arrivals["x"][list(kept)]
-        return {
-            "H_time": time_value().information(np.array(kept, np.float64)),
-            "H_motion": motion_value().information(x),
-            "H_overlap": views.overlap_information(on.seen, kept),
-            "least_overlap": views.least_overlap(on.seen, kept),
-            "coverage": on.coverage.share(kept),
-        }
 
     @property
     def about(self) -> str:
@@ -153,6 +142,17 @@ class FrameFigure(Figure):
             link = f"of which the link {self.link.name} carries {carried:.0%}"
             parts.append(f"{recording}: {RECORDINGS[recording]}, {frames}, {link}.")
         return "\n\n".join(parts)
+
+
+def over_places(
+    numbers: Sequence[float] | NDArray[np.float64], label: str, units: float | NDArray[np.float64] = 1.0
+) -> Interval:
+    """Divide the sum of the numbers, one of each place of the fade, by that of their units: by default their mean.
+
+    The interval comes from a paired bootstrap over places: a drawn one brings all its runs.
+    """
+    drawn = times_drawn(len(numbers), RESAMPLES, stream(0, label))
+    return percentile_interval(drawn @ np.asarray(numbers) / (drawn * units).sum(axis=1))
 
 
 def spearman(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

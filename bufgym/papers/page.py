@@ -12,10 +12,7 @@ from typing import Any
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers import FIGURES, TAKES_DATA, figure
-from bufgym.papers.figure import UNDECIDED, facts_of, source, statements
-
-PAPERS = {"afr": "AFR [wang2022afr]", "robofleet": "Robofleet [sikand2021robofleet]"}
-"""Prefix of a section's name -> the paper with its key in references.bib."""
+from bufgym.papers.figure import PAPERS, UNDECIDED, facts_of, source, statements
 
 VERDICTS = {True: "holds", False: "**differs**", None: "not checked", UNDECIDED: UNDECIDED}
 

@@ -30,7 +30,7 @@ BYTES = {
     "PoseStamped": (75, 240, 281),
 }
 """Bytes as ROS binary, Robofleet flatbuffer and JSON, from the paper's Table I. PoseStamped is not in it and comes from
-robofleet-table1 with ``ros1``, ``robofleet`` and ``json-numbers``, the JSON of the paper's images."""
+the study robofleet-table1 with ``ros1``, ``robofleet`` and ``json-numbers``, the JSON of the paper's images."""
 _CLOUD_EXTRA = (111, 344)
 _CLOUD_JSON = 562_376 / POINTS
 """Bytes of a PointCloud2 besides its points, and its JSON bytes per point, both from robofleet-table1."""
@@ -40,6 +40,7 @@ ROUND_TRIP_MS = 10.0
 """Round trip, our choice. With n_T = 1 it limits throughput to one message per transmission plus round trip."""
 QUEUE_SIZE = 10  # Queue of a native ROS publisher in messages, our choice after ROS's own tutorials
 MBIT = 125_000  # Bytes/s in a Mbit/s
+Run = TypeVar("Run")
 
 
 @dataclass(frozen=True)
@@ -180,8 +181,15 @@ class ClientFigure(Figure):
 
     @functools.cached_property
     def played(self) -> dict[Any, Any]:
-        """Results of earlier runs; see ``played_once``."""
+        """Results of live runs."""
         return {}
+
+    def once(self, run: Callable[..., Run], *arguments: Any) -> Run:
+        """Do a run of the figure; a live one is done once, because it is slow and the picture needs it again."""
+        kept = self.played if self.live else {}
+        if arguments not in kept:
+            kept[arguments] = run(*arguments)
+        return cast(Run, kept[arguments])
 
     def send(
         self, name: str, streams: Sequence[Stream], link: Trace, duration_s: float, seed: int, **client: Any
@@ -192,22 +200,6 @@ class ClientFigure(Figure):
         for told in self.watchers:
             told(min(last_s, max(duration_s, client.get("watched_s", math.inf))))
         return sent
-
-
-Run = TypeVar("Run", bound=Callable[..., Any])
-
-
-def played_once(run: Run) -> Run:
-    """Keep the result of each live run of a figure, because it is slow and the picture needs it again."""
-
-    @functools.wraps(run)
-    def once(figure: ClientFigure, *arguments: Any) -> Any:
-        kept = figure.played if figure.live else {}
-        if arguments not in kept:
-            kept[arguments] = run(figure, *arguments)
-        return kept[arguments]
-
-    return cast(Run, once)
 
 
 @dataclass(frozen=True)

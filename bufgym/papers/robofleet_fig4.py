@@ -15,7 +15,7 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError
 from bufgym.papers.figure import COLOURS, UNDECIDED, about, at_least_0, finish, legend_below
-from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, SHORT, CloudFigure, Sent, played_once, stream
+from bufgym.papers.robofleet_evaluation import MBIT, PROGRAMS, SHORT, CloudFigure, Sent, stream
 from bufgym.papers.rows import FigureRows
 from bufgym.traces import Trace
 
@@ -51,7 +51,6 @@ class Reproduction(CloudFigure):
         if not self.kinds or isinstance(self.kinds, str) or not set(self.kinds) <= set(RATES_HZ):
             raise BufgymError(f"kinds = {self.kinds!r}: must be some of {', '.join(RATES_HZ)}")
 
-    @played_once
     def run(self, kind: str, mbit: float, dropout_s: float, name: str, seed: int) -> tuple[float, Sent]:
         """Play one dropout; return when the link goes away, and the messages' outcome."""
         away_s = BEFORE_S + float(np.random.default_rng(seed).random()) / RATES_HZ[kind]
@@ -66,7 +65,7 @@ class Reproduction(CloudFigure):
         for kind, mbit, dropout_s, seed, name in product(
             self.kinds, self.links_mbit_per_s, self.dropouts_s, range(self.runs), SENDERS
         ):
-            away_s, sent = self.run(kind, mbit, dropout_s, name, seed)
+            away_s, sent = self.once(self.run, kind, mbit, dropout_s, name, seed)
             key = {"message": kind, "link_mbit_per_s": mbit, "dropout_s": dropout_s, "run": seed, "sender": name}
             rows.append(key | {"recovery_s": recovery_s(sent, away_s, away_s + dropout_s, FACTOR)})
         return rows
@@ -112,7 +111,7 @@ class Reproduction(CloudFigure):
         shown_s = min(self.dropouts_s, key=lambda s: abs(s - 10))
         kind, mbit = self.kinds[0], max(self.links_mbit_per_s)
         for name in reversed(SENDERS):
-            away_s, sent = self.run(kind, mbit, shown_s, name, 0)
+            away_s, sent = self.once(self.run, kind, mbit, shown_s, name, 0)
             received, style = sent.received, PROGRAMS[name].style | {"markersize": 3, "linewidth": 0}
             at_s = received.received_s - away_s - shown_s
             near = np.abs(at_s) < shown_s + 3

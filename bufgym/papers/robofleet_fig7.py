@@ -18,18 +18,7 @@ import numpy as np
 
 from bufgym.benchmark.rows import Row
 from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.robofleet_evaluation import (
-    BYTES,
-    MBIT,
-    PROGRAMS,
-    QUEUE_SIZE,
-    SHORT,
-    ClientFigure,
-    Sent,
-    p95,
-    played_once,
-    stream,
-)
+from bufgym.papers.robofleet_evaluation import BYTES, MBIT, PROGRAMS, QUEUE_SIZE, SHORT, ClientFigure, Sent, p95, stream
 from bufgym.papers.rows import FigureRows
 from bufgym.traces import Trace
 
@@ -78,7 +67,6 @@ class Reproduction(ClientFigure):
         from_s = self.bad_from / COUNTED_HZ
         return from_s, from_s + self.bad_s
 
-    @played_once
     def run(self, bad: float, name: str, image_priority: float, seed: int) -> Sent:
         """Send the messages of one drive through the zone."""
         rates = ((self.zone_s[0], self.good_mbit_per_s), (self.bad_s, bad), (self.after_s, self.good_mbit_per_s))
@@ -93,7 +81,7 @@ class Reproduction(ClientFigure):
         cases += [(self.shown, "robofleet", priority) for priority in others]
         rows = FigureRows()
         for (bad, name, priority), seed in product(cases, range(self.runs)):
-            sent = self.run(bad, name, priority, seed)
+            sent = self.once(self.run, bad, name, priority, seed)
             key = {"bad_mbit_per_s": bad, "sender": name, "image_priority": priority, "run": seed}
             rows += [{**key, "topic": kind, **_entry(sent.on(k), self.zone_s)} for k, kind in enumerate(TOPICS)]
         return rows
@@ -145,7 +133,7 @@ class Reproduction(ClientFigure):
     def draw(self, rows: FigureRows, figure: Any) -> None:
         panels = figure.subplots(len(SENDERS), 1, sharex=True, sharey=True)
         for axes, name in zip(panels, SENDERS, strict=True):
-            sent = self.run(self.shown, name, self.image_priorities[0], 0)
+            sent = self.once(self.run, self.shown, name, self.image_priorities[0], 0)
             for k, (kind, (colour, marker, size)) in reversed(list(enumerate(LOOKS.items()))):
                 topic, label = sent.on(k), f"{kind}, {TOPICS[kind][0]:g} Hz"
                 style = {"color": colour, "markersize": size, "label": label}

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Final
 
 from websockets.asyncio.server import ServerConnection
@@ -30,6 +31,7 @@ class Caller:
         self.answers: deque[str] = deque()
         self.subscriptions: dict[str, Subscription] = {}
         self._verifier, self._listens = verifier, listens
+        self.told: Callable[[], None] = lambda: None  # called with each answer to come
 
     async def prove(self, token: str | None) -> Identity:
         """Learn who it is: by token, certificate, or address alone."""
@@ -59,6 +61,7 @@ class Caller:
         """Have this sent before any message."""
         if self._listens:
             self.answers.append(wire.say(op, **fields))
+            self.told()
 
     def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
         """Tell it of a refusal and the reason. Refusals of messages are audited elsewhere."""

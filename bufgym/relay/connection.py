@@ -35,7 +35,8 @@ class Connection:
         self.session, self.permissions, self.subscriptions = session, admitted.permissions, caller.subscriptions
         self._outbox = Outbox(caller, self, admitted.form, admitted.received)
         self._recordings = None if self._hub.config.folder is None else self._hub.config.folder / RECORDINGS
-        self.wake, self.sent = self._outbox.wake, 0
+        self.wake, self.tell, self.sent = self._outbox.wake, caller.tell, 0
+        caller.told = self._told
         self._ending: asyncio.Task[None] | None = None
 
     @staticmethod
@@ -96,7 +97,7 @@ class Connection:
         try:
             part = await asyncio.to_thread(replay.piece, self._recordings, *asked, may)
         except BufgymError as error:
-            self._refuse("replay", error, id=said["id"])
+            self._caller.refuse("replay", error, id=said["id"])
         else:
             self.tell("replayed", id=said["id"], **part)
 
@@ -116,7 +117,7 @@ class Connection:
             about = {"code": refused.code, "topic": message.topic, "session": self.session.name}
             first = hub.audit.repeated(what="publish", **about, address=who.address, email=who.email)
             if message.no_drop or first:
-                self._refuse("publish", refused, topic=message.topic, seq=message.seq)
+                self._caller.refuse("publish", refused, topic=message.topic, seq=message.seq)
 
     async def _hold(self, message: wire.Message) -> bool:
         """Hold a no_drop message; return whether it is held."""
@@ -143,7 +144,7 @@ class Connection:
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
             self._hub.subscribe(self, subscription)
         except BufgymError as error:
-            self._refuse("subscribe", error, id=said["id"])
+            self._caller.refuse("subscribe", error, id=said["id"])
             return
         self.tell("subscribed", id=subscription.id, policy=subscription.policy.name, capacity=subscription.capacity)
 
@@ -151,15 +152,6 @@ class Connection:
         """A message that its queues decide on."""
         subscription.offer(frame.message.topic, frame, frame.size_bytes)
         self._outbox.wake()
-
-    def tell(self, op: str, **fields: Any) -> None:
-        """Say this, before any message."""
-        self._caller.tell(op, **fields)
-        self._told()
-
-    def _refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
-        self._caller.refuse(what, error, **fields)
-        self._told()
 
     def _told(self) -> None:
         self._outbox.wake()

@@ -123,7 +123,7 @@ class RobofleetConnection(Connection):
             warmed = await asyncio.to_thread(policies.warm, SKIP_PENDING)
             self._quota.subscribe(flat.pattern, self.subscriptions)
         except BufgymError as error:
-            self._refuse("subscribe", error)
+            self._caller.refuse("subscribe", error)
             return
         left_bytes = self._socket.transport.get_write_buffer_size
         self._hub.subscribe(self, Subscription(flat.pattern, chosen, warmed, DEFAULT_CAPACITY, left_bytes=left_bytes))

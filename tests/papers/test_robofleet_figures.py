@@ -11,9 +11,9 @@ from bufgym.model.topics import Topic
 from bufgym.papers import figure
 from bufgym.papers.robofleet_evaluation import BYTES, Sent, cloud_bytes, send, stream
 from bufgym.papers.robofleet_fig4 import recovery_s
-from bufgym.papers.robofleet_table1 import PAPER
 from bufgym.scenario import Stream
 from bufgym.traces import Trace
+from studies.robofleet_table1 import PAPER
 
 TEN_HZ = Stream(Topic("scan"), 10, 12_500, jitter=0, encodings={"ros": 12_500, "json": 37_500})
 """12.5 ms over 1 MB/s, 37.5 ms as JSON."""
@@ -74,7 +74,7 @@ def test_sizes_are_table1s() -> None:
     assert all(BYTES[kind] == PAPER[kind] for kind in set(BYTES) & set(PAPER))
     pytest.importorskip("rosbags")
     pytest.importorskip("flatbuffers")
-    from bufgym.papers.encodings import content, encode
+    from studies.encodings import content, encode
 
     def sizes(kind: str, **parameters: Any) -> list[int]:
         message = content(kind, **parameters)

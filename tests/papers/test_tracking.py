@@ -13,7 +13,7 @@ from bufgym.papers.perception.orb import OrbSimilarity, decision_ms, orbbuf_by
 from bufgym.papers.perception.room import MadeUpRoom, made_up_room
 from bufgym.papers.perception.tracking import Tracker, difference, smoothed, track
 from bufgym.papers.perception.tsdf import raycast
-from bufgym.papers.perception.views import Coverage, overlap_information, seen_shares
+from bufgym.papers.perception.views import Coverage, seen_shares
 from bufgym.policies import get
 from bufgym.scenario.numbered import draw
 from bufgym.traces import Trace
@@ -169,10 +169,7 @@ def test_shares_of_a_view_that_were_seen_before() -> None:
     assert seen_shares(turned)[0, 1] == 0
 
 
-def test_information_and_coverage_count_what_is_new() -> None:
-    seen = seen_shares(wall(0, 1, 0))
-    # A quarter there, and another back.
-    assert [overlap_information(seen, kept) for kept in ([], [1], [0, 1, 2], [0, 2])] == [0, 1, 1.5, 1]
+def test_coverage_counts_what_is_new() -> None:
     # Frame 0 and its return see 40 columns of the wall, frame 1 the 10 beyond them, and 30 of the 40.
     coverage = Coverage(wall(0, 1, 0), least_views=1)
     assert coverage.cells == 50 * 30

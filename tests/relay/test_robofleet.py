@@ -55,7 +55,7 @@ def test_what_the_schema_says_is_read() -> None:
 
 def test_whole_messages_by_another_writer() -> None:
     """The flatbuffers of Table I, which are made from ROS's definitions."""
-    encodings = pytest.importorskip("bufgym.papers.encodings")
+    encodings = pytest.importorskip("studies.encodings")
     pytest.importorskip("rosbags", reason="no rosbags here: the extra robofleet")
     data = encodings.encode("LaserScan", encodings.content("LaserScan"), "robofleet", topic="/robot/scan")
     assert robofleet.read(data)[:2] == ("sensor_msgs/LaserScan", "/robot/scan")

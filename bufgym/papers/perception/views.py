@@ -78,14 +78,6 @@ def seen_shares(sequence: Sequence) -> NDArray[np.float32]:
     return seen
 
 
-def overlap_information(seen: NDArray[np.float32], frames: Iterable[int]) -> float:
-    """H of these frames by the measured V, 1 + the sum of V(before, frame) in order; 0 without frames."""
-    kept = np.fromiter(frames, np.int64)
-    if not len(kept):
-        return 0.0
-    return 1.0 + float((1.0 - seen[kept[:-1], kept[1:]].astype(np.float64)).sum())
-
-
 def least_overlap(seen: NDArray[np.float32], frames: Iterable[int]) -> float:
     """Least overlap of consecutive frames: the part of a frame that the one before it has seen.
 

@@ -19,9 +19,9 @@ from flatbuffers.table import Table
 from rosbags.typesys import get_types_from_msg
 
 from bufgym.ground.errors import install
-from bufgym.papers import encodings
-from bufgym.papers.encodings import KINDS, Kind, content, encode, stores
-from bufgym.papers.robofleet_table1 import PAPER, Reproduction, fitted
+from studies import encodings
+from studies.encodings import KINDS, Kind, content, encode, stores
+from studies.robofleet_table1 import PAPER, Reproduction, fitted
 
 HEADER = 4 + 8 + 4  # seq, stamp, length of frame_id
 STATUS = {"status": "on", "is_ok": True, "battery_level": 1.0, "location": "lab"}

@@ -3,10 +3,11 @@
 import sys
 
 import pytest
-from refusal_cases import refuse
 
-from bufgym.papers import figure, robofleet_table2, table2_programs
+from bufgym.ground.errors import BufgymError
+from bufgym.papers import figure
 from bufgym.papers.rows import FigureRows
+from studies import robofleet_table2, table2_programs
 
 for library in ("rosbags", "flatbuffers", "roslibpy", "websockets"):
     pytest.importorskip(library, reason="extra rosbridge")
@@ -40,6 +41,8 @@ def test_a_claim_holds_if_it_does_in_every_run() -> None:
 
 def test_a_program_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table2_programs, "__file__", "no_such_program.py")
-    refuse(r"robofleet-table2: robofleet: .*no_such_program", figure("robofleet-table2", runs=1).simulate)
+    with pytest.raises(BufgymError, match=r"robofleet-table2: robofleet: .*no_such_program"):
+        figure("robofleet-table2", runs=1).simulate()
     monkeypatch.setattr(robofleet_table2.sys, "platform", "darwin")
-    refuse("virtual memory is read from /proc", figure("robofleet-table2").simulate)
+    with pytest.raises(BufgymError, match="virtual memory is read from /proc"):
+        figure("robofleet-table2").simulate()

@@ -16,9 +16,9 @@ import numpy as np
 
 from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
-from bufgym.papers.encodings import ENCODINGS, KINDS, Content, content, encode
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
 from bufgym.papers.rows import FigureRows
+from studies.encodings import ENCODINGS, KINDS, Content, content, encode
 
 PAPER = {
     "LaserScan": (7_260, 7_328, 28_000),

@@ -23,11 +23,11 @@ from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import PACKAGE
 from bufgym.ground.libraries import library
-from bufgym.papers import table2_programs
-from bufgym.papers.encodings import content, encode
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
 from bufgym.papers.robofleet_evaluation import POINTS
 from bufgym.papers.rows import FigureRows
+from studies import table2_programs
+from studies.encodings import content, encode
 
 PROGRAMS = {"robofleet": "Robofleet", "rosbridge": "RosLibPy"}  # Program -> its label
 PAPER = {"robofleet": ((1.3, 452.5), (15.1, 425.6)), "rosbridge": ((16.6, 1_339.6), (155.9, 732.9))}
