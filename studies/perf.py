@@ -1,5 +1,7 @@
 """bufgym's own speed: its environments and its rollouts, beside a bare kernel that does the job of one step.
 
+``python -m studies.perf [--json FILE] [--history FILE] [--repeats N] [--quick]``
+
 Every figure is the best of several repeats in time of the processor, because other work on the machine can only slow a
 repeat down. Each repeat times the ``yardstick`` too: their ratio says more than either. Actions are drawn beforehand,
 uniform among the valid ones, by playing the same seeded episodes once. So the timed loop holds only the environment's
@@ -8,9 +10,11 @@ own work and its resets.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -26,13 +30,13 @@ import numpy as np
 
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark import yardstick
 from bufgym.benchmark.run import draw
 from bufgym.benchmark.table import Table
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT, compile_here
 from bufgym.sim import Senders
+from studies import yardstick
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"
@@ -118,7 +122,7 @@ class _Meter:
 
     def __init__(self, sizes: Sizes) -> None:
         self.sizes, (self._work, self._steps) = sizes, yardstick.passes(max(sizes.batches), sizes.capacity)
-        told = f"steps a second of bufgym.benchmark.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
+        told = f"steps a second of studies.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
         self._work()  # compiled, or loaded from disk, before the clock starts
         self.yardstick = self.figure("yardstick", told, self._steps, "steps", lambda: None, self._work)
 
@@ -235,7 +239,7 @@ def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
         before = [line["ratios"] for line in lines if line["sizes"] == told][-BEFORE:]
     except (ValueError, KeyError, TypeError) as error:
-        raise BufgymError(f"{path}: not a history that bufgym perf wrote ({type(error).__name__}: {error})") from None
+        raise BufgymError(f"{path}: not a history that studies.perf wrote ({type(error).__name__}: {error})") from None
     ratios = {figure.name: figure.ratio for figure in figures if figure.ratio}
     line = {"date": date.today().isoformat(), "version": version("bufgym"), "sizes": told, "ratios": ratios}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -248,3 +252,29 @@ def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
             fallen.append(f"{name}: {ratio:.3g} after {known:.3g}")
     what = f"fell by more than {FELL:.0%} below the median of the last {len(before)} runs"
     return f"{what}: {'; '.join(fallen)}" if fallen else f"no ratio {what}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the figures, as the command line asks."""
+    parser = argparse.ArgumentParser(prog="python -m studies.perf", description="Measure bufgym's own speed.")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to this file")
+    history = "add a line to this file, and say which ratios fell below the runs before"
+    parser.add_argument("--history", type=Path, metavar="FILE", help=history)
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="best of so many (%(default)s)")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
+    options = parser.parse_args(arguments)
+    if options.repeats < 1:
+        parser.error(f"--repeats {options.repeats}: must be a whole number >= 1")
+    sizes = Sizes(4, (4, 2), 80, 20, 1, options.repeats) if options.quick else Sizes(repeats=options.repeats)
+    if not options.quick and sys.stderr.isatty():
+        print("measuring; this takes about a minute ...", file=sys.stderr)
+    figures = measure(sizes)
+    print(report(figures, sizes.repeats))
+    if options.json is not None:
+        write_json(figures, sizes, options.json)
+    if options.history is not None:
+        print(remember(figures, sizes, options.history))
+
+
+if __name__ == "__main__":
+    main()
