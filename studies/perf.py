@@ -31,10 +31,10 @@ import numpy as np
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.table import Table
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT, compile_here
+from bufgym.ground.tables import Table
 from bufgym.sim import Senders
 from studies import yardstick
 

@@ -55,7 +55,7 @@ class Sweep:
     data: str | None = None  # folder of recordings, for suites that need one
     policy_file: str | None = None  # a Python file that registers policies, run wherever shards run
     sources: tuple[str, ...] = ()
-    """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
+    """Files of models and functions of modules, loaded wherever shards run; by default those the policies are from."""
     home: str = field(default_factory=os.getcwd)  # folder of the sources
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
@@ -97,7 +97,10 @@ class Sweep:
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         specs = self.specs if task.baseline in self.specs else (*self.specs, task.baseline)
-        complete = replace(self, specs=specs, capacities=self.capacities or suite.capacities, seeds=seeds)
+        files = self.sources or sources.made(specs, self.home)
+        complete = replace(
+            self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds
+        )
         check_distinct(complete.policies)
         for policy in complete.policies:
             task.check(policy)

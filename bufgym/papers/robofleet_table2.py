@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import PACKAGE
 from bufgym.ground.libraries import library
+from bufgym.ground.tables import aligned
 from bufgym.papers import table2_programs
 from bufgym.papers.encodings import content, encode
 from bufgym.papers.figure import COLOURS, Figure, finish, whole

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from bufgym.cli.options import Count, Least0, PolicyFile, Positive, command_line, load_policies, loaded
+from bufgym.cli.options import Count, Least0, PolicyFile, Positive, command_line, load_policies, policies_of
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.commands import REDRAW_S, redraw
 
@@ -48,7 +48,6 @@ def validate(
         out: Write every run to this folder (JSON).
     """
     from bufgym import traces
-    from bufgym.policies import get
     from bufgym.robot import tunnel as tunnels
     from bufgym.robot import validate as sockets
     from bufgym.robot.margins import margins
@@ -56,7 +55,7 @@ def validate(
     from bufgym.scenario import Uplink
 
     load_policies(policy_file)
-    names = loaded(policies)[0] or ["drop-oldest", "afr", "min-motion-gap", "learned"]
+    chosen = policies_of(policies or ["drop-oldest", "afr", "min-motion-gap", "learned"])
     scenario = Uplink(
         traces=tuple(traces.load(name) for name in trace),
         motion=tuple(traces.load_motion(name) for name in traces.shipped() if name.startswith("drive-")),
@@ -79,8 +78,7 @@ def validate(
             )
             print("TCP's own acks and its growing window cost over the round trip.\n")
         plays: dict[str, Play] = {name: _play_over(name, tunnel) for name in transport}
-        policies_of = [get(name) for name in names]
-        runs = sockets.validate(policies_of, scenario, capacity, seeds=seeds, plays=plays, speed=speed)
+        runs = sockets.validate(chosen, scenario, capacity, seeds=seeds, plays=plays, speed=speed)
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if out is not None:
         again = command_line(
