@@ -190,7 +190,6 @@ def _suite(
             address=options.address,
             command=again,
             form=out.format,
-            load=load_policies,
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(*["the same command resumes it"] * (folder is not None)) from None
