@@ -113,6 +113,7 @@ test_bad_arguments_are_named = refused(
     (lambda: run.run([AFR], UPLINK, [2], 0), "seeds = 0"),
     (lambda: run.run([AFR, AFR], UPLINK, [2], 1), "'afr' is given more than once"),
     (lambda: run.run([AFR], UPLINK, [2], 1, decide_at="never"), "'never'"),
+    (lambda: bufgym.compare([AFR], "topics", max_bytes=5), "max_bytes = 5: is for one queue, not for topics"),
     (lambda: bufgym.compare([3], UPLINK), "policy 3: must be a name, a Policy, or a function"),  # type: ignore[list-item]
     (
         lambda: run.run([Policy("afr", newest), AFR], UPLINK, [2], 1),

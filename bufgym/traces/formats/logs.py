@@ -8,8 +8,9 @@ Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018
 import json
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
+from bufgym.ground import strict_json
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
@@ -112,7 +113,7 @@ def read_json(path: StrPath) -> Any:
     with open_text(path) as file:
         text = file.text()
     try:
-        return json.loads(text, parse_constant=_no_constant)
+        return strict_json.loads(text)
     except json.JSONDecodeError as error:
         value = text[error.pos : error.pos + _SHOWN_CHARACTERS] or None
         raise fault(path, f"must be JSON ({error.msg})", line=error.lineno, value=value) from error
@@ -135,7 +136,3 @@ def json_number(line: Line, item: Any, name: str, most: float) -> float:
     if not 0 <= value <= most:
         raise line.error(value, f"must be from 0 to {most:g}", name)
     return value
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a finite number")
