@@ -10,7 +10,6 @@ own work and its resets.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -28,9 +27,11 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from agents.page import command
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
+from bufgym.cli.options import Count
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT, compile_here
@@ -254,27 +255,25 @@ def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
     return f"{what}: {'; '.join(fallen)}" if fallen else f"no ratio {what}"
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the figures, as the command line asks."""
-    parser = argparse.ArgumentParser(prog="python -m studies.perf", description="Measure bufgym's own speed.")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to this file")
-    history = "add a line to this file, and say which ratios fell below the runs before"
-    parser.add_argument("--history", type=Path, metavar="FILE", help=history)
-    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="best of so many (%(default)s)")
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: does it run at all?")
-    options = parser.parse_args(arguments)
-    if options.repeats < 1:
-        parser.error(f"--repeats {options.repeats}: must be a whole number >= 1")
-    sizes = Sizes(4, (4, 2), 80, 20, 1, options.repeats) if options.quick else Sizes(repeats=options.repeats)
-    if not options.quick and sys.stderr.isatty():
+def main(*, json: Path | None = None, history: Path | None = None, repeats: Count = 3, quick: bool = False) -> None:
+    """Measure bufgym's own speed on this machine, beside a bare kernel that does the job of one step.
+
+    Args:
+        json: Also write the figures to this file.
+        history: Add a line to this file, and say which ratios fell below the runs before.
+        repeats: Best of so many.
+        quick: Tiny sizes: does it run at all?
+    """
+    sizes = Sizes(4, (4, 2), 80, 20, 1, repeats) if quick else Sizes(repeats=repeats)
+    if not quick and sys.stderr.isatty():
         print("measuring; this takes about a minute ...", file=sys.stderr)
     figures = measure(sizes)
     print(report(figures, sizes.repeats))
-    if options.json is not None:
-        write_json(figures, sizes, options.json)
-    if options.history is not None:
-        print(remember(figures, sizes, options.history))
+    if json is not None:
+        write_json(figures, sizes, json)
+    if history is not None:
+        print(remember(figures, sizes, history))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)
