@@ -25,9 +25,10 @@ from bufgym.benchmark import summary
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
-from bufgym.benchmark.table import aligned, apart, decimal, same, told_once
+from bufgym.benchmark.table import apart, decimal, same, told_once
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
+from bufgym.ground.tables import aligned
 from bufgym.oracle import BASELINE
 from bufgym.policies import Policy, load, registry, weights
 

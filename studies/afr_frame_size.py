@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from bufgym import policies, sim
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.table import aligned
+from bufgym.ground.tables import aligned
 from bufgym.papers.afr_fig6 import LinkFigure
 from bufgym.papers.figure import COLOURS, finish
 from bufgym.papers.rows import FigureRows, listed

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.table import NONE, aligned
+from bufgym.benchmark.table import NONE
+from bufgym.ground.tables import aligned
 from bufgym.papers.figure import COLOURS, finish, legend_below
 from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure, FrameRun, spearman
 from bufgym.papers.perception import views

@@ -6,7 +6,6 @@ fitted to these recordings.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from agents.page import command
+from bufgym.cli.options import Count
 from bufgym.cli.trace_fit import recordings_of
 from bufgym.traces.fit import Rates, autocorrelation, outage_gaps, outage_lengths
 from bufgym.traces.formats.text import write_text
@@ -244,25 +245,34 @@ def _survival(axis: Axes, values: Float64Array, colour: str) -> None:
     axis.loglog(distinct[drawn], share[drawn], colour)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the page that the command line asks for."""
-    parser = argparse.ArgumentParser(prog="python -m studies.fit", description="Compare links with recordings.")
-    parser.add_argument("links", type=Path, metavar="LINKS.json")
-    parser.add_argument("page", type=Path, metavar="PAGE.md")
-    parser.add_argument("files", nargs="*", metavar="FILE", help="recordings that the links were fitted to")
-    parser.add_argument("--suite", metavar="A,B", help="or the suites whose training links they were fitted to")
-    parser.add_argument("--data", metavar="DIR", help="the folder of recordings that the suites need")
-    parser.add_argument("--sets", type=int, default=SETS, help="generated sets for each comparison (%(default)s)")
-    parser.add_argument("--held-out", type=int, metavar="N", help="most recordings of a mode held out, a fit each")
-    options = parser.parse_args(arguments)
-    rows, words = recordings_of(options.files, None, options.suite, options.data)
-    command = f"python -m studies.fit {options.links.name} {options.page.name} {words}"
-    if options.held_out is not None:
-        command += f" --held-out {options.held_out}"
-    links = read_links(options.links)
-    write_page(links, rows, options.page, command, options.links.name, options.sets, options.held_out)
-    print(f"wrote {options.page}")
+def main(
+    links: Path,
+    page: Path,
+    /,
+    *files: str,
+    suite: str | None = None,
+    data: str | None = None,
+    sets: Count = SETS,
+    held_out: Count | None = None,
+) -> None:
+    """Compare links with the recordings that they were fitted to.
+
+    Args:
+        links: The parameters of links (.json).
+        page: The page to write (.md).
+        files: Recordings that the links were fitted to.
+        suite: Or the suites (A,B) whose training links they were fitted to.
+        data: The folder of recordings that the suites need.
+        sets: Generated sets for each comparison.
+        held_out: Most recordings of a mode held out, a fit each.
+    """
+    rows, words = recordings_of(files, None, suite, data)
+    again = f"python -m studies.fit {links.name} {page.name} {words}"
+    if held_out is not None:
+        again += f" --held-out {held_out}"
+    write_page(read_links(links), rows, page, again, links.name, sets, held_out)
+    print(f"wrote {page}")
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

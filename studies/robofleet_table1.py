@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.tables import aligned
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
 from bufgym.papers.rows import FigureRows
 from studies.encodings import ENCODINGS, KINDS, Content, content, encode

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.table import aligned
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import PACKAGE
 from bufgym.ground.libraries import library
+from bufgym.ground.tables import aligned
 from bufgym.papers.figure import COLOURS, Figure, finish, whole
 from bufgym.papers.robofleet_evaluation import POINTS
 from bufgym.papers.rows import FigureRows

@@ -49,7 +49,7 @@ def test_the_page_has_its_tables_and_pictures(tmp_path: Path) -> None:
         write_csv(markov_link("known", seed, 200, links={"known": KNOWN}), file)
     links, page, figure = tmp_path / "links.json", tmp_path / "page.md", tmp_path / "figures" / "link-known.svg"
     write_links({"known": replace(KNOWN, recordings=3, seconds=600)}, links, 5e5, "by hand")
-    write_page([str(links), str(page), *files, "--sets", "9"])
+    write_page(links, page, *files, sets=9)
     text = page.read_text()
     assert "| autocorrelation at 30 s |" in text and str(tmp_path) not in text
     assert "![known: recordings and generated links](figures/link-known.svg)" in text and figure.exists()

@@ -29,11 +29,12 @@ from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.benchmark.table import Table, decimal
+from bufgym.benchmark.table import decimal
 from bufgym.cli.options import Seeds, Whole, command_line, policy_specs
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
+from bufgym.ground.tables import Table
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
 

@@ -1,12 +1,11 @@
 """Small pieces of Markdown."""
 
-import ast
-import inspect
 import re
-import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import Any
+
+from bufgym.model.documented import below_fields
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -35,15 +34,7 @@ def cited(text: str, up: str = "") -> str:
 
 def attributes(class_: type[Any]) -> dict[str, str]:
     """Map each field of a dataclass and its bases to the string below it."""
-    found: dict[str, str] = {}
-    for base in reversed(class_.__mro__[:-1]):
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        assert isinstance(definition, ast.ClassDef)
-        for field, text in zip(definition.body, definition.body[1:], strict=False):
-            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-                if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                    found[field.target.id] = inspect.cleandoc(str(text.value.value))
-    return found
+    return {name: text for base in reversed(class_.__mro__[:-1]) for name, text in below_fields(base).items()}
 
 
 def parameters(example: Any) -> str:

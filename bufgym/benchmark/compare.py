@@ -7,45 +7,29 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bufgym import policies, scenario
-from bufgym.benchmark import bootstrap, report, sources, summary, table, tasks
+from bufgym.benchmark import report, sources, table, tasks
+from bufgym.benchmark import sweep as sweeps
 from bufgym.benchmark.report import tables
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run
-from bufgym.benchmark.sweep import Sweep, run_sweep
+from bufgym.benchmark.sources import PolicyLike as PolicyLike
+from bufgym.benchmark.sources import make_policy as make_policy
+from bufgym.benchmark.sweep import Sweep
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.libraries import library
 from bufgym.ground.modules import is_named
-from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
-from bufgym.policies.registry import OnArrival
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
 
 KEYWORDS = ("capacity", "seeds", "progress", "about", "against")
 QUEUE = ("max_bytes", "decide_at", "bound")  # Settings of a queue
-PolicyLike = Policy | str | Path | OnArrival
-
-
-def make_policy(spec: PolicyLike) -> Policy:
-    """A policy from its name, a function, or a file.
-
-    Args:
-        spec: a registered name (``"afr"``, ``"decimate:every=2"``), a function (buffer, arrival, memory),
-            ``"module:function"``, a model of stable-baselines3 (``.zip``, which can run any code), or a learned policy
-            (``.safetensors``, which runs none). A ``Policy`` comes back as it is.
-
-    Raises:
-        BufgymError: there is no such policy, or the file holds none.
-    """
-    if isinstance(spec, Path) or (isinstance(spec, str) and sources.is_source(spec)):
-        spec = sources.load(os.fspath(spec))
-    return policies.get(spec)
 
 
 @dataclass(frozen=True, repr=False)
@@ -145,16 +129,14 @@ def compare(
     several = [policies] if isinstance(policies, str | Path | Policy) or callable(policies) else policies
     chosen = [make_policy(policy) for policy in several]
     rival = None if against is None else make_policy(against)
-    named = "" if rival is None else rival.name
-    words = (*several, against)
-    files = [os.fspath(p) for p in words if isinstance(p, Path) or (isinstance(p, str) and sources.is_source(p))]
     capacities = [capacity] if isinstance(capacity, int) else list(capacity or ())
     on = os.fspath(on) if isinstance(on, os.PathLike) else on
     if isinstance(on, str) and on in suites.SUITES:
         if settings:
             raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
-        chosen = _with(chosen, rival, tasks.TASKS[suites.get(on).kind])
-        return _on_suite(chosen, files, on, capacities, seeds, progress, named)
+        if seeds is not None and not isinstance(seeds, int):
+            raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
+        return on_suite(chosen, on, rival, capacities=tuple(capacities), seeds=seeds, form="csv", progress=progress)
     if isinstance(on, str) and not (on.partition(":")[0] in scenario.SCENARIOS or on.endswith(".toml") or is_named(on)):
         raise unknown("scenario or suite", on, [*scenario.SCENARIOS, *suites.SUITES])
     queue = {name: settings.pop(name) for name in QUEUE if name in settings}
@@ -183,31 +165,17 @@ def beside(
     """``compare`` for policies and a scenario that are at hand; ``label`` is the scenario's name in the rows."""
     task = tasks.of(stream)
     chosen = _with(chosen, rival, task)
-    alone = all(policy.name != task.baseline for policy in chosen)
-    chosen = [*chosen, make_policy(task.baseline)] if alone and chosen else chosen
-    unranked, named = table.apart(chosen), "" if rival is None else rival.name
+    added = all(policy.name != task.baseline for policy in chosen)
+    chosen = [*chosen, make_policy(task.baseline)] if added and chosen else chosen
     played = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
-    heading = about or label or scenario.about(stream)
+    unranked, heading = table.apart(chosen), about or label or scenario.about(stream)
+    found = task.summary(played, unranked, "" if rival is None else rival.name)
+    hidden = task.baseline if added and not task.shows_baseline else ""
+    rows, floor = ([row for row in played if (row["policy"] == hidden) == there] for there in (False, True))
+    shown = task.tables(rows, floor, found, unranked, {label: scenario.about(stream)})
+    forms = ["\n\n".join(texts) for texts in zip(*(part.forms() for part in shown), strict=True)]
     page = partial(report.page_of, played, () if queue else chosen, unranked, stream, heading)
-    if task.kind != "queue":
-        found = task.summary(played, unranked, named)
-        shown = summary.table_of(found, {label: scenario.about(stream)}, ["", *task.notes(played, found)])
-        return Comparison(played, heading, unranked, page, *shown.forms())
-    rows = [row for row in played if not (alone and row["policy"] == BASELINE)]
-    floor = [row for row in played if alone and row["policy"] == BASELINE]
-    found = task.summary(played, unranked, named)
-    cells = [cell for cell in found.scores.cells if cell.episodes > 1] if found.scores else []
-    behind = {(cell.capacity, cell.policy): bootstrap.written(cell.score, table.score)[1] for cell in cells}
-    shown = table.of(rows, floor, unranked, behind)
-    if "score" in shown.head:
-        shown = shown._replace(notes=[table.SCORE, *[table.BRACKETS] * any(behind.values()), *shown.notes])
-    texts = shown.forms()
-    if rival is not None:
-        paired = [quantity for quantity in found.quantities if quantity.key in ("share", "against")]
-        notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
-        more = summary.table_over([("", found.overall)], paired)._replace(notes=notes)
-        texts = ["\n\n".join(both) for both in zip(texts, more.forms(), strict=True)]
-    return Comparison(rows, heading, unranked, page, *texts)
+    return Comparison(rows, heading, unranked, page, *forms)
 
 
 def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
@@ -217,10 +185,14 @@ def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> l
     return [*chosen, *({policy.name: policy for policy in more if policy.name not in known}.values())]
 
 
-def _on_suite(
-    chosen: Sequence[Policy], files: list[str], name: str, capacities: Any, seeds: Any, progress: bool, against: str
+def on_suite(
+    chosen: Sequence[Policy], suite: str, rival: Policy | None = None, folder: Path | None = None, **how: Any
 ) -> Comparison:
-    """``compare`` on the test split of a suite. Its processes know policies by name, or load them from ``files``."""
+    """``compare`` for policies that are at hand and a suite, whose processes know them by name.
+
+    ``folder`` keeps the run. ``how`` has further settings of the ``Sweep``, and arguments of ``run_sweep``.
+    """
+    chosen = _with(chosen, rival, tasks.TASKS[suites.get(suite).kind])
     registered = {*policies.names(), *policies.names(named_only=True)}
     for policy in chosen:
         base = policy.name.partition(":")[0]
@@ -228,15 +200,14 @@ def _on_suite(
             raise BufgymError(
                 f"policy {policy.name}: register it to run it on a suite, whose processes know it by name"
             )
-    if seeds is not None and not isinstance(seeds, int):
-        raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
-    names = tuple(policy.name for policy in chosen)
-    sweep = Sweep(suites.get(name).name, names, "test", tuple(capacities), seeds, sources=tuple(dict.fromkeys(files)))
+    settings = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}
+    sweep = Sweep(suites.get(suite).name, tuple(policy.name for policy in chosen), **settings)
     # Other processes can't know what a user's own code registered in this one.
-    own = not all(policy.built_in for policy in chosen) and not files
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "run"
-        rows = run_sweep(sweep, out, jobs=1 if own else None, form="csv", progress=progress)
-        suite, found = report.run_of(out, against)
-        shown = tables.plain(suite, found), tables.markdown(suite, found), tables.html(found)
-        return Comparison(rows, f"suite {name}", table.apart(chosen), partial(report.page_for, suite), *shown)
+    if sweep.policy_file is None and not all(policy.built_in or sources.made([policy.name]) for policy in chosen):
+        how["jobs"] = 1
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = folder or Path(scratch) / "run"
+        rows = sweeps.run_sweep(sweep, folder, **how)
+        made, found = report.run_of(folder, "" if rival is None else rival.name)
+    shown = tables.plain(made, found), tables.markdown(made, found), tables.html(found)
+    return Comparison(rows, f"suite {sweep.suite}", table.apart(chosen), partial(report.page_for, made), *shown)

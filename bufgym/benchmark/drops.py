@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.table import Table
 from bufgym.benchmark.tasks.queue import meet
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
+from bufgym.ground.tables import Table
 from bufgym.policies import Policy
 from bufgym.scenario import Uplink
 from bufgym.sim.state import NEVER

@@ -14,8 +14,7 @@ from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.progress import bar
-from bufgym.policies import Policy, get, names
-from bufgym.policies.registry import OnArrival
+from bufgym.policies import Policy, names
 from bufgym.scenario.numbered import by_trace, draw
 
 __all__ = ["by_trace", "check_distinct", "draw", "run"]
@@ -24,7 +23,7 @@ _BATCH_MESSAGES = 1_000_000  # messages held at a time, 88 bytes each; many seed
 
 
 def run(
-    policies: Sequence[Policy | str | OnArrival],
+    policies: Sequence[Policy],
     scenario: Any,
     capacities: Sequence[int],
     seeds: int | Sequence[int],
@@ -36,7 +35,6 @@ def run(
     """Run every policy at every capacity on every trace and seed; return rows in the task's ``layout``.
 
     Args:
-        policies: each a ``Policy``, a name or a policy function, as ``bufgym.policies.get`` takes them.
         scenario: a ``Scenario`` or a ``FleetScenario``; each of its traces is met on its own.
         seeds: a number of seeds counted from 0, or a list of seeds.
         label: name of the scenario in the rows.
@@ -47,20 +45,19 @@ def run(
     for name, entries in (("policies", policies), ("capacities", capacities), ("seeds", numbers)):
         if not entries:
             raise BufgymError(f"{name} = {seeds if name == 'seeds' else list(entries)}: need at least one")
-    chosen = [get(policy) for policy in policies]
-    check_distinct(chosen)
-    for policy in chosen:
+    check_distinct(policies)
+    for policy in policies:
         task.check(policy)
     parts = by_trace(scenario)
     at_once = max(1, _BATCH_MESSAGES // task.messages(scenario))
     batches = [numbers[k : k + at_once] for k in range(0, len(numbers), at_once)]
     rows: list[Row] = []
-    with bar(len(parts) * len(numbers) * len(capacities) * len(chosen), progress) as advance:
+    with bar(len(parts) * len(numbers) * len(capacities) * len(policies), progress) as advance:
         for trace, part in parts:
             for batch in batches:
                 episodes = [draw(part, seed) for seed in batch]
                 for capacity in capacities:
-                    for policy, results in zip(chosen, task.play(chosen, part, episodes, capacity), strict=True):
+                    for policy, results in zip(policies, task.play(policies, part, episodes, capacity), strict=True):
                         for seed, result in zip(batch, results, strict=True):
                             key = {"scenario": label, "trace": trace, "seed": seed}
                             key |= {"policy": policy.name, "capacity": capacity}

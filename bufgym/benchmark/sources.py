@@ -19,6 +19,9 @@ from bufgym import policies
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, registry
+from bufgym.policies.registry import OnArrival
+
+PolicyLike = Policy | str | Path | OnArrival
 
 _FILES = (".zip", ".safetensors")
 
@@ -50,6 +53,28 @@ def load(source: str, folder: str | None = None) -> str:
         registry.register(policy.name, **given)(policy.on_arrival)
     _NAMES[place, source] = policy.name
     return policy.name
+
+
+def make_policy(spec: PolicyLike) -> Policy:
+    """A policy from its name, a function, or a file.
+
+    Args:
+        spec: a registered name (``"afr"``, ``"decimate:every=2"``), a function (buffer, arrival, memory),
+            ``"module:function"``, a model of stable-baselines3 (``.zip``, which can run any code), or a learned policy
+            (``.safetensors``, which runs none). A ``Policy`` comes back as it is.
+
+    Raises:
+        BufgymError: there is no such policy, or the file holds none.
+    """
+    if isinstance(spec, Path) or (isinstance(spec, str) and is_source(spec)):
+        spec = load(os.fspath(spec))
+    return policies.get(spec)
+
+
+def made(names: Iterable[str], folder: str | None = None) -> tuple[str, ...]:
+    """The sources in ``folder`` from which this process loaded policies of these names."""
+    place, wanted = folder or os.getcwd(), {name.partition(":")[0] for name in names}
+    return tuple(source for (home, source), name in _NAMES.items() if home == place and name in wanted)
 
 
 def digests(sources: Iterable[str], folder: str) -> dict[str, str]:

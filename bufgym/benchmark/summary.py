@@ -16,8 +16,9 @@ from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
-from bufgym.benchmark.table import NOBODY, NONE, RunRows, Table, Unranked, signed
+from bufgym.benchmark.table import NOBODY, NONE, RunRows, Unranked, signed
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.tables import Table
 
 
 class Quantity(NamedTuple):

@@ -15,7 +15,7 @@ import itertools
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -38,9 +38,6 @@ from bufgym.scenario.suites import Setting
 
 _SEEDS_PER_SHARD = 25
 
-Load = Callable[[str | None], None]
-"""Function that runs a policy file."""
-
 
 @dataclass(frozen=True)
 class Sweep:
@@ -55,7 +52,7 @@ class Sweep:
     data: str | None = None  # folder of recordings, for suites that need one
     policy_file: str | None = None  # a Python file that registers policies, run wherever shards run
     sources: tuple[str, ...] = ()
-    """Files of models and functions of modules (``bufgym.benchmark.sources``), loaded wherever shards run."""
+    """Files of models and functions of modules, loaded wherever shards run; by default those the policies are from."""
     home: str = field(default_factory=os.getcwd)  # folder of the sources
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
@@ -97,7 +94,10 @@ class Sweep:
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         specs = self.specs if task.baseline in self.specs else (*self.specs, task.baseline)
-        complete = replace(self, specs=specs, capacities=self.capacities or suite.capacities, seeds=seeds)
+        files = self.sources or sources.made(specs, self.home)
+        complete = replace(
+            self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds
+        )
         check_distinct(complete.policies)
         for policy in complete.policies:
             task.check(policy)
@@ -130,15 +130,12 @@ class Shard:
 
 _TRIES = 3  # worker deaths in a row, without a finished shard between them, that end the run
 
-_LOADED: set[str] = set()  # policy files that this process has run for a shard
 
-
-def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
-    """Run one shard and return its rows; ``load`` runs the sweep's policy file once in each process."""
+def run_shard(shard: Shard) -> list[Row]:
+    """Run one shard and return its rows. Each process runs the sweep's policy file once."""
     sweep = shard.sweep
-    if load is not None and sweep.policy_file is not None and sweep.policy_file not in _LOADED:
-        load(sweep.policy_file)
-        _LOADED.add(sweep.policy_file)
+    if sweep.policy_file is not None and sweep.policy_file not in modules.FILES:
+        modules.run_file(sweep.policy_file, "--policy-file")
     for source in sweep.sources:
         sources.load(source, sweep.home)
     setting = sweep.setting(shard.label, shard.trace)
@@ -146,10 +143,10 @@ def run_shard(shard: Shard, load: Load | None = None) -> list[Row]:
     return run(sweep.policies, setting.scenario, sweep.capacities_of(setting), shard.seeds, label=shard.label, **limits)
 
 
-def _attempt(number: int, shard: Shard, load: Load | None) -> tuple[int, list[Row] | Exception]:
+def _attempt(number: int, shard: Shard) -> tuple[int, list[Row] | Exception]:
     """Return the shard's number with its rows or its error, because joblib discards finished shards when one raises."""
     try:
-        return number, run_shard(shard, load)
+        return number, run_shard(shard)
     except BufgymError as error:
         return number, error
     except Exception as error:
@@ -167,7 +164,6 @@ def run_sweep(
     address: str | None = None,
     command: str = "",
     form: str | None = None,
-    load: Load | None = None,
     progress: bool = True,
 ) -> list[Row]:
     """Run the missing shards of the sweep, write the files in ``out`` and return all rows.
@@ -179,7 +175,6 @@ def run_sweep(
         backend: one of ``BACKENDS`` (joblib's); "ray" and "dask" use the cluster at ``address``, or a local one.
         command: command that the report shows to run it again.
         form: "parquet" or "csv"; by default parquet if pyarrow is installed.
-        load: function that runs ``Sweep.policy_file`` in a worker.
     """
     sweep = sweep.checked()
     if jobs is None:
@@ -202,7 +197,7 @@ def run_sweep(
             files = [parts / f"{shard.name}.{form}" for shard in shards]
             missing = [(shard, file) for shard, file in zip(shards, files, strict=True) if not file.exists()]
             with bar(len(shards), progress, unit="shard", done=len(shards) - len(missing)) as advance:
-                for k, part in _spread([shard for shard, _ in missing], jobs, backend, address, load):
+                for k, part in _spread([shard for shard, _ in missing], jobs, backend, address):
                     write_rows(part, missing[k][1], layout)
                     advance(1)
             rows = [row for shard, file in zip(shards, files, strict=True) for row in _read(file, shard)]
@@ -283,9 +278,7 @@ def _read(file: Path, shard: Shard) -> list[Row]:
     return rows
 
 
-def _spread(
-    shards: Sequence[Shard], jobs: int, backend: str, address: str | None, load: Load | None
-) -> Iterator[tuple[int, list[Row]]]:
+def _spread(shards: Sequence[Shard], jobs: int, backend: str, address: str | None) -> Iterator[tuple[int, list[Row]]]:
     """Yield each shard's number and rows as they become ready; after an error start no more.
 
     When a worker dies, unfinished shards run again, as long as each attempt finishes some.
@@ -294,13 +287,11 @@ def _spread(
         for k, shard in enumerate(shards):
             yield k, run_shard(shard)
         return
-    if backend == "threading":
-        load = None  # this process has run the policy file
     failed: list[Exception] = []
     waiting, vain = dict(enumerate(shards)), 0
     while waiting and not failed:
         now = itertools.takewhile(lambda _: not failed, list(waiting.items()))
-        calls = ((_attempt, (k, shard, load)) for k, shard in now)
+        calls = ((_attempt, (k, shard)) for k, shard in now)
         before = len(waiting)
         try:
             for k, result in cluster.spread(calls, before, jobs, backend, address):

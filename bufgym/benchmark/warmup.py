@@ -32,22 +32,24 @@ def _environments() -> None:
     env.step(_L)
 
 
+def _policies(for_topics: bool, on: Any) -> None:
+    run([policies.get(name) for name in policies.names(for_topics=for_topics)], on, [_L], 1)
+
+
 def _bound() -> None:
     for size_cv in (0.0, 0.5):
-        run(["drop-oldest"], scenario.get("lte", duration_s=1.0, size_cv=size_cv), [_L], 1)
+        run([policies.get("drop-oldest")], scenario.get("lte", duration_s=1.0, size_cv=size_cv), [_L], 1)
 
 
 def _fleets() -> None:
     _played(FleetVecEnv(1, 2, "lte", _L, parameters={"duration_s": 1.0}), 2)
-    run(["drop-oldest"], FleetScenario.of(2, "lte", duration_s=1.0), [_L], 1)
+    run([policies.get("drop-oldest")], FleetScenario.of(2, "lte", duration_s=1.0), [_L], 1)
 
 
 PARTS: dict[str, Callable[[], object]] = {
-    "policies of one queue": lambda: run(list(policies.names(for_topics=False)), Interruption(t_max=5), [_L], 1),
+    "policies of one queue": lambda: _policies(False, Interruption(t_max=5)),
     "environments": _environments,
-    "policies of several topics": lambda: run(
-        list(policies.names(for_topics=True)), scenario.get("topics", duration_s=1.0), [_L], 1
-    ),
+    "policies of several topics": lambda: _policies(True, scenario.get("topics", duration_s=1.0)),
     "the clairvoyant": _bound,
     "fleets": _fleets,
 }

@@ -47,7 +47,6 @@ COMMANDS: dict[str, Any] = {
         },
     ),
     "reproduce": "papers.commands:reproduce",
-    "perf": "cli.results:perf",
     "play": "cli.play:play",
     "live": (
         "Policies on real sockets, beside the simulator.",

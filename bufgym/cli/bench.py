@@ -21,8 +21,8 @@ from bufgym.cli.options import (
     command_line,
     given,
     load_policies,
-    loaded,
     one_policy,
+    policies_of,
     refuse,
 )
 from bufgym.cli.scenarios import (
@@ -34,7 +34,6 @@ from bufgym.cli.scenarios import (
     StreamOptions,
     WorkloadOptions,
 )
-from bufgym.cli.suite import print_topics, run_suite, topic_policy
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 
@@ -83,7 +82,7 @@ def bench(
     if suite.suite is not None:
         frozen = options.given() | given(buffer) | ({} if drops is None else {"drops": drops})
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
-        run_suite(suite, who, out, given(shared), against=against or "", by_topic=by_topic)
+        _suite(suite, who, out, given(shared), against, by_topic)
         return
     refuse(given(suite), "needs --suite")
     if drops is not None and workload.workload is None:
@@ -104,19 +103,19 @@ def _bench(
     by_topic: str | None,
     command: str,
 ) -> None:
-    from bufgym import policies
     from bufgym.benchmark import table, tasks
     from bufgym.benchmark.compare import beside
+    from bufgym.benchmark.rows import has_pyarrow, write_rows
 
-    stream, specs = made.scenario, loaded(who.policies)[0]
+    stream = made.scenario
     task = tasks.of(stream)
     if task.kind != "queue":
         refuse(given(buffer), "is for one queue")
-    chosen = [policies.get(spec) for spec in specs or task.default_policies("")]
-    if buffer.decide_at == "overflow" and not specs:
+    chosen = policies_of(who.policies or task.default_policies(""))
+    if buffer.decide_at == "overflow" and not who.policies:
         chosen = [policy for policy in chosen if policy.privileged is None]  # see QueueTask.check
-    by_name = topic_policy(by_topic, task, [policy.name for policy in chosen])
-    rival = None if against is None else policies.get(one_policy(against))
+    rival = None if against is None else one_policy(against)
+    by_name = _topic_policy(by_topic, task, chosen, rival)
     file, folder, page = out.file(), out.folder(), out.page()
     capacity = who.capacity or (task.capacity,)
     seeds = who.seeds or (1 if made.recorded else task.seeds)
@@ -135,9 +134,104 @@ def _bench(
     if made.recorded:
         order = list(dict.fromkeys(entry["policy"] for entry in table.means(done.rows, alone=done.unranked)))
         _dropped(chosen, stream, capacity, seeds, queue, order, drops)
-    if by_name is not None:
-        print_topics(done.rows, by_name)
-    _write(done, task, file, folder, out.format, bounds)
+    _print_topics(done, by_name)
+    if folder is not None:
+        form = out.format or ("parquet" if has_pyarrow() else "csv")
+        written = write_rows(done.rows, folder / f"rows.{form}", task.layout)
+        with replaced(folder / "table.md") as temporary:
+            text = "\n".join([f"{done.about}\n\n{done.markdown}", *([""] if bounds else []), *bounds])
+            temporary.write_text(text + "\n", encoding="utf-8")
+        print(f"\n{len(done.rows)} rows in {written}, this table in {folder / 'table.md'}")
+    _write(done, task, file, page, command)
+
+
+def _suite(
+    options: SuiteOptions,
+    who: WhoOptions,
+    out: OutOptions,
+    changes: dict[str, Any],
+    against: str | None,
+    by_topic: str | None,
+) -> None:
+    """Run a suite and print its summary; ``changes`` are parameters of its scenarios that are not as they are."""
+    from bufgym.benchmark.compare import on_suite
+    from bufgym.benchmark.tasks import TASKS
+    from bufgym.scenario import suites
+
+    suite, file, page = suites.get(options.suite or ""), out.file(), out.page()
+    task = TASKS[suite.kind]
+    chosen = policies_of(who.policies or task.default_policies(suite.name))
+    rival = None if against is None else one_policy(against)
+    by_name = _topic_policy(by_topic, task, chosen, rival)
+    folder = None if out.out is None or file is not None else Path(out.out)
+    again = command_line(
+        "bufgym bench",
+        suite=suite.name,
+        split=None if options.split == "test" else options.split,
+        policies=tuple(who.policies or ()) or None,
+        capacity=who.capacity,
+        seeds=who.seeds,
+        against=None if rival is None else rival.name,
+        by_topic=by_topic,
+        **changes,
+        policy_file=who.policy_file,
+        data=options.data,
+        out=out.out,
+    )
+    try:
+        done = on_suite(
+            chosen,
+            suite.name,
+            rival,
+            folder,
+            split=options.split or "test",
+            capacities=who.capacity or (),
+            seeds=who.seeds,
+            data=options.data,
+            policy_file=who.policy_file,
+            changes=changes,
+            jobs=options.jobs,
+            backend=options.backend or "loky",
+            address=options.address,
+            command=again,
+            form=out.format,
+        )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(*["the same command resumes it"] * (folder is not None)) from None
+    print(done.plain)
+    _print_topics(done, by_name)
+    if folder is not None:
+        print(f"\n{len(done.rows)} rows in {folder}; bufgym report {folder} makes a page of them")
+    _write(done, task, file, page, again)
+
+
+def _topic_policy(by_topic: str | None, task: Task, chosen: Sequence[Policy], rival: Policy | None) -> str | None:
+    """The policy of ``--by-topic``; an error if it does not run, or not on several topics."""
+    from bufgym import policies
+
+    if by_topic is None:
+        return None
+    if task.kind != "topics":
+        raise BufgymError("--by-topic needs several topics")
+    name = policies.get(by_topic).name
+    if name not in {task.baseline, *(policy.name for policy in (*chosen, rival) if policy is not None)}:
+        raise BufgymError(f"--by-topic {by_topic}: not among the policies that run")
+    return name
+
+
+def _print_topics(done: Comparison, policy: str | None) -> None:
+    from bufgym.benchmark.tasks import topics
+
+    if policy is not None:
+        print(f"\n{policy}, topic by topic: means over episodes\n{topics.by_topic(done.rows, policy)}")
+
+
+def _write(done: Comparison, task: Task, file: Path | None, page: Path | None, command: str) -> None:
+    """Write rows to ``file`` and the page to ``page``, where these are asked for."""
+    from bufgym.benchmark.rows import write_rows
+
+    if file is not None:
+        print(f"\n{len(done.rows)} rows in {write_rows(done.rows, file, task.layout)}")
     if page is not None:
         print(f"\nwrote {done.report(page, command)}")
 
@@ -154,22 +248,6 @@ def _about(made: Described, task: Task, seeds: int | None) -> str:
         means = f"Means over {met}{seeds} seeds; every policy meets the same episodes."
         lines.append(task.describe([made.scenario], seeds * traces) or means)
     return "\n".join(lines)
-
-
-def _write(
-    done: Comparison, task: Task, file: Path | None, folder: Path | None, form: str | None, bounds: Sequence[str]
-) -> None:
-    from bufgym.benchmark.rows import has_pyarrow, write_rows
-
-    if file is not None:
-        print(f"\n{len(done.rows)} rows in {write_rows(done.rows, file, task.layout)}")
-    elif folder is not None:
-        target = folder / f"rows.{form or ('parquet' if has_pyarrow() else 'csv')}"
-        written = write_rows(done.rows, target, task.layout)
-        with replaced(folder / "table.md") as temporary:
-            text = "\n".join([f"{done.about}\n\n{done.markdown}", *([""] if bounds else []), *bounds])
-            temporary.write_text(text + "\n", encoding="utf-8")
-        print(f"\n{len(done.rows)} rows in {written}, this table in {folder / 'table.md'}")
 
 
 def _bound_notes(rows: Sequence[Mapping[str, Any]], stream: Scenario, decide_at: str) -> list[str]:

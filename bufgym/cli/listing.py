@@ -54,20 +54,17 @@ def _list_policies() -> str:
         "only where it is named": policies.names(named_only=True),
         "made for several topics side by side": policies.names(for_topics=True),
     }
-    width = max(map(len, policies.names()))
-    lines: list[str] = []
-    for title, names in parts.items():
-        lines += [f"  -- {title} --"] if title else []
-        for policy in map(policies.get, names):
-            settings = ", ".join(f"{setting}={number:g}" for setting, number in policy.parameters.items())
-            told = [
-                f"{policy.summary[:1].upper()}{policy.summary[1:]}",
-                *([f"settings: {settings}"] if settings else []),
-            ]
-            told.append(f"from: {policy.source or 'a policy file'}")
-            heads = [policy.name, *[""] * (len(told) - 1)]
-            lines += [f"  {head:<{width}}  {text}".rstrip() for head, text in zip(heads, told, strict=True)]
-    return "\n".join(lines)
+    return _in_parts({title: [row for name in names for row in _about(name)] for title, names in parts.items()})
+
+
+def _about(name: str) -> list[tuple[str, str]]:
+    from bufgym.policies import get
+
+    policy = get(name)
+    settings = ", ".join(f"{setting}={number:g}" for setting, number in policy.parameters.items())
+    rows = [(policy.name, f"{policy.summary[:1].upper()}{policy.summary[1:]}")]
+    rows += [("", f"settings: {settings}")] if settings else []
+    return [*rows, ("", f"from: {policy.source or 'a policy file'}")]
 
 
 def _list_values() -> str:

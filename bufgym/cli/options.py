@@ -1,18 +1,24 @@
 """What commands share: types and groups of options, what goes together, policies by name and from files, columns."""
 
+from __future__ import annotations
+
 import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from cyclopts import Group, Parameter
 
 from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError, install, printable
+from bufgym.ground.errors import BufgymError, install
 from bufgym.ground.libraries import library
+from bufgym.ground.tables import aligned
 from bufgym.ground.units import bytes_of, rate_or_number
+
+if TYPE_CHECKING:
+    from bufgym.policies import Policy
 
 MAX_EPISODES = 100_000  # Limit on episodes of each trace; memory holds a row for each, times policies and capacities
 
@@ -214,25 +220,24 @@ def policy_specs(texts: Sequence[str] | None) -> list[str]:
     return specs
 
 
-def loaded(texts: Sequence[str] | None) -> tuple[list[str], tuple[str, ...]]:
-    """Register the policies of ``--policies``; return their names and the words that had to be loaded."""
-    from bufgym.benchmark import sources
+def policies_of(texts: Sequence[str] | None) -> list[Policy]:
+    """The policies of ``--policies``; those from files and modules are loaded."""
+    from bufgym.benchmark.sources import make_policy
 
     words = policy_specs(texts)
     for word in words:
         if word.endswith(".py"):
             raise BufgymError(f"--policies {word}: a Python file; --policy-file {word} registers its policies")
-    found = tuple(word for word in words if sources.is_source(word))
-    return [sources.load(word) if word in found else word for word in words], found
+    return [make_policy(word) for word in words]
 
 
-def one_policy(text: str, file: str | None = None) -> str:
+def one_policy(text: str, file: str | None = None) -> Policy:
     """The single policy of ``--policies``, after the user's file was run."""
     load_policies(file)
-    names = loaded([text])[0]
-    if len(names) != 1:
+    chosen = policies_of([text])
+    if len(chosen) != 1:
         raise BufgymError(f"--policies {text}: must be one policy")
-    return names[0]
+    return chosen[0]
 
 
 def load_policies(path: str | None) -> None:
@@ -242,9 +247,5 @@ def load_policies(path: str | None) -> None:
 
 
 def columns(lines: Sequence[Sequence[str]]) -> str:
-    """Align columns to the left, indented; the last is not padded."""
-    lines = [list(map(printable, line)) for line in lines]
-    widths = [max((len(line[c]) for line in lines), default=0) for c in range(max(map(len, lines), default=0))]
-    return "\n".join(
-        "  " + "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
+    """Align columns to the left, indented."""
+    return "\n".join(f"  {line}" for line in aligned(lines, left=max(map(len, lines), default=0)))

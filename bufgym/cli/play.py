@@ -43,9 +43,8 @@ def play(
 
     from bufgym.benchmark.run import draw
     from bufgym.envs.expert import Player
-    from bufgym.policies import get
 
-    policy = get(one_policy(policies, policy_file))
+    policy = one_policy(policies, policy_file)
     known = environments()
     id = env if "/" in env else f"bufgym/{env}"
     if id not in known:

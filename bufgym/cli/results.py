@@ -1,12 +1,11 @@
-"""``bufgym report``, ``leaderboard``, ``validate``, ``perf`` and ``warmup``."""
+"""``bufgym report``, ``leaderboard``, ``validate`` and ``warmup``."""
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from bufgym.cli.options import Count, Whole
+from bufgym.cli.options import Whole
 from bufgym.ground.errors import BufgymError, printable
 
 DEFAULT = "docs/leaderboard.csv"
@@ -68,28 +67,6 @@ def validate(row: str, /, *, file: Path = Path(DEFAULT), data: str | None = None
     print(f"{entry.name}: holds")
     for key, (stated, low, high) in entry.values.items():
         print(f"  {key}: {again.values[key].value:.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {file}")
-
-
-def perf(*, json: Path | None = None, history: Path | None = None, repeats: Count = 3, quick: bool = False) -> None:
-    """Measure bufgym's own speed on this machine, beside a bare kernel that does the job of one step.
-
-    Args:
-        json: Also write the figures to this file.
-        history: Add a line to this file, and say which ratios fell below the runs before.
-        repeats: Best of so many.
-        quick: Tiny sizes: does it run at all?
-    """
-    from bufgym.benchmark import perf as speed
-
-    sizes = speed.Sizes(4, (4, 2), 80, 20, 1, repeats) if quick else speed.Sizes(repeats=repeats)
-    if not quick and sys.stderr.isatty():
-        print("measuring; this takes about a minute ...", file=sys.stderr)
-    figures = speed.measure(sizes)
-    print(speed.report(figures, sizes.repeats))
-    if json is not None:
-        speed.write_json(figures, sizes, json)
-    if history is not None:
-        print(speed.remember(figures, sizes, history))
 
 
 def warmup() -> None:

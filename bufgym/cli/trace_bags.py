@@ -68,7 +68,7 @@ class RecordingOptions(MotionOptions):
 
 
 def workload_lines(workload: Workload) -> list[str]:
-    from bufgym.benchmark.table import aligned
+    from bufgym.ground.tables import aligned
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "mean bytes", "share"]]
     for topic in workload.summary():
@@ -156,7 +156,7 @@ def from_poses(
 
 def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     """List every topic of a recording with its type, topics without messages last."""
-    from bufgym.benchmark.table import aligned
+    from bufgym.ground.tables import aligned
     from bufgym.traces.formats.bag_files import BETWEEN_TYPES
     from bufgym.traces.formats.bag_poses import carries_poses
 

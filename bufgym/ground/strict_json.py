@@ -5,9 +5,16 @@ import math
 from typing import Any, NoReturn
 
 
+class Decoder(json.JSONDecoder):
+    """Raises ValueError for a number that is not finite."""
+
+    def __init__(self) -> None:
+        super().__init__(parse_constant=_refuse, parse_float=_finite)
+
+
 def loads(text: str | bytes) -> Any:
     """Parse JSON; raise ValueError for a number that is not finite."""
-    return json.loads(text, parse_constant=_refuse, parse_float=_finite)
+    return json.loads(text, cls=Decoder)
 
 
 def _finite(digits: str) -> float:

@@ -54,19 +54,6 @@ def check_name(what: str, name: Any) -> None:
         raise BufgymError(f"{what} {name!r}: a name must be non-empty, without spaces, ':', ',' or '='")
 
 
-def named_settings(what: str, spec: str) -> tuple[str, dict[str, float]]:
-    """Split ``"decimate:every=2"`` into its name and its settings; ``what`` is the kind of thing, for the message."""
-    name, _, settings = spec.partition(":")
-    numbers: dict[str, float] = {}
-    for setting in filter(None, settings.split(",")):
-        key, _, number = setting.partition("=")
-        try:
-            numbers[key.strip()] = float(number)
-        except ValueError:
-            raise BufgymError(f"{what} {spec!r}: {setting!r} is not of the form parameter=number") from None
-    return name, numbers
-
-
 def constants(numbers: Iterable[float]) -> NDArray[np.float64]:
     """The numbers as a read-only array for kernels."""
     array = np.array(list(numbers), np.float64)

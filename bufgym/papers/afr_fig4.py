@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.benchmark.table import aligned
+from bufgym.ground.tables import aligned
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.papers.figure import COLOURS, Figure, finish, legend_below
 from bufgym.papers.rows import FigureRows, listed

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.benchmark.bootstrap import Interval
-from bufgym.benchmark.table import aligned
+from bufgym.ground.tables import aligned
 from bufgym.papers.figure import about, finish, heat_table, of_all, within
 from bufgym.papers.frame_runs import POLICIES, FrameFigure, over_places
 from bufgym.papers.perception.stage import IMAGES

@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.kernel import JIT, compile_for
 from bufgym.ground.modules import first_line, takes
+from bufgym.ground.settings import named_settings
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
-from bufgym.model.checks import changed, check_name, constants, named_settings
+from bufgym.model.checks import changed, check_name, constants
 
 Arrival = Any
 """A MESSAGE record."""

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from bufgym.cli.options import Count, Least0, PolicyFile, Positive, command_line, load_policies, loaded
+from bufgym.cli.options import Count, Least0, PolicyFile, Positive, command_line, load_policies, policies_of
 from bufgym.ground.errors import BufgymError
 from bufgym.robot.commands import REDRAW_S, redraw
 
@@ -48,7 +48,6 @@ def validate(
         out: Write every run to this folder (JSON).
     """
     from bufgym import traces
-    from bufgym.policies import get
     from bufgym.robot import tunnel as tunnels
     from bufgym.robot import validate as sockets
     from bufgym.robot.margins import margins
@@ -56,7 +55,7 @@ def validate(
     from bufgym.scenario import Uplink
 
     load_policies(policy_file)
-    names = loaded(policies)[0] or ["drop-oldest", "afr", "min-motion-gap", "learned"]
+    chosen = policies_of(policies or ["drop-oldest", "afr", "min-motion-gap", "learned"])
     scenario = Uplink(
         traces=tuple(traces.load(name) for name in trace),
         motion=tuple(traces.load_motion(name) for name in traces.shipped() if name.startswith("drive-")),
@@ -70,7 +69,7 @@ def validate(
         f"{duration:g} s, {size} bytes at 30 Hz, L = {capacity}, V = {scenario.value.name}, round trip {rtt:g} ms, "
         f"over {', '.join(transport)} and in the simulator"
     )
-    played = [get(name) for name in names]
+
     with contextlib.ExitStack() as stack:
         tunnel = stack.enter_context(tunnels.opened()) if rtt and not tunnels.impossible() else None
         plays: dict[str, Play] = {name: _play_over(name, tunnel) for name in transport}
@@ -80,7 +79,7 @@ def validate(
                 f"note: {tunnels.impossible()}. Instead a proxy delays all bytes. It ends TCP, so it cannot show what"
             )
             print("TCP's own acks and its growing window cost over the round trip.\n")
-        runs = sockets.validate(played, scenario, capacity, seeds=seeds, plays=plays, speed=speed)
+        runs = sockets.validate(chosen, scenario, capacity, seeds=seeds, plays=plays, speed=speed)
     print("\n".join([table(runs), "", *map(str, margins(runs))]))
     if out is not None:
         again = command_line(

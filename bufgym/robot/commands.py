@@ -79,14 +79,13 @@ async def send(
     decide_in_python(unless=compiled)
     from bufgym import traces
     from bufgym.model import qoi
-    from bufgym.policies import get
     from bufgym.robot import LogFile, PolicyQueue
     from bufgym.robot.channels import TRANSPORTS
     from bufgym.robot.log import Record
     from bufgym.robot.sender import Leaves, Sender
     from bufgym.robot.view import View
 
-    policy, (host, port) = get(one_policy(policies, policy_file)), address(to)
+    policy, (host, port) = one_policy(policies, policy_file), address(to)
     path = None if motion == "none" else traces.load_motion(motion)
     with contextlib.ExitStack() as stack:
         file = None if log is None else stack.enter_context(LogFile(log))

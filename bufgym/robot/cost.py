@@ -9,8 +9,8 @@ import time
 
 import numpy as np
 
-from bufgym.benchmark.table import Table
 from bufgym.cli.options import Positive
+from bufgym.ground.tables import Table
 from bufgym.robot.queue import PolicyQueue
 
 POLICIES = ("drop-oldest", "afr", "learned")

@@ -8,9 +8,9 @@ from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.benchmark.table import Table
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
+from bufgym.ground.tables import Table
 from bufgym.oracle.measure import regret
 
 DIFFER: Final = 0.01  # Relative difference in simulated H beyond which two policies should rank alike live

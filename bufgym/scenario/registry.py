@@ -3,7 +3,6 @@
 import ast
 import functools
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
@@ -12,6 +11,7 @@ import numpy as np
 
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.settings import named_settings
 from bufgym.model.qoi import Value
 from bufgym.scenario.afr_evaluation import afr_evaluation
 from bufgym.scenario.client import client_over_lte, read_client
@@ -84,17 +84,12 @@ def checked(scenario: Any, name: str) -> Scenario:
     return cast(Scenario, scenario)
 
 
-def split_text(text: str) -> tuple[str, dict[str, Any]]:
-    """Split ``"lte:rate_hz=5,motion=none"`` into the name and its parameters, literals of Python or text."""
-    name, _, settings = text.partition(":")
-    found: dict[str, Any] = {}
-    for setting in re.split(r",(?=[A-Za-z_]\w*=)", settings):
-        key, _, value = setting.partition("=")
-        try:
-            found[key] = ast.literal_eval(value)
-        except (SyntaxError, ValueError):
-            found[key] = value
-    return name, found
+def _literal(text: str) -> Any:
+    """A literal of Python, or the text itself."""
+    try:
+        return ast.literal_eval(text)
+    except (SyntaxError, ValueError):
+        return text
 
 
 def get(spec: str | os.PathLike[str] | Scenario, options: Iterable[str] = (), /, **overrides: Any) -> Scenario:
@@ -109,7 +104,7 @@ def get(spec: str | os.PathLike[str] | Scenario, options: Iterable[str] = (), /,
     if isinstance(spec, os.PathLike):
         spec = os.fspath(spec)
     if isinstance(spec, str) and "=" in spec.partition(":")[2]:
-        spec, settings = split_text(spec)
+        spec, settings = named_settings("scenario", spec, _literal)
         overrides = settings | overrides
     if isinstance(spec, str) and spec.endswith(".toml"):
         spec = read_client(spec)

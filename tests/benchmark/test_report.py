@@ -16,7 +16,7 @@ from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
 from bufgym.benchmark import report
-from bufgym.benchmark.report import timeline
+from bufgym.benchmark.report import tables, timeline
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import FleetScenario, suites
@@ -49,7 +49,8 @@ def test_the_ranking_in_markdown(folder: Path) -> None:
         ["–", "clairvoyant (it knows the future)", "1.000", "1.000", "0.000 %", "0.000", "1.000", "−1.000"],
     ]
     # By default the others are compared with the best rule: a policy that is not registered is none.
-    assert "minus random's" in report.plain(folder, "random") and "minus" not in report.plain(folder)
+    assert "minus random's" in tables.plain(*report.run_of(folder, "random"))
+    assert "minus" not in tables.plain(*report.run_of(folder, ""))
     assert "minus afr&#39;s" in report.write(folder).read_text(encoding="utf-8")
 
 
@@ -102,7 +103,7 @@ def test_topics_and_fleets_have_a_page_too(
     assert f"{next(iter(changes))} = 2" in page and "not ranked: its queue is unbounded" in page
     assert "ranking" in drawn(page) and "discriminative" not in page
     assert report.markdown(tmp_path).count("\n| # | policy |") == 1 + 2 * len(short)
-    assert f"Suite {suite}, validation: " in report.plain(tmp_path)
+    assert f"Suite {suite}, validation: " in tables.plain(*report.run_of(tmp_path))
 
 
 def shortened(scenario: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from refusal_cases import refuse, refused
 
+import bufgym
 from bufgym import oracle, policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
@@ -105,21 +106,24 @@ def newest(buffer: Any, arrival: Any, memory: Any) -> int:
     return policies.ACCEPT if len(buffer.slots) < buffer.capacity else 0
 
 
+AFR = policies.get("afr")
+
 test_bad_arguments_are_named = refused(
-    (lambda: run.run(["afr"], UPLINK, [0], 1), "capacity = 0"),
-    (lambda: run.run(["afr"], UPLINK, [2], 0), "seeds = 0"),
-    (lambda: run.run(["afr", "afr"], UPLINK, [2], 1), "'afr' is given more than once"),
-    (lambda: run.run(["afr"], UPLINK, [2], 1, decide_at="never"), "'never'"),
-    (lambda: run.run([3], UPLINK, [2], 1), "policy 3: must be a name, a Policy, or a function"),  # type: ignore[list-item]
+    (lambda: run.run([AFR], UPLINK, [0], 1), "capacity = 0"),
+    (lambda: run.run([AFR], UPLINK, [2], 0), "seeds = 0"),
+    (lambda: run.run([AFR, AFR], UPLINK, [2], 1), "'afr' is given more than once"),
+    (lambda: run.run([AFR], UPLINK, [2], 1, decide_at="never"), "'never'"),
+    (lambda: bufgym.compare([AFR], "topics", max_bytes=5), "max_bytes = 5: is for one queue, not for topics"),
+    (lambda: bufgym.compare([3], UPLINK), "policy 3: must be a name, a Policy, or a function"),  # type: ignore[list-item]
     (
-        lambda: run.run([Policy("afr", newest), "afr"], UPLINK, [2], 1),
+        lambda: run.run([Policy("afr", newest), AFR], UPLINK, [2], 1),
         "'afr' is given more than once; 'afr' is a built-in policy's name",
     ),
 )
 
 
 def test_functions_and_names_are_policies_too() -> None:
-    rows = run.run([newest, "drop-oldest", policies.get("afr")], UPLINK, [2], 1)
+    rows = bufgym.compare([newest, "drop-oldest", AFR], UPLINK, capacity=2, seeds=1, progress=False).rows
     qoi_of = {row["policy"]: row["qoi"] for row in rows if row["trace"] == "slow"}
     assert list(qoi_of) == ["newest", "drop-oldest", "afr"] and qoi_of["newest"] == qoi_of["drop-oldest"]
 

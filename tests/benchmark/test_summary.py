@@ -16,6 +16,7 @@ from bufgym import policies
 from bufgym.benchmark import leaderboard, report
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
+from bufgym.benchmark.report import tables
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.summary import Quantity, Run, Summary, summarise, table_of
 from bufgym.benchmark.sweep import Sweep, run_sweep
@@ -158,7 +159,7 @@ def test_a_byte_limit_of_a_setting_holds(monkeypatch: pytest.MonkeyPatch, tmp_pa
     for truth in (h, best):
         assert truth["tight", 2] == truth["tight", 9] == truth["free", 2] < truth["free", 9]
     assert all(row["certified"] for row in rows)
-    printed = report.plain(tmp_path / "run")
+    printed = tables.plain(*report.run_of(tmp_path / "run", ""))
     assert "worst cell" in printed.splitlines()[0] and "is worst in " in printed
     assert "is worst in " in report.markdown(tmp_path / "run")
 

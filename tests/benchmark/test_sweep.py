@@ -140,7 +140,7 @@ def test_an_error_loses_no_finished_rows(tmp_path: Path, small: Sweep, backend: 
     assert "one-0-0" in written and written == set(begun) - {"one-1-1000"}
 
     begun.clear()
-    monkeypatch.setattr(sweep, "run_shard", lambda shard, load=None: begun.append(shard.name) or right(shard))
+    monkeypatch.setattr(sweep, "run_shard", lambda shard: begun.append(shard.name) or right(shard))
     rows = sweep.run_sweep(small, tmp_path, jobs=2, backend="sequential", form="csv")
     assert len(begun) == 4 - len(kept) and not set(begun) & written
     assert repr(rows) == repr(sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form="csv"))

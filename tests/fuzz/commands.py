@@ -22,7 +22,7 @@ lte-v1 topics-v1 fleet-v1 lte-synthetic-0 drive-0 exponential:0.5 exponential:2 
 VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", "\udcff"]
 
 WORK = """benchmark.run.run benchmark.sweep.run_sweep benchmark.leaderboard.make
-benchmark.leaderboard.validate benchmark.perf.measure robot.cost.measure traces.datasets.fetch.fetch_dataset
+benchmark.leaderboard.validate robot.cost.measure traces.datasets.fetch.fetch_dataset
 papers.commands._text cli.play.play robot.commands.send robot.commands.receive robot.commands.link
 robot.ros2.commands.send robot.ros2.commands.receive relay.commands.serve relay.commands.robot
 relay.commands.foxglove robot.cost.cost robot.validate.validate envs.expert.dataset.make"""

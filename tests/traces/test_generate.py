@@ -161,7 +161,7 @@ def test_broken_arguments_and_parameter_files(tmp_path: Path) -> None:
         ("[]", 'must be an object with "modes"'),
         ('{"modes": {"bus": {"seconds": 5}}}', "mode 'bus': must be an object with fast_memory"),
         ("[" * 100_000, "must be JSON"),
-        *((text, "mode '.*': level_stay_s = |is not a finite number") for text in stays),
+        *((text, "mode '.*': level_stay_s = |numbers must be finite") for text in stays),
     ):
         file.write_text(text, encoding="utf-8")
         refuse(f"links.json.*({says})", read_links, file, kind=TraceError)

@@ -25,7 +25,7 @@ from bufgym.policies import Policy
 from bufgym.scenario import about
 from bufgym.scenario.suites import Setting
 
-__all__ = ["markdown", "page_for", "page_of", "plain", "run_of", "save", "write"]
+__all__ = ["markdown", "page_for", "page_of", "run_of", "save", "write"]
 
 
 def write(folder: str | Path, target: Path | None = None) -> Path:
@@ -70,11 +70,6 @@ def markdown(folder: str | Path, against: str | None = None) -> str:
     ``against`` is the policy that every other is compared with, by default ``best_rule``; empty for none.
     """
     return tables.markdown(*run_of(folder, against))
-
-
-def plain(folder: str | Path, against: str = "") -> str:
-    """The summary as text, for a terminal. Errors as for ``write``."""
-    return tables.plain(*run_of(folder, against))
 
 
 def best_rule(summary: Summary) -> str:

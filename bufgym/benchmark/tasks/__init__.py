@@ -13,6 +13,7 @@ from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.benchmark.tasks.stress import StressTask
 from bufgym.benchmark.tasks.task import Task
 from bufgym.benchmark.tasks.topics import TopicsTask
+from bufgym.ground.errors import BufgymError
 
 __all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "of"]
 
@@ -26,4 +27,7 @@ def of(scenario: Any, **settings: Any) -> Task:
     ``settings`` are the task's own, such as max_bytes, decide_at and bound of ``QueueTask``.
     """
     task = next((task for task in TASKS.values() if isinstance(scenario, task.scenarios)), TASKS["queue"])
+    for name in settings:
+        if not hasattr(task, name):
+            raise BufgymError(f"{name} = {settings[name]!r}: is for one queue, not for {task.kind}")
     return replace(task, **settings)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from bufgym.benchmark import bootstrap, table
 from bufgym.benchmark.rows import RUNS, Row
 from bufgym.benchmark.score import REFERENCE, scores
-from bufgym.benchmark.summary import Quantity, Summary, difference
-from bufgym.benchmark.table import NOBODY, REGRET_AT_MOST, Unranked, percent, score
+from bufgym.benchmark.summary import Quantity, Summary, difference, table_over
+from bufgym.benchmark.table import NOBODY, REGRET_AT_MOST, Table, Unranked, percent, score
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
 from bufgym.ground.errors import BufgymError
@@ -76,6 +77,7 @@ class QueueTask(Task):
     baseline = BASELINE
     reference = REFERENCE
     listed = ("score", "regret", "improvement")
+    shows_baseline = False
 
     def default_policies(self, suite: str) -> list[str]:
         """List all policies for one queue with their sources' parameters, and the variants tuned on the suite."""
@@ -129,6 +131,21 @@ class QueueTask(Task):
         if not scored.exact:
             quantities = tuple(q._replace(title=REGRET_AT_MOST) if q.key == "regret" else q for q in quantities)
         return Summary(quantities, "score", scored.standings, {}, self.baseline, scored)
+
+    def tables(
+        self, rows: Sequence[Row], floor: Sequence[Row], summary: Summary, unranked: Unranked, abouts: Mapping[str, str]
+    ) -> list[Table]:
+        """The table of means; then, where policies are compared with one of them, their shares of AFR's regret."""
+        cells = [cell for cell in summary.scores.cells if cell.episodes > 1] if summary.scores else []
+        behind = {(cell.capacity, cell.policy): bootstrap.written(cell.score, score)[1] for cell in cells}
+        means = table.of(rows, floor, unranked, behind)
+        if "score" in means.head:
+            means = means._replace(notes=[table.SCORE, *[table.BRACKETS] * any(behind.values()), *means.notes])
+        paired = [quantity for quantity in summary.quantities if quantity.key in ("share", "against")]
+        if len(paired) == 1:
+            return [means]
+        notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
+        return [means, table_over([("", summary.overall)], paired)._replace(notes=notes)]
 
     def example(
         self, policies: Sequence[Policy], rows: Sequence[Row], setting_of: Callable[[Row], Setting]

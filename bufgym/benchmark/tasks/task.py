@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from bufgym.benchmark.rows import Layout, Row
-from bufgym.benchmark.summary import Quantity, Summary
-from bufgym.benchmark.table import NOBODY, Unranked, invalid
+from bufgym.benchmark.summary import Quantity, Summary, table_of
+from bufgym.benchmark.table import NOBODY, Table, Unranked, invalid
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
@@ -33,6 +33,7 @@ class Task(ABC):
     capacity: ClassVar[int] = 8  # L unless the caller says otherwise, messages
     seeds: ClassVar[int] = 10  # episodes on each trace, likewise
     legend: ClassVar[tuple[str, ...]] = ()  # lines under a printed summary
+    shows_baseline: ClassVar[bool] = True  # whether tables and rows have the baseline where nobody named it
 
     @abstractmethod
     def default_policies(self, suite: str) -> list[str]:
@@ -77,6 +78,12 @@ class Task(ABC):
         """Lines under a printed summary: the legend, who has no rank, invalid decisions, and the summary's own."""
         apart = [f"{s.policy} has no rank: {s.apart}." for s in summary.overall if not s.ranked]
         return [*self.legend, *apart, *invalid(self.senders(rows)), *summary.notes]
+
+    def tables(
+        self, rows: Sequence[Row], floor: Sequence[Row], summary: Summary, unranked: Unranked, abouts: Mapping[str, str]
+    ) -> list[Table]:
+        """Tables of one scenario's rows. ``floor`` has the baseline's rows where they are not among ``rows``."""
+        return [table_of(summary, abouts, ["", *self.notes(rows, summary)])]
 
     def describe(self, scenarios: Sequence[Any], episodes: int) -> str:
         """Describe the scenarios in one sentence; empty if their own descriptions do."""

@@ -13,9 +13,10 @@ from bufgym.benchmark.bootstrap import ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
-from bufgym.benchmark.table import NOBODY, Column, RunRows, Table, Unranked, decimal, mean, percent, score
+from bufgym.benchmark.table import NOBODY, Column, RunRows, Unranked, decimal, mean, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.tables import Table
 from bufgym.policies import Policy, names
 from bufgym.scenario import Client, Episode
 from bufgym.sim import Senders, run

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
-from bufgym.model.checks import changed, check_name, constants, is_number, named_settings
+from bufgym.ground.settings import named_settings
+from bufgym.model.checks import changed, check_name, constants, is_number
 from bufgym.model.observe.declare import Field, Function
 from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, RewardTerm
 

@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots
@@ -121,7 +121,7 @@ def read_json_values(path: StrPath) -> list[Any]:
     """The values of JSON that follow each other in the file, whose numbers are finite."""
     with open_text(path) as file:
         text = file.text()
-    decoder, values = json.JSONDecoder(parse_constant=_no_constant), []
+    decoder, values = strict_json.Decoder(), []
     at = len(text) - len(text.lstrip())
     try:
         while at < len(text):
@@ -151,7 +151,3 @@ def json_number(line: Line, item: Any, name: str, most: float) -> float:
     if not 0 <= value <= most:
         raise line.error(value, f"must be from 0 to {most:g}", name)
     return value
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a finite number")

@@ -15,6 +15,7 @@ import numpy as np
 
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.settings import named_settings
 from bufgym.traces.formats.faults import fault
 from bufgym.traces.formats.text import open_text, split_cells
 from bufgym.traces.generate.draws import ar1, checked
@@ -107,17 +108,13 @@ def parsed(text: str) -> tuple[str, Numbers, str]:
     if name not in LAWS:
         raise unknown("sizes", name, [*LAWS, "recorded"], ":NAME")
     ranges = LAWS[name][1]
-    numbers = {key: known.default for key, known in ranges.items()}
-    for setting in rest.split(",") if rest else []:
-        key, _, number = (part.strip() for part in setting.partition("="))
+    given = named_settings("sizes", text)[1]
+    for key, number in given.items():
         if key not in ranges:
             none = BufgymError(f"sizes {text!r}: {name!r} has no parameters")
             raise unknown(f"parameter of sizes {name!r}", key, ranges) if ranges else none
-        try:
-            numbers[key] = float(number)
-        except ValueError:
-            raise BufgymError(f"sizes {text!r}: {setting!r} is not of the form parameter=number") from None
-        checked(f"sizes {text!r}: {key}", numbers[key], ranges[key].least, ranges[key].most)
+        checked(f"sizes {text!r}: {key}", number, ranges[key].least, ranges[key].most)
+    numbers = {key: known.default for key, known in ranges.items()} | given
     if numbers.get("every", 1) % 1:
         raise BufgymError(f"sizes {text!r}: every = {numbers['every']:g}: must be a whole number")
     return name, numbers, ""

@@ -1,5 +1,7 @@
 """bufgym's own speed: its environments and its rollouts, beside a bare kernel that does the job of one step.
 
+``python -m studies.perf [--json FILE] [--history FILE] [--repeats N] [--quick]``
+
 Every figure is the best of several repeats in time of the processor, because other work on the machine can only slow a
 repeat down. Each repeat times the ``yardstick`` too: their ratio says more than either. Actions are drawn beforehand,
 uniform among the valid ones, by playing the same seeded episodes once. So the timed loop holds only the environment's
@@ -11,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -24,15 +27,17 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from agents.page import command
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark import yardstick
 from bufgym.benchmark.run import draw
-from bufgym.benchmark.table import Table
+from bufgym.cli.options import Count
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT, compile_here
+from bufgym.ground.tables import Table
 from bufgym.sim import Senders
+from studies import yardstick
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"
@@ -118,7 +123,7 @@ class _Meter:
 
     def __init__(self, sizes: Sizes) -> None:
         self.sizes, (self._work, self._steps) = sizes, yardstick.passes(max(sizes.batches), sizes.capacity)
-        told = f"steps a second of bufgym.benchmark.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
+        told = f"steps a second of studies.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
         self._work()  # compiled, or loaded from disk, before the clock starts
         self.yardstick = self.figure("yardstick", told, self._steps, "steps", lambda: None, self._work)
 
@@ -235,7 +240,7 @@ def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
         before = [line["ratios"] for line in lines if line["sizes"] == told][-BEFORE:]
     except (ValueError, KeyError, TypeError) as error:
-        raise BufgymError(f"{path}: not a history that bufgym perf wrote ({type(error).__name__}: {error})") from None
+        raise BufgymError(f"{path}: not a history that studies.perf wrote ({type(error).__name__}: {error})") from None
     ratios = {figure.name: figure.ratio for figure in figures if figure.ratio}
     line = {"date": date.today().isoformat(), "version": version("bufgym"), "sizes": told, "ratios": ratios}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -248,3 +253,27 @@ def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
             fallen.append(f"{name}: {ratio:.3g} after {known:.3g}")
     what = f"fell by more than {FELL:.0%} below the median of the last {len(before)} runs"
     return f"{what}: {'; '.join(fallen)}" if fallen else f"no ratio {what}"
+
+
+def main(*, json: Path | None = None, history: Path | None = None, repeats: Count = 3, quick: bool = False) -> None:
+    """Measure bufgym's own speed on this machine, beside a bare kernel that does the job of one step.
+
+    Args:
+        json: Also write the figures to this file.
+        history: Add a line to this file, and say which ratios fell below the runs before.
+        repeats: Best of so many.
+        quick: Tiny sizes: does it run at all?
+    """
+    sizes = Sizes(4, (4, 2), 80, 20, 1, repeats) if quick else Sizes(repeats=repeats)
+    if not quick and sys.stderr.isatty():
+        print("measuring; this takes about a minute ...", file=sys.stderr)
+    figures = measure(sizes)
+    print(report(figures, sizes.repeats))
+    if json is not None:
+        write_json(figures, sizes, json)
+    if history is not None:
+        print(remember(figures, sizes, history))
+
+
+if __name__ == "__main__":
+    command(main)

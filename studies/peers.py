@@ -1,6 +1,6 @@
-"""Speed beside other packages, and the parts of a step, for docs/guide/speed.md: ``python -m website.speed``.
+"""Speed beside other packages, and the parts of a step, for docs/guide/speed.md: ``python -m studies.peers``.
 
-``bufgym perf`` measures bufgym alone. This adds CartPole of other packages, as far as they are installed, and says how
+``studies.perf`` measures bufgym alone. This adds CartPole of other packages, as far as they are installed, and says how
 the time of a step divides.
 """
 
@@ -16,22 +16,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from bufgym.benchmark.perf import (
-    ENVIRONMENTS,
-    NATIVE,
-    SEED,
-    TOPICS,
-    Measurement,
-    Sizes,
-    best_s,
-    measure,
-    play,
-    record,
-    report,
-)
 from bufgym.envs.output import StepOutput, write_mask, write_observation
 from bufgym.ground.kernel import compile_here, kernel
 from bufgym.sim.state import NOTHING_WAITS, Batch
+from studies.perf import ENVIRONMENTS, NATIVE, SEED, TOPICS, Measurement, Sizes, best_s, measure, play, record, report
 
 PEERS = {
     "gymnasium": f"gym.make_vec('CartPole-v1', vectorization_mode='{NATIVE}'), in numpy",

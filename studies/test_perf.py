@@ -1,0 +1,75 @@
+"""The speed report at tiny sizes, its history, and the yardstick beside the environment."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from refusal_cases import refuse
+
+import bufgym.envs  # noqa: F401  (registers)
+from bufgym.ground.kernel import named
+from bufgym.sim.rollout import python_arrival, python_view
+from studies import perf, yardstick
+
+TINY = perf.Sizes(3, (2, 1), 24, 10, 1, 1)
+
+
+def test_every_figure_is_a_number_with_its_ratio_and_definition(tmp_path: Path) -> None:
+    figures = perf.measure(TINY)
+    assert all(math.isfinite(figure.value) and figure.value > 0 and figure.definition for figure in figures)
+    assert all(figure.ratio and math.isfinite(figure.ratio) for figure in figures)
+    assert figures[0].name == "yardstick" and len({figure.name for figure in figures}) == len(figures) == 19
+    text = perf.report(figures, TINY.repeats)
+    assert all(figure.name in text and figure.definition in text for figure in figures)
+    perf.write_json(figures, TINY, tmp_path / "perf.json")
+    read = json.loads((tmp_path / "perf.json").read_text())
+    assert [figure["name"] for figure in read["figures"]] == [figure.name for figure in figures]
+
+
+def test_a_history_says_what_fell_below_the_median_of_the_last_five(tmp_path: Path) -> None:
+    file = tmp_path / "new" / "perf.jsonl"
+
+    def told(ratio: float, sizes: perf.Sizes = TINY) -> str:
+        return perf.remember([perf.Measurement("batch", 1.0, "steps/s", ratio, "")], sizes, file)
+
+    assert all(told(ratio).startswith("no ratio") for ratio in (1.0, 1.0, 1.0, 9.0, 0.9, 1.1))
+    assert told(0.86).startswith("no ratio fell") and told(0.84) == (
+        "fell by more than 15% below the median of the last 5 runs: batch: 0.84 after 1"
+    )
+    assert told(0.1, perf.Sizes()).startswith("no ratio"), "other sizes"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert len(lines) == 9 and lines[3]["ratios"] == {"batch": 9.0}
+    file.write_text("nothing\n")
+    refuse("not a history", told, 1.0)
+
+
+def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:
+    """It is set to the state of an environment; those that need its link and past stay out."""
+    env: Any = gym.make("bufgym/Uplink-v0", capacity=4, observation="flat").unwrapped
+    flat, info = env.reset(seed=3)
+    for k in range(40):
+        flat, _, ended, _, info = env.step(5 if info["action_mask"][5] else k % 4)
+        assert not ended
+    buffer, arrival = python_view(named(env.rows.senders.batch), 0), python_arrival(named(env.rows.senders.batch), 0)
+    bare, s = yardstick.Bare.new(1, 4), len(buffer.slots)
+    at_s, x, size, gain = bare.places[0]
+    zero = buffer.dequeued_arrival_us
+    rows = [*buffer.slots, arrival]
+    at_s[1 : s + 2] = [(row.arrival_us - zero) * 1e-6 for row in rows]
+    x[0], x[1 : s + 2] = buffer.dequeued_x, [row.x for row in rows]
+    size[1 : s + 2] = [row.size_bytes for row in rows]
+    bare.previous[0, :2] = (buffer.previous_us - zero) * 1e-6, buffer.previous_x
+    at_s[s + 2] = 2 * at_s[s + 1] - bare.previous[0, 0]
+    x[s + 2] = 2 * x[s + 1] - bare.previous[0, 1]
+    gain[1:] = 1 - np.exp(-yardstick.STEEP * np.diff(x))
+    bare.state[0, yardstick.QUEUED] = s
+    mine, mask = np.zeros((1, 56), np.float32), np.zeros((1, 6), np.int8)
+    yardstick.observe(bare, 0, mine, mask)
+    assert s >= 2 and mask[0].tolist() == info["action_mask"].tolist()
+    of_v = {*range(30, 35), *range(40, 45)}  # losses: this V is another
+    places = [k for k in range(49) if k not in of_v]
+    assert mine[0, places] == pytest.approx(flat[places], abs=2e-4)
