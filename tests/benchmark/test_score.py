@@ -167,15 +167,6 @@ def noisy(n: int, seed: int = 0, shared: float = 5.0) -> dict[str, Any]:
     return {"h": {"drop-oldest": b, "afr": b + 1 + rng.normal(0, 0.5, n)}, "best": list(b + 2)}
 
 
-@pytest.mark.nightly
-def test_the_interval_holds_the_truth_as_often_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 experiments of AFR in ``noisy``, whose score is 1/2: 95 % but for what few lack, and chance."""
-    monkeypatch.setattr(score, "RESAMPLES", 300)
-    scored = [score.scores(rows_of(**noisy(30, seed=k))) for k in range(100)]
-    held = [low <= 0.5 <= high for _, low, high in (cell_of(one, "afr").score for one in scored)]
-    assert 0.84 < sum(held) / 100 <= 0.99
-
-
 def test_what_an_episode_is_worth_to_everybody_cancels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Adding a constant per episode to all policies moves neither differences nor improvements nor scores."""
     calm, wild = noisy(50, shared=0.0), noisy(50, shared=0.0)
