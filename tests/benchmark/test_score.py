@@ -299,12 +299,6 @@ def test_the_score_leads_and_is_computed_on_sums() -> None:
     assert "drop-oldest" not in table.of(MINE, BASE).plain()
 
 
-def test_the_score_of_a_table_is_that_of_its_cell() -> None:
-    rows = [{**entry, "scenario": ""} for entry in [*BASE, scored("mine", 0, 6.0), scored("mine", 1, 7.0)]]
-    cells = {cell.policy: (cell.score.value, cell.qoi.value) for cell in score.scores(rows).cells}
-    assert cells == {entry["policy"]: (entry["score"], entry["qoi"]) for entry in table.means(rows)}
-
-
 def test_policies_that_no_row_tells_apart_are_one_line() -> None:
     twins = [{**entry, "policy": name} for entry in BASE for name in ("ros-keep-last", "near")]
     twins[-1] |= {"delivered": 2}
