@@ -77,6 +77,7 @@ def test_linear_with_alpha_1_is_afr(case, v):
         ("paced-motion-gap:discount=0.01", 3, 5, [2, 4, 5]),
         ("paced-motion-gap:pace=0.9", 3, 5, [2, 3, 4]),
         ("ros-keep-last", 16, 30, [*range(21, 31)]),  # 10 by default
+        ("latest-only", 16, 30, [30]),
         # Message 0 was the first of three; 1 and 2 are decimated, as are 4 and 5.
         ("decimate", 3, 6, [1, 4]),
         # 4 drops 1 (of equal gaps the oldest), 5 drops 3, 6 drops 5: the gaps stay 2.
