@@ -15,12 +15,13 @@ from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy, guided, learned
-from bufgym.policies.learned import NAMES, Network, Weights
+from bufgym.policies.learned import NAMES
 from bufgym.robot.c import CALL, SUPPORTED, header, random_episode, recorded
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received
 from bufgym.traces import Trace
+from tests.core.weight_cases import random_weights
 
 REPO = Path(__file__).resolve().parent.parent
 EXPONENTIAL = qoi.exponential()
@@ -85,19 +86,7 @@ def driver(folder, text, *flags):
 
 def every_field() -> Policy:
     """A random agent of two layers that reads every field there is."""
-    rng = np.random.default_rng(3)
-
-    def some(*shape):
-        return rng.normal(size=shape).astype(np.float32)
-
-    def network(*widths):
-        inputs, layers = len(NAMES), []
-        for width in widths:
-            layers.append((some(inputs, width), some(width)))
-            inputs = width
-        return Network(some(len(NAMES)), some(1), tuple(layers), some(inputs if widths else 0))
-
-    return learned.policy("every-field", Weights(NAMES, network(7, 5), network(7, 5)))
+    return learned.policy("every-field", random_weights(NAMES, 7, 5, seed=3))
 
 
 def every_output() -> Policy:

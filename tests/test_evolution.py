@@ -1,4 +1,4 @@
-"""Evolved agents: where they begin, what they leave, that a killed run goes on and repeats, also on a cluster."""
+"""Evolved agents: where they begin, what they leave, and that a run that goes on repeats on a cluster."""
 
 import csv
 import importlib.util
@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 from cli_cases import Patch
 from safetensors.numpy import load_file
-from train_cases import columns
 
-from agents import cluster, families, joint, training
+from agents import cluster, families, joint
 from agents.families import Family, Run, run_of
 from agents.mixed_env import Cell
 from agents.objectives import suites
-from agents.runs import MODEL, prepare
+from agents.runs import MODEL
 from agents.settings import Cluster, Evolve, Suites
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
@@ -71,26 +70,6 @@ def test_where_afr_loses_nothing_nothing_can_be_learned(tmp_path: Path, monkeypa
 def runs_of(bytes_per_s: float) -> list[Run]:
     link = Trace.steps([(1.0, bytes_per_s), (1.0, bytes_per_s / 4)], name="link")
     return [run_of(str(seed), Uplink(traces=(link,), duration_s=4.0), seed, 5) for seed in range(12)]
-
-
-@pytest.mark.nightly
-def test_a_run_goes_on_after_a_kill_and_repeats() -> None:
-    """What it leaves behind, test_train.py shows for every algorithm."""
-    few = replace(TINY, steps=38_000, validate_every=19_000, validation_episodes=6, suites=replace(ON, test_seeds=2))
-    folder = prepare(few)
-    training.train_all(few, folder)
-    whole, notes = weights.read_any(folder / "seed-0" / MODEL)
-    assert (notes["algo"], notes["suite"]) == ("evolve", "interruption-v1")
-    rows = columns(folder / "seed-0" / "validation.csv", "steps", "regret")
-    assert rows[0][0] == 0 and rows[-1][0] >= few.steps and all(0 <= regret < 1 for _, regret in rows)
-    # Half of the steps, then the rest: the same agent to the last bit.
-    half = replace(few, name="half", steps=few.steps // 2)
-    folder = prepare(half)
-    training.train_all(half, folder)
-    rest = replace(half, steps=few.steps, resume=True)
-    training.train_all(rest, prepare(rest))
-    again, _ = weights.read_any(folder / "seed-0" / MODEL)
-    assert (again.weight == whole.weight).all()
 
 
 REPO = Path(__file__).resolve().parent.parent

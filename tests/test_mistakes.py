@@ -249,7 +249,3 @@ def test_the_right_name_is_suggested(name: str, call: Callable[[str], Any]) -> N
         call(without_one(name))
     told = str(caught.value)
     assert "unknown " in told and f"{without_one(name)!r}; did you mean {name!r}?" in told and "\n" not in told
-
-
-def test_there_are_many() -> None:
-    assert len(CASES) >= 60

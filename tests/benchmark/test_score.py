@@ -167,15 +167,6 @@ def noisy(n: int, seed: int = 0, shared: float = 5.0) -> dict[str, Any]:
     return {"h": {"drop-oldest": b, "afr": b + 1 + rng.normal(0, 0.5, n)}, "best": list(b + 2)}
 
 
-@pytest.mark.nightly
-def test_the_interval_holds_the_truth_as_often_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 experiments of AFR in ``noisy``, whose score is 1/2: 95 % but for what few lack, and chance."""
-    monkeypatch.setattr(score, "RESAMPLES", 300)
-    scored = [score.scores(rows_of(**noisy(30, seed=k))) for k in range(100)]
-    held = [low <= 0.5 <= high for _, low, high in (cell_of(one, "afr").score for one in scored)]
-    assert 0.84 < sum(held) / 100 <= 0.99
-
-
 def test_what_an_episode_is_worth_to_everybody_cancels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Adding a constant per episode to all policies moves neither differences nor improvements nor scores."""
     calm, wild = noisy(50, shared=0.0), noisy(50, shared=0.0)
@@ -306,12 +297,6 @@ def test_the_score_leads_and_is_computed_on_sums() -> None:
     assert "score" not in table.of(MINE).plain()
     assert table.of(MINE, BASE).plain().split("\n")[1].split()[2] == "0.364"
     assert "drop-oldest" not in table.of(MINE, BASE).plain()
-
-
-def test_the_score_of_a_table_is_that_of_its_cell() -> None:
-    rows = [{**entry, "scenario": ""} for entry in [*BASE, scored("mine", 0, 6.0), scored("mine", 1, 7.0)]]
-    cells = {cell.policy: (cell.score.value, cell.qoi.value) for cell in score.scores(rows).cells}
-    assert cells == {entry["policy"]: (entry["score"], entry["qoi"]) for entry in table.means(rows)}
 
 
 def test_policies_that_no_row_tells_apart_are_one_line() -> None:

@@ -1,7 +1,7 @@
 """Short runs of policies that their tests follow step by step."""
 
 import numpy as np
-from cases import log, order
+from cases import order
 
 from bufgym import policies
 from bufgym.model import qoi
@@ -23,11 +23,6 @@ def interruption(spec, L, T, uniform=0):
 def kept(spec, L, T):
     """What is delivered between message 0 and message T + 1."""
     return order(interruption(spec, L, T))[1:-1]
-
-
-def drops(senders, period_us=33_333):
-    """[(arrival at which it happened, message dropped)], in that order."""
-    return sorted((us // period_us, seq) for seq, us in log(senders)["dropped_us"].items())
 
 
 def worst_ratio(spec, L, lengths):

@@ -51,27 +51,6 @@ def test_one_robot_is_a_sender_bit_for_bit(case, v, policy):
     assert cases.same(fleet.senders, run(policy, [episode.episode(0)], case.capacity, v, **limits))
 
 
-@kernels
-@given(cases.cases(max_messages=15), st.integers(2, 3), st.sampled_from(POLICIES))
-def test_robots_that_are_alike_fare_as_one_on_its_share(case, n, policy):
-    # N times the capacity, N times the demand: at the same times, to the microsecond (on links that have carried whole
-    # bytes at every whole microsecond: a link that begins anew in the middle of a byte drops the rest of that byte).
-    link = case.episode.link
-    rates = [(t - s, -(-(b - a) // (t - s))) for (s, a), (t, b) in itertools.pairwise(case.knots)]
-
-    def links(robots):
-        knots = [(0, 0)]
-        for us, rate in rates:
-            knots.append((knots[-1][0] + us, knots[-1][1] + us * rate * robots))
-        return Link(cases.trace(knots, link.trace.after), link.offset_us, link.propagation_us)
-
-    fleet = run_fleet(policy, [FleetEpisode((case.episode.arrivals,) * n, links(n))], case.capacity, V)
-    alone = run(policy, [FleetEpisode((case.episode.arrivals,), links(1)).episode(0)], case.capacity, V)
-    for i in range(n):
-        assert cases.log(fleet.senders, i) == cases.log(alone)
-        assert cases.order(fleet.senders, i) == cases.order(alone)
-
-
 @st.composite
 def cells(draw):
     """(episode of 1..4 robots, its knots, L, B); arrivals may come so late that the cell falls idle."""

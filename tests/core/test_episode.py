@@ -152,15 +152,6 @@ def test_pauses_for_acks_count_too() -> None:
     refuse(r"may need 3.46e\+18 us", Episode, THREE, STEADY, ack_delay_us=2**60)
 
 
-def test_a_fleet_of_one_meets_the_episodes_of_its_uplink() -> None:
-    uplink = scenario.get("lte", duration_s=5.0, size_cv=0.4)
-    one = FleetScenario(1, uplink).draw(Streams.seeded(5))
-    single = uplink.draw(Streams.seeded(5))
-    assert (np.asarray(one.arrivals[0]) == np.asarray(single.arrivals)).all()
-    assert one.link.trace.cumulative_bytes.tolist() == single.link.trace.cumulative_bytes.tolist()
-    assert one.link.offset_us == single.link.offset_us
-
-
 def test_cameras_tick_together_and_each_robot_moves_for_itself() -> None:
     made = FleetScenario.of(4, "lte", duration_s=3.0, size_cv=0.5)
     episode, again, other = (made.draw(Streams.seeded(k)) for k in (0, 0, 1))

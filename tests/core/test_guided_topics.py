@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import VALUES, cases, log, order, same
+from cases import VALUES, cases, same
 from hypothesis import given
 from hypothesis import strategies as st
 from refusal_cases import refuse
@@ -14,14 +14,10 @@ from topic_cases import topic_cases
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, loss
-from bufgym.model.link import Link
-from bufgym.model.topics import NO_DEADLINE_US, Topic
+from bufgym.model.topics import NO_DEADLINE_US
 from bufgym.policies import guided_topics
 from bufgym.policies.guided_topics import FEATURES, INPUTS, OUTPUTS, PLAIN, SchedulerWeights
 from bufgym.policies.registry import ClientSettings, Policy
-from bufgym.scenario import Episode, messages
-from bufgym.sim import run
-from bufgym.traces import Trace
 
 pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.618)
@@ -135,27 +131,6 @@ def test_on_one_queue_it_drops_its_oldest_first_in_first_out(case, v):
     policy = random_scheduler(1).policy("some")
     assert same(case.run(policy, v), case.run(policies.get("fifo"), v))
     assert same(case.run(policy, v), case.run(replace(policy, compile=False), v))
-
-
-def by_priority(sign):
-    """Numbers that see priorities alone: sent as ``sign`` says, the lowest dropped."""
-    W = SchedulerWeights(np.zeros(SchedulerWeights.SHAPE, np.float32))
-    wanted = {"send_priority": sign, "drop_priority": -1.0, "room": 100.0}
-    W.weight[:, 0] = [wanted.get(name, 0.0) - PLAIN.get(name, 0.0) for name in OUTPUTS]
-    return W.policy("by-priority")
-
-
-def test_sends_and_drops_by_hand():
-    """L = 4: 0 is taken; 1 2 3 4 are queued. By the highest priority kept and sent: 3, then nothing but 0s may go."""
-    topics = (Topic("low", priority=1), Topic("high", priority=5), Topic("kept", priority=2, no_drop=True))
-    arrivals = messages(10 * np.arange(10), np.ones(10, np.int64))  # 0 1 2 0 1 2 ... every 10 us
-    arrivals["topic"] = np.arange(10) % 3
-    late = Trace("late", np.array([0, 1_000, 101_000]), np.array([0, 0, 1_000]), after="hold")
-    senders = run(by_priority(1.0), [Episode(arrivals, Link(late))], 4, V, topics=topics)
-    # 5 (kept) drives out 3 (low); 6 (low) is rejected; 7 (high) and 8 (kept) drive out 1 and 4, the oldest high ones;
-    # 9 (low) is rejected. Queued are 2 5 7 8: the no_drop ones go first.
-    assert sorted(log(senders)["dropped_us"].items()) == [(1, 70), (3, 50), (4, 80), (6, 60), (9, 90)]
-    assert order(senders) == [0, 2, 5, 8, 7]
 
 
 def test_weights_of_another_shape_are_refused():

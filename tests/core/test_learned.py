@@ -112,14 +112,6 @@ def start(fields, seen):
 
 
 @kernels
-@pytest.mark.parametrize(("field", "fixed"), [("motion_merged", "min-motion-gap"), ("time_merged", "min-gap")])
-@given(case=cases(max_bytes=False), v=VALUES, capacity=st.integers(1, 20))
-def test_a_linear_scorer_of_merged_gaps_is_the_fixed_policy(field, fixed, case, v, capacity):
-    case = replace(case, capacity=capacity)  # one set of weights serves every L
-    assert same(case.run(start(("rank", field, "service_ratio"), field), v), case.run(policies.get(fixed), v))
-
-
-@kernels
 def test_bytes_that_fit_exactly_are_room():
     """With B for three messages and L = 8, three are queued; then one goes for each that comes."""
     episode = Interruption(t_max=10).episode(10)

@@ -74,17 +74,6 @@ def test_laws_are_those_that_lengths_are_drawn_from(name, parameters):
     assert (np.abs(drawn - p) <= 4.5 * np.sqrt(p * (1 - p) / n)).all()
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("L", "t_max", "optimum", "afr"),
-    [(1, 60, 0.98532, 0.96357), (2, 60, 0.98490, 0.95834), (3, 40, 0.98061, 0.95718), (4, 30, 0.98311, 0.96286)],
-)
-def test_numbers_of_the_design(L, t_max, optimum, afr):
-    p = uniform(L, t_max)
-    assert online_optimum(L, p, V).value == pytest.approx(optimum, abs=5e-6)
-    assert means(policies.get("afr"), L, p)["ratio"] == pytest.approx(afr, abs=5e-6)
-
-
 def all_policies(L: int, p: list[float], v: qoi.Value, objective: str, kept: tuple[int, ...] = (), t: int = 0) -> float:
     """The best over every way to decide from t arrivals on, with ``kept`` in the queue.
 

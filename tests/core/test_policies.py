@@ -1,4 +1,4 @@
-"""Drop policies by hand: AFR's figures step by step, what chance may do, what each paper or program says it does."""
+"""Drop policies by hand, their settings and their sources. (Each decision of theirs: ``test_policy_registry``.)"""
 
 import re
 from pathlib import Path
@@ -7,42 +7,13 @@ import numpy as np
 import pytest
 from cases import VALUES, cases, log, newcomer, order, queue_of, same
 from hypothesis import given
-from policy_cases import V, drops, interruption, kept, stream, worst_ratio
+from policy_cases import kept, stream, worst_ratio
 
 from bufgym import policies
-from bufgym.model.link import Link
 from bufgym.policies import ACCEPT, REJECT, afr
-from bufgym.scenario import Episode, Interruption, messages
-from bufgym.sim import run
-from bufgym.sim.metrics import outcome
-from bufgym.traces import Trace
 
 MS = 1_000
 kernels = pytest.mark.kernels
-
-
-@kernels
-@pytest.mark.parametrize("name", ["afr", "afr-paper"])
-def test_figure_4(name):
-    # L = 8. Arrivals 9 .. 16 drop 1, 3, ..., 15: every second message is left and the rate is halved (r = 2, p = 0).
-    # The counter rejects 17; 18 drops 2.
-    evens = [(arrival, 2 * arrival - 17) for arrival in range(9, 17)]
-    assert drops(interruption(name, 8, 18)) == [*evens, (17, 17), (18, 2)]
-    assert kept(name, 8, 16) == [2, 4, 6, 8, 10, 12, 14, 16]
-
-
-@kernels
-def test_more_time_may_show_less():
-    # H - 1 at L = 8: at T = 35 the queue holds an even 4, 8, ..., 32; at T = 36 message 4 goes.
-    gains = [outcome(interruption("afr", 8, T), 0).qoi - 1 for T in (35, 36)]
-    assert gains == pytest.approx([7.687, 7.340], abs=5e-4)
-    assert [kept("afr", 8, T) for T in (35, 36)] == [[*range(4, 33, 4)], [*range(8, 37, 4)]]
-
-
-@kernels
-@pytest.mark.parametrize("T", [1, 2, 3, 4, 7, 8, 63, 64])
-def test_one_place_keeps_powers_of_two(T):
-    assert kept("afr", 1, T) == kept("afr-paper", 1, T) == [2 ** (T.bit_length() - 1)]
 
 
 def ask(on_arrival, L, s, r, c, p):
@@ -62,26 +33,6 @@ def test_the_bound_for_halving():
         assert ask(on_arrival, 3, 3, r=1, c=0, p=2) == (2, 2, 0, 0)  # the end of a pass
 
 
-L, T, RUNS = 4, 12, 3_000
-
-
-@pytest.mark.parametrize(
-    ("name", "decide_at", "expected"),
-    [
-        # Equation 9: P{i is kept} = (L / (L + 1))^min(T - i + 1, T - L), 0.8^8 for the first five, 0.8 for the last.
-        ("random", "arrival", np.array([0.8 ** min(T - i + 1, T - L) for i in range(1, T + 1)])),
-        ("reservoir", "arrival", np.full(T, L / T)),
-        ("reservoir", "overflow", np.full(T, L / T)),
-    ],
-)
-def test_how_often_chance_keeps_each_message(name, decide_at, expected):
-    rng = np.random.default_rng(7)
-    episodes = [Interruption(t_max=T).episode(T).with_uniforms(rng) for _ in range(RUNS)]
-    senders = run(policies.get(name), episodes, L, V, decide_at=decide_at)
-    share = (np.asarray(senders.batch.log)["transmitted_us"] >= 0)[:, 1 : T + 1].mean(0)
-    assert (np.abs(share - expected) < 4.5 * np.sqrt(expected * (1 - expected) / RUNS)).all()
-
-
 def test_worst_gaps():
     # The first eviction at L = 8 leaves one gap of 2 where 10/9 would be ideal: 1.8 for whoever drops at all.
     assert worst_ratio("min-gap", 8, [9]) == pytest.approx(1.8)
@@ -90,13 +41,6 @@ def test_worst_gaps():
     assert 1.9 < worst_ratio("afr", 8, range(8, 600)) < 2
     assert worst_ratio("afr", 32, range(512, 1_500, 5)) == pytest.approx(2, abs=0.01)
     assert worst_ratio("linear-alpha", 32, range(512, 1_500, 5)) == pytest.approx(1.59, abs=0.07)
-
-
-@kernels
-@pytest.mark.parametrize(("every", "accepted"), [(2, [0, 2, 4, 6, 8]), (2.5, [0, 3, 5, 8]), (1, list(range(10)))])
-def test_decimate_keeps_one_in_every(every, accepted):
-    """An open link sends whatever is accepted; one in 2.5 alternates between steps of 3 and 2."""
-    assert order(stream(f"decimate:every={every}", 10, 1_000_000, 4, size_bytes=1)) == accepted
 
 
 @kernels
@@ -133,6 +77,7 @@ def test_linear_with_alpha_1_is_afr(case, v):
         ("paced-motion-gap:discount=0.01", 3, 5, [2, 4, 5]),
         ("paced-motion-gap:pace=0.9", 3, 5, [2, 3, 4]),
         ("ros-keep-last", 16, 30, [*range(21, 31)]),  # 10 by default
+        ("latest-only", 16, 30, [30]),
         # Message 0 was the first of three; 1 and 2 are decimated, as are 4 and 5.
         ("decimate", 3, 6, [1, 4]),
         # 4 drops 1 (of equal gaps the oldest), 5 drops 3, 6 drops 5: the gaps stay 2.
@@ -143,24 +88,6 @@ def test_linear_with_alpha_1_is_afr(case, v):
 )
 def test_what_is_kept(spec, L, T, expected):
     assert kept(spec, L, T) == expected
-
-
-@kernels
-def test_greedy_is_a_trap():
-    # It thins evenly until the gaps are 2. Then a merger costs V(1) - (2 V(2) - V(4)) = 0, and the tail V(3) - V(2) is
-    # gained by replacing it: 2, 4, ..., 14 stay, and only the newest changes. H grows by V(T - 14) <= 1 at most.
-    for T in (16, 17, 40):
-        assert kept("greedy-qoi", 8, T) == [2, 4, 6, 8, 10, 12, 14, T]
-    greedy, afr = (outcome(interruption(name, 8, 40), 0).qoi for name in ("greedy-qoi", "afr"))
-    assert greedy == pytest.approx(1 + 7 * V(2) + V(26) + V(1), abs=1e-12) and greedy < afr - 0.14
-
-
-@kernels
-@pytest.mark.parametrize(("lifespan_s", "dropped"), [(0.499999, 1), (0.5, 0), (0.500001, 0)])
-def test_lifespan(lifespan_s, dropped):
-    # The second message waits until the first is transmitted, at 0.5 s. Exactly 0.5 s old is not too old.
-    episode = Episode(messages(np.array([0, 0]), 500_000), Link(Trace.constant(1e6, 20)))
-    assert len(log(run(policies.get(f"lifespan:lifespan_s={lifespan_s}"), [episode], 4, V))["dropped_us"]) == dropped
 
 
 @kernels
@@ -191,6 +118,11 @@ def test_codel_drops_ever_faster():
     exact = 110 + np.cumsum([0, *(100 / np.sqrt(np.arange(1, 3)))])
     assert exact == pytest.approx([110, 210, 280.7], abs=0.05)
     assert times_ms == np.ceil(exact).tolist()  # the socket takes a message each ms
+
+
+@pytest.mark.parametrize(("name", "default"), [("lifespan", {"lifespan_s": 0.5}), ("keyframe", {"step": 0.05})])
+def test_settings_by_default(name, default):
+    assert dict(policies.get(name).parameters) == default
 
 
 ROOT = Path(__file__).parents[2]

@@ -4,18 +4,15 @@
 """
 
 import math
-from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import log, order, same, trace, watched
+from cases import log, same, trace, watched
 from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.model.topics import Topic
 from bufgym.policies import ACCEPT, REJECT, Policy
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders, run
@@ -26,26 +23,12 @@ V = qoi.exponential(0.5)
 MS = 1_000
 
 
-def line(times_ms, *, capacity=2, after="loop", sizes=1_000, knots=((0, 0), (1_000 * MS, 1_000_000)), **limits):
+def line(times_ms, *, capacity=2, sizes=1_000):
     """A sender on a link of 1 MB/s, so that a message of 1000 bytes takes 1 ms."""
     arrivals = messages(np.array(times_ms, np.int64) * MS, np.asarray(sizes, np.int64))
-    senders = Senders(1, capacity, V, max_messages=len(arrivals), **limits)
-    senders.load(0, Episode(arrivals, Link(trace(list(knots), after))))
+    senders = Senders(1, capacity, V, max_messages=len(arrivals))
+    senders.load(0, Episode(arrivals, Link(trace([(0, 0), (1_000 * MS, 1_000_000)], "loop"))))
     return senders
-
-
-def times(dequeued_ms, transmitted_ms, dropped_ms):
-    """A log in ms."""
-    made = {"dequeued_us": dequeued_ms, "transmitted_us": transmitted_ms, "dropped_us": dropped_ms}
-    return {name: {seq: ms * MS for seq, ms in entries.items()} for name, entries in made.items()}
-
-
-@kernels
-@pytest.mark.parametrize(("third_us", "dropped"), [(1_000, {}), (999, {2: 999})])
-def test_a_departure_makes_room_for_the_arrival_at_its_instant(third_us, dropped):
-    # L = 1. At 1 ms the socket takes message 1, so message 2, which arrives then, finds room.
-    episode = Episode(messages(np.array([0, 0, third_us]), 1_000), Link(trace([(0, 0), (1_000, 1_000)], "loop")))
-    assert log(run(policies.get("drop-newest"), [episode], 1, V))["dropped_us"] == dropped
 
 
 @kernels
@@ -83,41 +66,6 @@ def every_second(buffer, memory):
     return memory[0] % 2 == 0
 
 
-def stale(buffer, memory):
-    """Drops what has waited for more than 2 ms."""
-    return buffer.now_us - buffer.slots[0].arrival_us > 2_000
-
-
-def head_dropper(on_dequeue, compiled=True):
-    return Policy("test-head", take_all, on_dequeue=on_dequeue, memory={"heads": 0.0}, compile=compiled)
-
-
-SLOW_FIRST = [5_000, 1_000, 1_000, 1_000, 1_000]
-
-
-@kernels
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize(
-    ("drops", "times_ms", "sizes", "logged", "h"),
-    [
-        # 0 goes out at 0 ms, 1 is dropped at 1 ms and 2 goes out, 3 is dropped at 2 ms. H = 1 + V(2) + V(2)
-        (every_second, [0, 0, 0, 0, 0], 1_000, times({0: 0, 2: 1, 4: 2}, {0: 1, 2: 2, 4: 3}, {1: 1, 3: 2}), 2.5),
-        # Message 0 takes 5 ms. By then 1 and 2 have waited for 5 and 4 ms: both go, 3 (1 ms) is taken. Message 4 finds
-        # an idle link at 10 ms. H = 1 + V(3) + V(1)
-        (stale, [0, 0, 1, 4, 10], SLOW_FIRST, times({0: 0, 3: 5, 4: 10}, {0: 5, 3: 6, 4: 11}, {1: 5, 2: 5}), 2.375),
-        # Nothing is ever sent: each message goes as it comes, and nothing is known.
-        (lambda buffer, memory: True, [0, 0, 3], 1_000, times({}, {}, {0: 0, 1: 0, 2: 3}), 0.0),
-    ],
-)
-def test_heads_that_are_dropped(compiled, drops, times_ms, sizes, logged, h):
-    senders = line(times_ms, capacity=5, sizes=sizes)
-    senders.run(head_dropper(drops, compiled))
-    assert log(senders) == logged
-    told, sender = outcome(senders, 0), senders.batch.senders[0]
-    assert (told.qoi, told.dropped, told.invalid) == (h, len(logged["dropped_us"]), 0)
-    assert (sender["evicted"], sender["retained_gain"]) == (told.dropped, max(0.0, h - 1))
-
-
 @kernels
 def test_peak_backlog():
     # 0 is in transmission. 1 and 2 wait: 5000 bytes, the most of all, as 3 (500) takes the place of 1 (2000).
@@ -126,7 +74,8 @@ def test_peak_backlog():
     assert outcome(senders, 0).peak_backlog_bytes == 5_000
     # At 1 ms 1 is dropped at the head and 2 is taken. So 3, which comes at 2 ms, waits alone: no more than 5000 yet.
     senders = line([0, 0, 0, 2], sizes=[1_000, 2_000, 3_000, 4_000])
-    senders.run(head_dropper(every_second))
+    drops_heads = Policy("test-head", take_all, on_dequeue=every_second, memory={"heads": 0.0}, compile=True)
+    senders.run(drops_heads)
     assert outcome(senders, 0).peak_backlog_bytes == 5_000
     assert senders.batch.senders[0]["backlog_bytes"] == 0
 
@@ -151,23 +100,6 @@ def test_no_episode():
     refuse("no episode to run", run, policies.get("afr"), [], 2, V)
 
 
-SLOW = Link(trace([(0, 0), (1_000_000, 100), (2_000_000, 10_000_000)], "hold"))
-"""What arrives in its first second waits: message 0 alone is in the socket."""
-
-
-def blocked(sizes, limit, topic=None, **episode):
-    """(the episode in which these come at once while the link stands, its limits)."""
-    arrivals = messages(np.zeros(len(sizes), np.int64), np.array(sizes))
-    arrivals["topic"] = 0 if topic is None else topic
-    return Episode(arrivals, SLOW, **episode), {"capacity": 8, "v": V, "max_bytes": limit}
-
-
-def played(name, sizes, limit, **more):
-    policy = policies.get(name) if isinstance(name, str) else name
-    episode, limits = blocked(sizes, limit)
-    return run(policy, [episode], **limits, **more)
-
-
 @kernels
 def test_asks_again_about_the_same_arrival():
     def on_arrival(buffer, arrival, memory):
@@ -176,7 +108,10 @@ def test_asks_again_about_the_same_arrival():
         return REJECT if arrival.seq == 5 and buffer.evictions == 1 else 0
 
     policy, asked = watched(lambda b, arrival: (int(arrival.seq), b.slots.seq.tolist(), b.evictions), on_arrival)
-    senders = played(policy, [100, 1_000, 1_000, 500, 2_000, 2_400, 2_501], 2_500)
+    # Nothing but message 0 is in the socket for a second.
+    slow = Link(trace([(0, 0), (1_000_000, 100), (2_000_000, 10_000_000)], "hold"))
+    at_once = messages(np.zeros(7, np.int64), np.array([100, 1_000, 1_000, 500, 2_000, 2_400, 2_501]))
+    senders = run(policy, [Episode(at_once, slow)], 8, V, max_bytes=2_500)
     four = [(4, [1, 2, 3], 0), (4, [2, 3], 1)]
     five = [(5, [3, 4], 0), (5, [4], 1)]  # and rejects: what it evicted is gone all the same
     # 6 is larger than B and is dropped unasked.
@@ -184,19 +119,6 @@ def test_asks_again_about_the_same_arrival():
     told = outcome(senders, 0)
     assert log(senders)["dropped_us"].keys() == {1, 2, 3, 5, 6}
     assert (told.invalid, told.dropped, told.delivered) == (0, 5, 2)
-
-
-@kernels
-def test_a_no_drop_message_drives_out_as_many_as_it_needs():
-    # A policy that rejects them: the least important goes, oldest first, until the no_drop message 4 fits. 5 could not
-    # fit whatever went, as 4 stays: nothing goes for it.
-    topics = [Topic("low", priority=1), Topic("high", priority=2), Topic("kept", no_drop=True)]
-    reject = Policy("test-reject", lambda buffer, arrival, memory: REJECT if arrival.topic == 2 else ACCEPT)
-    episode, limits = blocked([100, 400, 400, 200, 700, 400], 1_000, topic=[0, 1, 0, 0, 2, 2])
-    for first in (0, 100):  # asked, or not
-        senders = run(reject, [replace(episode, first_decision=first)], **limits, topics=topics)
-        assert log(senders)["dropped_us"].keys() == {1, 2, 3, 5}
-        assert order(senders) == [0, 4]
 
 
 RANKED = [p for p in map(policies.get, policies.names(for_topics=False)) if p.ranked and not p.weights]
@@ -213,18 +135,6 @@ def test_with_equal_sizes_it_is_a_limit_of_messages(policy):
         by_bytes = run(policy, [episode], 8, V, max_bytes=k * 1_000)
         assert outcome(by_bytes, 0).invalid == 0
         assert same(by_bytes, run(policy, [episode], k, V))
-
-
-def test_each_victim_is_a_draw_of_its_own():
-    # Random Drop, five queued, 1000 bytes each; the newcomer needs two of them to go. Rejected at once: 1/6. Else one
-    # of five goes, then one of the four others: 5/6 for ten pairs.
-    n, rng = 3_000, np.random.default_rng(0)
-    episode, limits = blocked([100, 1_000, 1_000, 1_000, 1_000, 1_000, 2_000], 5_000)
-    senders = run(policies.get("random"), [episode.with_uniforms(rng) for _ in range(n)], **limits)
-    gone = Counter(tuple(sorted(log(senders, i)["dropped_us"])) for i in range(n))
-    assert gone[(6,)] / n == pytest.approx(1 / 6, abs=0.03)
-    assert [len(pair) for pair in gone if 6 in pair] == [1]
-    assert [count / n for pair, count in gone.items() if 6 not in pair] == pytest.approx([1 / 12] * 10, abs=0.02)
 
 
 # What a run was worth, worked by hand.

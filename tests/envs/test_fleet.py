@@ -100,22 +100,6 @@ def test_an_episode_is_the_rollout_of_the_same_policy(reward):
         env.step({})
 
 
-@pytest.mark.kernels
-def test_left_is_what_is_left_of_the_share():
-    # 1 byte/us. A alone from 0; at 500 it has 500 of its 1000 bytes left, and B joins. At 750 A has 375 left, B 875.
-    link = Link(Trace("even", np.array([0, 1_000_000]), np.array([0, 1_000_000])))
-    ticks = np.array([0, 500, 750])
-    episode = FleetEpisode((messages(ticks, np.array([1_000, 10, 10])),) * 2, link)
-    env = FleetEnv(2, FleetScenario.of(2, "lte"), 2)
-    env.reset(options={"episode": episode})
-    seen, *_ = env.step({"robot_0": 3, "robot_1": 2})  # robot 1 rejects its first
-    assert seen["robot_0"]["left"] == [0.5]
-    assert seen["robot_1"]["busy"] == [0.0]
-    # Robot 1's second has 10 bytes: at 20 us after its start both have had 10.
-    seen, *_ = env.step({"robot_0": 2, "robot_1": 3})
-    assert seen["robot_0"]["left"] == [np.float32((500 - 10 - 230) / 1_000)]
-
-
 def test_what_a_step_hands_out_is_never_written_again():
     env = FleetEnv(robots=2, mask_in_observation=True, **SMALL)
     seen, infos = env.reset(seed=0)

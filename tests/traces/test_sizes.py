@@ -2,12 +2,10 @@
 
 import re
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from refusal_cases import refuse
 
-import bufgym.envs  # noqa: F401  (registers the environments)
 from bufgym import scenario, traces
 from bufgym.cli import main
 from bufgym.model.topics import Topic
@@ -133,21 +131,6 @@ def test_an_interruption_has_sizes_too() -> None:
     one, other = (made.draw(Streams.seeded(4)) for made in (Interruption(), Interruption(sizes="jpeg")))
     assert len(one.arrivals) == len(other.arrivals) and one.link.offset_us == other.link.offset_us
     assert np.ptp(other.arrivals["size_bytes"]) > 0
-
-
-@pytest.mark.parametrize("law", ["gop", "motion"])
-def test_environments_take_the_law_and_one_is_a_row_of_many(law: str) -> None:
-    options = {"sizes": law, "duration_s": 2.0}
-    single = gym.make("bufgym/Uplink-v0", **options)
-    many = gym.make_vec("bufgym/Uplink-v0", num_envs=2, vectorization_mode="vector_entry_point", **options)
-    seen, _ = single.reset(seed=11)
-    rows, _ = many.reset(seed=[11, 12])
-    for _ in range(40):
-        for key in seen:
-            assert np.array_equal(seen[key], rows[key][0])
-        seen, reward, ended, cut, _ = single.step(0)
-        rows, rewards, *_ = many.step(np.zeros(2, np.int64))
-        assert reward == rewards[0] and not ended and not cut
 
 
 @pytest.mark.parametrize(
