@@ -17,13 +17,12 @@ SHORT = {
     "relay_mesh": "--robots 3 --viewers 3 --seconds 3",
     "relay_others": "--robots 2 --viewers 1 --seconds 1",
     "hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms evolve",
-    "speed": "",
 }
 """Program and verb -> the options that make it short."""
 NEEDS = {"relay_load page": "chromium", "relay_mesh": "nats-server", "relay_others": "mosquitto"}
 ELSEWHERE = {
     "films": "tests/test_gallery.py",
-    "fit": "tests/traces/test_fit.py",
+    "round_trips": "tests/robot/test_round_trip.py",
     "row": "needs the folder of a suite's run",
     "shares": "needs the folder of a suite's run",
     "sizes": "needs a recording, and PyAV",

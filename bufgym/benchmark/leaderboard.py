@@ -64,9 +64,13 @@ class Entry:
 def made_of(spec: str) -> str:
     """Hash of what a policy decides by: its functions with all that they call and read, and its settings.
 
-    The version of Python comes first, as its bytecode is part of the hash: only hashes of the same version compare.
+    The version of Python comes first, as its bytecode is part of the hash: only hashes of the same version compare. A
+    policy that is not registered here has none.
     """
-    policy = policies.get(spec)
+    try:
+        policy = policies.get(spec)
+    except BufgymError:
+        return ""
     functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send, policy.privileged
     closures = [closure(getattr(function, "py_func", function)) for function in functions if function is not None]
     numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client

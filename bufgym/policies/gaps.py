@@ -147,7 +147,8 @@ def greedy_qoi(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """
     if has_space(buffer, arrival):
         return ACCEPT
-    decision, most = REJECT, 0.0
+    # A newcomer for which a message has gone stays.
+    decision, most = REJECT, -np.inf if buffer.evictions > 0 else 0.0
     for k in range(len(buffer.slots)):
         # The tail's loss counts its gap to the newcomer too: together V(a + b) - V(a).
         added = arrival_gain(buffer, arrival) - loss(buffer, arrival, k)

@@ -7,15 +7,20 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.formats.bag_poses import typestore
+
+
+def _types(encoding: str) -> Any:
+    from bufgym.traces.formats.bag_poses import typestore  # not at a relay's start: it brings the compiler
+
+    return typestore(encoding)
 
 
 def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
     """Decode a message; raise a BufgymError if it is not of this type."""
     try:
         if encoding == "ros1":
-            return typestore("ros1").deserialize_ros1(payload, type)
-        return typestore("cdr").deserialize_cdr(payload, type)
+            return _types("ros1").deserialize_ros1(payload, type)
+        return _types("cdr").deserialize_cdr(payload, type)
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type} in {encoding}: {error}") from None
 
@@ -28,10 +33,10 @@ def planar(place: Any, turn: Any) -> dict[str, float]:
 
 def modern(payload: bytes, type: str, encoding: str) -> tuple[str, bytes]:
     """Convert a ROS 1 payload of a type common to both versions to CDR; return (encoding, payload)."""
-    if encoding == "ros1" and type in typestore("cdr").types:
+    if encoding == "ros1" and type in _types("cdr").types:
         with contextlib.suppress(Exception):  # same type name, but another definition
-            message = _moulded(typestore("ros1").deserialize_ros1(payload, type), typestore("cdr"))
-            return "cdr", bytes(typestore("cdr").serialize_cdr(message, type))
+            message = _moulded(_types("ros1").deserialize_ros1(payload, type), _types("cdr"))
+            return "cdr", bytes(_types("cdr").serialize_cdr(message, type))
     return encoding, payload
 
 
@@ -48,8 +53,8 @@ def _moulded(value: Any, types: Any) -> Any:
 def as_ros1(payload: bytes, type: str) -> bytes:
     """Convert a message from CDR to ROS 1."""
     try:
-        message = _moulded(typestore("cdr").deserialize_cdr(payload, type), typestore("ros1"))
-        return bytes(typestore("ros1").serialize_ros1(message, type))
+        message = _moulded(_types("cdr").deserialize_cdr(payload, type), _types("ros1"))
+        return bytes(_types("ros1").serialize_ros1(message, type))
     except Exception as error:  # what does not fit fails in many ways
         raise BufgymError(f"message of {len(payload)} bytes: no {type}: {error}") from None
 
@@ -58,6 +63,6 @@ def as_ros1(payload: bytes, type: str) -> bytes:
 def definition(type: str, encoding: str = "cdr") -> bytes:
     """Write the type's definition with all types that it uses, as in recordings; empty for an unknown type."""
     version = 1 if encoding == "ros1" else 2
-    if encoding not in ("cdr", "ros1") or type not in typestore(encoding).types:
+    if encoding not in ("cdr", "ros1") or type not in _types(encoding).types:
         return b""
-    return str(typestore(encoding).generate_msgdef(type, ros_version=version)[0]).encode()
+    return str(_types(encoding).generate_msgdef(type, ros_version=version)[0]).encode()

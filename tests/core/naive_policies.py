@@ -150,7 +150,7 @@ def greedy_qoi(v):
         x = [m["x"] for m in [sender.last_dequeued, *queue, newcomer]]
         gain = v(x[-1] - x[-2])
         added = [gain - loss(b - a, c - b) for a, b, c in zip(x, x[1:], x[2:], strict=False)]
-        victim, most = queues.REJECT, 0.0
+        victim, most = queues.REJECT, 0.0 if sender.evictions == 0 else -math.inf
         for k, gain in enumerate(added):
             if gain > most + 1e-12:
                 victim, most = k, gain

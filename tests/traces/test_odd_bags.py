@@ -135,6 +135,7 @@ def test_twelve_files_are_read_and_played_in_the_order_of_the_metadata(tmp_path:
     assert [len(call.args[1]) for call in robot.publish.call_args_list] == SIZES
 
 
+@pytest.mark.filterwarnings("ignore::bufgym.ground.errors.TraceWarning")
 def test_messages_come_again_in_the_order_of_the_bag(tmp_path: Path) -> None:
     """Threads of a recorder log late: 2 before 1; and the second file begins before the first ends."""
     names = ["a.mcap", "b.mcap"]

@@ -2,7 +2,7 @@
 static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const int s = q->occupancy;
-    double most = 0.0, newcomer_gain;
+    double most = q->evictions > 0 ? -HUGE_VAL : 0.0, newcomer_gain;
     int k, decision = BUFGYM_REJECT;
     if (bufgym_has_space(q, arrival))
         return BUFGYM_ACCEPT;
