@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from bufgym.envs.output import StepOutput, write_mask, write_observation
-from bufgym.ground.kernel import compile_here, kernel
+from bufgym.ground.kernel import kernel
 from bufgym.sim.state import NOTHING_WAITS, Batch
 from studies.perf import ENVIRONMENTS, NATIVE, SEED, TOPICS, Measurement, Sizes, best_s, measure, play, record, report
 
@@ -102,7 +102,6 @@ def profile(sizes: Sizes) -> str:
 
     Kernels that write are timed alone, over the batch as it stands after a while. The transition is the remainder.
     """
-    compile_here()
     batches = [_profile_batch(id, sizes.capacity, sizes) for id in ENVIRONMENTS]
     tables = [*batches, _profile_batch(TOPICS, sizes.topic_slots, sizes), _profile_single("bufgym/Uplink-v0", sizes)]
     return "\n\n".join(tables)

@@ -34,7 +34,7 @@ from bufgym.benchmark.run import draw
 from bufgym.cli.options import Count
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
-from bufgym.ground.kernel import JIT, compile_here
+from bufgym.ground.kernel import JIT
 from bufgym.ground.tables import Table
 from bufgym.sim import Senders
 from studies import yardstick
@@ -148,7 +148,6 @@ class _Meter:
 
 def measure(sizes: Sizes | None = None) -> list[Measurement]:
     """Speed of the yardstick, the batches, the single environments and of rollouts."""
-    compile_here()
     meter = _Meter(sizes or Sizes())
     return [meter.yardstick, *_batches(meter), *_singles(meter), *_rollouts(meter)]
 

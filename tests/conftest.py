@@ -20,7 +20,6 @@ from hypothesis import HealthCheck, settings
 from bufgym.ground import kernel
 
 kernel.compile_silently()  # tests count lines on stderr
-kernel.compile_here()  # and what is tested is compiled, in the first test too
 
 REPO = Path(__file__).resolve().parent.parent
 COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")

@@ -21,7 +21,6 @@ from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.step import step_rows
 from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.kernel import code_for
 from bufgym.ground.threads import Threads
 from bufgym.model.checks import is_number, whole
 from bufgym.model.observe import (
@@ -150,7 +149,6 @@ class Rows:
         guided = is_guided(actions, fields, "several topics" if topics else "")
         self.guiding = Guiding(n, self.capacity, actions, fields) if guided else None
         self._guide = self.guiding and self.guiding.guide
-        self._step: Any = None  # found at the next step
         self._acts = self.guiding if self.guiding and self.guiding.acts else None
         if self.guiding and self.guiding.sees:
             slot_fields, context_fields, fields = (), INPUT_FIELDS, None
@@ -202,7 +200,6 @@ class Rows:
         if self.guiding:
             self.guiding.begin(rows)
         self._run(self._load(rows, episodes), NO_ACTIONS)
-        self._step = None
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
             self._own_fields.write(self.senders.batch, self.output)
@@ -240,12 +237,7 @@ class Rows:
         return rows
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        if self._step is None:
-            self._step = code_for(step_rows, self.senders.batch, self._guide)
-        self._step(self.senders.batch, rows, actions, self.rewarded, self.output, self._guide)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_step": None}  # compiled code is this process's own
+        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self._guide)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""

@@ -9,8 +9,6 @@ import time
 from typing import Final
 
 PATIENCE_S: Final = 1.0  # Time between a worker's checks that its parent process is alive
-COMPILES: Final = "BUFGYM_COMPILES"
-"""Environment variable of a process that compiles: it starts no other, whatever program it turns out to be."""
 _CALL = "import sys; sys.path[:] = {path!r}; from {module} import {name}; {name}({arguments})"
 
 
@@ -30,14 +28,11 @@ def _watch(parent: int) -> None:
     os._exit(1)
 
 
-def compiling(module: str, name: str, *arguments: str, given: bytes = b"", quiet: bool = False) -> int:
+def compiling(module: str, name: str, *arguments: str) -> int:
     """Call the function ``name`` of ``module`` in another process, which compiles; return that process's exit code.
 
-    The compiler would hold this process's lock for tens of seconds. ``given`` is the standard input of the process.
+    The compiler would hold this process's lock for tens of seconds.
     """
     path = [place for place in sys.path if isinstance(place, str)]
     call = _CALL.format(path=path, module=module, name=name, arguments=", ".join(map(repr, arguments)))
-    output = subprocess.DEVNULL if quiet else None
-    marked = {**os.environ, COMPILES: "1"}
-    command = [sys.executable, "-c", call]
-    return subprocess.run(command, input=given, stdout=output, stderr=output, env=marked, check=False).returncode
+    return subprocess.run([sys.executable, "-c", call], check=False).returncode

@@ -29,15 +29,11 @@ print(double(21))
 """
 
 
-OURS = "import sys; __name__ = 'bufgym.tale'; sys.modules[__name__] = sys.modules['__main__']"
-"""Makes the module one of the package's."""
-
-
 def run(tmp_path: Path, before: str = "", source: str = TALE, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run ``source``, a module whose kernels print 42."""
     file = tmp_path / "tale.py"
     file.write_text(source.format(before=before))
-    environment = {"PYTHONPATH": str(Path(cache.__file__).parents[2]), **os.environ, **environment}
+    environment = {"PYTHONPATH": str(Path(cache.__file__).parents[3]), **os.environ, **environment}
     done = subprocess.run([sys.executable, str(file)], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "42\n"
@@ -67,7 +63,7 @@ def test_damaged_code_is_compiled_anew(tmp_path: Path, left: float) -> None:
 
 @needs_compilation
 def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path: Path) -> None:
-    impatient = f"from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0; {OURS}"
+    impatient = "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0"
     assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
     assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
 
@@ -76,11 +72,10 @@ def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path
 @pytest.mark.parametrize(
     "before",
     [
-        "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0",
-        f"from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 1e6; {OURS}",
-        f"from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0; k.compile_silently(); {OURS}",
+        "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 1e6",
+        "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0; k.compile_silently()",
     ],
-    ids=["not ours", "quick", "silent"],
+    ids=["quick", "silent"],
 )
 def test_what_is_not_announced(tmp_path: Path, before: str) -> None:
     assert run(tmp_path, before=before, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
@@ -139,56 +134,6 @@ def test_a_direct_call_is_the_call() -> None:
     assert len(double.overloads) == 2  # type: ignore[attr-defined]
 
 
-SMALL = """
-from typing import Any, NamedTuple
-from bufgym.ground.kernel import direct, kernel
-
-class Rows(NamedTuple):
-    cells: Any
-    several: bool | None = None
-
-@kernel
-def doubled(cell, factor):
-    return 2 * cell.number * factor
-
-@direct
-@kernel
-def double(rows, factor):
-    for k in range(len(rows.cells)):
-        rows.cells[k].number = doubled(rows.cells[k], factor)
-"""
-
-
-@needs_compilation
-@pytest.mark.parametrize("possible", [True, False], ids=["elsewhere", "nowhere else"])
-def test_few_rows_run_as_plain_python_while_another_process_compiles(tmp_path: Path, possible: bool) -> None:
-    """Where no other process can be started, the kernel is compiled here at the next call."""
-    (tmp_path / "small.py").write_text(SMALL)
-    asked = f"""
-import sys
-import numpy as np
-from small import Rows, double
-from bufgym.ground.kernel import only_kept, records
-if not {possible}:
-    sys.executable = "/nowhere"
-rows = Rows(records(3, np.dtype([("number", np.int64)])))
-rows.cells["number"] = 1
-with only_kept():
-    double(rows, 3)  # nothing is compiled here
-assert rows.cells["number"].tolist() == [6, 6, 6] and not double._compiled.overloads
-next(iter(double._meanwhile.values())).wait()
-if {possible}:
-    with only_kept():
-        double(rows, 1)  # it lies on disk
-else:
-    double(rows, 1)
-assert len(double._compiled.overloads) == 1
-print(int(rows.cells["number"].sum()) + 6)
-"""
-    source = TALE.replace("print(double(21))", asked)
-    assert run(tmp_path, source=source, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
-
-
 @needs_compilation
 def test_a_branch_that_needs_a_missing_field_is_not_compiled() -> None:
     @kernel
@@ -222,40 +167,6 @@ def test_a_named_tuple_made_in_a_kernel_is_handed_on() -> None:
         return doubled(made) + doubled(made) + numbers[0]
 
     assert twice(np.array([100.0, 3.0])) == 6 + 12 + 100
-
-
-EPISODE = """
-import sys
-{before}
-import numpy as np
-from bufgym.envs import SenderVectorEnv
-from bufgym.ground import kernel
-kernel.compile_silently()
-kernel.compile_here()
-env = SenderVectorEnv(2, "interruption", 3, t_max=12)
-obs, info = env.reset(seed=1)
-total = 0.0
-for k in range(40):
-    actions = np.array([np.flatnonzero(mask)[k % mask.sum()] for mask in info["action_mask"]])
-    obs, rewards, *_, info = env.step(actions)
-    total += float(rewards.sum()) + sum(float(np.sum(part)) for part in obs.values())
-print(total.hex(), kernel.FOLDER != "")
-"""
-
-
-@needs_compilation
-def test_without_numbas_private_parts_episodes_are_equal() -> None:
-    """They are compiled by ``njit`` alone, and one line says so."""
-
-    def played(before: str) -> tuple[list[str], str]:
-        call = [sys.executable, "-c", EPISODE.format(before=before)]
-        done = subprocess.run(call, capture_output=True, text=True, check=True)
-        return done.stdout.split(), done.stderr
-
-    (whole, kept), silent = played("")
-    (plain, unkept), said = played("from numba.core import codegen; del codegen.JITCodeLibrary")
-    assert (plain, kept, unkept, silent) == (whole, "True", "False", "")
-    assert said.startswith("bufgym: this Numba's private parts differ") and said.count("\n") == 1
 
 
 # Ctrl-C is answered within a second while a kernel works, and what a kernel's thread raises arrives.

@@ -14,9 +14,7 @@ from refusal_cases import refused
 
 import bufgym
 from bufgym.envs import SenderEnv
-from bufgym.envs.step import step_cells, step_rows
 from bufgym.ground.kernel import named
-from bufgym.ground.kernel.meanwhile import Meanwhile
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
@@ -24,7 +22,6 @@ from bufgym.model.observe import FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
 from bufgym.sim.rollout import python_view
 from bufgym.traces import Trace, drive_motion
-from tests.conftest import COMPILED
 
 kernels = pytest.mark.kernels
 SCENARIOS: dict[str, Scenario] = {
@@ -89,17 +86,6 @@ def test_a_copy_plays_on_and_begins_anew_as_the_original(copied: Any) -> None:
     env = begun()
     env.step(4)
     assert str(rest(copied(env))) == str(rest(env))
-
-
-@pytest.mark.skipif(not COMPILED, reason="all runs as plain Python")
-@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
-def test_while_the_kernel_is_compiled_elsewhere_steps_are_equal(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    compiled = played(env_id, 5)
-    monkeypatch.setattr(Meanwhile, "_compile", lambda self: None)
-    for step in (step_rows, step_cells):
-        python = Meanwhile(step, ())
-        monkeypatch.setattr(step, "_entries", {None: python, True: python})
-    assert played(env_id, 5) == compiled
 
 
 def test_fields_choose_what_is_observed() -> None:

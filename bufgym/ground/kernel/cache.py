@@ -13,48 +13,47 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, cast
 
+import llvmlite
+import numba
+import numpy as np
 from numba.core import compiler, serialize
 
 from bufgym.ground.files import PACKAGE, replaced
-from bufgym.ground.kernel.arrays import JIT
-from bufgym.ground.kernel.closure import TOOLS, closure, told_types
-from bufgym.ground.kernel.pipeline import PART, PartLibrary, set_environments
+from bufgym.ground.kernel.closure import closure
 
 
-def _writable(folder: Path) -> bool:
+def _is_writable(folder: Path) -> bool:
     """Whether files can be written in ``folder``, which is made if missing."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return folder.is_dir() and os.access(folder, os.W_OK)
 
 
-def _temporary_folder() -> Path:
-    """Make a folder for this process and its children. Its name cannot be foreseen, as its content is executed."""
-    folder = tempfile.mkdtemp(prefix="bufgym-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ["NUMBA_CACHE_DIR"] = folder
-    print(
-        "bufgym: compiled code cannot be kept, as neither the package nor the cache folder can be written; "
-        "set NUMBA_CACHE_DIR to a folder that can",
-        file=sys.stderr,
-    )
-    return Path(folder)
-
-
 def _cache_folder() -> str:
-    """Choose the folder for machine code: ``NUMBA_CACHE_DIR``, beside the package, or in the user's cache."""
+    """Choose the folder for machine code: ``NUMBA_CACHE_DIR``, beside the package, or in the user's cache.
+
+    If none can be written, this process and its children share a new one, whose name nobody can foresee.
+    """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        parent = Path(os.environ["NUMBA_CACHE_DIR"])
-    else:
-        places = PACKAGE / "__pycache__", Path(home) / "bufgym"
-        parent = next((place for place in places if _writable(place)), None) or _temporary_folder()
-    return str(parent / "kernels")
+    places = PACKAGE / "__pycache__", Path(home) / "bufgym"
+    parent = os.environ.get("NUMBA_CACHE_DIR") or next(filter(_is_writable, places), None)
+    if parent is None:
+        parent = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="bufgym-")
+        atexit.register(shutil.rmtree, parent, ignore_errors=True)
+        print(
+            "bufgym: compiled code cannot be kept, as neither the package nor the cache folder can be written; "
+            "set NUMBA_CACHE_DIR to a folder that can",
+            file=sys.stderr,
+        )
+    return str(Path(parent, "kernels"))
 
 
-FOLDER = _cache_folder() if JIT else ""
-"""Folder for machine code; empty if nothing is compiled."""
+FOLDER = _cache_folder()
+"""Folder for machine code."""
 
+_COMPILER = [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(Path(__file__).parent.glob("*.py"))]
+_TOOLS = (sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, np.__version__, *_COMPILER)
+"""Versions of all that translates kernels, and the sources of this package."""
 _KEPT_VERSIONS = 16  # most files of one kernel: one for each set of argument types and each state of its sources
 
 
@@ -63,12 +62,11 @@ class Code:
 
     A file is named by everything that its code depends on (see ``closure``). So processes that compile side by side
     never write different code into one file, and code of an earlier source is never found. A damaged file is compiled
-    anew. If no file can be written, nothing is stored.
+    anew. If no file can be written, nothing is kept.
     """
 
     def __init__(self, function: Any, role: str) -> None:
-        self._function, self._role = function, role
-        self._closure = ""
+        self._function = function
         name = f"{function.__module__}.{function.__qualname__}-{role}"
         self._name = "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in name)[-150:]
 
@@ -77,16 +75,14 @@ class Code:
         target.refresh()
         try:
             kept = pickle.loads(self._file(signature, target.codegen()).read_bytes())
-            return _rebuilt(target, kept)
+            return cast(Any, compiler).CompileResult._rebuild(target, *kept)
         except Exception:  # a file that is missing, or cut short, which ends in many kinds of error
             if _ONLY_KEPT.get():
                 raise NotKeptError from None
             return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Store the code that was compiled for the types of ``signature``."""
-        if not isinstance(result.library, PartLibrary):
-            set_environments(result)
+        """Keep the code that was compiled for the types of ``signature``."""
         if result.lifted or result.library.has_dynamic_globals:  # it holds addresses of this process
             return
         file = self._file(signature, result.codegen)
@@ -99,28 +95,19 @@ class Code:
                 old.unlink(missing_ok=True)
 
     def _file(self, signature: Any, generator: Any) -> Path:
-        if not self._closure:  # now, as the module's later functions did not exist when it was decorated
-            self._closure = closure(self._function)
-        depends_on = repr((TOOLS, self._closure, told_types(signature), generator.magic_tuple()))
+        # The closure now, as the module's later functions did not exist when the kernel was decorated.
+        depends_on = repr((_TOOLS, closure(self._function), told_types(signature), generator.magic_tuple()))
         return Path(FOLDER, f"{self._name}-{hashlib.sha256(depends_on.encode()).hexdigest()[:20]}.nbc")
 
 
-_REDUCED = ("fndesc", "environment", "signature", "objectmode", "lifted", "type_annotation", "reload_init")
-"""What ``CompileResult._reduce`` gives after the library and before the environments of other functions."""
-
-
-def _rebuilt(target: Any, kept: tuple[Any, ...]) -> Any:
-    """Rebuild a compile result from ``kept``, the output of ``CompileResult._reduce``."""
-    library, *parts, environments = kept
-    found = dict(zip(_REDUCED, parts, strict=True))
-    for function in found["reload_init"]:
-        function()
-    code = PartLibrary.read(target, library) if library[1] == PART else target.codegen().unserialize_library(library)
-    found["entry_point"] = target.get_executable(code, found["fndesc"], found["environment"])
-    for known in environments:
-        code.codegen.set_env(known.env_name, known)
-    found |= {"target_context": target, "typing_context": target.typing_context, "library": code}
-    return cast(Any, compiler).compile_result(**found, referenced_envs=environments)
+def told_types(types: Any) -> str:
+    """``types``, a signature or several types, in words that name the fields of every tuple too."""
+    found, waiting = [repr(types)], list(getattr(types, "args", types))
+    while waiting:
+        kind = waiting.pop()
+        found.append(str(getattr(getattr(kind, "instance_class", None), "_fields", "")))
+        waiting += getattr(kind, "types", ())
+    return "\n".join(found)
 
 
 class NotKeptError(Exception):

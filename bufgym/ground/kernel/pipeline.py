@@ -3,28 +3,64 @@
 See docs/methods.md, "Kernels in parts".
 """
 
+import threading
 from typing import Any, cast
 
-from llvmlite import binding
 from numba import types
-from numba.core import codegen, compiler, datamodel
+from numba.core import codegen, compiler, config, datamodel, ir, ir_utils, untyped_passes
+from numba.core.compiler_machinery import FunctionPass, register_pass
 
-from bufgym.ground.kernel.none_fields import with_none_fields
-
-PART = "part"  # Marks a part among the code that is kept on disk
+from bufgym.ground.kernel import announce
 
 # Numba has no types.
-_Library: Any = codegen.JITCodeLibrary
 _Compiler: Any = compiler.Compiler
+_Library: Any = codegen.JITCodeLibrary
 _Model: Any = datamodel.models.TupleModel
+_Pass: Any = FunctionPass
 
 
-class PartLibrary(_Library):  # type: ignore[misc]
-    """Code of one part and of the parts that it calls, neither optimised nor made into machine code."""
+class WholeCompiler(_Compiler):  # type: ignore[misc]
+    """Compiler of the kernels that Python calls."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Numba's own passes, and ``_NoneFields`` before all that look at types."""
+        (passes,) = super().define_pipelines()
+        passes.add_pass_after(_NoneFields, untyped_passes.IRProcessing)
+        passes.finalize()
+        return [passes]
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compile ``function``; Numba calls it with its compiler's lock held."""
+        notice = threading.Timer(announce.PATIENCE_S, announce.say)
+        numbas, notice.daemon = cast(Any, config), True
+        level = numbas.OPT
+        notice.start()
+        try:
+            numbas.OPT = 2  # LLVM's level; 3 takes longer, and the code is no faster
+            result = super().compile_extra(function)
+        finally:
+            numbas.OPT = level
+            notice.cancel()
+        for environment in result._find_referenced_environments():  # of Python objects that parts use, such as texts
+            result.codegen.set_env(environment.env_name, environment)
+        return result
+
+
+class PartCompiler(WholeCompiler):
+    """Compiler of the kernels that go into others."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, *others: Any) -> None:
+        super().__init__(typing, target, library, *others)
+        self.state.library = _PartLibrary(target.codegen(), "part")
+
+    compile_extra = _Compiler.compile_extra
+
+
+class _PartLibrary(_Library):  # type: ignore[misc]
+    """Code of one part and of the parts that it calls, neither optimised as a whole nor made into machine code."""
 
     def finalize(self) -> None:
         """Link the parts that it calls. After this call nothing can be added."""
-        self._raise_if_finalized()
         for library in dict.fromkeys(self._linking_libraries):
             self._reload_init.update(library._reload_init)
             self._final_module.link_in(library._get_module_for_linking(), preserve=True)
@@ -37,70 +73,47 @@ class PartLibrary(_Library):  # type: ignore[misc]
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Ignore the environment: ``set_environments`` sets it in the kernel that the part is linked into."""
+        """Ignore the environment: the kernel that the part is linked into sets it."""
 
     def get_pointer_to_function(self, name: str) -> int:
         """Address of the function ``name``: 0, as a part has no machine code."""
         self._ensure_finalized()
         return 0
 
-    def serialize_using_object_code(self) -> tuple[str, str, bytes]:
-        """(name, ``PART``, bitcode), the form stored on disk."""
-        self._ensure_finalized()
-        return self.name, PART, self._final_module.as_bitcode()
 
-    @classmethod
-    def read(cls, target: Any, kept: tuple[str, str, bytes]) -> Any:
-        """Restore the part from ``kept``, the output of ``serialize_using_object_code``."""
-        name, _, bitcode = kept
-        library = cls(target.codegen(), name)
-        library._final_module = binding.parse_bitcode(bitcode)
-        library._finalized = True
-        return library
-
-
-def set_environments(result: Any) -> None:
-    """Tell the machine code of ``result`` where the Python objects are that its parts use, such as texts to print."""
-    for environment in result._find_referenced_environments():
-        result.codegen.set_env(environment.env_name, environment)
-
-
-@cast(Any, datamodel).register_default(cast(Any, types).NamedTuple)
+@cast(Any, datamodel).register_default(types.NamedTuple)
 class _OneArgument(_Model):  # type: ignore[misc]
     """Hands a named tuple of this package on as one value; Numba hands a tuple of ten arrays on as seventy numbers."""
 
-    def _is_ours(self) -> bool:
-        return str(self.fe_type.instance_class.__module__).startswith("bufgym.")
-
-    def get_argument_type(self) -> Any:
-        return self.get_value_type() if self._is_ours() else super().get_argument_type()
-
-    def as_argument(self, builder: Any, value: Any) -> Any:
-        return value if self._is_ours() else super().as_argument(builder, value)
-
-    def from_argument(self, builder: Any, value: Any) -> Any:
-        return value if self._is_ours() else super().from_argument(builder, value)
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind)
+        if str(kind.instance_class.__module__).startswith("bufgym."):
+            self.get_argument_type = self.get_value_type
+            self.as_argument = self.from_argument = lambda builder, value: value
 
 
-class WholeCompiler(_Compiler):  # type: ignore[misc]
-    """Compiler of the kernels that Python calls."""
+@cast(Any, register_pass)(mutates_CFG=True, analysis_only=False)
+class _NoneFields(_Pass):  # type: ignore[misc]
+    """A pass that turns reads of the arguments' fields that are None into None, known at compile time."""
 
-    library: Any = _Library
+    _name = "bufgym_none_fields"
 
-    def __init__(
-        self, typing: Any, target: Any, library: Any, arguments: Any, result: Any, flags: Any, names: Any
-    ) -> None:
-        super().__init__(typing, target, library, arguments, result, flags, names)
-        self.state.library = self.library(target.codegen(), type(self).__name__)
-        self.state.library.enable_object_caching()
+    def __init__(self) -> None:
+        super().__init__()
 
-    def define_pipelines(self) -> list[Any]:
-        """Numba's own passes and this package's."""
-        (passes,) = super().define_pipelines()
-        return [with_none_fields(passes)]
-
-
-class PartCompiler(WholeCompiler):
-    """Compiler of the kernels that go into others."""
-
-    library = PartLibrary
+    def run_pass(self, state: Any) -> bool:
+        """Change the code of one kernel in place; return whether it changed."""
+        changed = False
+        for block in state.func_ir.blocks.values():
+            for statement in block.find_insts(ir.Assign):
+                read = statement.value
+                if not (isinstance(read, ir.Expr) and cast(Any, read).op == "getattr"):
+                    continue
+                source = cast(Any, ir_utils).guard(ir_utils.get_definition, state.func_ir, read.value)
+                kind = state.args[source.index] if isinstance(source, ir.Arg) else None
+                fields = getattr(getattr(kind, "instance_class", None), "_fields", ())
+                if read.attr in fields and cast(Any, kind).types[fields.index(read.attr)] is types.none:
+                    statement.value = cast(Any, ir).Const(None, statement.loc)
+                    state.func_ir._definitions[statement.target.name] = [statement.value]
+                    changed = True
+        return changed
