@@ -21,7 +21,7 @@ SHORT = {
 """Program and verb -> the options that make it short."""
 NEEDS = {"relay_load page": "chromium", "relay_mesh": "nats-server", "relay_others": "mosquitto"}
 ELSEWHERE = {
-    "films": "tests/test_gallery.py",
+    "films": "website/test_gallery.py",
     "round_trips": "tests/robot/test_round_trip.py",
     "row": "needs the folder of a suite's run",
     "shares": "needs the folder of a suite's run",
