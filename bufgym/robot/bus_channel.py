@@ -1,4 +1,7 @@
-"""Frames over a publish-subscribe library, one library message per frame; the library hides its socket.
+"""Frames over a publish-subscribe library, one library message per frame.
+
+The library hides its socket. On Linux it is found among this process's, so that the system says when it wants more;
+elsewhere the receiver's acks do.
 
 A sender has a name of its own for every connection. It publishes to the receiver under that name and hears what the
 receiver publishes for it. None of these libraries tells which messages a broken connection lost. So a receiver
@@ -11,12 +14,14 @@ import asyncio
 import atexit
 import contextlib
 import os
+import socket
 import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, Final, Protocol
 from weakref import WeakSet
 
 from bufgym.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, whole
+from bufgym.robot.sockets import connections_to, little_unsent, unsent_bytes, until_writable
 
 _MOST_WAITING: Final = 1024  # limit on frames waiting to be taken, more than a sender ever has unacked
 _LEAVE_S: Final = 3.0  # time for a library to leave when the program ends
@@ -50,6 +55,8 @@ class BusChannel:
         self.on_close: Callable[[], None] = lambda: None
         self._max_body_bytes, self._room = max_body_bytes, room or Room(_MOST_WAITING * max_body_bytes)
         self._loop = asyncio.get_running_loop()
+        self.socket: socket.socket | None = None
+        """The library's socket, if it was found: then the system says when it wants more."""
         self._came: asyncio.Queue[bytes] = asyncio.Queue()
         self._there = asyncio.Event()
 
@@ -58,9 +65,9 @@ class BusChannel:
         """Connect a sender once the receiver is there; ``small`` has no effect on the library's buffers."""
         channel = cls(os.urandom(8).hex())
         there = host, port, channel.name, lambda _, data: channel.soon(channel.take, data), channel.peer
-        made = asyncio.ensure_future(asyncio.to_thread(opening, *there))
+        made = asyncio.ensure_future(asyncio.to_thread(_opened, opening, *there))
         try:
-            bus = await asyncio.shield(made)
+            bus, channel.socket = await asyncio.shield(made)
         except asyncio.CancelledError:
             made.add_done_callback(_abandoned)
             raise
@@ -102,14 +109,18 @@ class BusChannel:
         return whole(data, self._max_body_bytes)
 
     async def until_wanted(self) -> bool:
-        return False
+        if self.socket is not None:
+            await until_writable(self.socket)
+        return self.socket is not None
 
     def left_bytes(self) -> int | None:
-        return None
+        return None if self.socket is None else unsent_bytes(self.socket)
 
     def close(self) -> None:
         while not self._came.empty():
             self._room.left_bytes += len(self._came.get_nowait())
+        if self.socket is not None:
+            self.socket.close()
         self.on_close()
 
 
@@ -162,10 +173,26 @@ class BusServer:
             _aside(self._bus.publish, name, b"")
 
 
-def _abandoned(made: asyncio.Future[Bus]) -> None:
+def _opened(opening: Open, host: str, port: int, *others: Any) -> tuple[Bus, socket.socket | None]:
+    """Open a bus and find its socket among those of this process."""
+    before = connections_to(host, port)
+    bus = opening(host, port, *others)
+    after = connections_to(host, port)
+    found = next((after.pop(inode) for inode in after if inode not in before), None)
+    for one in (*before.values(), *after.values()):
+        one.close()
+    if found is not None:
+        little_unsent(found)
+    return bus, found
+
+
+def _abandoned(made: asyncio.Future[tuple[Bus, socket.socket | None]]) -> None:
     """Close a bus whose opener has given up."""
     if not made.cancelled() and made.exception() is None:
-        _aside(made.result().close)
+        bus, found = made.result()
+        if found is not None:
+            found.close()
+        _aside(bus.close)
 
 
 def _aside(do: Callable[..., None], *arguments: Any) -> None:

@@ -5,7 +5,7 @@
 | zenoh | ``eclipse-zenoh`` | listens, a peer of Zenoh over TCP | where the receiver listens |
 | mqtt | ``paho-mqtt`` | connects, as the sender does | the broker's |
 
-Both send and receive reliably, drop nothing themselves, and are given the next message when the window of acks allows.
+Both send and receive reliably, and drop nothing themselves.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from bufgym.ground.libraries import needs
 from bufgym.robot.bus_channel import Hear, Open, Peer
-from bufgym.robot.sockets import DEAD_AFTER_S, little_unsent
+from bufgym.robot.sockets import DEAD_AFTER_S
 
 ROOT: Final = "bufgym"
 MQTT_PORT: Final = 1883  # Standard port of an MQTT broker
@@ -105,7 +105,6 @@ class MqttBus:
         self._client.on_message = on_message
         self._client.on_subscribe = lambda *_: joined.set()
         self._client.on_disconnect = on_disconnect
-        self._client.on_socket_open = lambda _, __, connection: little_unsent(connection)
         if not name:
             self._client.will_set(presence, b"", qos=1, retain=True)
         self._presence = presence

@@ -9,8 +9,11 @@ SIOCOUTQ counts bytes that the peer's kernel has not acked, SIOCOUTQNSD those of
 """
 
 import asyncio
+import contextlib
+import os
 import select
 import socket
+import stat
 import struct
 import sys
 from typing import Any, Final
@@ -67,6 +70,31 @@ def is_writable(connection: socket.socket, patience_s: float) -> bool:
     poll = select.poll()
     poll.register(connection, select.POLLOUT)
     return bool(poll.poll(patience_s * 1000))
+
+
+def connections_to(host: str, port: int) -> dict[int, socket.socket]:
+    """This process's TCP connections to there, by inode, also those of libraries; none where the system hides them."""
+    peers = {address[:2] for *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
+    found: dict[int, socket.socket] = {}
+    for name in os.listdir("/proc/self/fd") if os.path.isdir("/proc/self/fd") else ():
+        with contextlib.suppress(OSError):  # a descriptor that was closed meanwhile
+            about = os.stat(f"/proc/self/fd/{name}")
+            if stat.S_ISSOCK(about.st_mode) and about.st_ino not in found:
+                one = socket.socket(fileno=os.dup(int(name)))
+                if _peer(one) in peers:
+                    found[about.st_ino] = one
+                else:
+                    one.close()
+    return found
+
+
+def _peer(connection: socket.socket) -> tuple[str, int] | None:
+    """Address of the other end; None for a socket that has none."""
+    with contextlib.suppress(OSError):
+        if connection.family in (socket.AF_INET, socket.AF_INET6):
+            host, port, *_ = connection.getpeername()
+            return host, port
+    return None
 
 
 def set_option(connection: socket.socket, option: str, number: int) -> None:
