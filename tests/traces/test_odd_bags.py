@@ -141,8 +141,9 @@ def test_messages_come_again_in_the_order_of_the_bag(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", rows(0, 2, 1, 3, 5, 7))
     write(tmp_path / "b.mcap", rows(4, 6, 8, 9, 11, 10))
     describe(tmp_path, "mcap", names)
-    holds_all(tmp_path)
-    again = [(logged_ns, len(data)) for _, logged_ns, data in messages(read_bag(tmp_path))]
+    with pytest.warns(TraceWarning, match="4 of 12 messages logged before"):
+        holds_all(tmp_path)
+        again = [(logged_ns, len(data)) for _, logged_ns, data in messages(read_bag(tmp_path))]
     assert again == [(cases.START_NS + k * cases.MS, 109 + k) for k in range(12)]
 
 
@@ -193,6 +194,7 @@ def test_what_the_metadata_names_must_be_there(tmp_path: Path, storage: str) -> 
 def test_without_metadata_files_come_in_order_of_time(tmp_path: Path, storage: str) -> None:
     files = split_bag(tmp_path / "bag", storage)
     (tmp_path / "bag" / "metadata.yaml").unlink()
+    (tmp_path / "bag" / f"._{files[0].name}").write_bytes(b"as macOS leaves it beside a file")
     renamed = [file.rename(file.with_name(f"{name}{file.suffix}")) for file, name in zip(files, "zcab", strict=True)]
     pack(renamed[1], keep=True)
     shutil.copy(renamed[2], renamed[2].with_name(f"d{renamed[2].suffix}"))
@@ -258,7 +260,7 @@ def test_damage_is_named_with_what_is_sound(tmp_path: Path) -> None:
     refuse(r"b\.db3: cut off or damaged: DatabaseError: .* `sqlite3 b\.db3 \.recover \| sqlite3", read_bag, base)
     odometry = [(k, "/odom", "nav_msgs/msg/Odometry", cases.odometry(k, 0)[: 900 - 800 * (k == 2)]) for k in range(4)]
     refuse(
-        r"o\.mcap: message 2 on /odom is cut off", read_bag, cases.write_mcap(tmp_path / "o.mcap", odometry), "/odom"
+        r"o\.mcap: message 3 on /odom is cut off", read_bag, cases.write_mcap(tmp_path / "o.mcap", odometry), "/odom"
     )
 
 
