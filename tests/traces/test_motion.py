@@ -74,7 +74,7 @@ def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
     for text, says in (
         ("0\n1\n", r"00.txt, line 3: must have a time, but .*times.txt has no more"),
         (KITTI_TIMES + "3\n", "holds more times than .*00.txt has poses"),
-        ("0\n2\n1\n", r"00.txt, line 3: time in s = 1: must not be before the line above"),
+        ("0\n0.2\n0.1\n", r"00.txt, line 3: time in s = 0.1: must not be before the line above"),
     ):
         times.write_text(text)
         refuse(says, read_motion, path, times=times, kind=TraceError)

@@ -95,12 +95,30 @@ def test_the_unit_of_a_trajectory_is_found(tmp_path: Path, unit: str, separator:
             assert motion.total == pytest.approx(59 / 60, abs=1e-6)
 
 
+def test_the_unit_of_kittis_times_is_found(tmp_path: Path) -> None:
+    """Four poses at 10 Hz; of steps of 10 the user says that they are seconds."""
+    path = written(tmp_path, "1 0 0 0 0 1 0 0 0 0 1 0\n" * 4, "00.txt")
+    for unit, start in (("s", 0), ("ms", 0), ("us", 0), ("ns", 1_700_000_000)):
+        step = UNITS[unit] / 10
+        times = "".join(f"{start * UNITS[unit] + k * step:.1f}\n" for k in range(4))
+        motion = read_motion(path, times=written(tmp_path, times, "times.txt"))
+        assert motion.duration_us == pytest.approx(300_000, abs=1), unit
+    tens = written(tmp_path, "0\n10\n20\n30\n", "times.txt")
+    refuse(r"times\.txt: median step of the times = 10: may be s or ms", read_motion, path, times=tens)
+    assert read_motion(path, format="kitti", times=tens).duration_us == 30_000_000
+
+
 def test_times_in_a_unit_that_cannot_be_are_refused(tmp_path: Path) -> None:
     """Steps of 5 may be s or ms, and microseconds under a header that says ns give 30,000 poses a second."""
     pose = ",0,0,0,0,0,0,1\n"
     fives = written(tmp_path, "".join(f"{5 * k}{pose}" for k in range(4)), "path.csv")
     refuse(r"path.csv: median step of the times = 5: may be s or ms: say format='tum'", read_motion, fives)
     assert read_motion(fives, format="tum").duration_us == 15_000_000
+    refuse(
+        "median step of the times = 10: may be s or ms",
+        read_motion,
+        written(tmp_path, "0 0 0 0 0 0 0 1\n10 0 0 0 0 0 0 1\n", "t.txt"),
+    )
     header = "#timestamp [ns],p_x,...\n" + turning("us", ",", 0, True)
     for text, format in ((header, None), (turning("us", ",", 1_700_000_000, True), "euroc")):
         path = written(tmp_path, text, "path.csv")
@@ -151,6 +169,9 @@ def test_rates_are_held_for_a_day_at_any_rate_and_holes_are_named(tmp_path: Path
         (1, 61, True),
         (1, 59, False),
         (1800, 3600, False),
+        (1800, 5400, True),
+        (3600, 7200, True),
+        (7200, 10_799, False),
     ):
         times = [0, step_s, 2 * step_s, 2 * step_s + hole_s, 3 * step_s + hole_s]
         path = written(tmp_path, "".join(f"{time} 0.1\n" for time in times))

@@ -18,6 +18,7 @@ MAX_HOLD_S: Final = 86_400
 # A rate held for longer than this and for so many usual steps is a hole in the recording, of which we warn.
 HOLE_S: Final = 60
 HOLE_STEPS: Final = 3
+HOUR_S: Final = 3600  # Longer than usual by this much is a hole too: a clock was set to daylight-saving time
 
 
 class Knots(NamedTuple):
@@ -96,7 +97,7 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     for rate in rates:
         if previous is not None:
             length_us = rate.start_us - previous.start_us
-            above = f"the line above ({previous.start_us / US_PER_S:.10g})"
+            above = f"the line above ({previous.time})"
             if length_us < 0:
                 raise rate.line.error(rate.time, f"must not be before {above}", "time in s")
             if length_us > MAX_HOLD_S * US_PER_S:
@@ -118,7 +119,8 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
 
 def _warn_of_holes(path: StrPath, lengths_us: Int64Array, usual_us: int, steps: list[Rate]) -> None:
     """Warn of rates held much longer than usual; ``steps`` end the intervals."""
-    holes = np.flatnonzero((lengths_us > HOLE_S * US_PER_S) & (lengths_us > HOLE_STEPS * usual_us))
+    longer = (lengths_us > HOLE_STEPS * usual_us) | (lengths_us - usual_us >= HOUR_S * US_PER_S)
+    holes = np.flatnonzero((lengths_us > HOLE_S * US_PER_S) & longer)
     if not len(holes):
         return
     longest = int(holes[np.argmax(lengths_us[holes])])
