@@ -118,7 +118,7 @@ def test_what_threads_log_out_of_order_is_sorted_and_said(tmp_path: Path) -> Non
 def test_log_times_that_are_none(tmp_path: Path) -> None:
     zero_ms = -cases.START_NS // cases.MS
     for place, ms, says in (
-        (0, zero_ms, r"message 1 \(/odom, logged at 0.000 s\) has no log time, others have: must all have one"),
+        (0, zero_ms, r"message 1 \(/odom, logged at 0.000 s\) has no log time: all messages must have one"),
         (7, zero_ms, r"message 8 \(/odom, logged at 0.000 s\) has no log time"),
         (
             59,
@@ -136,6 +136,8 @@ def test_log_times_that_are_none(tmp_path: Path) -> None:
         times[place] = ms
         path = cases.write_mcap(tmp_path / f"{place}{ms}.mcap", odometry(times))
         refuse(says, read_bag, path, kind=TraceError)
+    unset = cases.write_mcap(tmp_path / "unset.mcap", odometry([zero_ms] * 60))
+    refuse("message 1 .* has no log time", read_bag, unset)
     # A simulated clock begins at 0.
     simulated = cases.write_mcap(tmp_path / "sim.mcap", odometry([zero_ms + 50 * k for k in range(60)]))
     assert read_workload(simulated).duration_us == 2_950_000

@@ -13,6 +13,7 @@ from refusal_cases import refuse
 from bufgym.cli import main
 from bufgym.ground.errors import TraceError, TraceWarning
 from bufgym.traces import Trace, read_motion, read_trace, read_workload
+from bufgym.traces.formats.trajectories import read_poses
 
 RIGHT: list[tuple[str, Any, str | None]] = [
     ("good.mcap", (2.95, 1.475), None),
@@ -141,6 +142,18 @@ def test_a_jump_in_a_trajectory_is_warned_of(tmp_path: Path) -> None:
             assert read_motion(path).total == step_m / 2
 
 
+def test_a_car_whose_poses_come_in_bursts_does_not_jump(tmp_path: Path) -> None:
+    """25 m/s at 20 Hz: 1.25 m each, of which ten are logged within 10 ms. Steps of 3 m instead are jumps."""
+    times = [k // 10 / 2 + k % 10 / 1000 for k in range(60)]
+    for step_m, total in ((1.25, 59 * 1.25 / 2), (3, 59 * 3 / 2)):
+        text = "".join(f"{time:.3f} {step_m * k} 0 0 0 0 0 1\n" for k, time in enumerate(times))
+        path = written(tmp_path, text, "car.txt")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert read_poses(path).position_m[-1, 0] / 2 == total
+        assert len(caught) == (step_m == 3)
+
+
 def test_the_command_says_a_warning_in_a_line(tmp_path: Path) -> None:
     path = written(tmp_path, "0 1\n1 1\n3601 1\n3602 1\n")
     with warnings.catch_warnings(record=True) as caught:
@@ -210,7 +223,7 @@ def test_the_events_of_iperf3(tmp_path: Path) -> None:
             start + '{"event": "error", "data": "unable to connect"}\n',
             "error = 'unable to connect': must be a run that",
         ),
-        (start + intervals + '{"event": "inter', "line 5: .*: must be JSON"),
+        (start + intervals + '{"event": "inter', "line 5: .*: must be JSON .*; the 4 values above are sound$"),
         (start + end, "holds no measurement"),
         ("{}\n{}\n", "must be an object with a list of intervals"),
     ):

@@ -69,8 +69,7 @@ class LogTimes:
         """The messages in order of log time, int64[n].
 
         Raises:
-            TraceError: a log time that is 0 among others that are not, or too far from the others; a clock that went
-                back.
+            TraceError: a log time of 0 where no clock begins there, or too far from the others; a clock that went back.
         """
         time_ns = self.time_ns
         self._check_range(time_ns)
@@ -88,8 +87,8 @@ class LogTimes:
 
     def _check_range(self, time_ns: Int64Array) -> None:
         zero = first_true(time_ns == 0)
-        if zero is not None and time_ns[time_ns > 0].min(initial=MAX_LOG_NS) > NS_PER_S and time_ns.any():
-            raise fault(self.path, f"{self._place(zero)} has no log time, others have: must all have one")
+        if zero is not None and len(time_ns) > 1 and time_ns[time_ns > 0].min(initial=MAX_LOG_NS) > NS_PER_S:
+            raise fault(self.path, f"{self._place(zero)} has no log time: all messages must have one")
         most_ns = MAX_DURATION_S * NS_PER_S
         if len(time_ns) == 0 or int(np.ptp(time_ns)) <= most_ns:
             return
@@ -132,7 +131,8 @@ class LogTimes:
 
     def _place(self, k: int) -> str:
         topic = list(self.topics)[self._topic[k]]
-        return f"message {k + 1} ({topic}, logged at {_seconds(self._time_ns[k])} s)"
+        seconds, ns = divmod(self._time_ns[k], NS_PER_S)
+        return f"message {k + 1} ({topic}, logged at {seconds}.{ns // 10**6:03d} s)"
 
 
 def _goes_back(time_ns: Int64Array) -> npt.NDArray[np.bool_]:
@@ -179,7 +179,3 @@ def _stamp_ns(channel: BagTopic, data: bytes) -> int | None:
     seconds, ns = _HEADER[channel.encoding == "ros1" or bool(data[1] & 1)].unpack_from(data)
     stamp_ns: int = seconds * NS_PER_S + ns
     return stamp_ns if stamp_ns > 0 else None
-
-
-def _seconds(ns: int) -> str:
-    return f"{ns // NS_PER_S}.{ns % NS_PER_S // 10**6:03d}"
