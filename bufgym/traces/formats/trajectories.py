@@ -77,20 +77,14 @@ def read_poses(path: StrPath, *, format: str | None = None, times: StrPath | Non
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(POSE_FORMATS)}")
     if format == "kitti":
         poses = _read_kitti(path, times, unit)
-        warn_of_jumps(path, poses)
-        return poses
-    if times is not None:
+    elif times is not None:
         raise BufgymError(f"times = {str(times)!r}: goes with KITTI matrices only, and {path} is in format {format}")
-    time_us, values = read_rows(path, _pose_row(format, unit))
-    note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
-    poses = Poses(time_us, values[:, :3], normalized(values[:, 3:]), f"{format}{note}")
+    else:
+        time_us, values = read_rows(path, _pose_row(format, unit))
+        note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
+        poses = Poses(time_us, values[:, :3], normalized(values[:, 3:]), f"{format}{note}")
     warn_of_jumps(path, poses)
     return poses
-
-
-def detect_pose_format(path: StrPath) -> str:
-    """The format that the file's first lines fit (see above)."""
-    return _detected(path)[0]
 
 
 def _detected(path: StrPath) -> tuple[str, str]:
