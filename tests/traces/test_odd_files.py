@@ -197,6 +197,16 @@ def test_rates_are_held_for_a_day_at_any_rate_and_holes_are_named(tmp_path: Path
             read_trace(path)
 
 
+def test_an_hour_that_comes_twice_is_said(tmp_path: Path) -> None:
+    """Hourly lines in autumn: daylight saving ends at 3, which is 2 again. Two lines in one second are usual."""
+    lines = "".join(f"2024-10-27 0{hour}:00:00,8\n" for hour in (0, 1, 2, 2, 3))
+    with pytest.warns(
+        TraceWarning, match=r"line 5: 2024-10-27 02:00:00 is the time of the line above, where 3600 s is"
+    ):
+        assert read_trace(written(tmp_path, "time,mbps\n" + lines)).duration_us == 4 * 3600 * 10**6
+    assert read_trace(written(tmp_path, "0 8\n1 8\n1 8\n2 8\n")).duration_us == 3 * 10**6
+
+
 def test_a_comma_at_the_end_of_each_line_begins_no_column(tmp_path: Path) -> None:
     for text in (SAMPLES["csv"], SAMPLES["rates"], SAMPLES["nyu"], "Run 1\n0,0.5\n8,16\n"):
         plain = read_trace(written(tmp_path, text))

@@ -92,7 +92,7 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     interval's bytes are rounded to a whole number, so the total is off by at most half a byte a line.
     """
     intervals = Intervals()
-    previous: Rate | None = None
+    previous = again = None
     steps: list[Rate] = []  # the rate at the end of each interval
     for rate in rates:
         if previous is not None:
@@ -102,7 +102,9 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
                 raise rate.line.error(rate.time, f"must not be before {above}", "time in s")
             if length_us > MAX_HOLD_S * US_PER_S:
                 raise rate.line.error(rate.time, f"must be at most {MAX_HOLD_S} s after {above}", "time in s")
-            if length_us > 0:
+            if length_us == 0:
+                again = rate
+            else:
                 intervals.add(length_us, round(previous.bytes_per_us * length_us))
                 steps.append(rate)
         previous = rate
@@ -112,6 +114,11 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
         line = previous.line
         raise line.error(line.text, "must have a second line: how long a single rate holds is unknown")
     length_us = round(float(np.median(np.asarray(intervals.us))))
+    if again is not None and length_us > HOLE_S * US_PER_S:
+        doubt = (
+            f"{again.time} is the time of the line above, where {length_us / US_PER_S:g} s is usual: this one counts"
+        )
+        warn(path, doubt, line=again.line.number)
     _warn_of_holes(path, np.array(intervals.us, np.int64), length_us, steps)
     intervals.add(length_us, round(previous.bytes_per_us * length_us))
     return intervals.knots(path)
