@@ -76,7 +76,7 @@ class LogTimes:
         self._check_steps(time_ns)
         order = np.argsort(time_ns, kind="stable")
         behind_ns = np.maximum.accumulate(time_ns) - time_ns if len(time_ns) else time_ns
-        if behind_ns.any():
+        if (behind_ns > _THREADS_NS).any():
             k, count = int(np.argmax(behind_ns)), int(np.count_nonzero(behind_ns))
             warn(
                 self.path,
