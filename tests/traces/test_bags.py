@@ -128,8 +128,8 @@ def test_odometry_that_is_none(tmp_path: Path) -> None:
         (drive, "/status", "/status carries std_msgs/msg/String: must be one of nav_msgs/msg/Odometry"),
         (drive, "/odom:a:b", "odom = '/odom:a:b': say which frames: /odom:odom:base"),
         (drive, "/goal_pose", "odom = '/goal_pose': /goal_pose is a goal, no place where the robot is"),
-        (odometry(good, cases.odometry(0, 0, scale=0.5)), "/odom", "/odom, pose 1, norm = 0.5: must be 1 within 1 %"),
-        (odometry(good, cases.odometry(math.nan, 0)), "/odom", "pose 1, position = .*nan.*: must be finite and wit"),
+        (odometry(good, cases.odometry(0, 0, scale=0.5)), "/odom", "/odom, pose 2, norm = 0.5: must be 1 within 1 %"),
+        (odometry(good, cases.odometry(math.nan, 0)), "/odom", "pose 2, position = .*nan.*: must be finite and wit"),
         (odometry(good, good[:40]), "/odom", "cut off or damaged: "),
         (odometry(good, good, encoding="json"), "/odom", "/odom is encoded in 'json': must be cdr or ros1"),
     ):

@@ -50,24 +50,48 @@ def test_a_clock_that_went_back_is_refused_with_place_and_size(tmp_path: Path, c
             (False, f"by at least {size_ms / 1000 - 0.05:.6g} s"),
         ):
             path = write(tmp_path / f"{size_ms}-{stamped}", odometry(stepped(size_ms), store, stamped))
-            place = r"before message 31 \(/odom, logged at .*\), after 1700000001.450 s in message 30 of the same topic"
+            place = r"before message 31 \(/odom, logged at .*\), after message 30 \(/odom, logged at 1700000001.450 s\)"
             refuse(f"the recorder's clock goes back {says} {place}", read_bag, path, kind=TraceError)
 
 
+def with_pictures(odometry: list[cases.Entry]) -> list[cases.Entry]:
+    """20 ms after each message one of /camera, next to it in the file."""
+    return [one for entry in odometry for one in (entry, (entry[0] + 20, "/camera", STRING, cases.text("x")))]
+
+
 def test_a_step_shorter_than_the_period_shows_by_the_header_stamps(tmp_path: Path) -> None:
-    """Odometry never goes back by itself: 1450, then 1460. But a picture of 1470 comes before it in the file."""
+    """Odometry never goes back by itself: 1450, then 1455. But a picture of 1470 comes before it in the file."""
     for stamped in (True, False):
-        entries = []
-        for entry in odometry(stepped(40), stamped=stamped):
-            entries += [entry, (entry[0] + 20, "/camera", STRING, cases.text("x"))]
+        entries = with_pictures(odometry(stepped(45), stamped=stamped))
         path = cases.write_mcap(tmp_path / f"{stamped}.mcap", entries)
         if stamped:
-            refuse(r"goes back by 0.04 s before message 61 \(/odom, logged at 1700000001.460 s\)", read_bag, path)
+            place = r"before message 61 \(/odom, logged at 1700000001.455 s\), after message 60 \(/camera"
+            refuse(f"goes back by 0.045 s {place}", read_bag, path)
         else:
             with pytest.warns(
-                TraceWarning, match=r"1 of 120 messages logged before .* at most 0.01 s \(message 61 \(/odom"
+                TraceWarning, match=r"1 of 120 messages logged before .* at most 0.015 s \(message 61 \(/odom"
             ):
                 read_bag(path)
+
+
+@pytest.mark.parametrize("sound", ["fast", "settled"])
+def test_stamps_that_come_nearer_to_sound_log_times_are_no_step(tmp_path: Path, sound: str) -> None:
+    """Threads log a picture 15 ms early at 1450 and 1470, where stamps come nearer as they do in sound recordings.
+
+    A simulation at double speed: 50 ms each 25 ms. A pose whose filter needs 45 ms less from then on, while that of the
+    wheels needs what it did.
+    """
+    entries = odometry([50 * k for k in range(60)], stamped=True)
+    if sound == "fast":
+        entries = odometry([25 * k for k in range(60)], stamped=True)
+    else:
+        filtered = [(ms - 45 * (k >= 30) + 46, "/ekf", type, pose) for k, (ms, _, type, pose) in enumerate(entries)]
+        entries = [one for pair in zip(entries, filtered, strict=True) for one in pair]
+    place = len(entries) // 2
+    entries.insert(place, (entries[place][0] + 15, "/camera", STRING, cases.text("x")))
+    with pytest.warns(TraceWarning, match="messages logged before a message above them"):
+        bag = read_bag(cases.write_mcap(tmp_path / "sound.mcap", entries))
+    assert len(bag.time_ns) == len(entries)
 
 
 def test_what_threads_log_out_of_order_is_sorted_and_said(tmp_path: Path) -> None:
@@ -94,7 +118,7 @@ def test_what_threads_log_out_of_order_is_sorted_and_said(tmp_path: Path) -> Non
 def test_log_times_that_are_none(tmp_path: Path) -> None:
     zero_ms = -cases.START_NS // cases.MS
     for place, ms, says in (
-        (0, zero_ms, r"message 1 \(/odom, logged at 0.000 s\) has no log time, others have: must all have one"),
+        (0, zero_ms, r"message 1 \(/odom, logged at 0.000 s\) has no log time: all messages must have one"),
         (7, zero_ms, r"message 8 \(/odom, logged at 0.000 s\) has no log time"),
         (
             59,
@@ -112,6 +136,8 @@ def test_log_times_that_are_none(tmp_path: Path) -> None:
         times[place] = ms
         path = cases.write_mcap(tmp_path / f"{place}{ms}.mcap", odometry(times))
         refuse(says, read_bag, path, kind=TraceError)
+    unset = cases.write_mcap(tmp_path / "unset.mcap", odometry([zero_ms] * 60))
+    refuse("message 1 .* has no log time", read_bag, unset)
     # A simulated clock begins at 0.
     simulated = cases.write_mcap(tmp_path / "sim.mcap", odometry([zero_ms + 50 * k for k in range(60)]))
     assert read_workload(simulated).duration_us == 2_950_000

@@ -13,11 +13,12 @@ from refusal_cases import refuse
 from bufgym.cli import main
 from bufgym.ground.errors import TraceError, TraceWarning
 from bufgym.traces import Trace, read_motion, read_trace, read_workload
+from bufgym.traces.formats.trajectories import read_poses
 
 RIGHT: list[tuple[str, Any, str | None]] = [
     ("good.mcap", (2.95, 1.475), None),
     # By the header stamps, which went on: by the log times alone it is 0.683 s or more.
-    ("clock_back_0.733s.mcap", r"goes back by 0.733 s before message 46 \(/odom, .* in message 45 of the same", None),
+    ("clock_back_0.733s.mcap", r"goes back by 0.733 s before message 46 \(/odom, .*, after message 45 \(/odom", None),
     ("rollover.mcap", r"message 51 \(/odom\), log time in ns = 18446744068709551616: must be from 0 to 2", None),
     ("clock_1970.mcap", r"message 46 \(/odom, .*\) is 1699999960 s from message 45 \(/odom, logged at 41.450", None),
     ("odom_jump.mcap", (2.95, 501.475), r"pose 31 of 60 \(/odom\), 1.500 s after .*, is 1000.05 m from the one 0.05"),
@@ -95,12 +96,30 @@ def test_the_unit_of_a_trajectory_is_found(tmp_path: Path, unit: str, separator:
             assert motion.total == pytest.approx(59 / 60, abs=1e-6)
 
 
+def test_the_unit_of_kittis_times_is_found(tmp_path: Path) -> None:
+    """Four poses at 10 Hz; of steps of 10 the user says that they are seconds."""
+    path = written(tmp_path, "1 0 0 0 0 1 0 0 0 0 1 0\n" * 4, "00.txt")
+    for unit, start in (("s", 0), ("ms", 0), ("us", 0), ("ns", 1_700_000_000)):
+        step = UNITS[unit] / 10
+        times = "".join(f"{start * UNITS[unit] + k * step:.1f}\n" for k in range(4))
+        motion = read_motion(path, times=written(tmp_path, times, "times.txt"))
+        assert motion.duration_us == pytest.approx(300_000, abs=1), unit
+    tens = written(tmp_path, "0\n10\n20\n30\n", "times.txt")
+    refuse(r"times\.txt: median step of the times = 10: may be s or ms", read_motion, path, times=tens)
+    assert read_motion(path, format="kitti", times=tens).duration_us == 30_000_000
+
+
 def test_times_in_a_unit_that_cannot_be_are_refused(tmp_path: Path) -> None:
     """Steps of 5 may be s or ms, and microseconds under a header that says ns give 30,000 poses a second."""
     pose = ",0,0,0,0,0,0,1\n"
     fives = written(tmp_path, "".join(f"{5 * k}{pose}" for k in range(4)), "path.csv")
     refuse(r"path.csv: median step of the times = 5: may be s or ms: say format='tum'", read_motion, fives)
     assert read_motion(fives, format="tum").duration_us == 15_000_000
+    refuse(
+        "median step of the times = 10: may be s or ms",
+        read_motion,
+        written(tmp_path, "0 0 0 0 0 0 0 1\n10 0 0 0 0 0 0 1\n", "t.txt"),
+    )
     header = "#timestamp [ns],p_x,...\n" + turning("us", ",", 0, True)
     for text, format in ((header, None), (turning("us", ",", 1_700_000_000, True), "euroc")):
         path = written(tmp_path, text, "path.csv")
@@ -121,6 +140,18 @@ def test_a_jump_in_a_trajectory_is_warned_of(tmp_path: Path) -> None:
                 assert read_motion(path).total == step_m / 2
         else:
             assert read_motion(path).total == step_m / 2
+
+
+def test_a_car_whose_poses_come_in_bursts_does_not_jump(tmp_path: Path) -> None:
+    """25 m/s at 20 Hz: 1.25 m each, of which ten are logged within 10 ms. Steps of 3 m instead are jumps."""
+    times = [k // 10 / 2 + k % 10 / 1000 for k in range(60)]
+    for step_m, total in ((1.25, 59 * 1.25 / 2), (3, 59 * 3 / 2)):
+        text = "".join(f"{time:.3f} {step_m * k} 0 0 0 0 0 1\n" for k, time in enumerate(times))
+        path = written(tmp_path, text, "car.txt")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert read_poses(path).position_m[-1, 0] / 2 == total
+        assert len(caught) == (step_m == 3)
 
 
 def test_the_command_says_a_warning_in_a_line(tmp_path: Path) -> None:
@@ -151,6 +182,9 @@ def test_rates_are_held_for_a_day_at_any_rate_and_holes_are_named(tmp_path: Path
         (1, 61, True),
         (1, 59, False),
         (1800, 3600, False),
+        (1800, 5400, True),
+        (3600, 7200, True),
+        (7200, 10_799, False),
     ):
         times = [0, step_s, 2 * step_s, 2 * step_s + hole_s, 3 * step_s + hole_s]
         path = written(tmp_path, "".join(f"{time} 0.1\n" for time in times))
@@ -161,6 +195,16 @@ def test_rates_are_held_for_a_day_at_any_rate_and_holes_are_named(tmp_path: Path
                 read_trace(path)
         else:
             read_trace(path)
+
+
+def test_an_hour_that_comes_twice_is_said(tmp_path: Path) -> None:
+    """Hourly lines in autumn: daylight saving ends at 3, which is 2 again. Two lines in one second are usual."""
+    lines = "".join(f"2024-10-27 0{hour}:00:00,8\n" for hour in (0, 1, 2, 2, 3))
+    with pytest.warns(
+        TraceWarning, match=r"line 5: 2024-10-27 02:00:00 is the time of the line above, where 3600 s is"
+    ):
+        assert read_trace(written(tmp_path, "time,mbps\n" + lines)).duration_us == 4 * 3600 * 10**6
+    assert read_trace(written(tmp_path, "0 8\n1 8\n1 8\n2 8\n")).duration_us == 3 * 10**6
 
 
 def test_a_comma_at_the_end_of_each_line_begins_no_column(tmp_path: Path) -> None:
@@ -189,7 +233,7 @@ def test_the_events_of_iperf3(tmp_path: Path) -> None:
             start + '{"event": "error", "data": "unable to connect"}\n',
             "error = 'unable to connect': must be a run that",
         ),
-        (start + intervals + '{"event": "inter', "line 5: .*: must be JSON"),
+        (start + intervals + '{"event": "inter', "line 5: .*: must be JSON .*; the 4 values above are sound$"),
         (start + end, "holds no measurement"),
         ("{}\n{}\n", "must be an object with a list of intervals"),
     ):

@@ -125,7 +125,7 @@ class PoseCollector:
 
     def _keep(self, frames: Frames, time_ns: int, position: Any, quaternion: Any) -> None:
         poses = self._poses.setdefault(frames, [])
-        field = f"{self.topic}, pose {len(poses)}"
+        field = f"{self.topic}, pose {len(poses) + 1}"
         values = (position.x, position.y, position.z, quaternion.x, quaternion.y, quaternion.z, quaternion.w)
         # Written so that NaN fails.
         if not all(abs(value) <= MAX_POSITION_M for value in values[:3]):

@@ -85,7 +85,7 @@ def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], ob
             raise fault(path, f"more than {MAX_TOPICS} topics: must be fewer")
         if len(sizes) >= MAX_BAG_MESSAGES:
             raise fault(path, f"more than {MAX_BAG_MESSAGES} messages: must be fewer")
-        with damage_errors(file, f"message {len(sizes)} on {channel.topic} is "):
+        with damage_errors(file, f"message {len(sizes) + 1} on {channel.topic} is "):
             times.add(channel, logged_ns, data)
             sizes.append(max(1, len(data)))
             if collector is not None and channel.topic == collector.topic:

@@ -69,15 +69,14 @@ class LogTimes:
         """The messages in order of log time, int64[n].
 
         Raises:
-            TraceError: a log time that is 0 among others that are not, or too far from the others; a clock that went
-                back.
+            TraceError: a log time of 0 where no clock begins there, or too far from the others; a clock that went back.
         """
         time_ns = self.time_ns
         self._check_range(time_ns)
         self._check_steps(time_ns)
         order = np.argsort(time_ns, kind="stable")
         behind_ns = np.maximum.accumulate(time_ns) - time_ns if len(time_ns) else time_ns
-        if behind_ns.any():
+        if (behind_ns > _THREADS_NS).any():
             k, count = int(np.argmax(behind_ns)), int(np.count_nonzero(behind_ns))
             warn(
                 self.path,
@@ -88,8 +87,8 @@ class LogTimes:
 
     def _check_range(self, time_ns: Int64Array) -> None:
         zero = first_true(time_ns == 0)
-        if zero is not None and time_ns[time_ns > 0].min(initial=MAX_LOG_NS) > NS_PER_S and time_ns.any():
-            raise fault(self.path, f"{self._place(zero)} has no log time, others have: must all have one")
+        if zero is not None and len(time_ns) > 1 and time_ns[time_ns > 0].min(initial=MAX_LOG_NS) > NS_PER_S:
+            raise fault(self.path, f"{self._place(zero)} has no log time: all messages must have one")
         most_ns = MAX_DURATION_S * NS_PER_S
         if len(time_ns) == 0 or int(np.ptp(time_ns)) <= most_ns:
             return
@@ -102,37 +101,38 @@ class LogTimes:
         raise fault(self.path, f"{self._place(far)} {rule}")
 
     def _check_steps(self, time_ns: Int64Array) -> None:
-        """Refuse a clock that went back: by the log times of a topic, or by their distance from its header stamps."""
+        """Refuse a clock that went back: by the log times of a topic, or by their distance from header stamps."""
         by_topic = np.argsort(self.topic, kind="stable")
-        back_above = np.append(0, np.cumsum(time_ns[1:] < time_ns[:-1])) if len(time_ns) else time_ns
         ahead_ns, stamped = np.array(self._ahead_ns, np.int64), np.frombuffer(self._stamped, np.bool_)
         ends = np.cumsum(np.bincount(self.topic))
-        steps: list[tuple[int, int, int]] = []  # message, message above on its topic, size in ns
+        back_ns = time_ns[:-1] - time_ns[1:]
+        falls = np.flatnonzero(back_ns > _THREADS_NS) + 1  # messages before which the clock may have gone back
+        fell_ns, steady = np.zeros(len(falls), np.int64), np.zeros(len(falls), np.bool_)
+        steps: list[tuple[int, int]] = []  # message, message above it
         for places in np.split(by_topic, ends[:-1]):
-            for k in np.flatnonzero(_goes_back(time_ns[places])):
-                steps.append((int(places[k + 1]), int(places[k]), 0))
+            steps += [(int(places[k + 1]), int(places[k])) for k in np.flatnonzero(_goes_back(time_ns[places]))]
             places = places[stamped[places]]
-            fell_ns = _falls(ahead_ns[places])
-            for k in np.flatnonzero(fell_ns > _THREADS_NS):
-                if back_above[places[k + 1]] > back_above[places[k]]:
-                    steps.append((int(places[k + 1]), int(places[k]), int(fell_ns[k])))
+            known, of_topic_ns = _fell(ahead_ns[places], np.searchsorted(places, falls))
+            fell_ns = np.maximum(fell_ns, of_topic_ns)
+            steady |= known & (of_topic_ns == 0)
+        sizes_ns = dict(zip(falls.tolist(), np.where(steady, 0, fell_ns).tolist(), strict=True))
+        steps += [(k, k - 1) for k, fell in sizes_ns.items() if fell >= back_ns[k - 1] - _THREADS_NS and fell > 0]
         if not steps:
             return
-        message, above, _ = min(steps)
-        size_ns = max(fell_ns for last, first, fell_ns in steps if first < message <= last)
+        message, above = min(steps)
+        size_ns = sizes_ns.get(message, 0)
         least = "" if size_ns else "at least "
         size_ns = max(size_ns, int(time_ns[above] - time_ns[message]))
-        size = f"{least}{size_ns / NS_PER_S:.6g} s"
-        times = f"after {_seconds(int(time_ns[above]))} s in message {above + 1} of the same topic"
         raise fault(
             self.path,
-            f"the recorder's clock goes back by {size} before {self._place(message)}, {times}"
-            ": must not, as log times say when messages arrived (split the recording there)",
+            f"the recorder's clock goes back by {least}{size_ns / NS_PER_S:.6g} s before {self._place(message)}, after "
+            f"{self._place(above)}: must not, as log times say when messages arrived (split the recording there)",
         )
 
     def _place(self, k: int) -> str:
         topic = list(self.topics)[self._topic[k]]
-        return f"message {k + 1} ({topic}, logged at {_seconds(self._time_ns[k])} s)"
+        seconds, ns = divmod(self._time_ns[k], NS_PER_S)
+        return f"message {k + 1} ({topic}, logged at {seconds}.{ns // 10**6:03d} s)"
 
 
 def _goes_back(time_ns: Int64Array) -> npt.NDArray[np.bool_]:
@@ -147,16 +147,19 @@ def _goes_back(time_ns: Int64Array) -> npt.NDArray[np.bool_]:
     return np.asarray((back_ns > _ALONE_NS) | ((back_ns > _THREADS_NS) & stays & was_before))
 
 
-def _falls(ahead_ns: Int64Array) -> Int64Array:
-    """By how much log times less header stamps fell for good before each message but the first, int64[n-1]."""
-    fell_ns = np.zeros(max(0, len(ahead_ns) - 1), np.int64)
-    if len(ahead_ns) >= 2 * _AROUND:
+def _fell(ahead_ns: Int64Array, after: Int64Array) -> tuple[npt.NDArray[np.bool_], Int64Array]:
+    """Whether a topic shows how log times less header stamps went on from each of its messages ``after``, and by how
+    much they fell there for good: 0 where they did not, or vary as much around it.
+    """
+    known = (after >= _AROUND) & (after <= len(ahead_ns) - _AROUND)
+    fell_ns = np.zeros(len(after), np.int64)
+    if known.any():
         windows = np.lib.stride_tricks.sliding_window_view(ahead_ns, _AROUND)
-        least, most = windows.min(axis=1)[:-_AROUND], windows.max(axis=1)[_AROUND:]
-        middle = np.median(windows, axis=1).astype(np.int64)
-        fell = middle[:-_AROUND] - middle[_AROUND:]
-        fell_ns[_AROUND - 1 : _AROUND - 1 + len(fell)] = np.where(least - most > _THREADS_NS, fell, 0)
-    return fell_ns
+        before, below = windows[after[known] - _AROUND], windows[after[known]]
+        spread_ns = np.maximum(np.ptp(before, axis=1), np.ptp(below, axis=1))
+        fell = (np.median(before, axis=1) - np.median(below, axis=1)).astype(np.int64)
+        fell_ns[known] = np.where(before.min(axis=1) - below.max(axis=1) > _THREADS_NS + spread_ns, fell, 0)
+    return known, fell_ns
 
 
 @cache
@@ -176,7 +179,3 @@ def _stamp_ns(channel: BagTopic, data: bytes) -> int | None:
     seconds, ns = _HEADER[channel.encoding == "ros1" or bool(data[1] & 1)].unpack_from(data)
     stamp_ns: int = seconds * NS_PER_S + ns
     return stamp_ns if stamp_ns > 0 else None
-
-
-def _seconds(ns: int) -> str:
-    return f"{ns // NS_PER_S}.{ns % NS_PER_S // 10**6:03d}"

@@ -18,6 +18,7 @@ MAX_HOLD_S: Final = 86_400
 # A rate held for longer than this and for so many usual steps is a hole in the recording, of which we warn.
 HOLE_S: Final = 60
 HOLE_STEPS: Final = 3
+HOUR_S: Final = 3600  # Longer than usual by this much is a hole too: a clock was set to daylight-saving time
 
 
 class Knots(NamedTuple):
@@ -91,17 +92,19 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     interval's bytes are rounded to a whole number, so the total is off by at most half a byte a line.
     """
     intervals = Intervals()
-    previous: Rate | None = None
+    previous = again = None
     steps: list[Rate] = []  # the rate at the end of each interval
     for rate in rates:
         if previous is not None:
             length_us = rate.start_us - previous.start_us
-            above = f"the line above ({previous.start_us / US_PER_S:.10g})"
+            above = f"the line above ({previous.time})"
             if length_us < 0:
                 raise rate.line.error(rate.time, f"must not be before {above}", "time in s")
             if length_us > MAX_HOLD_S * US_PER_S:
                 raise rate.line.error(rate.time, f"must be at most {MAX_HOLD_S} s after {above}", "time in s")
-            if length_us > 0:
+            if length_us == 0:
+                again = rate
+            else:
                 intervals.add(length_us, round(previous.bytes_per_us * length_us))
                 steps.append(rate)
         previous = rate
@@ -111,6 +114,11 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
         line = previous.line
         raise line.error(line.text, "must have a second line: how long a single rate holds is unknown")
     length_us = round(float(np.median(np.asarray(intervals.us))))
+    if again is not None and length_us > HOLE_S * US_PER_S:
+        doubt = (
+            f"{again.time} is the time of the line above, where {length_us / US_PER_S:g} s is usual: this one counts"
+        )
+        warn(path, doubt, line=again.line.number)
     _warn_of_holes(path, np.array(intervals.us, np.int64), length_us, steps)
     intervals.add(length_us, round(previous.bytes_per_us * length_us))
     return intervals.knots(path)
@@ -118,7 +126,8 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
 
 def _warn_of_holes(path: StrPath, lengths_us: Int64Array, usual_us: int, steps: list[Rate]) -> None:
     """Warn of rates held much longer than usual; ``steps`` end the intervals."""
-    holes = np.flatnonzero((lengths_us > HOLE_S * US_PER_S) & (lengths_us > HOLE_STEPS * usual_us))
+    longer = (lengths_us > HOLE_STEPS * usual_us) | (lengths_us - usual_us >= HOUR_S * US_PER_S)
+    holes = np.flatnonzero((lengths_us > HOLE_S * US_PER_S) & longer)
     if not len(holes):
         return
     longest = int(holes[np.argmax(lengths_us[holes])])

@@ -57,7 +57,7 @@ FORMATS: Final[dict[str, Format]] = {
     ),
     "sabre": Format("JSON list", _cells(r"\["), read_sabre),
     "nuttcp": Format("nuttcp's log", lambda text: INTERVAL.fullmatch(text) or REMARK.fullmatch(text), read_nuttcp),
-    "iperf3": Format("JSON object, or one a line", _cells(r"\{"), read_iperf3),
+    "iperf3": Format("JSON objects", _cells(r"\{"), read_iperf3),
     "runs": Format("Run 1, or ###", lambda text: RUN.fullmatch(text) or RULER.fullmatch(text), read_runs, RUNS),
 }
 

@@ -132,7 +132,8 @@ def read_json_values(path: StrPath) -> list[Any]:
         return values
     except json.JSONDecodeError as error:
         value = text[error.pos : error.pos + _SHOWN_CHARACTERS] or None
-        raise fault(path, f"must be JSON ({error.msg})", line=error.lineno, value=value) from error
+        sound = f"; the {len(values)} values above are sound" if values else ""
+        raise fault(path, f"must be JSON ({error.msg}){sound}", line=error.lineno, value=value) from error
     except (ValueError, RecursionError) as error:
         reason = "nested too deep" if isinstance(error, RecursionError) else str(error).partition(";")[0]
         raise fault(path, f"must be JSON ({reason})") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from bufgym.traces.formats.bags import refuse_bag
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.text import Line, is_header, open_text, write_text
 from bufgym.traces.formats.trajectories import read_poses, read_rows, seconds
@@ -34,9 +34,7 @@ def read_motion(
     refuse_bag(path, "must be a trajectory (motion in it is taken with --odom)")
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
-    if first is None:
-        raise fault(path, "is empty: must hold a trajectory or a motion recording")
-    if format is None and times is None and is_header(first.text, MOTION_HEADER):
+    if first is not None and format is None and times is None and is_header(first.text, MOTION_HEADER):
         time_us, values = read_rows(path, _motion_row, skip=first.number)
         return Motion(trace_name(path), time_us, values[:, 0] - values[0, 0], f"{path} ({MOTION_HEADER})")
     poses = read_poses(path, format=format, times=times)

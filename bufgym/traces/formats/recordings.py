@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -45,7 +46,7 @@ def read_workload(
         BufgymError: an unknown topic, no message, or gaps without `bridge_gaps`.
     """
     if not bags.is_bag(path):
-        if odom is not None:
+        if odom is not None and Path(path).exists():
             raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
         return _with_topics(read_workload_csv(path), topics)
     bag = bags.read_bag(path, odom, advance)

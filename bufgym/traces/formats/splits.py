@@ -196,7 +196,7 @@ def _listed(folder: Path) -> list[Split]:
 
 def _unlisted(folder: Path) -> list[Split]:
     """All files of the folder in order of time, each once."""
-    files = sorted(path for path in folder.iterdir() if path.name.endswith(_ENDINGS))
+    files = sorted(path for path in folder.iterdir() if path.name.endswith(_ENDINGS) and path.name[0] != ".")
     files = [path for path in files if path.suffix != ".zstd" or path.with_suffix("") not in files]
     by_size: dict[int, list[Path]] = {}
     copies: list[str] = []

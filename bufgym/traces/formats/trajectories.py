@@ -4,7 +4,7 @@
 |---|---|---|
 | `tum` | `t tx ty tz qx qy qz qw`: s, m, unit quaternion | TUM RGB-D [sturm2012tum]; any odometry |
 | `euroc` | `t px py pz qw qx qy qz`: ns, m; a state estimate has 11 or 17 columns | EuRoC [burri2016euroc], VINS |
-| `kitti` | a 3x4 matrix row by row, m; the times (s, one a line) in another file | KITTI [geiger2012kitti] |
+| `kitti` | a 3x4 matrix row by row, m; the times (one a line) in another file | KITTI [geiger2012kitti] |
 
 Columns of TUM and EuRoC are separated by blanks or commas. The format is recognised by the first lines: 12 numbers are
 KITTI's; a header such as `#timestamp [ns]`, or more than 8 columns, EuRoC's. Without such a header `_unit` finds the
@@ -46,7 +46,7 @@ _COLUMNS: Final = {"tum": (8,), "euroc": (8, 11, 17)}
 _NAMES: Final = {"tum": ("tx", "ty", "tz", "qx", "qy", "qz", "qw"), "euroc": ("px", "py", "pz", "qw", "qx", "qy", "qz")}
 _OWN_UNIT: Final = {"tum": "s", "euroc": "ns"}
 _UNIT_S: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_USUAL_STEPS_S: Final = (1e-3, 10.0)  # From one pose to the next, where only the steps tell the unit
+_USUAL_STEPS_S: Final = (0.9e-3, 10.0)  # From one pose to the next, where only the steps tell the unit
 _LONGEST_STEP_S: Final = 3600  # The same where the times count from 1970
 _LEAST_STEP_S: Final = 1e-4  # No camera or robot tells its pose more often
 _TIMES_READ: Final = 1000  # Lines by which the unit is found
@@ -76,21 +76,15 @@ def read_poses(path: StrPath, *, format: str | None = None, times: StrPath | Non
     if format not in POSE_FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(POSE_FORMATS)}")
     if format == "kitti":
-        poses = _read_kitti(path, times)
-        warn_of_jumps(path, poses)
-        return poses
-    if times is not None:
+        poses = _read_kitti(path, times, unit)
+    elif times is not None:
         raise BufgymError(f"times = {str(times)!r}: goes with KITTI matrices only, and {path} is in format {format}")
-    time_us, values = read_rows(path, _pose_row(format, unit))
-    note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
-    poses = Poses(time_us, values[:, :3], normalized(values[:, 3:]), f"{format}{note}")
+    else:
+        time_us, values = read_rows(path, _pose_row(format, unit))
+        note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
+        poses = Poses(time_us, values[:, :3], normalized(values[:, 3:]), f"{format}{note}")
     warn_of_jumps(path, poses)
     return poses
-
-
-def detect_pose_format(path: StrPath) -> str:
-    """The format that the file's first lines fit (see above)."""
-    return _detected(path)[0]
 
 
 def _detected(path: StrPath) -> tuple[str, str]:
@@ -112,7 +106,7 @@ def _detected(path: StrPath) -> tuple[str, str]:
     if not columns:
         raise fault(path, "is empty: must hold a trajectory or a motion recording")
     if columns == 12 and blanks:
-        return "kitti", "s"
+        return "kitti", ""
     likely = "tum" if blanks and columns <= 8 else "euroc"
     unit = _unit(path, np.array(times), _OWN_UNIT[likely])
     return ("tum" if unit == "s" and columns <= 8 else likely), unit
@@ -137,10 +131,13 @@ def _unit(path: StrPath, times: Float64Array, own: str) -> str:
             return unit
     least_s, most_s = _USUAL_STEPS_S
     likely = [unit for unit, unit_s in _UNIT_S.items() if least_s <= step * unit_s <= most_s]
-    if own in likely or not likely:
+    # Whole steps of 10 are rather ms than one pose in 10 s.
+    if not likely or (own in likely and (step * _UNIT_S[own] <= 1 or bool((times % 1).any()))):
         return own
     if len(likely) > 1:
-        rule = f"may be {' or '.join(likely)}: say format='tum' (s) or 'euroc' (ns), and write others in one of these"
+        rule = (
+            f"may be {' or '.join(likely)}: say format='tum' or 'kitti' (s) or 'euroc' (ns), and write others in these"
+        )
         raise fault(path, rule, value=f"{step:g}", field="median step of the times")
     return likely[0]
 
@@ -168,7 +165,7 @@ def read_rows(path: StrPath, read_row: RowReader, skip: int = 0) -> tuple[Int64A
             times.append(time_us)
             rows.append(row)
     if len(times) < 2:
-        raise fault(path, f"holds {len(times)} samples: must hold at least 2")
+        raise fault(path, f"holds {len(times)} samples: must hold at least 2 of different times")
     time_array = np.asarray(times, np.int64)
     step_s = float(np.median(np.diff(time_array))) / US_PER_S
     if step_s < _LEAST_STEP_S:
@@ -186,21 +183,23 @@ def _pose_row(format: str, unit: str) -> RowReader:
     """The reader of a line of TUM or EuRoC with times in this unit."""
     columns, names = _COLUMNS[format], _NAMES[format]
     more = f" (or {' or '.join(map(str, columns[1:]))} of a state estimate)" if columns[1:] else ""
-    unit_us = Decimal(str(_UNIT_S[unit])) * US_PER_S
 
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
         cells = _cells(line)
         if len(cells) not in columns:
             raise line.error(line.text, f"must have 8 columns{more}, has {len(cells)}")
-        if unit == "s":
-            time_us = seconds(line, cells[0])
-        else:
-            line.decimal(f"time in {unit}", cells[0], 0, _MAX_EPOCH_S / _UNIT_S[unit])
-            # A float holds such a time to 256 ns only.
-            time_us = int(Decimal(cells[0]) * unit_us)
-        return cells[0], time_us, _pose(line, cells[1:8], names)
+        return cells[0], _time_us(line, cells[0], unit), _pose(line, cells[1:8], names)
 
     return row
+
+
+def _time_us(line: Line, text: str, unit: str) -> int:
+    """A time in this unit, as microseconds."""
+    if unit == "s":
+        return seconds(line, text)
+    line.decimal(f"time in {unit}", text, 0, _MAX_EPOCH_S / _UNIT_S[unit])
+    # A float holds such a time to 256 ns only.
+    return int(Decimal(text) * Decimal(str(_UNIT_S[unit])) * US_PER_S)
 
 
 def _cells(line: Line) -> list[str]:
@@ -219,9 +218,9 @@ def _pose(line: Line, cells: list[str], names: tuple[str, ...]) -> list[float]:
     return values
 
 
-def _read_kitti(path: StrPath, times: StrPath | None) -> Poses:
+def _read_kitti(path: StrPath, times: StrPath | None, unit: str) -> Poses:
     times = _times_beside(path) if times is None else times
-    stamps = _read_times(times)
+    stamps = _read_times(times, unit or _detected(times)[1])
 
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
         cells = line.columns(12)
@@ -241,11 +240,11 @@ def _read_kitti(path: StrPath, times: StrPath | None) -> Poses:
     return Poses(time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), f"kitti, times from {Path(times).name}")
 
 
-def _read_times(path: StrPath) -> Iterator[tuple[str, int]]:
+def _read_times(path: StrPath, unit: str) -> Iterator[tuple[str, int]]:
     with open_text(path) as file:
         for line in file.lines():
             (text,) = line.columns(1)
-            yield text, seconds(line, text)
+            yield text, _time_us(line, text, unit)
 
 
 def _times_beside(path: StrPath) -> Path:
