@@ -1,4 +1,4 @@
-"""``bufgym trace fit``: parameters of generated links, or of message sizes, from recordings."""
+"""``bufgym trace fit``: parameters of generated links, from recordings."""
 
 from __future__ import annotations
 
@@ -21,29 +21,17 @@ def fit(
     mode: str | None = None,
     suite: str | None = None,
     data: str | None = None,
-    sizes: bool = False,
     out: Annotated[Path | None, Parameter(alias="-o")] = None,
 ) -> None:
-    """Fit the parameters of generated links, or of message sizes, to recordings.
+    """Fit the parameters of generated links to recordings.
 
     Args:
         files: Recordings; their names say the mode (report_car_2.csv).
         mode: All files are of this mode, whatever their names.
         suite: Or the links that these suites (A,B) train on; the mode is the suite's name without its version.
         data: The folder of recordings that the suites need.
-        sizes: Print the laws of message sizes (for ``--sizes`` of bench) of workloads, bags or tables of sizes.
         out: The parameters of links to write (.json).
     """
-    if sizes:
-        from bufgym.traces.fit_sizes import fits
-
-        others = {"--mode": mode, "--suite": suite, "--data": data, "--out": out}
-        if given := [name for name, value in others.items() if value is not None]:
-            raise BufgymError(f"{given[0]}: cannot go with --sizes")
-        if not files:
-            raise BufgymError("trace fit --sizes: needs recordings, FILE ...")
-        print(columns([(name, "  ".join(laws)) for file in files for name, laws in fits(file).items()]))
-        return
     if out is None:
         raise BufgymError("trace fit: needs --out FILE.json")
     from bufgym.traces.fit import LOW_BYTES_PER_S, fit_links

@@ -22,7 +22,6 @@ from bufgym.traces import (
     Motion,
     Trace,
     Workload,
-    describe,
     load,
     load_motion,
     read_motion,
@@ -36,7 +35,6 @@ from bufgym.traces.generate.driving import drive_motion
 from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates, markov_link
 from bufgym.traces.generate.parameters import LINKS, LinkParameters, OutageParameters, fitted_links, read_links
 from bufgym.traces.generate.rules import ramp, steady, tunnel
-from bufgym.traces.generate.shipped import shipped_calls, write_shipped
 
 MODES = ("bicycle", "bus", "car", "foot", "train", "tram")
 SEEDED: Any = (lambda seed: markov_link("tram", seed, 120), lambda seed: synthetic_lte(seed, 120))
@@ -168,23 +166,6 @@ def test_broken_arguments_and_parameter_files(tmp_path: Path) -> None:
 
 
 # --- files that come with bufgym, and the command ``generate`` -------------------------------------------------------
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def test_the_calls_that_are_stated_make_the_shipped_files_byte_for_byte(tmp_path: Path) -> None:
-    write_shipped(tmp_path)
-    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    assert made == {path.name: path.read_bytes() for path in (ROOT / "traces").glob("*.csv")}
-    assert set(shipped_calls()) == set(traces.shipped()) == {name.removesuffix(".csv") for name in made}
-    for name, call in shipped_calls().items():
-        generated: Any = eval(call, {"synthetic_lte": synthetic_lte, "drive_motion": drive_motion})
-        if name.startswith("drive-"):
-            assert load_motion(name).coordinate.tolist() == generated.coordinate.tolist()
-        else:
-            assert load(name).cumulative_bytes.tolist() == generated.cumulative_bytes.tolist()
-            # They trouble a robot, but not always: 30 frames of 230 kB a second.
-            assert 3 <= describe(load(name))["seconds_below_500KBps"] <= 45
 
 
 def test_shipped_names_and_loading(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Laws of message sizes: their mean, spread and memory, what goes with them, and their fit."""
+"""Laws of message sizes: their mean, spread and memory, what goes with them."""
 
 import re
 
@@ -10,9 +10,7 @@ from bufgym import scenario, traces
 from bufgym.cli import main
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, FleetScenario, Interruption, Stream, Streams
-from bufgym.traces.fit_sizes import fits, laws
-from bufgym.traces.generate import sizes
-from bufgym.traces.generate.sizes import Moving, drawn, parsed, recorded, recorded_sizes
+from bufgym.traces.generate.sizes import Moving, drawn, recorded, recorded_sizes
 
 MEAN = 100_000
 DRIVE = traces.load_motion("drive-0")
@@ -131,35 +129,6 @@ def test_an_interruption_has_sizes_too() -> None:
     one, other = (made.draw(Streams.seeded(4)) for made in (Interruption(), Interruption(sizes="jpeg")))
     assert len(one.arrivals) == len(other.arrivals) and one.link.offset_us == other.link.offset_us
     assert np.ptp(other.arrivals["size_bytes"]) > 0
-
-
-@pytest.mark.parametrize(
-    ("law", "name", "numbers"),
-    [
-        ("jpeg:rho=0.9,cv=0.3,noise=0.15", "jpeg", {"rho": 0.9, "cv": 0.3, "noise": 0.15}),
-        ("gop:every=12,ratio=5,rho=0.8,cv=0.2,noise=0.1", "gop", {"every": 12, "ratio": 5, "cv": 0.2, "noise": 0.1}),
-        ("depth-colour:rho=0.9,cv=0.3", "depth-colour", {"ratio": 4, "rho": 0.9, "cv": 0.3, "noise": 0.05}),
-        ("motion:exponent=0.4,noise=0.1", "motion", {"exponent": 0.4, "noise": 0.1}),
-    ],
-)
-def test_a_fit_finds_the_law_again(law: str, name: str, numbers: dict[str, float]) -> None:
-    times = np.arange(20_000, dtype=np.int64) * 33_333
-    found = {parsed(text)[0]: parsed(text)[1] for text in laws(sample(law, 20_000), times, DRIVE.at(times))}
-    for key, value in numbers.items():
-        assert found[name][key] == pytest.approx(value, rel=0.1, abs=0.01)
-    assert laws(np.full(200, 5)) == ["equal"]
-
-
-def test_fit_reads_tables_workloads_and_names(tmp_path, capsys) -> None:
-    table = tmp_path / "t.csv"
-    table.write_text("a,b\n" + "".join(f"{100 + k % 7},{50 + 100 * (k % 2)}\n" for k in range(200)))
-    assert list(sizes.read_sizes(table)) == ["a", "b"] and fits(table)["b"][0].startswith("depth-colour:ratio=3,")
-    assert main(["trace", "fit", "--sizes", str(table), "7scenes-h264"]) in (0, None)
-    assert "gop:every=30,ratio=5.32" in capsys.readouterr().out
-    workload = tmp_path / "w.csv"
-    workload.write_text("time_s,bytes\n" + "".join(f"{k},{100 + k % 5}\n" for k in range(50)))
-    refuse("no topic has the 100 messages", fits, workload)
-    assert main(["trace", "fit", "--sizes"]) == 2 and "needs recordings" in capsys.readouterr().err
 
 
 def test_a_generated_workload_has_the_law_and_is_read_back(tmp_path, capsys) -> None:

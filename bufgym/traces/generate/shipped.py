@@ -1,17 +1,8 @@
-"""Generate the traces that bufgym ships: `python -m bufgym.traces.generate.shipped traces/`.
+"""Which seeds and parameters of `lte.py` and `driving.py` are shipped; `studies.shipped` writes the files."""
 
-The models are in `lte.py` and `driving.py`; this file states which seeds and parameters are shipped.
-"""
-
-import sys
-from pathlib import Path
 from typing import Final
 
-from bufgym.traces.formats.faults import StrPath
-from bufgym.traces.formats.motions import write_motion_csv
-from bufgym.traces.formats.writers import write_csv
-from bufgym.traces.generate.driving import drive_motion
-from bufgym.traces.generate.lte import LteMode, synthetic_lte
+from bufgym.traces.generate.lte import LteMode
 
 # Mode and mean in bytes/s of lte-synthetic-<seed>.csv. The means lie around the 6.9 MB/s of 30 frames of 230 kB a
 # second: from a link that barely suits a robot to one where only breakdowns are a problem.
@@ -32,16 +23,3 @@ def shipped_calls() -> dict[str, str]:
     }
     motions = {f"drive-{seed}": f"drive_motion({seed}, {SHIPPED_DURATION_S})" for seed in SHIPPED_SEEDS_OF_MOTION}
     return motions | links
-
-
-def write_shipped(folder: StrPath) -> None:
-    """Write the shipped traces and motion recordings into `folder`."""
-    for seed, (mode, mean_bytes_per_s) in enumerate(SHIPPED_LTE):
-        trace = synthetic_lte(seed, SHIPPED_DURATION_S, mean_bytes_per_s, mode)
-        write_csv(trace, Path(folder) / f"lte-synthetic-{seed}.csv")
-    for seed in SHIPPED_SEEDS_OF_MOTION:
-        write_motion_csv(drive_motion(seed, SHIPPED_DURATION_S), Path(folder) / f"drive-{seed}.csv")
-
-
-if __name__ == "__main__":
-    write_shipped(*sys.argv[1:])

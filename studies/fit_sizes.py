@@ -1,4 +1,4 @@
-"""Fit the laws of `generate.sizes` to recorded sizes: `bufgym trace fit --sizes FILE`.
+"""Fit the laws of message sizes to workloads, bags or tables of sizes: `python -m studies.fit_sizes FILE ...`.
 
 The slow part and the part drawn anew come from the covariances of log sizes at lags 1 to `LAGS`, cv^2 of the slow part
 times rho^lag, by least squares; the rest of the variance is drawn anew. Long trends of a short recording count as
@@ -12,6 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.page import command
+from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.recordings import read_workload
@@ -133,3 +135,16 @@ def _header(path: StrPath) -> str:
     with open_text(path) as file:
         first = file.first()
     return "" if first is None else first.text.replace(" ", "")
+
+
+def main(*files: str) -> None:
+    """Print the laws of each topic or column, as `--sizes` of `bufgym bench` takes them.
+
+    Args:
+        files: Workloads, bags, tables of sizes, or names of shipped sequences.
+    """
+    print(columns([(name, "  ".join(laws)) for file in files for name, laws in fits(file).items()]))
+
+
+if __name__ == "__main__":
+    command(main)
