@@ -10,6 +10,11 @@ a sender as stock ROS has it: Drop Oldest, and a socket that takes whatever the 
 
 import argparse
 import importlib
+import os
+import shutil
+import subprocess
+import tempfile
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -39,6 +44,24 @@ def _over(transport: str, **settings: Any) -> Play:
     )
 
 
+def _mqtt(through: tunnel.Tunnel, episode: Episode, policy: str) -> list[Received]:
+    """By a broker (Debian's mosquitto) at the far end."""
+    with tempfile.NamedTemporaryFile("w", suffix=".conf") as settings:
+        settings.write(f"listener 1883 {through.far.address}\nallow_anonymous true\n")
+        settings.flush()
+        command = [
+            shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin") or "mosquitto",
+            "-c",
+            settings.name,
+        ]
+        with subprocess.Popen(command, preexec_fn=through.far.enter, stderr=subprocess.DEVNULL) as broker:
+            try:
+                time.sleep(1)
+                return far.over(through, "mqtt", 1883)(policies.get(policy), episode, CAPACITY, V)
+            finally:
+                broker.kill()
+
+
 def _ros(version: str) -> Play:
     def play(through: tunnel.Tunnel, episode: Episode, policy: str) -> list[Received]:
         player = importlib.import_module(f"bufgym.robot.{version}.episode").player(through)
@@ -54,6 +77,7 @@ SENDERS: dict[str, tuple[str, Play]] = {
     "tcp": ("afr", _over("tcp")),
     "websocket": ("afr", _over("websocket")),
     "zenoh": ("afr", _over("zenoh")),
+    "mqtt": ("afr", _mqtt),
     "ros1": ("afr", _ros("ros1")),
     "ros2": ("afr", _ros("ros2")),
 }
