@@ -8,7 +8,7 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parent.parent
 WINGS = ("papers", "relay", "robot")
 """Rooms that the core does not import (see ``[tool.importlinter]`` in pyproject.toml)."""
-LIMITS = {"package": 43_465, "core": 27_300, "tests": 25_350}
+LIMITS = {"package": 42_800, "core": 27_250, "tests": 25_350}
 """The aim is 40,000 and 25,000 lines of package and core."""
 LONGEST = 350
 """Lines of a file."""

@@ -22,7 +22,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -101,21 +101,13 @@ class Tunnel:
                     devices[device](device, packet)
 
 
-@contextmanager
-def _closing(tunnel: Tunnel) -> Iterator[Tunnel]:
-    try:
-        yield tunnel
-    finally:
-        tunnel.close()
-
-
 def opened() -> AbstractContextManager[Tunnel]:
     """Open a tunnel for a block.
 
     Raises:
         BufgymError: there can be none here; the error says why.
     """
-    return _closing(Tunnel())
+    return closing(Tunnel())
 
 
 class _Carrier:
