@@ -35,10 +35,10 @@ MIXED = [mixed_env.Cell("short", SHORT, 3), mixed_env.Cell("steep", STEEP, 5)]
 SUITE = Evolve(suites=Suites(("interruption-v1",), capacities=(4, 8)), validation_episodes=60)
 
 
-def mixed_rows(rows: int = 4, slots: int = 7) -> mixed_env.MixedEnv:
-    """So many rows of each cell of MIXED, each with its own episode, padded to so many slots."""
-    env = mixed_env.MixedEnv(MIXED, [rows] * 2, slots)
-    env.load([draw(cell.scenario, seed) for cell in MIXED for seed in range(rows)])
+def mixed_rows(slots: int = 7) -> mixed_env.MixedEnv:
+    """Four rows of each cell of MIXED, each with its own episode, padded to so many slots."""
+    env = mixed_env.MixedEnv(MIXED, [4] * 2, slots)
+    env.load([draw(cell.scenario, seed) for cell in MIXED for seed in range(4)])
     return env
 
 

@@ -98,12 +98,12 @@ AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
 AGENTS |= {"every-field": every_field(), "every-output": every_output()}
 
 
-def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, text=None, flags=("-O0",)):
+def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, flags=("-O0",)):
     """(parity, decisions, how many differ) of a recorded run that is played again in C."""
     calls = recorded(policy, episodes, L, value, B)
     assert calls.dtype == CALL
     calls.tofile(folder / "calls")
-    program = driver(folder, text or header(policy, L, value, B), *flags)
+    program = driver(folder, header(policy, L, value, B), *flags)
     return tuple(map(int, output(program, folder / "calls").split()))
 
 

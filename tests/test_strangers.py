@@ -111,9 +111,9 @@ def test_a_file_s_name_forges_no_line(tmp_path: Path, capsys: Capsys) -> None:
     assert all(line.isprintable() for line in shown(["trace", "info", str(paths[0])], capsys).splitlines())
 
 
-def ran(words: str, encoding: str = "utf-8", **options: Any) -> subprocess.CompletedProcess[bytes]:
+def ran(words: str, **options: Any) -> subprocess.CompletedProcess[bytes]:
     options = options or {"capture_output": True}
-    where = {**os.environ, "PYTHONPATH": str(REPO), "PYTHONIOENCODING": encoding}
+    where = {**os.environ, "PYTHONPATH": str(REPO), "PYTHONIOENCODING": "utf-8"}
     return subprocess.run([sys.executable, "-m", "bufgym", *words.split()], cwd=REPO, env=where, **options)
 
 

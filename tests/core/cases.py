@@ -48,10 +48,10 @@ def queue_of(s: int, capacity: int, parameters: NDArray[np.float64] = NO_PARAMET
     return Buffer(**fields)
 
 
-def newcomer(uniform: float = 0.0) -> Any:
+def newcomer() -> Any:
     """A MESSAGE of one byte."""
     made = np.zeros(1, MESSAGE).view(np.recarray)
-    made["uniform"], made["size_bytes"] = uniform, 1
+    made["size_bytes"] = 1
     return made[0]
 
 

@@ -14,9 +14,9 @@ from bufgym.traces import Trace
 V = qoi.exponential(0.618)
 
 
-def interruption(spec, L, T, uniform=0):
+def interruption(spec, L, T):
     """One run through an interruption of T messages."""
-    episode = Interruption(t_max=T).episode(T).with_uniforms(np.random.default_rng(uniform))
+    episode = Interruption(t_max=T).episode(T).with_uniforms(np.random.default_rng(0))
     return run(policies.get(spec), [episode], L, V)
 
 

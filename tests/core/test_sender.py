@@ -4,6 +4,7 @@
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from refusal_cases import refuse
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.policies import ACCEPT, REJECT, Policy
+from bufgym.policies import ACCEPT, REJECT
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders, run
 from bufgym.sim.metrics import ages_s, outcome, received
@@ -56,11 +57,6 @@ def test_running_means_by_hand():
     assert [view[2] for view in views] == [1_000, 1_875, 1_640.75, 1_435.78125]
 
 
-def take_all(buffer, arrival, memory):
-    """Accepts what fits and drops the oldest where nothing does."""
-    return ACCEPT if len(buffer.slots) < buffer.capacity else 0
-
-
 def every_second(buffer, memory):
     memory[0] += 1
     return memory[0] % 2 == 0
@@ -74,8 +70,8 @@ def test_peak_backlog():
     assert outcome(senders, 0).peak_backlog_bytes == 5_000
     # At 1 ms 1 is dropped at the head and 2 is taken. So 3, which comes at 2 ms, waits alone: no more than 5000 yet.
     senders = line([0, 0, 0, 2], sizes=[1_000, 2_000, 3_000, 4_000])
-    drops_heads = Policy("test-head", take_all, on_dequeue=every_second, memory={"heads": 0.0}, compile=True)
-    senders.run(drops_heads)
+    changes = {"name": "test-head", "on_dequeue": every_second, "memory": {"heads": 0.0}}
+    senders.run(replace(policies.get("drop-oldest"), **changes))
     assert outcome(senders, 0).peak_backlog_bytes == 5_000
     assert senders.batch.senders[0]["backlog_bytes"] == 0
 

@@ -20,8 +20,8 @@ DATA = random.Random(1).randbytes(300_000)
 Members = dict[str, str | bytes]
 
 
-def zipped(path: Path, contents: Members, method: int = zipfile.ZIP_DEFLATED) -> Path:
-    with zipfile.ZipFile(path, "w", method) as archive:
+def zipped(path: Path, contents: Members) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in contents.items():
             archive.writestr(name, data)
     return path

@@ -29,8 +29,8 @@ KNOWN = LinkParameters(
 )
 
 
-def recordings(link: LinkParameters = KNOWN, first_seed: int = 0) -> list[Float64Array]:
-    return [link_rates(link, first_seed + seed, link.seconds // link.recordings) for seed in range(link.recordings)]
+def recordings(link: LinkParameters = KNOWN) -> list[Float64Array]:
+    return [link_rates(link, seed, link.seconds // link.recordings) for seed in range(link.recordings)]
 
 
 @pytest.fixture(autouse=True)
