@@ -5,8 +5,8 @@
 //     ./robot                # 30 frames a second for 12 s; the link stands still from second 4 to 8
 //     ./robot - < arrivals   # the same link, with arrivals as lines of "microseconds bytes x"
 //
-// On a real robot a frame comes from the camera, x from odometry, `left` from the socket (ioctl SIOCOUTQ, or what the
-// receiver has not acked), and a message has left when that says so.
+// On a real robot a frame comes from the camera, x from odometry, `left` from the socket (ioctl SIOCOUTQNSD: what the
+// kernel has not sent), and a message has left when the socket is writable again under TCP_NOTSENT_LOWAT.
 #include "policy.h"
 
 #include <algorithm>

@@ -4,8 +4,6 @@ The system's default buffers take megabytes at once, and no policy can drop mess
 only bytes that the kernel has not sent: the socket becomes writable when they fall below it, whatever is still in
 flight. So the next message is chosen late, and the link never waits for an ack. A small send buffer (SO_SNDBUF) would
 limit bytes in flight instead, to one buffer a round trip.
-
-SIOCOUTQ counts bytes that the peer's kernel has not acked, SIOCOUTQNSD those of them that were not sent.
 """
 
 import asyncio
@@ -24,25 +22,16 @@ _SIOCOUTQNSD: Final = 0x894B  # of linux/sockios.h; Python's termios lacks it
 
 
 def unsent_bytes(connection: socket.socket) -> int | None:
-    """Bytes in the kernel that were not sent yet; None where the system does not tell."""
-    return _counted(connection, _SIOCOUTQNSD)
+    """Bytes in the kernel that were not sent yet; None where the system does not tell.
 
-
-def in_flight_bytes(connection: socket.socket) -> int | None:
-    """Bytes that were sent and that the peer's kernel has not acked; None where the system does not tell."""
-    import termios
-
-    unsent, unacked = unsent_bytes(connection), _counted(connection, getattr(termios, "TIOCOUTQ", 0))
-    return None if unsent is None or unacked is None else unacked - unsent
-
-
-def _counted(connection: socket.socket, request: int) -> int | None:
+    SIOCOUTQ would count bytes in flight as well, which no decision can change.
+    """
     if not sys.platform.startswith("linux"):
         return None
     import fcntl
 
     try:
-        return int(struct.unpack("i", fcntl.ioctl(connection.fileno(), request, b"\0\0\0\0"))[0])
+        return int(struct.unpack("i", fcntl.ioctl(connection.fileno(), _SIOCOUTQNSD, b"\0\0\0\0"))[0])
     except (OSError, ValueError):  # it is closed
         return None
 

@@ -169,7 +169,7 @@ static inline void bufgym_init(struct bufgym_queue *q, int64_t now_us)
     memcpy(q->memory, bufgym_memory, sizeof q->memory);
 }
 
-/* A message arrives, while so many bytes of what was dequeued are still in the socket (SIOCOUTQ, or what is not acked).
+/* A message arrives, while so many bytes of what was dequeued are still in the socket (SIOCOUTQNSD: not sent yet).
    The decision is carried out and returned; what was dropped for it is q->dropped. Only under B one eviction may not be
    enough: while q->evictions > 0, call again with the same message. */
 static inline int bufgym_arrival(struct bufgym_queue *q, struct bufgym_message arrival, int64_t left_bytes)
