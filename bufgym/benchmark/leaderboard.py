@@ -24,6 +24,7 @@ from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_utf8, replaced
 from bufgym.ground.kernel.closure import closure
+from bufgym.oracle import kept
 from bufgym.scenario import suites
 
 COLUMNS: Layout = {
@@ -71,8 +72,10 @@ def made_of(spec: str) -> str:
         policy = policies.get(spec)
     except BufgymError:
         return ""
-    functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send, policy.privileged
+    functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send
     closures = [closure(getattr(function, "py_func", function)) for function in functions if function is not None]
+    if policy.privileged is not None:  # an oracle, by the texts of its files, as its plans are kept
+        closures.append(kept.sources())
     numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client
     digest = hashlib.sha256(repr((closures, numbers)).encode()).hexdigest()
     return f"{sys.implementation.cache_tag}-{digest[:12]}"

@@ -34,7 +34,7 @@ def kept(inputs: tuple[Any, ...], messages: int, find: Callable[[], Found]) -> F
         return find()
     told = [one.tobytes() if isinstance(one, np.ndarray) else repr(one).encode() for one in inputs]
     name = hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in told)).hexdigest()[:32]
-    file = Path(FOLDER).parent / "plans" / _sources() / name
+    file = Path(FOLDER).parent / "plans" / sources() / name
     with contextlib.suppress(OSError):
         data = file.read_bytes()
         head, digest = struct.calcsize(_HEAD), hashlib.sha256(data[:-32]).digest()
@@ -56,6 +56,7 @@ def kept(inputs: tuple[Any, ...], messages: int, find: Callable[[], Found]) -> F
 
 
 @functools.cache
-def _sources() -> str:
+def sources() -> str:
+    """Hash of all that says what a plan is."""
     files = sorted(file for folder in SOURCES for file in (PACKAGE / folder).glob("*.py"))
     return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()[:16]
