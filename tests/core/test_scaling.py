@@ -42,7 +42,6 @@ def dropped(name, kind, unequal, L, unit):
     return np.asarray(batch.log)["dropped_us"]
 
 
-@pytest.mark.kernels
 @pytest.mark.parametrize("name", BLIND)
 def test_a_change_of_units_changes_no_decision_in_240_episodes(name):
     changed = dict.fromkeys(VALUES, 0)
