@@ -18,4 +18,4 @@ Compiled = Annotated[
 def decide_in_python(*, unless: bool = False) -> None:
     """Let this program run without a compiler from now on, if it has not imported one yet."""
     if not unless and "bufgym.ground.kernel" not in sys.modules:
-        os.environ.setdefault("NUMBA_DISABLE_JIT", "1")
+        os.environ["NUMBA_DISABLE_JIT"] = "1"

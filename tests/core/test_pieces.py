@@ -95,5 +95,5 @@ def test_a_kept_plan_is_read_and_a_damaged_one_made_anew(monkeypatch, tmp_path):
         if file.is_file():
             file.write_bytes(file.read_bytes()[:-1])
     assert [asked(size, 3), asked(size, 3)] == [4, 4]
-    monkeypatch.setattr(kept, "_sources", lambda: "another text")
+    monkeypatch.setattr(kept, "sources", lambda: "another text")
     assert asked(size, 3) == 5
