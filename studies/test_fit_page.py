@@ -3,26 +3,18 @@
 from dataclasses import replace
 from pathlib import Path
 
+import fit_cases
 import numpy as np
 import pytest
 
 from bufgym.traces import write_csv
-from bufgym.traces.generate import LinkParameters, OutageParameters, markov_link
+from bufgym.traces.generate import markov_link
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import write_links
 from studies.compare_links import compare, held_out, ks_distance
 from studies.fit import main as write_page
 
-KNOWN = LinkParameters(
-    recordings=5,
-    seconds=1500,
-    quantiles_bytes_per_s=(0.6e6, 1e6, 2e6, 2.5e6, 3.2e6, 4e6, 5e6, 6e6, 6.5e6, 7.5e6, 9e6),
-    place_share=0.0,
-    level_share=0.7,
-    level_stay_s=28.0,
-    fast_memory=0.3,
-    outages=OutageParameters(100, 0.5, 5.0, 120.0, 0.5, 3.0, 4.0, (0.0, 0.0, 1e5, 3e5, 4.9e5)),
-)
+KNOWN = replace(fit_cases.KNOWN, recordings=5, seconds=1500)
 
 
 def test_the_distance_by_hand() -> None:

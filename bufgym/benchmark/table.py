@@ -94,8 +94,8 @@ UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exac
 def means(rows: RunRows, floor: RunRows = (), alone: Collection[str] = ()) -> list[dict[str, Any]]:
     """Average the rows of each policy and capacity, sorted by capacity ascending, then QoI descending.
 
-    Those ``alone``, which do not compete, come last within a capacity. None and NaN count as missing, and a mean of
-    missing numbers is NaN. The score is that of the cell, see ``measure.normalised_score``. ``floor`` holds rows of
+    Policies in ``alone``, which do not compete, come last within a capacity. None and NaN count as missing, and a mean
+    of missing numbers is NaN. The score is that of the cell, see ``measure.normalised_score``. ``floor`` holds rows of
     Drop Oldest on the same episodes if it is not among ``rows``.
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}

@@ -69,7 +69,6 @@ def validate(
         f"{duration:g} s, {size} bytes at 30 Hz, L = {capacity}, V = {scenario.value.name}, round trip {rtt:g} ms, "
         f"over {', '.join(transport)} and in the simulator"
     )
-
     with contextlib.ExitStack() as stack:
         tunnel = stack.enter_context(tunnels.opened()) if rtt and not tunnels.impossible() else None
         plays: dict[str, Play] = {name: _play_over(name, tunnel) for name in transport}

@@ -17,8 +17,8 @@ from bufgym.robot.tasks import until_one_ends
 Leaves = Literal["sent", "acked", "written"]
 """Event at which a message has left.
 
-"sent": the system wants more bytes, because it has sent nearly all of them. Where a library hides its socket, the
-    receiver's acks say when the next message is due (``PathWindow``).
+"sent": the system wants more bytes, because it has sent nearly all of them. Where a library's socket is not found,
+    the receiver's acks say when the next message is due (``PathWindow``).
 "acked": the receiver has acked it. With the queue's ``window`` this is Robofleet's n_T.
 "written": this system has taken it. That hides a queue in the system's buffers, and serves to measure what that costs.
 """

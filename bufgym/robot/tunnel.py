@@ -56,14 +56,24 @@ class End:
     """One end: a network namespace with a tun device."""
 
     address: str
-    namespace: int
-    """File descriptor of the namespace."""
-    device: int
+    namespace: int | None = None
+    """File descriptor of the namespace; None where the program is already."""
+    device: int = -1
     """File descriptor of the tun device, whose packets are read and written by ``Tunnel.carry``."""
 
     def enter(self) -> None:
         """Move this thread, and all that it starts, into the namespace."""
-        _call("setns", self.namespace, _CLONE_NEWNET)
+        if self.namespace is not None:
+            _call("setns", self.namespace, _CLONE_NEWNET)
+
+
+HERE: Final = End("127.0.0.1")
+"""Both ends where there is no tunnel."""
+
+
+def ends(tunnel: Tunnel | None) -> tuple[End, End]:
+    """The near and the far end of a tunnel, or twice ``HERE``."""
+    return (HERE, HERE) if tunnel is None else (tunnel.near, tunnel.far)
 
 
 class Tunnel:
@@ -77,8 +87,9 @@ class Tunnel:
     def close(self) -> None:
         """Give both ends up; they vanish when the last program in them ends."""
         for end in (self.near, self.far):
-            os.close(end.namespace)
             os.close(end.device)
+            if end.namespace is not None:
+                os.close(end.namespace)
 
     def carry(self, link: Link, words: Connection) -> None:
         """Forward packets until the process is ended; a number that comes as words is the link's beginning, s.

@@ -6,27 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
+from fit_cases import KNOWN
 from refusal_cases import refuse
 
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
 from bufgym.traces import write_csv
 from bufgym.traces.fit import autocorrelation, fit_links, mode_of, rates_of, spells
-from bufgym.traces.generate import LinkParameters, OutageParameters, markov_link, read_links
+from bufgym.traces.generate import LinkParameters, markov_link, read_links
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import LINKS, UPLINKS
 from bufgym.traces.trace import Float64Array
-
-KNOWN = LinkParameters(
-    recordings=20,
-    seconds=12_000,
-    quantiles_bytes_per_s=(0.6e6, 1e6, 2e6, 2.5e6, 3.2e6, 4e6, 5e6, 6e6, 6.5e6, 7.5e6, 9e6),
-    place_share=0.0,
-    level_share=0.7,
-    level_stay_s=28.0,
-    fast_memory=0.3,
-    outages=OutageParameters(100, 0.5, 5.0, 120.0, 0.5, 3.0, 4.0, (0.0, 0.0, 1e5, 3e5, 4.9e5)),
-)
 
 
 def recordings(link: LinkParameters = KNOWN) -> list[Float64Array]:

@@ -23,7 +23,7 @@ from bufgym.policies.registry import Policy
 from bufgym.robot import PolicyQueue, programs, ros1
 from bufgym.robot.receiver import Received
 from bufgym.robot.shaped import ShapedLink
-from bufgym.robot.tunnel import End, Tunnel
+from bufgym.robot.tunnel import HERE, End, Tunnel, ends
 from bufgym.robot.validate import Play, warm
 from bufgym.scenario import Episode
 
@@ -55,7 +55,7 @@ def play(
     programs.check_speed(speed)
     warm(PolicyQueue(policy, capacity, value=value))
     with tempfile.TemporaryDirectory() as logs:
-        near, far = (None, None) if tunnel is None else (tunnel.near, tunnel.far)
+        near, far = ends(tunnel)
         camera = partial(_publish, logs, near, policy, episode, capacity, value)
         works = {"viewer": partial(_view, logs, far), "camera": camera}
         if tunnel is not None:
@@ -85,25 +85,22 @@ async def _play(workers: Sequence[programs.Worker], episode: Episode) -> list[Re
             await link.close()
 
 
-def _in_ros(uri: str, logs: str, node: str, end: End | None) -> None:
+def _in_ros(uri: str, logs: str, node: str, end: End) -> None:
     """Make this process a node of that name."""
-    address = "127.0.0.1" if end is None else end.address
-    os.environ.update(ROS_MASTER_URI=uri, ROS_IP=address, ROS_LOG_DIR=logs)
+    os.environ.update(ROS_MASTER_URI=uri, ROS_IP=end.address, ROS_LOG_DIR=logs)
     import rospy
 
     rospy.init_node(node, disable_signals=True, disable_rosout=True, disable_rostime=True)
 
 
-def _view(logs: str, end: End | None, parent: Connection) -> None:
+def _view(logs: str, end: End, parent: Connection) -> None:
     """Run the master, and a subscriber that connects through the link: by a proxy, or at the tunnel's far end."""
-    if end is not None:
-        end.enter()
+    end.enter()
     from rosmaster.master import Master
 
     master = Master(0)
     master.start()
-    address = "127.0.0.1" if end is None else end.address
-    uri = f"http://{address}:{master.master_node.server.socket.getsockname()[1]}"
+    uri = f"http://{end.address}:{master.master_node.server.socket.getsockname()[1]}"
 
     import rospy
     from rospy.impl.tcpros_pubsub import TCPROSHandler
@@ -117,7 +114,7 @@ def _view(logs: str, end: End | None, parent: Connection) -> None:
         connected.set()
         return create(handler, name, uri, [protocol[0], "127.0.0.1", port])
 
-    if end is None:
+    if end is HERE:
         TCPROSHandler.create_transport = through_the_link
     else:
         connected.set()
@@ -132,11 +129,10 @@ def _view(logs: str, end: End | None, parent: Connection) -> None:
 
 
 def _publish(
-    logs: str, end: End | None, policy: Policy, episode: Episode, capacity: int, value: Value, parent: Connection
+    logs: str, end: End, policy: Policy, episode: Episode, capacity: int, value: Value, parent: Connection
 ) -> None:
     """Run the node, and report its progress to the other programs."""
-    if end is not None:
-        end.enter()
+    end.enter()
     uri = parent.recv()
     ros1.install(policy, topics={programs.ODOMETRY: None}, odometry=programs.ODOMETRY, value=value)
 

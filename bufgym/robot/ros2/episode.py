@@ -27,7 +27,7 @@ from bufgym.robot.receiver import Received
 from bufgym.robot.ros2.names import needs_rclpy
 from bufgym.robot.ros2.relay import RosSender, receive
 from bufgym.robot.shaped import ShapedLink
-from bufgym.robot.tunnel import End, Tunnel
+from bufgym.robot.tunnel import End, Tunnel, ends
 from bufgym.robot.validate import Play, warm
 from bufgym.scenario import Client, Episode, Stream
 from bufgym.traces import Trace, load_motion
@@ -64,7 +64,7 @@ def play(
     """Play the episode; return the messages that a viewer got. Randomised policies use their own draws."""
     programs.check_speed(speed)
     warm(PolicyQueue(policy, capacity, value=value))
-    near, far = (None, None) if tunnel is None else (tunnel.near, tunnel.far)
+    near, far = ends(tunnel)
     works = {
         "receive": partial(_receive, far),
         "send": partial(_send, near, policy, capacity, value),
@@ -74,7 +74,7 @@ def play(
     if tunnel is not None:
         works["link"] = partial(tunnel.carry, episode.link)
     with programs.running(**works) as workers:
-        return asyncio.run(_play(workers, episode, "127.0.0.1" if far is None else far.address))
+        return asyncio.run(_play(workers, episode, far.address))
 
 
 async def _play(workers: Sequence[programs.Worker], episode: Episode, address: str) -> list[Received]:
@@ -97,14 +97,13 @@ async def _play(workers: Sequence[programs.Worker], episode: Episode, address: s
             await link.close()
 
 
-def _on(domain: int, end: End | None) -> None:
+def _on(domain: int, end: End) -> None:
     """Put this process into a domain limited to this machine, at one end of the tunnel if there is one."""
-    if end is not None:
-        end.enter()
+    end.enter()
     os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
 
 
-def _node(domain: int, name: str, end: End | None) -> Any:
+def _node(domain: int, name: str, end: End) -> Any:
     _on(domain, end)
     import rclpy
 
@@ -112,16 +111,16 @@ def _node(domain: int, name: str, end: End | None) -> Any:
     return rclpy.create_node(name, enable_rosout=False, start_parameter_services=False)
 
 
-def _receive(end: End | None, parent: Connection) -> None:
+def _receive(end: End, parent: Connection) -> None:
     def say(text: str) -> None:
         if text.startswith("listening on "):
             parent.send(int(text.rpartition(":")[2]))
 
     _on(_DOMAIN + 1, end)
-    asyncio.run(receive(0, "127.0.0.1" if end is None else end.address, say=say))
+    asyncio.run(receive(0, end.address, say=say))
 
 
-def _send(end: End | None, policy: Policy, capacity: int, value: Value, parent: Connection) -> None:
+def _send(end: End, policy: Policy, capacity: int, value: Value, parent: Connection) -> None:
     records: list[Record] = []
     stream = Stream(Topic(programs.CAMERA), rate_hz=30.0, size_bytes=1, moves=True)
     # Where a client is simulated, it needs a link and a motion as well.
@@ -141,7 +140,7 @@ def _send(end: End | None, policy: Policy, capacity: int, value: Value, parent: 
     asyncio.run(relay())
 
 
-def _view(end: End | None, parent: Connection) -> None:
+def _view(end: End, parent: Connection) -> None:
     node, seen = _node(_DOMAIN + 1, "viewer", end), programs.Seen()
 
     import rclpy
@@ -156,7 +155,7 @@ def _view(end: End | None, parent: Connection) -> None:
     parent.recv()
 
 
-def _publish(end: End | None, episode: Episode, parent: Connection) -> None:
+def _publish(end: End, episode: Episode, parent: Connection) -> None:
     node = _node(_DOMAIN, "camera", end)
 
     from geometry_msgs.msg import PoseStamped
