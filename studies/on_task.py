@@ -24,9 +24,9 @@ from agents.page import command, publish, table
 from bufgym import policies
 from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
 from bufgym.benchmark.run import by_trace, draw
-from bufgym.papers.perception import worth
 from bufgym.policies import Policy
 from bufgym.sim import Senders
+from bufgym_papers.perception import worth
 
 TEST_LINKS = 2
 """Number of shipped links for tests alone, the last ones."""
