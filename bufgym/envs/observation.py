@@ -43,8 +43,8 @@ class ObservationForm:
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
-    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views; where
-    ``is_row``, the row itself.
+    your own come last. ``has_slots`` says whether rows hold slot fields of the tables. Where ``is_view``, an
+    observation is a dict of views; where ``is_row``, the row itself.
     ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
     """
 
@@ -72,7 +72,7 @@ class ObservationForm:
                 own[found.name], names[k] = found, found.name
         if not names:
             raise BufgymError("fields: choose at least one field to observe")
-        self.form = form
+        self.form, self.has_slots = form, bool(slot_fields)
         self._width = capacity + 1
         self._slot_fields, self._context_fields = len(slot_fields), len(context_fields)
         self._first_context = self._slot_fields * self._width
