@@ -12,17 +12,13 @@ from cyclopts import Group, Parameter
 
 from bufgym.cli.options import (
     RESULTS,
-    WHO,
     Bytes,
-    ByTopic,
     OutOptions,
     SuiteOptions,
     WhoOptions,
     command_line,
     given,
     load_policies,
-    one_policy,
-    policies_of,
     refuse,
 )
 from bufgym.cli.scenarios import (
@@ -72,22 +68,19 @@ def bench(
     shared: SharedOptions = SharedOptions(),
     buffer: BufferOptions = BufferOptions(),
     out: OutOptions = OutOptions(),
-    against: Annotated[str | None, Parameter(group=WHO)] = None,
     drops: Annotated[str | None, Parameter(group=RESULTS)] = None,
-    by_topic: ByTopic = None,
 ) -> None:
     """Run policies side by side on the same episodes.
 
     Args:
-        against: Compare every policy with this one, by the paired difference of their shares of AFR's regret (of QoI
-            over Robofleet's with topics, of the gain over AFR with a fleet).
         drops: With --workload: write each message that each policy dropped to this CSV file.
     """
     from bufgym.benchmark.compare import compare
+    from bufgym.benchmark.tasks import topics
 
     load_policies(who.policy_file)
     options = ScenarioOptions(stream, workload, interruption, own, shared)
-    command = _command(suite, who, options, buffer, out, against, by_topic)
+    command = _command(suite, who, options, buffer, out)
     if suite.suite is not None:
         frozen = options.given() | given(buffer) | ({} if drops is None else {"drops": drops})
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
@@ -96,50 +89,44 @@ def bench(
         refuse(given(suite), "needs --suite")
         if drops is not None and workload.workload is None:
             raise BufgymError("--drops needs --workload")
-        experiment = _on_scenario(options, who, buffer)
-    entrants = policies_of(who.policies or experiment.task.default_policies(suite.suite or ""))
-    rival = None if against is None else one_policy(against)
-    if by_topic is not None:
-        by_topic = _topic_policy(by_topic, experiment.task, [*entrants, *([] if rival is None else [rival])])
+        experiment = _on_scenario(options, buffer, who.seeds)
+    entrants, rival = who.entrants(experiment.task, suite.suite), who.rival()
+    topic_policy = out.topic_policy(experiment.task, [*entrants, *([] if rival is None else [rival])])
     file, folder, page = out.file(), out.folder(), out.page()
+    capacity = who.capacity or (() if suite.suite else (experiment.task.capacity,))
     if experiment.recorded:
-        _announce(experiment)
+        _announce(experiment, len(capacity))
 
     try:
-        comparison = compare(
-            entrants, experiment.on, against=rival, out=folder, form=out.format, **experiment.arguments
-        )
+        kept: dict[str, Any] = {"out": folder, "form": out.format}
+        done = compare(entrants, experiment.on, capacity=capacity, against=rival, **kept, **experiment.arguments)
     except KeyboardInterrupt:
         resumable = suite.suite is not None and folder is not None
         raise KeyboardInterrupt(*["the same command resumes it"] * resumable) from None
 
     if suite.suite is not None:
-        print(comparison.plain)
+        print(done.plain)
     else:
-        print(f"\n{comparison.plain}" if experiment.recorded else comparison)
+        print(f"\n{done.plain}" if experiment.recorded else done)
     if experiment.recorded:
-        _print_drops(comparison, entrants, experiment, drops)
-    if by_topic is not None:
-        _print_topics(comparison, by_topic)
+        _print_drops(done, entrants, experiment, capacity, drops)
+    if topic_policy is not None:
+        by_topic = topics.by_topic(done.rows, topic_policy)
+        print(f"\n{topic_policy}, topic by topic: means over episodes\n{by_topic}")
     if folder is not None:
         what = f"bufgym report {folder} makes a page of them" if suite.suite else "the table is in table.md beside them"
-        print(f"\n{len(comparison.rows)} rows in {folder}; {what}")
+        print(f"\n{len(done.rows)} rows in {folder}; {what}")
     if file is not None:
-        print(f"\n{len(comparison.rows)} rows in {comparison.write_rows(file)}")
+        print(f"\n{len(done.rows)} rows in {done.write_rows(file)}")
     if page is not None:
-        print(f"\nwrote {comparison.report(page, command)}")
+        print(f"\nwrote {done.report(page, command)}")
 
 
 def _command(
-    suite: SuiteOptions,
-    who: WhoOptions,
-    options: ScenarioOptions,
-    buffer: BufferOptions,
-    out: OutOptions,
-    against: str | None,
-    by_topic: str | None,
+    suite: SuiteOptions, who: WhoOptions, options: ScenarioOptions, buffer: BufferOptions, out: OutOptions
 ) -> str:
     """The command that runs this again: a suite's keeps its folder, any other makes its page."""
+    kept = {"report": out.report} if suite.suite is None else {"by_topic": out.by_topic, "out": out.out}
     return command_line(
         "bufgym bench",
         suite=suite.suite,
@@ -147,14 +134,13 @@ def _command(
         policies=tuple(who.policies or ()) or None,
         capacity=who.capacity,
         seeds=who.seeds,
-        against=against,
-        by_topic=by_topic,
+        against=who.against,
         **options.given(),
         **given(options.shared),
         **given(buffer),
         policy_file=who.policy_file,
         data=suite.data,
-        **({"report": out.report} if suite.suite is None else {"out": out.out}),
+        **kept,
     )
 
 
@@ -164,7 +150,6 @@ def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], com
 
     found = suites.get(suite.suite or "")
     arguments = {
-        "capacity": who.capacity,
         "seeds": who.seeds,
         "split": suite.split or "test",
         "data": suite.data,
@@ -178,18 +163,18 @@ def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], com
     return Experiment(found.name, TASKS[found.kind], arguments)
 
 
-def _on_scenario(options: ScenarioOptions, who: WhoOptions, buffer: BufferOptions) -> Experiment:
+def _on_scenario(options: ScenarioOptions, buffer: BufferOptions, asked_seeds: int | None) -> Experiment:
     from bufgym.benchmark.tasks import task_for
 
-    scenario, lines, label, recorded = options.scenario(who.seeds)
+    scenario, lines, label, recorded = options.scenario(asked_seeds)
     if task_for(scenario).kind != "queue":
         refuse(given(buffer), "is for one queue")
     of_a_queue = given(buffer, "max_bytes", "decide_at") | ({"bound": False} if buffer.no_bound else {})
     task = task_for(scenario, **of_a_queue)
-    seeds = who.seeds or (1 if recorded else task.seeds)
-    about = [*lines, *_about(scenario, task, None if recorded and who.seeds is None else seeds)]
-    arguments = {"capacity": who.capacity or (task.capacity,), "seeds": seeds, "label": label}
-    return Experiment(scenario, task, {**arguments, "about": "\n".join(about), **of_a_queue}, recorded)
+    seeds = asked_seeds or (1 if recorded else task.seeds)
+    about = [*lines, *_about(scenario, task, None if recorded and asked_seeds is None else seeds)]
+    arguments = {"seeds": seeds, "label": label, "about": "\n".join(about)}
+    return Experiment(scenario, task, {**arguments, **of_a_queue}, recorded)
 
 
 def _about(scenario: Any, task: Task, seeds: int | None) -> list[str]:
@@ -206,32 +191,22 @@ def _about(scenario: Any, task: Task, seeds: int | None) -> list[str]:
     return [*lines, task.describe([scenario], seeds * traces) or means]
 
 
-def _topic_policy(by_topic: str, task: Task, players: Sequence[Policy]) -> str:
-    """The policy of ``--by-topic``; an error if it does not run, or not on several topics."""
-    from bufgym import policies
-
-    if task.kind != "topics":
-        raise BufgymError("--by-topic needs several topics")
-    name = policies.get(by_topic).name
-    if name not in {task.baseline, *(policy.name for policy in players)}:
-        raise BufgymError(f"--by-topic {by_topic}: not among the policies that run")
-    return name
-
-
-def _announce(experiment: Experiment) -> None:
+def _announce(experiment: Experiment, capacities: int) -> None:
     """Print what was read of a recording, which is of use before the long work, and how much work there is."""
     arguments, scenario = experiment.arguments, experiment.on
     print(arguments["about"], flush=True)
-    episodes = len(scenario.traces) * arguments["seeds"] * len(arguments["capacity"])
+    episodes = len(scenario.traces) * arguments["seeds"] * capacities
     plans = f"finding the clairvoyant's plans for {episodes} x {scenario.max_messages:,} messages, then "
     print(f"bufgym: {plans if arguments.get('bound', True) else ''}playing every policy", file=sys.stderr)
 
 
-def _print_drops(comparison: Comparison, players: Sequence[Policy], experiment: Experiment, file: str | None) -> None:
+def _print_drops(
+    done: Comparison, players: Sequence[Policy], experiment: Experiment, capacity: Sequence[int], file: str | None
+) -> None:
     """Print the drops of a recording's messages by topic if it has several, and write each drop to ``file``."""
     from bufgym.benchmark import drops, table
 
-    scenario, (capacity, seeds) = experiment.on, (experiment.arguments[name] for name in ("capacity", "seeds"))
+    scenario, seeds = experiment.on, experiment.arguments["seeds"]
     several = len(scenario.workload.summary()) > 1
     if not several and file is None:
         return
@@ -239,13 +214,7 @@ def _print_drops(comparison: Comparison, players: Sequence[Policy], experiment: 
     messages = drops.drops(players, scenario, capacity, seeds, **settings)
     counts = drops.write_drops(messages, None if file is None else Path(file))
     if several and counts:
-        best_first = dict.fromkeys(entry["policy"] for entry in table.means(comparison.rows, comparison.unranked))
+        best_first = dict.fromkeys(entry["policy"] for entry in table.means(done.rows, done.unranked))
         print("\n" + drops.by_topic(counts, scenario, list(best_first), seeds * len(scenario.traces)))
     if file is not None:
         print(f"\n{counts.total()} dropped messages in {file}")
-
-
-def _print_topics(comparison: Comparison, policy: str) -> None:
-    from bufgym.benchmark.tasks import topics
-
-    print(f"\n{policy}, topic by topic: means over episodes\n{topics.by_topic(comparison.rows, policy)}")
