@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 from cyclopts import Group, Parameter
 
 from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
 from bufgym.ground.tables import aligned
 from bufgym.ground.units import bytes_of, rate_or_number
@@ -145,10 +145,10 @@ class OutOptions:
 
     def file(self) -> Path | None:
         """The file of ``--out``; None for a folder or nothing. Another kind of file is an error."""
-        from bufgym.benchmark.rows import checked_target, has_pyarrow
+        from bufgym.benchmark.rows import checked_target
 
-        if self.format == "parquet" and self.out is not None and not has_pyarrow():
-            raise BufgymError(f"--format parquet needs pyarrow: {install('bench')} (or --format csv)")
+        if self.format == "parquet" and self.out is not None:
+            library("pyarrow", "bench", "--format parquet, unlike csv,")
         if self.out is None or not Path(self.out).suffix[1:].isalpha() or Path(self.out).is_dir():
             return None
         file = checked_target(self.out)
