@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.observation import Observation, Reused
+from bufgym.envs.observation import BufferPool, Observation
 from bufgym.envs.options import RENDER_MODES, Options, read_arguments
 from bufgym.envs.rows import Rows, check_entries
 from bufgym.ground.errors import BufgymError
@@ -72,7 +72,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done, self._any_done = np.zeros(self.num_envs, np.bool_), False
         self._every_row = np.ones(self.num_envs, np.bool_)
-        self._handed = Reused(self._new_handed)
+        self._buffers = BufferPool(self._new_buffers)
         self._renew_output()
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
@@ -193,7 +193,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """The present observation; a dict of its own each time."""
         return self._views.copy() if self._views else self.rows.observation()
 
-    def _new_handed(self) -> Any:
+    def _new_buffers(self) -> Any:
         """(New arrays for a step, the views that are its observation, its info), and all these arrays."""
         rows, output = self.rows, self.rows.new_output()
         shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.options.shows_mask else {}
@@ -222,7 +222,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _renew_output(self, keep: bool = False) -> None:
         """Let the next step write into arrays that nobody outside holds; ``keep`` copies the last step's results."""
         rows, before = self.rows, self.rows.output
-        rows.output, self._views, self._shown = self._handed.take()
+        rows.output, self._views, self._shown = self._buffers.take()
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old

@@ -17,7 +17,7 @@ from bufgym.scenario.afr_evaluation import afr_evaluation
 from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
-from bufgym.scenario.texts import rated
+from bufgym.scenario.texts import how_rated
 from bufgym.scenario.uplink import uplink_over_lte
 
 
@@ -122,7 +122,7 @@ def get(spec: str | os.PathLike[str] | Scenario, /, **overrides: Any) -> Scenari
 
 def about(scenario: Any) -> str:
     """Lines about a scenario: its own ``about``, or how it is rated where it has none."""
-    return str(getattr(scenario, "about", "") or rated(scenario))
+    return str(getattr(scenario, "about", "") or how_rated(scenario))
 
 
 def parameters(spec: Any) -> list[str]:
