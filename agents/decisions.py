@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 from abc import abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -19,12 +19,16 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.callbacks import Budget, Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.evaluation import Agent, SlotModel
-from agents.learner import Learner, S
+from agents.learner import Learner
 from agents.runs import MODEL, Numbers, Run, Validations
+from agents.settings import SingleDecisions
 from bufgym.policies import weights
 
 
-class DecisionLearner(Learner[S]):
+D = TypeVar("D", bound=SingleDecisions)
+
+
+class DecisionLearner(Learner[D]):
     """An algorithm of stable-baselines3."""
 
     algorithm: Any
@@ -46,7 +50,7 @@ class DecisionLearner(Learner[S]):
 
     def env(self, folder: Path, seed: int = 0) -> VecEnv:
         """The batch of environments to train on."""
-        return self.objective(folder, seed).env(self.env_options)
+        return self.objective(folder, seed).env(self.settings.num_envs, self.settings.reward, **self.env_options)
 
     def agent_of(self, model: Any, name: str) -> Agent:
         """The agent of a model, by its name."""

@@ -22,8 +22,8 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
-from agents.decisions import DecisionLearner
 from agents import settings as options
+from agents.decisions import DecisionLearner
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 
 INVALID = -1e9

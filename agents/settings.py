@@ -66,6 +66,14 @@ class SlotEnvironment(Environment):
 
 
 @dataclass(frozen=True)
+class FullBuffer(SlotEnvironment):
+    """The same, where the agent is asked only when the buffer is full, unless it is told otherwise."""
+
+    decide_at: Literal["arrival", "overflow"] = "overflow"
+    """When the agent is asked: at every arrival, or only when the buffer is full."""
+
+
+@dataclass(frozen=True)
 class Suites:
     """Suites to train on instead of an environment."""
 
@@ -209,7 +217,8 @@ class SingleDecisions(Settings):
     width: Count = 32
     """Hidden units a layer."""
     num_envs: Count = 256
-    batch_size: Batch = 2048
+    """Environments side by side."""
+    batch_size: Batch = 1024
     """Decisions of one gradient step."""
     learning_rate: Positive = 1e-3
     """At the start; falls linearly to 0."""
@@ -225,8 +234,8 @@ class ActorCritic(SingleDecisions):
 
     n_steps: Count = 32
     """Steps in each environment between updates."""
-    epochs: Count = 4
-    """Passes over each batch of experience."""
+    epochs: Count = 3
+    """Passes over the decisions of an update."""
     gae_lambda: Share = 0.9
     entropy: Least0 = 0.0
     """Weight of the entropy bonus."""
@@ -245,6 +254,8 @@ class GuidedPPO(ActorCritic):
     """Steps in each environment between updates."""
     batch_size: Batch = 4096
     """Decisions of one gradient step."""
+    epochs: Count = 4
+    """Passes over the decisions of an update."""
 
 
 @dataclass(frozen=True)
@@ -263,6 +274,12 @@ class PPO(OnSlots, ActorCritic):
     algo = "ppo"
     learner = "agents.ppo:SlotPPO"
     kinds = ("environment", "queue", "fleet")
+    steps: Natural = 600_000
+    """Decisions to learn from, for each seed."""
+    num_envs: Count = 64
+    """Environments side by side. Many small updates learn more than few large ones."""
+    batch_size: Batch = 512
+    """Decisions of one gradient step."""
     learning_rate: Positive = 2e-3
     """At the start; falls linearly to 0."""
     unmasked: bool = False
@@ -282,8 +299,7 @@ class DQN(OnSlots):
     algo = "dqn"
     learner = "agents.dqn:SlotDQN"
     kinds = ("environment", "queue")
-    batch_size: Batch = 1024
-    """Decisions of one gradient step."""
+    environment: Annotated[FullBuffer, FLAT] = FullBuffer()
     learning_rate: Positive = 5e-4
     """At the start; falls linearly to 0."""
     train_freq: Count = 8

@@ -26,6 +26,7 @@ from agents.settings import (
     Cluster,
     Environment,
     Evolve,
+    FullBuffer,
     GuidedPPO,
     SingleDecisions,
     SlotEnvironment,
@@ -47,14 +48,16 @@ GUIDED = Environment(capacity=3, duration_s=1.0, episodes=3)
 LEARNERS = {
     "ppo": TINY,
     "unmasked": dataclasses.replace(TINY, unmasked=True),
-    "dqn": DQN(environment=ON, **SMALL, **REPLAYED),
+    "dqn": DQN(environment=FullBuffer(**vars(ON)), **SMALL, **REPLAYED),
     "guided-ppo": GuidedPPO(environment=GUIDED, **SMALL, **UPDATE),
 }
 ON_SUITE: dict[str, Any] = {"suites": Suites(("interruption-v1",), capacities=(4, 6), test_seeds=10), "name": "tiny"}
 ON_SUITE |= {"steps": 1_152, "validate_every": 384, "validation_episodes": 60}
-ROWS = {"num_envs": 12, "batch_size": 96, "environment": SlotEnvironment()}
+ROWS = {"num_envs": 12, "batch_size": 96}
 SUITE: dict[str, Any] = {
-    name: dataclasses.replace(learner, **ON_SUITE, **ROWS) for name, learner in LEARNERS.items() if name != "guided-ppo"
+    name: dataclasses.replace(learner, **ON_SUITE, **ROWS, environment=type(learner.environment)())
+    for name, learner in LEARNERS.items()
+    if name != "guided-ppo"
 } | {"evolve": Evolve(**ON_SUITE)}
 """Three updates of 384 decisions: two rows of each of 3 scenarios x 2 capacities, 32 steps each."""
 
@@ -81,7 +84,8 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
     assert notes["scores"]["qoi"] == rows["agent (seed 0)"]["qoi"]
     assert json.loads((folder / "seed-0" / "notes.json").read_text(encoding="utf-8"))["seeds"] == [0]
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "model.zip").exists() and list((folder / "seed-0" / "tensorboard").glob("events*"))
+    assert (folder / ("model.zip" if plain else runs.MODEL)).exists()
+    assert list((folder / "seed-0" / "tensorboard").glob("events*"))
     printed = capsys.readouterr().out
     assert "drop-oldest" in printed and "agent (seed 0)" in printed
 
@@ -163,6 +167,18 @@ def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: Any) -> None
     assert any(outcome.dropped for outcome in outcomes)
 
 
+def test_a_slot_network_is_kept_as_a_policy_that_decides_as_it_does() -> None:
+    """The same episodes in torch and compiled, before anything was learned and afterwards."""
+    learner: Any = learner_of(TINY)
+    run = learner.train_seed(runs.prepare(TINY), 0)
+    test = FixedEpisodes(ON, "test", 3)
+    model = ppo.MaskablePPO.load(run.folder / "model.zip")
+    assert run.file == runs.MODEL and test.play(learner.agent(run)) == test.play(SlotModel(model, 3))
+    at_overflow = dataclasses.replace(TINY, environment=dataclasses.replace(ON, decide_at="overflow"))
+    others = (at_overflow, dataclasses.replace(TINY, unmasked=True))
+    assert [learner_of(other).weights_of(model) for other in others] == [None, None]  # type: ignore[attr-defined]
+
+
 SPLITS = ("test", "validation")
 
 
@@ -199,12 +215,12 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     home = folder / "seed-0"
     merit = (home / "validation.csv").read_text(encoding="utf-8").splitlines()[0].split(",")[-1]
     validation = {int(steps): value for steps, value in columns(home / "validation.csv", "steps", merit)}
-    model = runs.MODEL if algo == "evolve" else "model.zip"
+    model = runs.MODEL if algo in ("evolve", "ppo") else "model.zip"
     assert (folder / model).read_bytes() == (home / model).read_bytes()
     if algo in LEARNERS:
         assert list(validation) == [0, 384, 768, 1152]
         best = min(validation, key=lambda steps: validation[steps])
-        assert (home / model).read_bytes() == (home / "checkpoints" / f"{best:012d}.zip").read_bytes()
+        assert (home / "model.zip").read_bytes() == (home / "checkpoints" / f"{best:012d}.zip").read_bytes()
     assert results["validation"] == {"0": min(validation.values())}
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
