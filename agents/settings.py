@@ -51,6 +51,11 @@ class Environment:
         if "Uplink" not in self.env and (self.size_bytes, self.duration_s) != (RGBD_BYTES, Uplink.duration_s):
             raise BufgymError(f"{self.env}: its messages have no size and its episodes no length to set")
 
+    @property
+    def slots(self) -> int:
+        """Slots that an agent observes."""
+        return self.capacity
+
 
 @dataclass(frozen=True)
 class SlotEnvironment(Environment):
@@ -58,11 +63,6 @@ class SlotEnvironment(Environment):
 
     decide_at: Literal["arrival", "overflow"] = "arrival"
     """When the agent is asked: at every arrival, or only when the buffer is full."""
-
-    @property
-    def slots(self) -> int:
-        """Slots that an agent observes."""
-        return self.capacity
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,6 @@ class FullBuffer(SlotEnvironment):
 class Suites:
     """Suites to train on instead of an environment."""
 
-    decide_at: ClassVar[str] = "arrival"
     suite: Names = ()
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
     validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
@@ -265,6 +264,11 @@ class OnSlots(SingleDecisions):
     environment: Annotated[SlotEnvironment, FLAT] = SlotEnvironment()
     network: Literal["slots", "plain"] = "slots"
     """One small network for every slot, or one over all numbers at once."""
+
+    @property
+    def decide_at(self) -> str:
+        """When the agent is asked; on suites at every arrival."""
+        return "arrival" if self.suites.suite else self.environment.decide_at
 
 
 @dataclass(frozen=True)
