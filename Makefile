@@ -73,7 +73,7 @@ tutorials: $(READY)
 dist: $(READY)
 	rm -rf dist
 	$(PIP) install --quiet -c constraints.txt -e ".[dist]"
-	$(BIN)/python -m build
+	for folder in . packages/*; do $(BIN)/python -m build --outdir dist $$folder || exit 1; done
 	$(BIN)/python -m twine check --strict dist/*
 
 # Every Python that is here, each with the newest dependencies and with the oldest that pyproject allows.
@@ -86,13 +86,13 @@ format: $(READY)
 
 clean:
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find bufgym agents studies tests -name __pycache__ -prune -exec rm -rf {} +
+	find bufgym packages agents studies tests -name __pycache__ -prune -exec rm -rf {} +
 
 # Byte code is made when a module is first imported: making it for all takes half the time of an installation.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml packages/live/pyproject.toml packages/papers/pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "bufgym needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || true)." >&2; \
 	  echo "Name another one: make PYTHON=python3.11 ..." >&2; exit 1; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
-	$(PIP) install --quiet --no-compile -c constraints.txt -e ".[dev]"
+	$(PIP) install --quiet --no-compile -c constraints.txt -e ".[dev]" -e "packages/live[all]" -e "packages/papers[all]"
 	@touch $@

@@ -128,7 +128,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
     many = {"HYPOTHESIS_PROFILE": "nightly"}
     cov = {**many, **measured(folder)}
     add = [*COVERAGE, "--cov-append", *arguments]
-    servers = ["tests/relay", "tests/robot"]
+    servers = ["packages/live/tests"]
     others = [f"--ignore={name}" for name in ("tests/fuzz", *servers)]
     # Of the tests for the night, those of kernels alone run uncompiled: clusters, trainings and kills gain nothing.
     plain = ["-m", "kernels or not nightly", *others, *arguments]

@@ -8,6 +8,7 @@ envs = gym.make_vec("bufgym/Uplink-v0", num_envs=1024, capacity=8)
 print(bufgym.compare(["afr", "drop-oldest"], "lte", capacity=8))
 """
 
+from importlib.metadata import entry_points as _entry_points
 from typing import TYPE_CHECKING
 
 import gymnasium as _gym
@@ -19,27 +20,23 @@ from bufgym.ground.modules import on_demand as _on_demand
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy
 
-__all__ = ["ENVIRONMENTS", "ON_TASKS", "BufgymError", "Comparison", "compare", "make_policy"]
+__all__ = ["ENVIRONMENTS", "BufgymError", "Comparison", "compare", "make_policy"]
 
 ENVIRONMENTS = {
-    "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)"),
-    "bufgym/Uplink-v0": ("lte", "a camera stream over bandwidth traces"),
-    "bufgym/Suite-v0": ("suite", "the episodes of a benchmark suite, split by split"),
-    "bufgym/Topics-v0": ("topics", "many topics over one uplink: what to drop, and what to send next (Robofleet)"),
-}
-"""Id -> (name of the scenario, its description)."""
+    "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)", {}),
+    "bufgym/Uplink-v0": ("lte", "a camera stream over bandwidth traces", {}),
+    "bufgym/Suite-v0": ("suite", "the episodes of a benchmark suite, split by split", {}),
+    "bufgym/Topics-v0": (
+        "topics",
+        "many topics over one uplink: what to drop, and what to send next (Robofleet)",
+        {"capacity": 32},
+    ),
+} | {entry.name: entry.load() for entry in _entry_points(group="bufgym.environments")}
+"""Id -> (name of the scenario, its description, arguments that differ from the usual): the core's own, and those that
+installed packages declare as entry points of the group ``bufgym.environments``."""
 
-ON_TASKS = {
-    "bufgym/Mapping-v0": (
-        "bufgym.papers.perception.worth:mapping",
-        "a made-up room is filmed: what are the frames worth?",
-    )
-}
-"""Id -> task, for environments whose reward is a robot's own task; they need the extra ``perception``."""
-
-for _id, (_scenario, _) in {**ENVIRONMENTS, **ON_TASKS}.items():
+for _id, (_scenario, _, _options) in ENVIRONMENTS.items():
     if _id not in _gym.registry:
-        _options = {"capacity": 32} if _scenario == "topics" else {"reward": "covered"} if _id in ON_TASKS else {}
         _gym.register(
             _id,
             entry_point="bufgym.envs:SenderEnv",

@@ -20,10 +20,10 @@ from made_up_robot import CONFIG, MadeUp
 
 from bufgym.model import Link
 from bufgym.policies import Policy, get
-from bufgym.relay import Config, Foxglove, Robot, Rule, Server, compiled
-from bufgym.robot import ShapedLink
 from bufgym.scenario import read_client
 from bufgym.traces import Trace
+from bufgym_live.relay import Config, Foxglove, Robot, Rule, Server, compiled
+from bufgym_live.robot import ShapedLink
 
 CLEAR_BPS: Final = 1_000_000
 FADED_BPS: Final = 100_000

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 
-from bufgym.relay import Robot
 from bufgym.scenario import Stream, read_client
+from bufgym_live.relay import Robot
 
 Floats = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
     pip install small_gicp
     python examples/trackers.py [--recording FOLDER] [--frames 600] [--every 1 2 4 6 8 10]
 
-All follow the rule of `bufgym.papers.perception.track`: a tracker is lost at the first step that is more than
+All follow the rule of `bufgym_papers.perception.track`: a tracker is lost at the first step that is more than
 10 cm or 5 degrees off, or that it refuses. FOLDER is any that `open_sequence` reads; by default the made-up room.
 """
 
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import small_gicp
 
-from bufgym.papers.perception import (
+from bufgym_papers.perception import (
     Sequence,
     Tracker,
     difference,

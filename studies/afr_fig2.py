@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from bufgym import policies, sim
-from bufgym.papers.figure import COLOURS, Figure
-from bufgym.papers.rows import FigureRows
 from bufgym.scenario import Interruption
+from bufgym_papers.figures.figure import COLOURS, Figure
+from bufgym_papers.figures.rows import FigureRows
 
 PARTS = (
     ("robot", "Sensors, Sender", "scenario: messages\nwith time, bytes, x"),

@@ -20,12 +20,12 @@ from bufgym import policies, sim
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import draw
 from bufgym.ground.tables import aligned
-from bufgym.papers.afr_fig6 import LinkFigure
-from bufgym.papers.figure import COLOURS, finish
-from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario import Uplink
 from bufgym.scenario.afr_evaluation import FRAME_BYTES
 from bufgym.scenario.suites import CAPACITIES, RATE_HZ, time_value
+from bufgym_papers.figures.afr_fig6 import LinkFigure
+from bufgym_papers.figures.figure import COLOURS, finish
+from bufgym_papers.figures.rows import FigureRows, listed
 
 SECONDS = (21, 23)
 PAPER_RECALCULATIONS, PAPER_HZ = 400, 8.0

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.rows import Row
-from bufgym.papers.afr_theorems import gaps_of
-from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.frame_runs import FrameFigure
-from bufgym.papers.rows import FigureRows
+from bufgym_papers.figures.afr_theorems import gaps_of
+from bufgym_papers.figures.figure import COLOURS, finish, legend_below
+from bufgym_papers.figures.frame_runs import FrameFigure
+from bufgym_papers.figures.rows import FigureRows
 
 NOISE = 0.05  # Violation of a rule that still counts as keeping it, because depth has noise and edges
 EVERY = 10  # Distance between the starts of interruptions, frames

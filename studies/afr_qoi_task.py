@@ -20,11 +20,11 @@ from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.table import NONE
 from bufgym.ground.tables import aligned
-from bufgym.papers.figure import COLOURS, finish, legend_below
-from bufgym.papers.frame_runs import POLICIES, RESAMPLES, FrameFigure, FrameRun, spearman
-from bufgym.papers.perception import views
-from bufgym.papers.rows import FigureRows, listed
 from bufgym.scenario.suites import motion_value, time_value
+from bufgym_papers.figures.figure import COLOURS, finish, legend_below
+from bufgym_papers.figures.frame_runs import POLICIES, RESAMPLES, FrameFigure, FrameRun, spearman
+from bufgym_papers.figures.rows import FigureRows, listed
+from bufgym_papers.perception import views
 from studies.afr_overlap import overlap_information
 
 MEASURES = {

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from bufgym import policies, sim
-from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import FigureRows
 from bufgym.scenario import Interruption
+from bufgym_papers.figures.figure import COLOURS, Figure, finish, legend_below, whole
+from bufgym_papers.figures.rows import FigureRows
 
 POLICIES = {"drop-oldest": "Drop Oldest", "random": "Random", "afr": "AFR"}
 

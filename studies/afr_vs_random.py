@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.rows import Row
-from bufgym.papers.afr_theorems import extremes, gaps_of
-from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.rows import FigureRows
+from bufgym_papers.figures.afr_theorems import extremes, gaps_of
+from bufgym_papers.figures.figure import COLOURS, Figure, finish, whole
+from bufgym_papers.figures.rows import FigureRows
 
 ROUNDING = 1e-9  # Relative tolerance; the expectations are sums of some ten thousand products
 COUNTEREXAMPLE = (1, 4, 2)  # L, T and D at which AFR falls short of Random's expectation

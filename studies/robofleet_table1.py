@@ -16,8 +16,8 @@ import numpy as np
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.tables import aligned
-from bufgym.papers.figure import COLOURS, Figure, finish, legend_below, whole
-from bufgym.papers.rows import FigureRows
+from bufgym_papers.figures.figure import COLOURS, Figure, finish, legend_below, whole
+from bufgym_papers.figures.rows import FigureRows
 from studies.encodings import ENCODINGS, KINDS, Content, content, encode
 
 PAPER = {

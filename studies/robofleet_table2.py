@@ -23,9 +23,9 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import PACKAGE
 from bufgym.ground.libraries import library
 from bufgym.ground.tables import aligned
-from bufgym.papers.figure import COLOURS, Figure, finish, whole
-from bufgym.papers.robofleet_evaluation import POINTS
-from bufgym.papers.rows import FigureRows
+from bufgym_papers.figures.figure import COLOURS, Figure, finish, whole
+from bufgym_papers.figures.robofleet_evaluation import POINTS
+from bufgym_papers.figures.rows import FigureRows
 from studies import table2_programs
 from studies.encodings import content, encode
 
@@ -50,7 +50,7 @@ class Reproduction(Figure):
         if not sys.platform.startswith("linux"):
             raise BufgymError("robofleet-table2: virtual memory is read from /proc, which this system does not have")
         for name in ("roslibpy", "rosbags", "flatbuffers", "websockets"):
-            library(name, "rosbridge", "robofleet-table2")
+            library(name, "bufgym-live[rosbridge]", "robofleet-table2")
         return asyncio.run(self._measure())
 
     async def _measure(self) -> FigureRows:
@@ -128,7 +128,7 @@ class Reproduction(Figure):
 @contextlib.asynccontextmanager
 async def _receiver() -> AsyncIterator[tuple[int, list[Any]]]:
     """The other end of our sender; gives its port and the list of received messages."""
-    from bufgym.robot.receiver import Receiver
+    from bufgym_live.robot.receiver import Receiver
 
     came: list[Any] = []
     receiver = Receiver(lambda message: came.append(message.seq))

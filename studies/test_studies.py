@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bufgym.papers import figure
 from bufgym.sim import NEVER
 from bufgym.traces import Trace, write_csv
+from bufgym_papers.figures import figure
 from studies import afr_overlap, afr_qoi_task, afr_vs_random
 from studies.afr_frame_size import full
 

@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from bufgym.ground.errors import BufgymError
-from bufgym.papers import figure
-from bufgym.papers.rows import FigureRows
+from bufgym_papers.figures import figure
+from bufgym_papers.figures.rows import FigureRows
 from studies import robofleet_table2, table2_programs
 
 for library in ("rosbags", "flatbuffers", "roslibpy", "websockets"):

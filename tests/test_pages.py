@@ -120,7 +120,7 @@ def _is_public(module: str, name: str) -> bool:
     """Whether a room lists the name in ``__all__``, or has a room of this name."""
     if module.split(".")[0] == "agents":
         return hasattr(importlib.import_module(module), name)
-    if module.split(".")[0] != "bufgym" or module == "bufgym.robot.ros2":  # it needs ROS 2
+    if module.split(".")[0] != "bufgym" or module == "bufgym_live.robot.ros2":  # it needs ROS 2
         return True
     below = (
         importlib.util.find_spec(f"{module}.{name}")
@@ -206,7 +206,7 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 """What a page says of its program."""
 
 ELSEWHERE = {
-    "docs/guide/on-a-robot.md": "tests/robot/test_ros1.py, test_ros2.py",
+    "docs/guide/on-a-robot.md": "packages/live/tests/robot/test_ros1.py, test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
     "docs/guide/yours-to-change.md": "below",
     "docs/fleet.md": "it trains for minutes; what it imports is looked at above",
@@ -220,7 +220,7 @@ PROGRAMS = [block for block in blocks() if block.language == "python" and block.
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
 def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
-    for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym.papers.perception"}).items():
+    for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)

@@ -87,18 +87,25 @@ def test_sb3_without_its_extra_names_it() -> None:
 def test_a_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """pip finds it in the bufgym that is installed; a source tree is installed with it."""
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.2.0")
-    assert errors.install("relay") == 'pip install "bufgym[relay]"'
+    assert errors.install("plot") == 'pip install "bufgym[plot]"'
+    assert errors.install("bufgym-live[relay]") == 'pip install "bufgym-live[relay]"'
     monkeypatch.setattr(importlib.metadata, "version", importlib.metadata.distribution)
     monkeypatch.setattr(importlib.metadata.Distribution, "discover", lambda **_: iter(()))
-    assert errors.install("relay") == 'pip install -e ".[relay]"'
+    assert errors.install("plot") == 'pip install -e ".[plot]"'
+    assert errors.install("bufgym-live[relay]") == 'pip install -e "packages/live[relay]"'
 
 
 def test_every_hint_names_an_extra_that_there_is() -> None:
-    extras = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    extras = set()
+    for file in (REPO / "pyproject.toml", *(REPO / "packages").glob("*/pyproject.toml")):
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        name = project["name"]
+        extras |= {extra if name == "bufgym" else f"{name}[{extra}]" for extra in project["optional-dependencies"]}
     places, named = {"install": 0, "needs": 1, "library": 1}, set()
-    for path in sorted((REPO / "bufgym").rglob("*.py")):
+    sources = [REPO / "bufgym", *(REPO / "packages").glob("*/bufgym_*")]
+    for path in sorted(path for folder in sources for path in folder.rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in places:
                 words = call.args[places[call.func.id] :][:1]
                 named |= {word.value for word in words if isinstance(word, ast.Constant)}
-    assert {"plot", "train", "fleet", "ros"} <= named <= set(extras)
+    assert {"plot", "train", "fleet", "ros", "bufgym-live[relay]"} <= named <= extras

@@ -128,7 +128,7 @@ def _rendered_topics(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
 
 
 def _mapping() -> Frames:
-    scenario = get("bufgym.papers.perception.worth:mapping")
+    scenario = get("bufgym_papers.perception.worth:mapping")
     return _compared(QUEUE, draw(scenario, 2), scenario, "A made-up room is filmed over LTE, L = 8")
 
 

@@ -10,72 +10,60 @@ import io
 import os
 import re
 import sys
+import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
-from cyclopts import App, CycloptsError, MissingArgumentError
+from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandError, UnknownOptionError
 
 from bufgym.cli.options import OPTIONS
 from bufgym.ground import __version__, modules
 from bufgym.ground.errors import BufgymError, TraceWarning, printable
+from bufgym.ground.files import PACKAGE
 
 __all__ = ["app", "main"]
 
 _formatwarning = warnings.formatwarning
 
 COMMANDS: dict[str, Any] = {
-    "list": "cli.listing:listing",
-    "bench": "cli.bench:bench",
-    "topics": "cli.topics:topics",
-    "fleet": "cli.topics:fleet",
-    "report": "cli.results:report",
-    "leaderboard": "cli.results:leaderboard",
-    "validate": "cli.results:validate",
+    "list": "bufgym.cli.listing:listing",
+    "bench": "bufgym.cli.bench:bench",
+    "topics": "bufgym.cli.topics:topics",
+    "fleet": "bufgym.cli.topics:fleet",
+    "report": "bufgym.cli.results:report",
+    "leaderboard": "bufgym.cli.results:leaderboard",
+    "validate": "bufgym.cli.results:validate",
     "trace": (
         "Bandwidth traces and recordings: look at them, convert, fit, generate, fetch.",
         {
-            "info": "cli.traces:info",
-            "plot": "cli.traces:plot",
-            "validate": "cli.traces:validate",
-            "convert": "cli.traces:convert",
-            "from-bag": "cli.trace_bags:from_bag",
-            "from-poses": "cli.trace_bags:from_poses",
-            "fit": "cli.trace_fit:fit",
-            "generate": "cli.trace_generate:generate",
-            "fetch": "cli.trace_fetch:fetch",
+            "info": "bufgym.cli.traces:info",
+            "plot": "bufgym.cli.traces:plot",
+            "validate": "bufgym.cli.traces:validate",
+            "convert": "bufgym.cli.traces:convert",
+            "from-bag": "bufgym.cli.trace_bags:from_bag",
+            "from-poses": "bufgym.cli.trace_bags:from_poses",
+            "fit": "bufgym.cli.trace_fit:fit",
+            "generate": "bufgym.cli.trace_generate:generate",
+            "fetch": "bufgym.cli.trace_fetch:fetch",
         },
     ),
-    "reproduce": "papers.commands:reproduce",
-    "play": "cli.play:play",
-    "live": (
-        "Policies on real sockets, beside the simulator.",
-        {
-            "send": "robot.commands:send",
-            "receive": "robot.commands:receive",
-            "link": "robot.commands:link",
-            "validate": "robot.checks:validate",
-            "view": "robot.checks:view",
-            "replay": "robot.checks:replay",
-            "cost": "robot.cost:cost",
-        },
-    ),
-    "ros2": (
-        "A relay between ROS 2 networks, its uplink under a policy.",
-        {"send": "robot.ros2.commands:send", "receive": "robot.ros2.commands:receive"},
-    ),
-    "relay": (
-        "A server for fleets: robots and viewers meet there.",
-        {"serve": "relay.commands:serve", "robot": "relay.commands:robot", "foxglove": "relay.commands:foxglove"},
-    ),
-    "export": "robot.c.commands:export",
-    "dataset": ("Record data sets for imitation and offline learning.", {"make": "cli.dataset:dataset"}),
-    "warmup": "cli.results:warmup",
+    "play": "bufgym.cli.play:play",
+    "export": "bufgym.cli.export:export",
+    "dataset": ("Record data sets for imitation and offline learning.", {"make": "bufgym.cli.dataset:dataset"}),
+    "warmup": "bufgym.cli.results:warmup",
 }
-"""Commands in the order of ``--help``: where the function is, or (purpose, commands below it)."""
+"""The core's commands in the order of ``--help``: where the function is, or (purpose, commands below it)."""
+
+GROUP = "bufgym.commands"
+"""Entry points of this group are commands of other packages, declared as in ``COMMANDS``; one may stand in for the
+core's of its name, and do more."""
 
 
 def app() -> App:
+    """The command with the core's commands, then those of installed packages."""
     root = App(
         name="bufgym",
         help="A robot's send buffer is full: which message should go?",
@@ -87,16 +75,25 @@ def app() -> App:
         suppress_keyboard_interrupt=False,
         result_action="return_value",
     )
-    return _with(root, COMMANDS)
+    return _with(root, COMMANDS | {entry.name: entry.load() for entry in entry_points(group=GROUP)})
 
 
 def _with(parent: App, commands: Mapping[str, Any]) -> App:
     for k, (name, what) in enumerate(commands.items()):
         if isinstance(what, str):
-            parent.command(f"bufgym.{what}", name=name, sort_key=k)
+            parent.command(what, name=name, sort_key=k)
         else:
             parent.command(_with(App(name=name, help=what[0], sort_key=k), what[1]))
     return parent
+
+
+def _elsewhere(command: str) -> str:
+    """What to install for a command that a package of this checkout declares and no installed one; "" if none does."""
+    if command not in entry_points(group=GROUP).names:
+        for file in sorted((PACKAGE.parent / "packages").glob("*/pyproject.toml")):
+            if command in tomllib.loads(file.read_text(encoding="utf-8"))["project"]["entry-points"][GROUP]:
+                return f"{command} is a command of another package: pip install -e {file.parent}"
+    return ""
 
 
 def _shown(root: App, words: Sequence[str]) -> App:
@@ -114,8 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code."""
     _open_output()
     warnings.formatwarning = _warning
+    words = sys.argv[1:] if arguments is None else arguments
     try:
-        words = sys.argv[1:] if arguments is None else arguments
         code: int | None = _shown(app(), words)(words)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader (head, less) has gone
@@ -125,6 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed("; ".join(["stopped", *map(str, stop.args)]), 130)
     except MissingArgumentError as error:
         return _failed(_missing(error))
+    except (UnknownCommandError, UnknownOptionError) as error:
+        return _failed(_elsewhere(words[0]) or str(error))
     except (BufgymError, CycloptsError) as error:
         return _failed(str(error))
     except OSError as error:

@@ -92,12 +92,14 @@ def line_in(error: Exception, file: str) -> str | None:
 
 
 def install(extra: str) -> str:
-    """The command that installs an optional part.
+    """The command that installs an extra of bufgym ("plot"), or of a package beside it ("bufgym-NAME[EXTRA]").
 
-    pip finds the extra in the bufgym that is installed, so no package index needs to know bufgym.
+    pip finds the extra in what is installed, so no package index needs to know bufgym.
     """
+    package, _, bracket = (extra if "[" in extra else f"bufgym[{extra}]").partition("[")
     try:
-        importlib.metadata.version("bufgym")
+        importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:  # a source tree that was never installed
-        return f'pip install -e ".[{extra}]"'
-    return f'pip install "bufgym[{extra}]"'
+        folder = "." if package == "bufgym" else f"packages/{package.removeprefix('bufgym-')}"
+        return f'pip install -e "{folder}[{bracket}"'
+    return f'pip install "{package}[{bracket}"'

@@ -9,7 +9,7 @@ from bufgym.ground.errors import BufgymError, install
 
 
 @contextmanager
-def needs(libraries: str | tuple[str, ...], extra: str = "live", user: str = "bufgym") -> Iterator[None]:
+def needs(libraries: str | tuple[str, ...], extra: str, user: str = "bufgym") -> Iterator[None]:
     """Raise an error that says that ``user`` needs the extra if the block can't import one of its libraries."""
     try:
         yield
@@ -19,7 +19,7 @@ def needs(libraries: str | tuple[str, ...], extra: str = "live", user: str = "bu
         raise BufgymError(f"{user} needs {error.name}: {install(extra)}") from None
 
 
-def library(name: str, extra: str = "perception", user: str = "bufgym") -> Any:
+def library(name: str, extra: str, user: str = "bufgym") -> Any:
     """Import the module of that name, which comes with the extra; see ``needs``."""
     with needs(name.split(".")[0], extra, user):
         return importlib.import_module(name)

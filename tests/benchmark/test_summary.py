@@ -26,10 +26,10 @@ from bufgym.benchmark.tasks.stress import ratios
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import closure as closures
 from bufgym.policies import target_gap
-from bufgym.robot.margins import margins
-from bufgym.robot.runs import LiveRun
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
+from bufgym_live.robot.margins import margins
+from bufgym_live.robot.runs import LiveRun
 
 QUANTITIES = (
     Quantity("mean", "mean", score, "of H", interval=False),

@@ -9,10 +9,10 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from tests.conftest import COMPILED, REPO
 
 from bufgym.ground import kernel
 from bufgym.ground.kernel.closure import closure
-from tests.conftest import COMPILED, REPO
 
 TALE = """
 from typing import NamedTuple
@@ -142,15 +142,15 @@ event.register("numba:compile", Listener())
 
 @needs_compilation
 def test_a_change_recompiles_what_calls_it_and_nothing_else(tmp_path: Path) -> None:
-    """The relay's server has no kernels. AFR's text does not matter to Drop Oldest, and both are asked for here."""
+    """A command has no kernels. AFR's text does not matter to Drop Oldest, and both are asked for here."""
     shutil.copytree(REPO / "bufgym", tmp_path / "bufgym", ignore=shutil.ignore_patterns("__pycache__"))
     script = "from bufgym import policies\nfor name in ('afr', 'drop-oldest'): policies.get(name).compiled"
     cold = compiled(tmp_path, script)
     assert {"afr", "drop_oldest"} <= set(cold)
     assert compiled(tmp_path, script) == []
 
-    server = tmp_path / "bufgym" / "relay" / "server.py"
-    server.write_text(server.read_text() + "\nADDED = 1\n")
+    command = tmp_path / "bufgym" / "cli" / "bench.py"
+    command.write_text(command.read_text() + "\nADDED = 1\n")
     assert compiled(tmp_path, script) == []
 
     afr = tmp_path / "bufgym" / "policies" / "afr.py"

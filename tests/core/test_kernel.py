@@ -12,9 +12,9 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.conftest import COMPILED
 
 from bufgym.ground.kernel import JIT, announce, cache, direct, interruptible, kernel
-from tests.conftest import COMPILED
 
 TALE = """
 import os

@@ -1,0 +1,32 @@
+"""``bufgym export``: agents as files of weights."""
+
+from dataclasses import dataclass
+
+from cyclopts import Group, Parameter
+
+from bufgym.ground.errors import BufgymError
+
+
+@Parameter(name="*", group=Group.create_ordered("Weights (.safetensors)"))
+@dataclass(frozen=True)
+class WeightOptions:
+    name: str | None = None
+    """The policy's name; must be given."""
+    about: str | None = None
+    """A sentence on the purpose of its training."""
+
+
+def export(model: str, /, out: str, *, weights: WeightOptions = WeightOptions()) -> None:
+    """Write a trained agent as a file of weights, read without torch.
+
+    A model.zip holds pickles, so reading it can run any code: export models of your own alone.
+
+    Args:
+        model: Of a run of train.py: model.safetensors, or model.zip (ppo --network slots).
+        out: File to write.
+    """
+    from bufgym import sb3
+
+    if weights.name is None:
+        raise BufgymError("--name must be given: the policy's name")
+    print(f"wrote {sb3.export(model, out, name=weights.name, about=weights.about or '')}")

@@ -1,0 +1,31 @@
+"""A relay for fleets: robots and viewers connect to it, and publish and subscribe by topic as its rules allow.
+
+Robofleet [sikand2021robofleet] is a client on each robot, one server and a web page. This package is the server, built
+on bufgym's queues. ``Server`` serves what a ``Config`` allows. ``RobotClient``, ``Session`` and ``Robot`` connect to
+it, and ``wire`` defines the protocol on its WebSockets.
+"""
+
+from typing import TYPE_CHECKING
+
+from bufgym.ground.libraries import needs
+from bufgym.ground.modules import on_demand
+
+with needs("msgspec", "bufgym-live[relay]", "bufgym_live.relay"):  # the other libraries of the extra come with it
+    import msgspec  # noqa: F401
+
+if TYPE_CHECKING:
+    from bufgym_live.relay.bag import BagSource
+    from bufgym_live.relay.client import RobotClient
+    from bufgym_live.relay.config import Config, Foxglove, Limits, Nats, Rotation, Rule, StoreLimits, Tls, Tokens, load
+    from bufgym_live.relay.policies import compiled
+    from bufgym_live.relay.robot import Robot, Source
+    from bufgym_live.relay.server import Server, serve_forever
+    from bufgym_live.relay.session import Session, security, token
+    from bufgym_live.relay.wire import Message, RefusedError
+
+__all__ = [
+    "BagSource", "Config", "Foxglove", "Limits", "Message", "Nats", "RefusedError", "Robot", "RobotClient", "Rotation",
+    "Rule", "Server", "Session", "Source", "StoreLimits", "Tls", "Tokens", "compiled", "load", "security",
+    "serve_forever", "token",
+]  # fmt: skip
+__getattr__ = on_demand(__name__)

@@ -1,0 +1,85 @@
+"""The other end of a WebSocket: its identity as far as it has proved it, and the answers that it is to be sent."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Final
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import WebSocketException
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.relay import wire
+from bufgym_live.relay.hub import Hub
+from bufgym_live.relay.identity import Verifier, certificate_email
+from bufgym_live.relay.rules import Identity, plain_address
+from bufgym_live.relay.subscriber import Subscription
+from bufgym_live.relay.wire import RefusedError
+
+POLICY_VIOLATION: Final = 1008
+_FRAME_BYTES: Final = 500  # bytes of JSON whose parsing takes as long as all else that is done for a frame
+_PACE_S: Final = 0.05
+
+
+class Caller:
+    """Whoever has connected, before its hello and after."""
+
+    def __init__(self, hub: Hub, socket: ServerConnection, verifier: Verifier | None, *, listens: bool = True) -> None:
+        """With ``listens`` False it is told nothing, because it would not understand."""
+        self.hub, self.socket = hub, socket
+        self.identity = Identity(plain_address(socket.remote_address[0]))
+        self.answers: deque[str] = deque()
+        self.subscriptions: dict[str, Subscription] = {}
+        self._verifier, self._listens = verifier, listens
+        self.told: Callable[[], None] = lambda: None  # called with each answer to come
+
+    async def prove(self, token: str | None) -> Identity:
+        """Learn who it is: by token, certificate, or address alone."""
+        tls = self.socket.transport.get_extra_info("ssl_object")
+        email, until_s = certificate_email(tls.getpeercert()) if tls is not None else "", float("inf")
+        if token is not None:
+            if self._verifier is None:
+                raise RefusedError("unauthorized", "token: this relay takes none")
+            email, until_s = await self._verifier.email(token)
+        self.identity = Identity(self.identity.address, email, until_s=until_s)
+        return self.identity
+
+    async def heard(self) -> bytes | str:
+        """Receive a frame; a text frame is kept back until its identity may have it parsed."""
+        data = await self.socket.recv()
+        if isinstance(data, str):
+            await self.pace(len(data) + _FRAME_BYTES)
+        return data
+
+    async def pace(self, json_bytes: int) -> None:
+        """Wait until the identity's budget allows to parse so much JSON."""
+        budget, loop = self.hub.quotas.of(self.identity.key).json, asyncio.get_running_loop()
+        while not budget.take(json_bytes, loop.time()):
+            await asyncio.sleep(_PACE_S)
+
+    def tell(self, op: str, **fields: Any) -> None:
+        """Have this sent before any message."""
+        if self._listens:
+            self.answers.append(wire.say(op, **fields))
+            self.told()
+
+    def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
+        """Tell it of a refusal and the reason. Refusals of messages are audited elsewhere."""
+        code = error.code if isinstance(error, RefusedError) else "wrong"
+        if what != "publish":
+            self.hub.audit.repeated(what=what, code=code, why=str(error), **self.identity.as_json())
+        self.tell("refused", what=what, code=code, why=str(error), **fields)
+
+    async def send_answers(self) -> None:
+        """Send all answers."""
+        while self.answers:
+            await self.socket.send(self.answers.popleft())
+
+    async def close(self, why: str) -> None:
+        """Send the last answers, and close."""
+        try:
+            async with asyncio.timeout(1.0):
+                await self.send_answers()
+                await self.socket.close(POLICY_VIOLATION, why)
+        except (WebSocketException, TimeoutError):
+            self.socket.transport.abort()

@@ -1,0 +1,187 @@
+"""One client's connection in its session: its checked requests. Its ``outbox`` sends to it."""
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Final
+
+from websockets.exceptions import WebSocketException
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.relay import outbox, policies, protocol, replay, wire
+from bufgym_live.relay.caller import POLICY_VIOLATION, Caller
+from bufgym_live.relay.hub import Outgoing
+from bufgym_live.relay.outbox import Outbox
+from bufgym_live.relay.protocol import Admitted
+from bufgym_live.relay.quota import Quota
+from bufgym_live.relay.recorder import FOLDER as RECORDINGS
+from bufgym_live.relay.store import StoredSession
+from bufgym_live.relay.subscriber import Subscription
+from bufgym_live.relay.wire import RefusedError
+
+HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello
+
+
+class Connection:
+    """A ``hub.Member`` on a WebSocket, made once its client is let in."""
+
+    acks = True
+
+    def __init__(self, caller: Caller, admitted: Admitted, session: StoredSession, quota: Quota) -> None:
+        self._caller, self._admitted, self._quota = caller, admitted, quota
+        self._hub, self._socket = caller.hub, caller.socket
+        self.session, self.permissions, self.subscriptions = session, admitted.permissions, caller.subscriptions
+        self._outbox = Outbox(caller, self, admitted.form, admitted.received)
+        self._recordings = None if self._hub.config.folder is None else self._hub.config.folder / RECORDINGS
+        self.wake, self.tell, self.sent = self._outbox.wake, caller.tell, 0
+        caller.told = self._told
+        self._ending: asyncio.Task[None] | None = None
+
+    @staticmethod
+    async def greet(caller: Caller) -> Admitted:
+        """Take the client's hello."""
+        said = protocol.hello(await caller.heard())
+        identity = await caller.prove(said.get("token"))
+        return protocol.admit(said, identity, caller.hub.config.rules, secrets.token_hex(8))
+
+    async def run(self, greeted: Callable[[], None]) -> None:
+        """Serve the client to the end; call ``greeted`` after its welcome."""
+        hub, caller, admitted = self._hub, self._caller, self._admitted
+        hub.store.acked(self.session, admitted.received)
+        hub.join(self)
+        self._socket.protocol.max_message_size = hub.config.limits.message_bytes
+        hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
+        self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
+        greeted()
+        writer = asyncio.create_task(self._outbox.run())
+        left_s = min(caller.identity.until_s - time.time(), 2**20)
+        expiry = asyncio.get_running_loop().call_later(left_s, self.end, "the token has expired")
+        try:
+            await self._read()
+        except WebSocketException:
+            pass
+        finally:
+            expiry.cancel()
+            writer.cancel()
+            hub.leave(self)
+            hub.audit("left", session=self.session.name, **caller.identity.as_json())
+        if self._ending is not None:
+            await self._ending  # with its reason, which the end of this would not say
+
+    async def _read(self) -> None:
+        """What the client says, until one of both ends it."""
+        while self._ending is None:
+            match protocol.asked(await self._caller.heard(), self._hub.config.limits.message_bytes):
+                case wire.Message() as message:
+                    if message.encoding == "json":
+                        await self._caller.pace(len(message.payload))
+                    await self._publish(message)
+                case {"op": "subscribe"} as said:
+                    await self._subscribe(said)
+                case {"op": "unsubscribe", "id": id}:
+                    self._hub.unsubscribe(self, id)
+                case {"op": "ack", "seq": number}:
+                    self._outbox.acked(number)
+                    self._hub.store.acked(self.session, number)
+                case {"op": "recordings"}:
+                    folder = self._recordings if self.permissions.receives else None
+                    self.tell("recordings", files=await asyncio.to_thread(replay.recordings, folder))
+                case said:
+                    await self._replay(said)
+
+    async def _replay(self, said: Mapping[str, Any]) -> None:
+        may = partial(self.permissions.allow, "receive")
+        asked = said["file"], said["from_us"], said["most_bytes"]
+        try:
+            part = await asyncio.to_thread(replay.piece, self._recordings, *asked, may)
+        except BufgymError as error:
+            self._caller.refuse("replay", error, id=said["id"])
+        else:
+            self.tell("replayed", id=said["id"], **part)
+
+    async def _publish(self, message: wire.Message) -> None:
+        """Publish it, or say why not: of a no_drop message every time, of others now and then."""
+        hub, who = self._hub, self._caller.identity
+        try:
+            no_drop, now_s, received = hub.is_no_drop(message.topic), hub.clock(), self.session.received
+            new = protocol.check(message, received, self.permissions, self._quota, no_drop, now_s)
+            stamp_us = message.stamp_us or time.time_ns() // 1000
+            message = message._replace(sender=self._admitted.name, stamp_us=stamp_us)
+            if not message.no_drop:
+                hub.publish(self, message)
+            elif not new or await self._hold(message):
+                self.tell("ack", seq=message.seq)
+        except RefusedError as refused:
+            about = {"code": refused.code, "topic": message.topic, "session": self.session.name}
+            first = hub.audit.repeated(what="publish", **about, address=who.address, email=who.email)
+            if message.no_drop or first:
+                self._caller.refuse("publish", refused, topic=message.topic, seq=message.seq)
+
+    async def _hold(self, message: wire.Message) -> bool:
+        """Hold a no_drop message; return whether it is held."""
+        shared: bool | None = False
+        if self._hub.peers is not None:
+            self._hub.make_room(self, message)  # what is refused here, the others must not have
+            shared = await self._hub.peers.hold(self.session, message)
+        if shared is None:
+            self.end("NATS does not answer")  # the client connects again, and sends this again
+            return False
+        if message.seq > self.session.received:  # else it was taken meanwhile, over another connection
+            self._hub.hold(self, message, shared=shared)
+        return True
+
+    async def _subscribe(self, said: Mapping[str, Any]) -> None:
+        config, left_bytes = self._hub.config, self._socket.transport.get_write_buffer_size
+        name = said.get("policy", config.policies[0])
+        try:
+            self._quota.message(0, self._hub.clock())
+            self.permissions.check_subscription(said["topic"])
+            # A policy that nobody has asked for yet is compiled, while others are served.
+            policy = await asyncio.to_thread(policies.warm, name) if name in config.policies else None
+            self._quota.subscribe(said["id"], self.subscriptions)
+            subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
+            self._hub.subscribe(self, subscription)
+        except BufgymError as error:
+            self._caller.refuse("subscribe", error, id=said["id"])
+            return
+        self.tell("subscribed", id=subscription.id, policy=subscription.policy.name, capacity=subscription.capacity)
+
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
+        """A message that its queues decide on."""
+        subscription.offer(frame.message.topic, frame, frame.size_bytes)
+        self._outbox.wake()
+
+    def _told(self) -> None:
+        self._outbox.wake()
+        if len(self._caller.answers) > outbox.MAX_ANSWERS:
+            self.end("reads none of the answers")
+
+    def end(self, why: str) -> None:
+        """Close it."""
+        if self._ending is None:
+            self._hub.audit("closed", why=why, session=self.session.name, **self._caller.identity.as_json())
+            self._ending = asyncio.create_task(self._socket.close(POLICY_VIOLATION, why))
+
+
+async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], None]) -> None:
+    """Serve a client from its hello to the end; call ``greeted`` after the hello."""
+    hub, stage = caller.hub, "hello"
+    hello_s = hub.config.limits.hello_s
+    try:
+        try:
+            async with asyncio.timeout(hello_s):
+                admitted = await kind.greet(caller)
+        except TimeoutError:
+            raise RefusedError("wrong", f"no hello within {hello_s:g} s") from None
+        numbers = admitted.received, admitted.acked
+        with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
+            session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
+            stage = "frame"
+            await kind(caller, admitted, session, quota).run(greeted)
+    except BufgymError as error:
+        caller.refuse(stage, error)
+        await caller.close(stage)
+    except WebSocketException:
+        pass

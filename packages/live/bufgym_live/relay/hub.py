@@ -1,0 +1,270 @@
+"""Members of a relay and the routing between them, without sockets."""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from bufgym_live.relay import wire
+from bufgym_live.relay.audit import Audit
+from bufgym_live.relay.config import Config
+from bufgym_live.relay.patterns import pattern
+from bufgym_live.relay.quota import Quotas
+from bufgym_live.relay.recorder import Recorder
+from bufgym_live.relay.rules import Permissions
+from bufgym_live.relay.store import Settled, Store, StoredSession
+from bufgym_live.relay.subscriber import Subscription
+from bufgym_live.relay.wire import RefusedError
+
+if TYPE_CHECKING:
+    from bufgym_live.relay.foxglove import Window
+    from bufgym_live.relay.peers import Peers
+
+STATUS: Final = f"/{wire.OWN}/status"
+CONNECTED: Final = "connected"  # State of the connection to the other relays
+ROBOFLEET: Final = "robofleet"
+"""Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
+MAX_ROUTES: Final = 10_000
+
+
+@dataclass(eq=False)
+class Outgoing:
+    """An outgoing message; each of its forms is made once for all receivers."""
+
+    message: wire.Message
+
+    @functools.cached_property
+    def binary(self) -> bytes:
+        return wire.encode(self.message)
+
+    @functools.cached_property
+    def json(self) -> str:
+        return wire.to_json(self.message)
+
+    def form(self, name: str) -> bytes | str:
+        """Give the form that a client asked for."""
+        if name == ROBOFLEET:
+            return bytes(self.message.payload)
+        return self.json if name == "json" else self.binary
+
+    @property
+    def size_bytes(self) -> int:
+        return wire.HEADER_BYTES + len(self.message.payload)
+
+
+class Member(Protocol):
+    """A connection that has said hello."""
+
+    session: StoredSession
+    permissions: Permissions
+    subscriptions: dict[str, Subscription]
+    sent: int  # number of messages sent to it
+    acks: bool  # whether its client acks no_drop messages; otherwise it gets them like all others
+
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
+        """Offer a message to its queues."""
+
+    def wake(self) -> None:
+        """Say that the store has something for it."""
+
+    def tell(self, op: str, **fields: Any) -> None:
+        """Tell its client this before any message."""
+
+    def end(self, why: str) -> None:
+        """Close it."""
+
+
+class Hub:
+    """State shared by the connections."""
+
+    def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
+        self.config = config
+        self.clock = clock
+        if config.folder is not None:
+            config.folder.mkdir(parents=True, exist_ok=True)
+        self.audit = Audit(config.folder, config.audit)
+        self.quotas = Quotas(config.limits, clock)
+        self.members: dict[StoredSession, Member] = {}
+        self.store = Store(config, self.audit, self._settled, clock)
+        self.recorder = Recorder.of(config, self.audit)
+        self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
+        self._failed: set[str] = set()
+        self.received = 0
+        self._sent = 0
+        self._dropped = 0
+        self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
+        self.peers: Peers | None = None  # the other relays, if it shares topics with any
+
+    def join(self, member: Member) -> None:
+        """Add a member that has said hello; end any other connection of its session."""
+        other = self.members.get(member.session)
+        if other is not None:
+            self._detach(other)
+            other.end("taken over by another connection")
+        self.members[member.session] = member
+
+    def leave(self, member: Member) -> None:
+        """Remove a member whose connection has ended."""
+        if self.members.get(member.session) is member:
+            self._detach(member)
+            self.store.left(member.session)
+
+    def _detach(self, member: Member) -> None:
+        del self.members[member.session]
+        self._sent += member.sent
+        self._dropped += sum(each.dropped for each in member.subscriptions.values())
+        self._routes.clear()
+
+    def subscribe(self, member: Member, subscription: Subscription) -> None:
+        """Add a subscription; it replaces one with the same id.
+
+        Raises RefusedError: it is durable, and there are too many or the store cannot be written.
+        """
+        self.unsubscribe(member, subscription.id, subscription.pattern.text if subscription.durable else None)
+        member.subscriptions[subscription.id] = subscription
+
+    def unsubscribe(self, member: Member, id: str, durable: str | None = None) -> None:
+        """Remove a subscription if there is one of this id; messages of the pattern ``durable`` are held all the same.
+
+        Raises RefusedError: they cannot be held.
+        """
+        self.store.want(member.session, id, durable)
+        old = member.subscriptions.pop(id, None)
+        self._dropped += old.dropped if old else 0
+        self._routes.clear()
+
+    def is_no_drop(self, topic: str) -> bool:
+        """Whether the topic is lossless."""
+        return _any_whole(self.config.no_drop, topic)
+
+    def publish(self, sender: Member | None, message: wire.Message) -> None:
+        """Offer a message to each subscriber's queue except its sender's."""
+        self._show(message)
+        frame = Outgoing(message)
+        for member, subscription in self._route(message.topic):
+            if member is not sender:
+                member.offer(subscription, frame)
+
+    def _show(self, message: wire.Message) -> None:
+        """Count a message, and show it to the relay's own parts."""
+        self.received += 1
+        for each in self.own:
+            with self.spared(type(each).__name__):
+                each(message)
+
+    @contextmanager
+    def spared(self, part: str) -> Iterator[None]:
+        """Log the first fault of each kind in a part of the relay, without which the rest goes on."""
+        try:
+            yield
+        except Exception as error:
+            fault = f"{part}: {type(error).__name__}"
+            if fault not in self._failed:
+                self._failed.add(fault)
+                self.audit("failed", part=part, why=f"{type(error).__name__}: {error}")
+
+    def _route(self, topic: str) -> list[tuple[Member, Subscription]]:
+        """Find the receivers: each member once, by its first matching subscription."""
+        route = self._routes.get(topic)
+        if route is None:
+            if len(self._routes) >= MAX_ROUTES:
+                self._routes.clear()
+            route = self._routes[topic] = []
+            for member in self.members.values():
+                wanted = next((each for each in member.subscriptions.values() if each.pattern.part(topic)), None)
+                if wanted is not None and member.permissions.allow("receive", topic):
+                    route.append((member, wanted))
+        return route
+
+    def make_room(self, sender: Member, message: wire.Message) -> None:
+        """Make room for a no_drop message's receivers here; raise RefusedError if that cannot be."""
+        if receivers := self._holders(sender, message.topic):
+            self.store.make_room(len(wire.encode(message)), receivers)
+
+    def hold(self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None) -> None:
+        """Keep a no_drop message until its receivers have acked it.
+
+        Args:
+            shared: whether other relays have it too, and may have receivers.
+            taken: number under which it was taken from the sender; None means the message's own.
+
+        Raises RefusedError: it has no receiver, or there is no room.
+        """
+        receivers = self._holders(sender, message.topic)
+        if not receivers and not shared:
+            alone = self.peers is not None and self.peers.state != CONNECTED
+            other = ", and the other relays are out of reach" if alone else ""
+            raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it{other}")
+        frame = wire.encode(message)
+        number = message.seq if taken is None else taken
+        self.store.hold(sender.session, number, message.topic, frame, receivers)
+        self._show(message)
+        for session in receivers:
+            if session in self.members:
+                self.members[session].wake()
+        outgoing = Outgoing(message)
+        for member, subscription in self._route(message.topic):
+            if member is not sender and not member.acks:
+                member.offer(subscription, outgoing)
+
+    def _holders(self, sender: Member, topic: str) -> list[StoredSession]:
+        """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
+        here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
+        away = [
+            each
+            for each in self.store.sessions.values()
+            if each is not sender.session and each not in here
+            if any(pattern(text).part(topic) for text in each.durable.values())
+            if Permissions(self.config.rules, each.identity).allow("receive", topic)
+        ]
+        return here + away
+
+    def _settled(self, message: Settled) -> None:
+        """Tell the sender of a message its outcome."""
+        if message.sender in self.members:
+            about = {"seq": message.seq, "receivers": message.receivers, "lost": message.lost}
+            self.members[message.sender].tell("delivered", **about)
+
+    def status(self) -> dict[str, Any]:
+        """The relay's counts, and how it stands with the other relays."""
+        members = list(self.members.values())
+        subscriptions = [each for member in members for each in member.subscriptions.values()]
+        return {
+            "connections": len(members),
+            "received": self.received,
+            "sent": self._sent + sum(member.sent for member in members),
+            "dropped": self._dropped + sum(each.dropped for each in subscriptions),
+            "refused": self.audit.refused,
+            "held": sum(session.held for session in self.store.sessions.values()),
+            **({} if self.peers is None else {"nats": self.peers.state}),
+        }
+
+    def tick(self) -> None:
+        """Publish the relay's state once a second, and forget what has expired."""
+        payload = json.dumps(self.status()).encode()
+        self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=time.time_ns() // 1000))
+        self.audit.flush()
+        if self.recorder is not None:
+            self.recorder.flush()
+        self.quotas.tidy()
+        for session in self.store.expired(list(self.members)):
+            self.audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
+            self.store.forget(session)
+
+    def close(self) -> None:
+        """Finish the files."""
+        for each in self.own:
+            with self.spared(type(each).__name__):
+                each.close()
+        self.audit.close()
+        self.store.close()
+
+
+@functools.lru_cache(MAX_ROUTES)
+def _any_whole(patterns: tuple[str, ...], topic: str) -> bool:
+    return any(pattern(text).whole(topic) for text in patterns)

@@ -1,0 +1,90 @@
+"""Messages to one client, the most urgent first.
+
+The relay's answers go first, then no_drop messages while fewer than n_T are unacked, then messages from the queues.
+"""
+
+import asyncio
+from collections import deque
+from typing import Final
+
+from websockets.exceptions import WebSocketException
+
+from bufgym_live.relay import wire
+from bufgym_live.relay.caller import Caller
+from bufgym_live.relay.hub import Member, Outgoing
+from bufgym_live.relay.subscriber import next_lane
+from bufgym_live.relay.wire import WireError
+
+MAX_ANSWERS: Final = 4_096  # Limit on unsent answers; a client that asks on without reading is closed
+
+
+class Outbox:
+    """The only task that writes to a connection."""
+
+    def __init__(self, caller: Caller, member: Member, form: str, received: int) -> None:
+        """``form`` says how its messages are written; the client has no_drop messages up to ``received``."""
+        self._hub, self._caller, self._socket = caller.hub, caller, caller.socket
+        self._awake = asyncio.Event()
+        self._member, self._form = member, form
+        self._sent_number = received
+        self._in_flight: deque[int] = deque()
+
+    def wake(self) -> None:
+        """Look for something to send."""
+        self._awake.set()
+
+    def acked(self, number: int) -> None:
+        """Note that the client has processed all no_drop messages up to this number."""
+        if number > self._sent_number:
+            raise WireError(f"ack of {number}: must be at most {self._sent_number}, the last sent")
+        while self._in_flight and self._in_flight[0] <= number:
+            self._in_flight.popleft()
+        self._awake.set()
+
+    async def run(self) -> None:
+        """Send messages one after the other."""
+        try:
+            while True:
+                await self._awake.wait()
+                self._awake.clear()
+                while await self.one():
+                    pass
+        except WebSocketException:
+            pass  # the reader sees it too
+        except Exception:
+            self._socket.transport.abort()
+            raise
+
+    async def one(self) -> bool:
+        """Send the next message; return whether there was one."""
+        await self._caller.send_answers()
+        member = self._member
+        if self._sent_number < member.session.numbered and await self._no_drop(member):
+            return True
+        now_s = self._hub.clock()
+        lane = next_lane(list(member.subscriptions.values()), now_s)
+        item = None if lane is None else lane.take(now_s)
+        if lane is None or item is None:
+            return False
+        await self._send(item.message)
+        lane.gone()
+        return True
+
+    async def _no_drop(self, member: Member) -> bool:
+        """Send the next no_drop message, if the window has room and there is one."""
+        if len(self._in_flight) >= self._hub.config.store.window:
+            return False
+        waiting = self._hub.store.next(member.session, self._sent_number)
+        if waiting is None:
+            return False
+        self._sent_number, topic, frame = waiting
+        if member.permissions.allow("receive", topic):
+            self._in_flight.append(self._sent_number)
+            await self._send(Outgoing(wire.decode(frame, len(frame))._replace(seq=self._sent_number)))
+        else:
+            self._hub.store.denied(member.session, self._sent_number)
+        return True
+
+    async def _send(self, frame: Outgoing) -> None:
+        await self._socket.send(frame.form(self._form))
+        self._member.sent += 1

@@ -1,0 +1,215 @@
+"""Relays that share topics over NATS, so that robots at one of them reach viewers at another.
+
+A message published at one relay goes through a queue to all others, and from there to clients that *their* rules allow.
+Rules with ``nats = true`` say which topics a relay gives to the others, and which it takes from them.
+
+A no_drop message goes into a JetStream stream before it is acked. Each relay takes it from there and holds it for its
+own receivers. NATS keeps it until every relay has taken it, also one that is away.
+"""
+
+import asyncio
+import hashlib
+import math
+import re
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any, Final
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.relay import policies, protocol, wire
+from bufgym_live.relay.backoff import Backoff
+from bufgym_live.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
+from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats
+from bufgym_live.relay.hub import CONNECTED, Hub, Outgoing
+from bufgym_live.relay.patterns import pattern
+from bufgym_live.relay.rules import NATS, Permissions
+from bufgym_live.relay.store import StoredSession
+from bufgym_live.relay.subscriber import Subscription, next_lane
+from bufgym_live.robot.tasks import Tasks, until_one_ends
+
+_RETRY_S: Final = 1.0
+_MINUTE_S: Final = 60.0
+_MOST_RELAYS: Final = 1_000
+_MAX_FRAME_BYTES: Final = 2**26
+
+
+class Delays:
+    """Delays of another relay's messages beyond the least of the last minutes. Two clocks never agree."""
+
+    def __init__(self) -> None:
+        self._since_s, self._before_s, self._least_s = -math.inf, math.inf, math.inf
+
+    def extra_s(self, delay_s: float, now_s: float) -> float:
+        """Take a message's delay by two clocks; give what exceeds the usual."""
+        if now_s - self._since_s > _MINUTE_S:
+            self._since_s, self._before_s, self._least_s = now_s, self._least_s, math.inf
+        self._least_s = min(self._least_s, delay_s)
+        return delay_s - min(self._before_s, self._least_s)
+
+
+class Peers:
+    """All other relays as one ``hub.Member``; it has no subscription while NATS is away."""
+
+    acks = False
+
+    def __init__(self, hub: Hub, settings: Nats) -> None:
+        self._hub, self._settings, self._options = hub, settings, options(settings)
+        self.session: StoredSession = hub.store.open("nats", NATS, False, 0, 0)
+        self.permissions = Permissions(hub.config.rules, NATS)
+        self.subscriptions: dict[str, Subscription] = {}
+        self.sent = 0
+        self.state = "connecting"
+        """``CONNECTED``, or why there is no connection."""
+        self._bus: Bus | None = None
+        self._known: set[str] = set()
+        self._delays: defaultdict[str, Delays] = defaultdict(Delays)
+        self._awake = asyncio.Event()
+        self._tasks = Tasks()
+
+    async def start(self) -> None:
+        """Begin to share. Without NATS the relay goes on alone, and tries again until NATS is there.
+
+        Raises BufgymError: NATS does not let this relay in, or another relay has its name.
+        """
+        policy = await asyncio.to_thread(policies.warm, self._hub.config.policies[0])
+        self._hub.join(self)
+        tried: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._tasks.begin(self._run(policy, tried))
+        await tried
+
+    async def _run(self, policy: Any, tried: asyncio.Future[None]) -> None:
+        """Connect, and again whenever the connection ends; say by ``tried`` how the first try ended."""
+        backoff = Backoff()
+        while True:
+            bus = Bus(self._settings, self._hub.config.store, self._note)
+            try:
+                await bus.open(self._options, self._heard, self._known)
+                self._bus = bus
+                backoff.connected()
+                self._hub.subscribe(self, Subscription("all", pattern(""), policy, DEFAULT_CAPACITY))
+                self._becomes(CONNECTED)
+                if not tried.done():
+                    tried.set_result(None)
+                await until_one_ends(self._send_all(bus), self._take_all(bus), bus.watch(self._known))
+            except Exception as error:  # whatever it is, the relay goes on alone
+                fault = bus.fault(error)
+                self._becomes(str(fault))
+            finally:
+                self._bus = None
+                self._hub.unsubscribe(self, "all")
+                await bus.close()
+            if not tried.done():
+                if isinstance(fault, BufgymError):
+                    tried.set_exception(fault)
+                    return
+                tried.set_result(None)
+            await asyncio.sleep(backoff.delay_s())
+
+    def _becomes(self, state: str) -> None:
+        if state != self.state:
+            self.state = state
+            self._hub.audit("nats", state=state)
+
+    async def close(self) -> None:
+        """Leave the others."""
+        await self._tasks.end()
+        self._hub.leave(self)
+
+    def _note(self, why: object) -> None:
+        self._hub.audit.repeated(what="nats", code="wrong", why=str(why))
+
+    def _goes(self, verb: Any, topic: str) -> bool:
+        return not topic.startswith(f"/{wire.OWN}/") and self.permissions.allow(verb, topic)
+
+    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
+        """Offer a message of this relay."""
+        if not frame.message.no_drop and self._goes("receive", frame.message.topic):
+            subscription.offer(frame.message.topic, (frame, time.time_ns() // 1000), frame.size_bytes)
+            self._awake.set()
+
+    async def _send_all(self, bus: Bus) -> None:
+        """Send one message after the other, so that little waits outside the queue."""
+        while True:
+            await self._awake.wait()
+            self._awake.clear()
+            while (lane := next_lane(list(self.subscriptions.values()), self._hub.clock())) is not None:
+                item = lane.take(self._hub.clock())
+                if item is not None:
+                    frame, put_us = item.message
+                    headers = {"Relay": self._settings.name, "Put": str(put_us)}
+                    try:
+                        await bus.publish(frame.message.topic, frame.binary, headers)
+                        self.sent += 1
+                    except wire.RefusedError as refused:
+                        self._note(refused)
+                lane.gone()
+
+    async def _heard(self, heard: Any) -> None:
+        headers = heard.headers or {}
+        relay, put = headers.get("Relay", ""), headers.get("Put", "")
+        if not (relay and re.fullmatch("[0-9]{1,17}", put)):
+            return self._note(f"{MESSAGE}: a message without the headers Relay and Put")
+        if len(self._delays) > _MOST_RELAYS:
+            self._delays.clear()
+        delay_s = time.time() - int(put) / 1e6
+        if self._delays[relay].extra_s(delay_s, self._hub.clock()) > self._settings.late_s:
+            return self._note(f"relay {relay}: a message later than late_s = {self._settings.late_s:g}")
+        message = self._read(heard)
+        if message is not None and not self._hub.is_no_drop(message.topic):
+            self._hub.publish(self, message._replace(no_drop=False))
+
+    def _read(self, heard: Any) -> wire.Message | None:
+        """Decode a message of another relay; None if it is none, or may not come in."""
+        try:
+            message = wire.decode(heard.data, _MAX_FRAME_BYTES)
+            protocol.check_json(message)
+        except BufgymError as error:
+            self._note(error)
+            return None
+        return message if self._goes("send", message.topic) else None
+
+    async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
+        """Give a no_drop message to the other relays.
+
+        Return whether they may have it, None if NATS does not say whether it has it. Without NATS, they have not.
+
+        Raises RefusedError: NATS does not take it.
+        """
+        if self._bus is None or not self._goes("receive", message.topic):
+            return False
+        frame = wire.encode(message)
+        origin = f"{self._settings.name}\n{sender.identity.key}\n{sender.name}\n".encode()
+        id = hashlib.blake2b(origin + frame, digest_size=16).hexdigest()  # the same when it is sent again
+        headers = {"Nats-Msg-Id": id, "Relay": self._settings.name}
+        return await self._bus.hold(message.topic, frame, headers) or None
+
+    async def _take_all(self, bus: Bus) -> None:
+        while True:
+            await self._take(await bus.next())
+
+    async def _take(self, heard: Any) -> None:
+        """Hold a no_drop message of another relay for the receivers here; if there is no room, try again later."""
+        headers: Mapping[str, str] = heard.headers or {}
+        id, relay = headers.get("Nats-Msg-Id", ""), headers.get("Relay", "")
+        if not (id and relay):
+            self._note(f"{HOLD}: a message without the headers Nats-Msg-Id and Relay")
+            await heard.term()
+            return
+        number = int(hashlib.blake2b(id.encode(errors="replace"), digest_size=6).hexdigest(), 16)
+        message = None if relay == self._settings.name else self._read(heard)
+        if message is not None and self._hub.is_no_drop(message.topic) and number != self.session.received:
+            try:
+                self._hub.hold(self, message, taken=number)
+            except wire.RefusedError as refused:
+                if refused.code != "no_receiver":
+                    self._note(refused)
+                    if heard.metadata.num_delivered < TRIES:
+                        await heard.nak(delay=_RETRY_S)
+                        return
+        await heard.ack()
+
+    def _ignore(self, *words: Any, **fields: Any) -> None:
+        """Do nothing: the others are told nothing, no message is held for them, and they end with the relay."""
+
+    wake = tell = end = _ignore

@@ -1,0 +1,100 @@
+"""Limits of one identity over all its connections."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+from bufgym_live.relay.config import Limits
+from bufgym_live.relay.wire import RefusedError
+
+
+class Bucket:
+    """A token bucket that fills at ``rate`` a second and holds a second's worth."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = self._left = rate
+        self._at_s: float | None = None
+
+    def take(self, amount: float, now_s: float) -> bool:
+        """Take ``amount`` and return True if enough was left; a full bucket allows any amount."""
+        if self._at_s is not None:
+            self._left = min(self._rate, self._left + max(0.0, now_s - self._at_s) * self._rate)
+        self._at_s = now_s
+        if self._left < min(amount, self._rate):
+            return False
+        self._left -= amount
+        return True
+
+
+class Quota:
+    """Use that one identity has made of its limits."""
+
+    def __init__(self, limits: Limits, idle_since_s: float) -> None:
+        self.limits, self.idle_since_s = limits, idle_since_s
+        self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
+        self.json = Bucket(limits.json_bytes_per_s)
+        self.topics: set[str] = set()
+        self.connections: list[Mapping[str, object]] = []  # the subscriptions of each of its connections, by id
+
+    def message(self, size_bytes: int, now_s: float) -> None:
+        """Count a published message.
+
+        Raises RefusedError: beyond a limit, as do all methods here.
+        """
+        if not (self.messages.take(1, now_s) and self.bytes.take(size_bytes, now_s)):
+            most = f"{self.limits.messages_per_s} messages and {self.limits.bytes_per_s} bytes a second"
+            raise RefusedError("too_fast", f"must be at most {most}")
+
+    def topic(self, topic: str) -> None:
+        """Count a topic that it publishes on."""
+        if topic not in self.topics:
+            if len(self.topics) >= self.limits.topics:
+                raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
+            self.topics.add(topic)
+
+    def subscribe(self, id: str, before: Mapping[str, object]) -> None:
+        """Check that a connection with these subscriptions may have one of this id."""
+        if id not in before and sum(map(len, self.connections)) >= self.limits.subscriptions:
+            raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
+
+
+KEPT_S = 60.0  # Time for which a quota outlives its last connection, so that reconnecting does not reset it
+MAX_QUOTAS = 100_000
+
+
+class Quotas:
+    """Quotas of all identities."""
+
+    def __init__(self, limits: Limits, clock: Callable[[], float]) -> None:
+        self._limits, self._clock = limits, clock
+        self._quotas: dict[str, Quota] = {}
+
+    def of(self, key: str) -> Quota:
+        """Find the quota of an identity."""
+        if key not in self._quotas:
+            if len(self._quotas) >= MAX_QUOTAS:
+                self.tidy(kept_s=0.0)
+            self._quotas[key] = Quota(self._limits, self._clock())
+        return self._quotas[key]
+
+    @contextmanager
+    def connection(self, key: str, subscriptions: Mapping[str, object]) -> Iterator[Quota]:
+        """Count a connection of an identity, with whatever subscriptions it gets, until the block ends.
+
+        Raises RefusedError: too many.
+        """
+        quota = self.of(key)
+        if len(quota.connections) >= self._limits.connections:
+            raise RefusedError("too_many", f"must be at most {self._limits.connections} connections")
+        quota.connections.append(subscriptions)
+        try:
+            yield quota
+        finally:
+            quota.connections = [each for each in quota.connections if each is not subscriptions]
+            quota.idle_since_s = self._clock()
+
+    def tidy(self, kept_s: float = KEPT_S) -> None:
+        """Forget quotas that have not been used for ``kept_s``."""
+        now_s = self._clock()
+        for key, quota in list(self._quotas.items()):
+            if not quota.connections and now_s - quota.idle_since_s >= kept_s:
+                del self._quotas[key]

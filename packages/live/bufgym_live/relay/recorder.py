@@ -1,0 +1,103 @@
+"""Recorder of the messages that its rules allow, in MCAP files that ``bufgym bench --workload`` reads."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from bufgym_live.relay import ros_messages, wire
+from bufgym_live.relay.audit import Audit
+from bufgym_live.relay.config import Config, Rotation
+from bufgym_live.relay.rules import RECORDER, Permissions
+from bufgym_live.robot.mcap_file import McapFile
+
+FOLDER: Final = "recordings"
+PAUSE_S: Final = 10.0
+SCHEMAS: Final = {"json": "jsonschema", "cdr": "ros2msg", "ros1": "ros1msg"}
+"""Encoding -> format of its schemas in MCAP."""
+
+
+class Recorder:
+    """Writes each message that it may receive; after ``rotation.bytes`` it begins the next file.
+
+    A message that needs one channel too many (``robot.mcap_file``) is left out, which the audit log says once a file.
+    If the disk takes nothing, the recorder pauses for ``PAUSE_S`` and then begins the next file.
+    """
+
+    def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Audit) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self._rotation, self._permissions, self._audit = rotation, permissions, audit
+        self._file: McapFile | None = None
+        self._full = False  # whether it was said of this file
+        self._again_s = 0.0  # end of the pause after a failure, 0 if there was none
+
+    @classmethod
+    def of(cls, config: Config, audit: Audit) -> Recorder | None:
+        """Make the recorder if the relay has a folder and a rule that lets it record."""
+        permissions = Permissions(config.rules, RECORDER)
+        if config.folder is None or not permissions.rules:
+            return None
+        return cls(config.folder / FOLDER, config.recording, permissions, audit)
+
+    def __call__(self, message: wire.Message) -> None:
+        """Write a message if a rule allows it."""
+        if not self._permissions.allow("receive", message.topic) or time.monotonic() < self._again_s:
+            return
+        try:
+            self._write(message)
+        except OSError as error:
+            self._failed(error)
+            return
+        if self._again_s:
+            self._again_s = 0.0
+            self._audit("recording_resumed")
+
+    def _write(self, message: wire.Message) -> None:
+        if self._file is not None and self._file.file.tell() + len(message.payload) > self._rotation.bytes:
+            self.close()
+        if self._file is None:
+            self._file = self._next()
+        times_ns, encoding = (time.time_ns(), max(0, message.stamp_us) * 1000), message.encoding
+        schema = message.type or ("object" if encoding == "json" else "")
+        form: dict[str, Any] = {"encoding": encoding, "schema": schema, "schema_encoding": SCHEMAS.get(encoding, "")}
+        form["definition"] = ros_messages.definition(schema, encoding)
+        written = self._file.write(message.topic, bytes(message.payload), *times_ns, seq=message.seq, **form)
+        if not (written or self._full):
+            self._full = True
+            self._audit("recording_full", file=self._file.path.name, topic=message.topic, sender=message.sender)
+
+    def _next(self) -> McapFile:
+        """Begin the next file and delete the oldest."""
+        files = sorted(self.folder.glob("*.mcap"))
+        for path in files[: max(0, len(files) + 1 - self._rotation.files)]:
+            path.unlink()
+        now_s, now_ns = divmod(time.time_ns(), 10**9)  # a single clock reading keeps names in the order of the files
+        return McapFile(self.folder / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now_s))}-{now_ns:09}.mcap", "xb")
+
+    def flush(self) -> None:
+        """Flush the file."""
+        try:
+            if self._file is not None:
+                self._file.flush()
+        except OSError as error:
+            self._failed(error)
+
+    def _failed(self, error: OSError) -> None:
+        """Give the file up with its messages, and pause."""
+        if not self._again_s:
+            self._audit("recording_failed", why=error.strerror or str(error), pause_s=PAUSE_S)
+        self._again_s = time.monotonic() + PAUSE_S
+        file, self._file, self._full = self._file, None, False
+        if file is not None:
+            file.abandon()
+
+    def close(self) -> None:
+        """Finish the file."""
+        file, self._file, self._full = self._file, None, False
+        if file is not None:
+            try:
+                file.close()
+            except OSError:
+                file.abandon()  # it can be read as far as it goes

@@ -1,0 +1,153 @@
+"""A robot at a relay: it publishes its source's messages and its queue's state, and takes commands.
+
+A robot's topics lie under ``/robots/NAME/``. Besides its source's topics it publishes ``queue`` five times a second and
+``status`` once a second, with battery, location, network, queue and the list of topics. The command ``{"command":
+"policy", "policy": "afr"}`` on its topic ``command`` changes its queue's policy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
+from typing import Any, Final, Protocol
+
+from bufgym.ground.errors import BufgymError
+from bufgym.model.qoi import Value
+from bufgym.model.topics import Topic
+from bufgym.policies.registry import Policy, get
+from bufgym.scenario import Stream
+from bufgym_live.relay import wire
+from bufgym_live.relay.client import RobotClient
+from bufgym_live.relay.monitor import Monitor
+from bufgym_live.relay.place import Place
+from bufgym_live.robot.tasks import until_one_ends
+
+STATUS_S: Final = 1.0
+QUEUE_S: Final = 0.2
+POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "learned-scheduler")
+"""Policies that a viewer may choose by default."""
+_RATES_HZ: Final = {"status": 1 / STATUS_S, "queue": 1 / QUEUE_S}
+_OWN: Final = tuple(Stream(Topic(name, priority=20.0, weight=0.0), hz, 1000) for name, hz in _RATES_HZ.items())
+
+
+class Source(Protocol):
+    """Source of a robot's messages: the made-up robot, a recording, ROS, or any program."""
+
+    @property
+    def streams(self) -> Sequence[Stream]:
+        """Its topics, with the rules for each."""
+
+    async def run(self, robot: Robot) -> None:
+        """Publish with ``robot.publish`` until there is no more."""
+
+    def status(self) -> dict[str, Any]:
+        """Return ``battery``, from 0 to 1, and ``location``, as far as they are known."""
+
+    async def on_command(self, command: Any) -> None:
+        """Take a command that is not the robot's own."""
+
+
+class Robot:
+    """One robot's connection. See the module's text."""
+
+    def __init__(
+        self,
+        url: str,
+        name: str,
+        source: Source,
+        *,
+        policy: str | Policy = "robofleet",
+        value: Value | None = None,
+        policies: Sequence[str] = POLICIES,
+        odometry: str | None = None,
+        **session: Any,
+    ) -> None:
+        """Arguments as for ``RobotClient``; a command may choose one of ``policies``.
+
+        ``odometry`` names the source's topic that says where the robot is and gives x, as
+        ``bufgym_live.relay.place`` says.
+        """
+        if not name or "/" in name:
+            raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
+        self.name, self.source = name, source
+        streams = [*source.streams]
+        streams += [own for own in _OWN if own.topic.name not in {stream.topic.name for stream in streams}]
+        self._streams = {stream.topic.name: stream for stream in streams}
+        topics = [replace(stream.topic, name=self.topic(stream.topic.name)) for stream in streams]
+        self.monitor = Monitor([stream.topic for stream in streams], value)
+        self._policies = tuple(dict.fromkeys([get(policy).name, *policies]))
+        self._kinds: dict[str, dict[str, str]] = {}
+        self.place = Place(odometry)
+        self._began_s = time.monotonic()
+        settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
+        self.client = RobotClient(url, name, **settings)
+        self.client.subscribe(f"^{self.topic('command')}$", self._command)
+
+    def topic(self, name: str) -> str:
+        """Put the robot's prefix before a topic's name."""
+        return f"/robots/{self.name}/{name.lstrip('/')}"
+
+    def publish(self, topic: str, payload: bytes, encoding: str, type: str = "", stamp_us: int | None = None) -> None:
+        """Put a message of the source's topic into the queue, from any thread."""
+        stream = self._streams[topic]
+        self._kinds[topic] = {"type": type, "encoding": encoding}
+        self.place.take(topic, payload, type, encoding)
+        x = self.place.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
+        self.client.publish(self.topic(topic), payload, encoding, type, x, stamp_us)
+
+    def say(self, topic: str, data: Any) -> None:
+        """Publish ``data`` as JSON."""
+        self.publish(topic, json.dumps(data, separators=(",", ":"), allow_nan=False).encode(), "json")
+
+    def status(self) -> dict[str, Any]:
+        """Return the robot's state."""
+        queue = self.monitor.state()
+        round_trip_s = self.client.round_trip_s
+        return {
+            "battery": None,
+            "location": self.place.location,
+            "network": {
+                "rate_bps": queue["rate_bps"],
+                "rtt_ms": None if round_trip_s is None else round(1000 * round_trip_s, 1),
+            },
+            "queue": queue,
+            "publishes": self._kinds,
+            "policies": self._policies,
+            **self.source.status(),
+        }
+
+    async def run(self) -> None:
+        """Run until the source has no more, or until cancelled."""
+
+        async def status() -> None:
+            self.say("status", self.status())
+
+        async def queue() -> None:
+            self.say("queue", self.monitor.state())
+
+        own = [(STATUS_S, status), (STATUS_S, self.client.ping), (QUEUE_S, queue)]
+        every = [self._every(period_s, work) for period_s, work in own]
+        await until_one_ends(self.source.run(self), self.client.run(), *every)
+
+    async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
+        await self.client.connected.wait()
+        loop = asyncio.get_running_loop()
+        next_s = loop.time()
+        while True:
+            await work()
+            next_s = max(next_s + period_s, loop.time())
+            await asyncio.sleep(next_s - loop.time())
+
+    async def _command(self, message: wire.Message) -> None:
+        try:
+            command = json.loads(bytes(message.payload))
+        except ValueError:
+            return  # a sender's mistake is no reason for a robot to stop
+        if isinstance(command, dict) and command.get("command") == "policy":
+            if command.get("policy") in self._policies:
+                await asyncio.to_thread(self.client.change, command["policy"])
+        else:
+            await self.source.on_command(command)

@@ -1,0 +1,138 @@
+"""A robot's own ROS as a source: topics of ROS 1 or ROS 2 go to the relay, and messages come back from it.
+
+A message that others publish on ``/robots/NAME/to/TOPIC``, in CDR and with its type, is published on ``/TOPIC`` here if
+the robot was told to receive that topic.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, Final
+
+from bufgym.scenario import Stream
+from bufgym_live.relay import ros_messages, wire
+from bufgym_live.relay.robot import Robot
+from bufgym_live.robot.ros1 import needs_rospy
+from bufgym_live.robot.ros2.names import Published
+from bufgym_live.robot.ros2.relay import look, matched, own_node, resolved, spinning
+
+NODE: Final = "bufgym_robot"
+Outlet = Callable[[bytes], None]
+"""Publishes a message in CDR here."""
+
+
+class _RosSource:
+    """Code shared by both versions of ROS."""
+
+    def __init__(self, streams: Sequence[Stream], receive: Sequence[str] = ()) -> None:
+        """``receive`` lists topics to publish here."""
+        self.streams = tuple(streams)
+        self._names = {resolved(stream.topic.name): stream.topic.name for stream in streams}
+        self._receive = tuple(map(resolved, receive))
+
+    def _wanted(self, robot: Robot) -> list[str]:
+        """Its topics, and the one that is named as the robot's odometry, which need not be one of them."""
+        odometry = robot.place.topic
+        return sorted({*self._names, *([resolved(odometry)] if odometry else [])})
+
+    def _take(self, robot: Robot, name: str, payload: bytes, encoding: str, type: str) -> None:
+        """Publish a message of this ROS at the relay, from any thread."""
+        if name in self._names:
+            robot.publish(self._names[name], payload, encoding, type)
+        else:
+            robot.place.take(name, payload, type, encoding)
+
+    def _listen(self, robot: Robot, advertise: Callable[[Published], Awaitable[Outlet]]) -> None:
+        """Publish messages for the topics that this robot receives; note messages that fail."""
+        before = robot.topic("to")
+        outlets: dict[Published, Outlet] = {}
+
+        async def take(message: wire.Message) -> None:
+            name = message.topic.removeprefix(before)
+            if name not in self._receive or message.encoding != "cdr":
+                return
+            try:
+                topic = Published(name, message.type)
+                if topic not in outlets:
+                    outlets[topic] = await advertise(topic)
+                outlets[topic](bytes(message.payload))
+            except Exception as error:  # messages are untrusted, and ROS has its own error types
+                robot.client.note(f"{message.topic}: not published: {error}")
+
+        if self._receive:
+            robot.client.subscribe(f"^{before}/", take)
+
+    def status(self) -> dict[str, Any]:
+        """Return nothing, because ROS has no standard topic for a battery."""
+        return {}
+
+    async def on_command(self, command: Any) -> None:
+        """Ignore the command, because ROS takes commands on topics."""
+
+
+class Ros2(_RosSource):
+    """Topics of ROS 2 (rclpy)."""
+
+    async def run(self, robot: Robot) -> None:
+        with own_node(NODE) as here:
+            from rclpy.serialization import deserialize_message
+
+            async def advertise(topic: Published) -> Outlet:
+                publisher = here.create_publisher(topic.message_class, topic.name, topic.qos)
+                await matched(publisher.get_subscription_count)
+
+                def publish(payload: bytes) -> None:
+                    deserialize_message(payload, topic.message_class)  # nodes would meet what is broken
+                    publisher.publish(payload)
+
+                return publish
+
+            def subscribe(topic: Published) -> list[Any]:
+                def take(payload: bytes) -> None:
+                    self._take(robot, topic.name, payload, "cdr", topic.type)
+
+                return [here.create_subscription(topic.message_class, topic.name, take, topic.qos, raw=True)]
+
+            self._listen(robot, advertise)
+            async with spinning(here):
+                await look(here, self._wanted(robot), subscribe, NODE, robot.client.note)
+
+
+class Ros1(_RosSource):
+    """Topics of ROS 1 (rospy)."""
+
+    async def run(self, robot: Robot) -> None:
+        with needs_rospy():
+            import rospy
+        rospy.init_node(NODE, anonymous=True, disable_signals=True)
+
+        async def advertise(topic: Published) -> Outlet:
+            publisher = rospy.Publisher(topic.name, topic.message_class, queue_size=10)
+            await matched(publisher.get_num_connections)
+
+            def publish(payload: bytes) -> None:
+                sent = rospy.AnyMsg()
+                sent._buff = ros_messages.as_ros1(payload, topic.type)
+                publisher.publish(sent)
+
+            return publish
+
+        self._listen(robot, advertise)
+        subscribers = [rospy.Subscriber(name, rospy.AnyMsg, self._taker(robot, name)) for name in self._wanted(robot)]
+        try:
+            await asyncio.Event().wait()
+        finally:
+            for subscriber in subscribers:
+                subscriber.unregister()
+            rospy.signal_shutdown("the robot ends")
+
+    def _taker(self, robot: Robot, name: str) -> Callable[[Any], None]:
+        def take(message: Any) -> None:
+            package, _, kind = message._connection_header["type"].partition("/")
+            type = f"{package}/msg/{kind}"
+            encoding, payload = ros_messages.modern(message._buff, type, "ros1")
+            self._take(robot, name, payload, encoding, type)
+
+        return take
+
+
+SOURCES: Final = {"1": Ros1, "2": Ros2}  # Version of ROS -> its source

@@ -1,0 +1,96 @@
+"""Permissions by Robofleet's Algorithm 3: whatever no rule allows is denied.
+
+for each rule of the identity, by address, address range or e-mail: if the rule allows the verb, and its pattern matches
+    the whole topic: allowed
+denied
+"""
+
+import ipaddress
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from bufgym_live.relay.config import Rule
+from bufgym_live.relay.patterns import pattern
+from bufgym_live.relay.wire import RefusedError
+
+Verb = Literal["send", "receive"]
+_REMEMBERED: Final = 4_096  # answers cached for one identity
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Proven identity of the other end of a connection."""
+
+    address: str = ""
+    email: str = ""  # E-mail of a verified token or certificate
+    own: str = ""  # the relay's own part, as in ``Rule.own``
+    until_s: float = math.inf  # end of its token, s since 1970
+
+    @property
+    def key(self) -> str:
+        """Key under which limits are counted."""
+        return f"<{self.email.lower()}>" if self.email else self.address  # no address reads so
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields that others may see."""
+        return {"address": self.address, "email": self.email}
+
+
+RECORDER, FOXGLOVE = Identity(own="recorder"), Identity(own="foxglove")
+NATS = Identity(email="\0nats", own="nats")
+"""The other relays. No client can prove an e-mail with a character that does not print."""
+
+
+def plain_address(text: str) -> str:
+    """Normalize an address for rules: unwrap IPv4 in IPv6, as in ``::ffff:10.0.0.1``, and strip a scope."""
+    address = ipaddress.ip_address(text.partition("%")[0])
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return str(mapped or address)
+
+
+def means(rule: Rule, identity: Identity) -> bool:
+    """Whether the rule is for this identity."""
+    if rule.own or identity.own:
+        return rule.own == identity.own
+    if rule.email:
+        return rule.email.lower() == identity.email.lower()
+    return ipaddress.ip_address(identity.address) in ipaddress.ip_network(rule.address)
+
+
+class Permissions:
+    """Permissions of one identity."""
+
+    def __init__(self, rules: Sequence[Rule], identity: Identity) -> None:
+        self.rules = tuple(rule for rule in rules if means(rule, identity))
+        self._answers: dict[tuple[Verb, str], bool] = {}
+
+    def allow(self, verb: Verb, topic: str) -> bool:
+        """Whether a rule allows this on the topic."""
+        answer = self._answers.get((verb, topic))
+        if answer is None:
+            answer = any(getattr(rule, verb) and pattern(rule.topic).whole(topic) for rule in self.rules)
+            if len(self._answers) >= _REMEMBERED:
+                self._answers.clear()
+            self._answers[verb, topic] = answer
+        return answer
+
+    @property
+    def receives(self) -> bool:
+        """Whether a rule allows to receive anything."""
+        return any(rule.receive for rule in self.rules)
+
+    def check_subscription(self, text: str) -> None:
+        """Ask the rules before a subscription (Algorithm 3, line 9); each message is asked for again.
+
+        A pattern of one whole topic, ``^/a/b$``, needs a rule for it. Others need a rule that lets receive anything.
+
+        Raises RefusedError: there is none.
+        """
+        topic = text[1:-1]
+        if text == f"^{topic}$" and not set(topic) & set(r".^$*+?{}[]\|()"):
+            if not self.allow("receive", topic):
+                raise RefusedError("unauthorized", f"topic {topic}: no rule allows to receive it")
+        elif not self.receives:
+            raise RefusedError("unauthorized", "no rule allows to receive anything")

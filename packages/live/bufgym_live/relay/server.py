@@ -1,0 +1,316 @@
+"""The relay's server: WebSockets and the page on one port, over the library ``websockets``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+from collections import Counter
+from collections.abc import Sequence
+from functools import partial
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Final, cast
+from urllib.parse import urlsplit
+
+from websockets.asyncio.server import Server as WebSocketServer
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import NegotiationError
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import needs
+from bufgym_live.relay import connection, pages, policies, wire
+from bufgym_live.relay.caller import Caller
+from bufgym_live.relay.config import POLICIES, Config
+from bufgym_live.relay.connection import HELLO_BYTES, Connection
+from bufgym_live.relay.hub import CONNECTED, STATUS, Hub
+from bufgym_live.relay.identity import Verifier, server_context
+from bufgym_live.relay.robofleet import RobofleetConnection
+from bufgym_live.relay.rules import Identity, Permissions, plain_address
+from bufgym_live.relay.wire import RefusedError
+from bufgym_live.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
+from bufgym_live.robot.tasks import until_one_ends
+
+if TYPE_CHECKING:
+    from bufgym_live.relay.foxglove import Window
+
+_PING_S: Final = 20.0
+_PONG_S: Final = 60.0  # time for a pong, which on a slow link waits long behind the message being sent
+TICK_S: Final = 1.0  # Time between two ticks, which publish the relay's state and forget what has expired
+_QUIET: Final = logging.getLogger("bufgym.relay.websockets")
+"""Silenced logger; clients' faults go to the audit log, not to tracebacks."""
+_QUIET.setLevel(logging.CRITICAL + 1)
+
+
+def _is_ours(request: Request | None) -> bool:
+    """Whether the client speaks our protocol."""
+    return request is not None and request.path.partition("?")[0] == wire.PATH
+
+
+class Door:
+    """Admission of connections to the handshake."""
+
+    def __init__(self, hub: Hub) -> None:
+        self.hub = hub
+        self.waiting: Counter[str] = Counter()
+        """Address -> its connections that have not said hello."""
+        self.open: set[Accepted] = set()
+
+    def enter(self, one: Accepted) -> None:
+        """Count a new connection.
+
+        Raises RefusedError: too many.
+        """
+        limits = self.hub.config.limits
+        if len(self.open) >= limits.all_connections:
+            raise RefusedError("too_many", f"must be at most {limits.all_connections} connections in all")
+        if self.waiting[one.address] >= limits.connections:
+            raise RefusedError("too_many", f"must be at most {limits.connections} connections that have not said hello")
+        self.open.add(one)
+        self.waiting[one.address] += 1
+
+    def refusal(self, address: str, request: Request) -> RefusedError | None:
+        """Give the reason to deny this request, or None."""
+        config = self.hub.config
+        by_address = Permissions(config.rules, Identity(address)).rules
+        proves_more = config.tokens is not None or (config.tls is not None and config.tls.clients != "")
+        if not by_address and not (proves_more and any(rule.email for rule in config.rules)):
+            return RefusedError("unauthorized", "no rule allows anything to this address")
+        origins = request.headers.get_all("Origin")
+        if "Upgrade" in request.headers and any(not self._is_own(each, request) for each in origins):
+            return RefusedError("unauthorized", f"origin {origins[0]!r}: a page of another server")
+        return None
+
+    def _is_own(self, origin: str, request: Request) -> bool:
+        """Whether the connecting page is ours or named in the configuration.
+
+        Otherwise a page of any server could use the address of its viewer's machine. A foreign name can resolve to our
+        address, so a host counts as our own only if it is an address, localhost or named in the configuration.
+        """
+        if origin in self.hub.config.origins:
+            return True
+        try:
+            parts = urlsplit(origin)
+            host = parts.hostname or ""
+            if host != "localhost":
+                plain_address(host)
+        except ValueError:
+            return False
+        return parts.netloc in request.headers.get_all("Host")
+
+
+class Accepted(ServerConnection):
+    """A TCP connection, from its first byte on."""
+
+    def __init__(self, door: Door, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self._door = door
+        self.address = ""
+        self._waits = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        try:
+            self.address = plain_address(transport.get_extra_info("peername")[0])
+            self._door.enter(self)
+        except (TypeError, IndexError):  # the peer has gone already
+            self.transport.abort()
+            return
+        except RefusedError as refused:
+            self.refused(refused.code, refused)
+            self.transport.abort()
+            return
+        self._waits = True
+        tcp = transport.get_extra_info("socket")
+        with contextlib.suppress(OSError):
+            set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
+            if self._door.hub.config.small_buffers:
+                little_unsent(tcp)
+
+    def greeted(self) -> None:
+        """Note that the client has said hello, or has gone."""
+        if self._waits:
+            self._waits = False
+            self._door.waiting[self.address] -= 1
+            if not self._door.waiting[self.address]:
+                del self._door.waiting[self.address]
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self in self._door.open:
+            self._door.open.remove(self)
+            if self.response is None:
+                fault = self.protocol.handshake_exc
+                self.refused("wrong", f"{type(fault).__name__}: {fault}" if fault else "no whole request in time")
+            self.greeted()
+        super().connection_lost(exc)
+
+    def refused(self, code: str, why: object) -> None:
+        """Log why it was not let in."""
+        self._door.hub.audit.repeated(what="connection", code=code, address=self.address, why=str(why))
+
+
+class Server:
+    """A relay.
+
+    server = Server(config)
+    port = await server.start()
+    await server.close()
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.hub = Hub(config)
+        self._door = Door(self.hub)
+        self._verifier = None if config.tokens is None else Verifier(config.tokens)
+        self._tls = None if config.tls is None else server_context(config.tls)
+        self._server: WebSocketServer | None = None
+        self._ticking: asyncio.Task[None] | None = None
+        self.window: Window | None = None
+        """Foxglove's server, if the configuration has one."""
+
+    async def start(self) -> int:
+        """Listen and return the port; policies are imported and compiled while robots reconnect."""
+        limits = self.config.limits
+        if self.config.nats is not None:
+            from bufgym_live.relay.peers import Peers  # not at start-up: few need it
+
+            self.hub.peers = peers = Peers(self.hub, self.config.nats)
+            await peers.start()
+        if self.config.foxglove is not None:
+            from bufgym_live.relay.foxglove import Window  # not at start-up: few need it
+
+            self.window = Window(self.config.foxglove, self.config)
+            self.hub.own.append(self.window)
+        try:
+            self._server = await serve(
+                self._serve,
+                self.config.host,
+                self.config.port,
+                select_subprotocol=self._subprotocol,
+                process_request=self._request,
+                create_connection=cast(type[Accepted], partial(Accepted, self._door)),  # it is called, no more
+                compression=None,  # pictures are compressed; and a small message may unpack to a large one
+                max_size=HELLO_BYTES,
+                max_queue=2,
+                write_limit=(1, 0),  # a message has left when the system has all of it
+                open_timeout=limits.hello_s,
+                close_timeout=1.0,
+                ping_interval=_PING_S,
+                ping_timeout=_PONG_S,
+                logger=_QUIET,
+                server_header=None,
+                ssl=self._tls,
+                backlog=1_024,
+            )
+        except OSError as error:
+            raise BufgymError(f"{self.config.host}:{self.config.port}: {error.strerror or error}") from None
+        self._warming = asyncio.create_task(asyncio.to_thread(self._warm))
+        self._ticking = asyncio.create_task(self._tick())
+        self.hub.audit("started", host=self.config.host, port=self.port)
+        return self.port
+
+    @property
+    def port(self) -> int:
+        """Port on which it listens."""
+        assert self._server is not None
+        return int(next(iter(self._server.sockets)).getsockname()[1])
+
+    def _warm(self) -> None:
+        for name in self.config.policies:
+            if name not in POLICIES:
+                policies.policy(name)  # raises an error if there is none
+        policies.warm(self.config.policies[0])
+
+    async def warm(self) -> None:
+        """Wait until the first policy is compiled.
+
+        Raises BufgymError: the configuration names an unknown policy.
+        """
+        await asyncio.shield(self._warming)
+
+    async def close(self) -> None:
+        """Close all connections; held messages stay on disk."""
+        if self._ticking is not None:
+            self._ticking.cancel()
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+        if self.hub.peers is not None:
+            await self.hub.peers.close()
+        self.hub.close()
+        if self._server is not None:
+            await asyncio.wait([self._warming])  # after the files: a first compilation takes long
+
+    async def _serve(self, socket: ServerConnection) -> None:
+        assert isinstance(socket, Accepted)
+        ours = _is_ours(socket.request)
+        caller = Caller(self.hub, socket, self._verifier, listens=ours)
+        await connection.serve(Connection if ours else RobofleetConnection, caller, socket.greeted)
+
+    def _subprotocol(self, socket: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+        if not _is_ours(socket.request):
+            return None
+        if wire.SUBPROTOCOL not in offered:
+            raise NegotiationError(f"must offer the subprotocol {wire.SUBPROTOCOL}")
+        return Subprotocol(wire.SUBPROTOCOL)
+
+    def _request(self, socket: ServerConnection, request: Request) -> Response | None:
+        """Deny a request, answer it with a page, or let it become a WebSocket."""
+        assert isinstance(socket, Accepted)
+        refused = self._door.refusal(socket.address, request)
+        if refused is not None:
+            socket.refused(refused.code, refused)
+            return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")
+        if _is_ours(request) or (self.config.robofleet and "Upgrade" in request.headers):
+            return None
+        match request.path.partition("?")[0]:
+            case "/healthz":
+                if self._ticking is None or self._ticking.done():
+                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n")
+                return pages.response(HTTPStatus.OK, "ok\n")
+            case "/metrics":
+                return self._metrics(socket.address)
+        return pages.answer(request.path)
+
+    def _metrics(self, address: str) -> Response:
+        if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):
+            return pages.response(HTTPStatus.FORBIDDEN, f"no rule lets this address receive {STATUS}\n")
+        with needs("prometheus_client", "bufgym-live[relay]"):
+            from bufgym_live.relay import metrics  # not at start-up: few need it
+
+        counts = metrics.text(self.hub.status(), self.hub.audit.refusals)
+        return pages.response(HTTPStatus.OK, counts, metrics.CONTENT_TYPE)
+
+    async def _tick(self) -> None:
+        while True:
+            await asyncio.sleep(TICK_S)
+            with self.hub.spared("tick"):
+                self.hub.tick()
+
+
+async def serve_forever(config: Config, say: Any = print) -> None:
+    """Run a relay until cancelled, or until the process gets SIGTERM."""
+    server = Server(config)
+    port = await server.start()
+    scheme = "http" if config.tls is None else "https"
+    say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
+    if server.hub.peers is not None and server.hub.peers.state != CONNECTED:
+        say(f"{server.hub.peers.state}; goes on without the other relays until NATS is there")
+    if server.window is not None:
+        say(f"ws://{server.window.address}: Foxglove, Lichtblick")
+    told = asyncio.Event()
+    with contextlib.suppress(
+        NotImplementedError, RuntimeError, ValueError
+    ):  # Windows; a thread other than the main one
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+
+    async def works() -> None:
+        await server.warm()
+        await told.wait()
+
+    try:
+        await until_one_ends(works(), told.wait())
+    finally:
+        await server.close()

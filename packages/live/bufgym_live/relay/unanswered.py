@@ -1,0 +1,103 @@
+"""A client's unanswered no_drop messages: numbered, held until the relay answers, renumbered if refused.
+
+The relay takes number k only after k - 1, and answers each once, in order. A refused number stays unused. So once all
+messages under way are answered, the messages behind the refused one are sent again from that number on.
+"""
+
+import asyncio
+from collections import deque
+from dataclasses import dataclass
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.relay import wire
+
+AGAIN = "out_of_order"  # Code with which a message behind a refused one is refused too; it is sent again
+
+
+@dataclass
+class Pending:
+    """A message on its way."""
+
+    message: wire.Message
+    answered: asyncio.Future[None]  # done when the relay holds the message; a BufgymError if it was refused
+
+
+class Unanswered:
+    """The messages of one session, in order."""
+
+    def __init__(self) -> None:
+        self.acked = 0  # highest number that the relay holds
+        self.window = 1  # n_T, the most messages unanswered at a time
+        self._waiting: deque[Pending] = deque()
+        self._sent: deque[Pending] = deque()
+        self._again: list[Pending] = []
+        self._refused = 0  # refusals since the last ack, while more are to come
+
+    def __len__(self) -> int:
+        """Number of messages that the relay has not answered."""
+        return len(self._waiting) + len(self._sent) + len(self._again)
+
+    def put(self, message: wire.Message) -> asyncio.Future[None]:
+        """Add a message; the future is done once the relay holds it."""
+        pending = Pending(message, asyncio.get_running_loop().create_future())
+        self._waiting.append(pending)
+        return pending.answered
+
+    def next(self) -> wire.Message | None:
+        """Number the next message to send; None if nothing waits, the window is full or refusals are to come."""
+        if not self._waiting or self._refused or len(self._sent) >= self.window:
+            return None
+        self._sent.append(self._waiting.popleft())
+        return self._sent[-1].message._replace(seq=self.acked + len(self._sent))
+
+    def ack(self, seq: int) -> None:
+        """Note that the relay holds this message and all before it."""
+        while self._sent and self.acked < seq and not self._refused:
+            self.acked += 1
+            _settle(self._sent.popleft())
+
+    def expects(self, topic: str, seq: int | None) -> bool:
+        """Whether the next answer is about this message."""
+        expected = self._sent[0].message.topic if self._sent else None
+        return topic == expected and seq in (None, self.acked + self._refused + 1)
+
+    def refuse(self, code: str, why: str) -> None:
+        """Note that the relay refused the oldest unanswered message."""
+        if not self._sent:
+            return
+        pending = self._sent.popleft()
+        if code == AGAIN:
+            self._again.append(pending)
+        else:
+            _settle(pending, BufgymError(f"topic {pending.message.topic}: refused: {code}: {why}"))
+        # Messages behind a refused one are refused too: nothing new is sent until all their answers are in.
+        self._refused += 1
+        if not self._sent:
+            self._refused = 0
+            self._waiting.extendleft(reversed(self._again))
+            self._again.clear()
+
+    def resume(self, received: int, window: int) -> None:
+        """Resume after a reconnect: the relay holds all up to ``received``, and the rest is sent again."""
+        self.window = window
+        self.ack(received)
+        self._waiting.extendleft(reversed([*self._again, *self._sent]))
+        self._again.clear()
+        self._sent.clear()
+        self._refused = 0
+        self.acked = received
+
+    def give_up(self, why: str) -> None:
+        """Fail all messages, because no answer will come."""
+        for pending in (*self._again, *self._sent, *self._waiting):
+            _settle(pending, BufgymError(why))
+
+
+def _settle(pending: Pending, error: BufgymError | None = None) -> None:
+    if pending.answered.done():  # the waiting task has given up
+        return
+    if error is None:
+        pending.answered.set_result(None)
+    else:
+        pending.answered.set_exception(error)
+        pending.answered.exception()  # marks the error as seen, because nobody may await it

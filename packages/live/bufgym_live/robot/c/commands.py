@@ -1,0 +1,54 @@
+"""``bufgym export``, which also writes policies in C where this package is installed."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from cyclopts import Group, Parameter
+
+from bufgym.cli import export as of_weights
+from bufgym.cli.export import WeightOptions
+from bufgym.cli.options import Count, given, refuse
+
+
+@Parameter(name="*", group=Group.create_ordered("C (--to c): one C99 header that decides as Python does"))
+@dataclass(frozen=True)
+class COptions:
+    capacity: Count | None = None
+    """L, messages (default: 16)."""
+    max_bytes: Count | None = None
+    """Bytes queued at most (default: no limit)."""
+    value: str | None = None
+    """V as in saturating:4 (default: exponential:0.618)."""
+
+
+def export(
+    model: str,
+    /,
+    out: str,
+    *,
+    to: Literal["safetensors", "c"] = "safetensors",
+    weights: WeightOptions = WeightOptions(),
+    c: COptions = COptions(),
+) -> None:
+    """Write a trained agent as a file of weights, read without torch; or a policy in C.
+
+    A model.zip holds pickles, so reading it can run any code: export models of your own alone.
+
+    Args:
+        model: Of a run of train.py: model.safetensors, or model.zip (ppo --network slots). For C: a policy's name, such
+            as afr, or a .safetensors of weights.
+        out: File to write.
+        to: Kind of file.
+    """
+    if to == "safetensors":
+        refuse(given(c), "belongs to --to c")
+        of_weights.export(model, out, weights=weights)
+        return
+    from bufgym import policies
+    from bufgym.model import qoi
+    from bufgym_live.robot import c as header
+
+    refuse(given(weights), "belongs to --to safetensors")
+    policy = policies.load(model) if model.endswith(".safetensors") else policies.get(model)
+    value = qoi.load(c.value or "exponential:0.618")
+    print(f"wrote {header.write(policy, out, c.capacity or 16, value, c.max_bytes)}")

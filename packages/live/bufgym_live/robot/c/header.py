@@ -1,0 +1,174 @@
+"""Builder of a policy's header from parts in C and the policy's numbers as constants."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bufgym import policies
+from bufgym.ground import __version__
+from bufgym.ground.errors import BufgymError, printable
+from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
+from bufgym.model.link import FOREVER
+from bufgym.model.observe.declare import TINY
+from bufgym.model.observe.queue import ROUNDING
+from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
+from bufgym.policies import Policy, chains, gaps, guided, learned, price_dp, target_gap, thinning
+from bufgym.policies.scoring import unpack
+from bufgym.policies.target_gap import straight
+from bufgym.traces.formats.text import write_text
+from bufgym_live.robot.c.calls import random_episode, recorded
+
+_PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))
+SUPPORTED = tuple(sorted(path.stem for path in _RULES.glob("*.h")))
+"""Names of the exportable rules; learned agents for one queue are exportable too."""
+_HELPERS = {
+    "bufgym_gaps_of(": "gaps.h",
+    "bufgym_smallest_gap(": "gaps.h",
+    "bufgym_spare(": "thinning.h",
+    "bufgym_remember(": "target_gap.h",
+    "bufgym_weigh(": "chains.h",
+    "bufgym_priced(": "price_dp.h",
+    "bufgym_thin(": "thin.h",
+}
+"""Parts that rules share, each before its callers."""
+_LEARNED = ("features.h", "scorer.h")  # Parts of a learned agent
+_CONSTANTS = {
+    thinning: "WAITING SOON_US STEADY",
+    target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
+    price_dp: "LEAST_SHARE SIZES_WEIGHT UNPRICED",
+    chains: "SPAN",
+    gaps: "TIE",
+    guided: "MOST SPREAD_US SLOW_US HEAVY HEAVIER",
+}
+"""Constants that the parts name, by the module that has them."""
+_VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
+_SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40  # Seed, episodes and messages of the calls in the header
+
+
+def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_bytes: int | None = None) -> Path:
+    """Write ``header`` to the file ``out``, whole or not at all.
+
+    Raises:
+        BufgymError: as ``header``, or the file cannot be written.
+    """
+    write_text(out, [header(policy, capacity, value, max_bytes)])
+    return Path(out)
+
+
+def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None) -> str:
+    """Make the policy's C99 header for L = ``capacity`` and B = ``max_bytes`` with V = ``value``.
+
+    Raises:
+        BufgymError: the policy has no C, or a limit is invalid.
+    """
+    check_limits(capacity, max_bytes)
+    learns, guides = policy.on_arrival is learned.on_arrival, policy.on_arrival is guided.on_arrival
+    body = "".join(map(_part, _LEARNED)) if learns else _rule(policy, guides)
+    parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False)) if guides else policy.parameters
+    if "bufgym_departure(" not in body:
+        body += "\n" + _part("no_departure.h")
+    unlimited, rng = max_bytes is None, np.random.default_rng(_SEED)
+    # Messages of the calls in the header all fit into B.
+    episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
+    calls = recorded(policy, episodes, capacity, value, max_bytes)
+    numbers = {
+        "ABOUT": _comment(policy.summary),
+        "SOURCE": _comment(policy.source),
+        "NAME": _comment(policy.name),
+        "VERSION": __version__,
+        "CAPACITY": capacity,
+        "FOREVER": FOREVER,
+        "UNLIMITED": UNLIMITED_BYTES,
+        "MAX_BYTES": "BUFGYM_UNLIMITED" if unlimited else f"INT64_C({max_bytes})",
+        "LIMIT": "no limit" if unlimited else max_bytes,
+        "MEMORY": ", ".join(map(repr, map(float, policy.memory.values()))) or "0.0",
+        "MEMORY_SIZE": max(1, len(policy.memory)),
+        "PARAMETERS": _array("double", "bufgym_parameters", policy.parameters.values()) if policy.parameters else "",
+        "VALUE": _comment(value.name),
+        "VALUE_PART": _array("double", "bufgym_v", value.array) + _part(f"value_{_VALUES[int(value.array[0])]}.h"),
+        "SCRATCH": _part("places.h") if "bufgym_weigh(" in body else "",
+        "POLICY": body,
+        "TINY": repr(TINY),
+        "ROUNDING": repr(ROUNDING),
+        **{name: repr(getattr(module, name)) for module, names in _CONSTANTS.items() for name in names.split()},
+        "STRAIGHT": repr(straight(value.array)),
+        **{name.upper(): repr(float(number)) for name, number in parameters.items()},
+        "INPUTS": _lines(f"BUFGYM_IN_{name.upper()}" for name in guided.INPUTS),
+        "OUTPUTS": _lines(f"BUFGYM_OUT_{output.name.upper()}" for output in guided.OUTPUTS),
+        "WEIGHTS": _array("double", "bufgym_weights", policy.weights[guided.NUMBERS :]) if guides else "",
+        "STEADY_US": repr(thinning.HORIZON_US),
+        "CALLS": "".join(f"    {{{', '.join(map(repr, call.item()))}}},\n" for call in calls),
+    }
+    if learns:
+        numbers |= _scorer(policy)
+    return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
+
+
+def _rule(policy: Policy, guides: bool) -> str:
+    """Write the C of a rule, or of an agent that guides one, after the parts that it shares."""
+    name = policy.name.partition(":")[0]
+    if not guides and (name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival):
+        known = ", ".join(SUPPORTED)
+        raise BufgymError(f"policy {policy.name}: has no C; known: {known}, and learned agents for one queue")
+    rule = _part("guided.h") if guides else (_RULES / f"{name}.h").read_text(encoding="utf-8")
+    helpers = ""
+    for call, part in reversed(_HELPERS.items()):  # a helper may call the one before it
+        if call in helpers + rule and _part(part) not in helpers:
+            helpers = _part(part) + helpers
+    return helpers + rule
+
+
+def _scorer(policy: Policy) -> dict[str, Any]:
+    """Collect the values for a learned policy's C: its scorer, the scratch and the fields."""
+    scorer = getattr(unpack, "py_func", unpack)(np.array(policy.weights))
+    inputs, units = len(scorer.fields), max(1, 2 * scorer.first + scorer.second)
+    text = _array("int", "bufgym_fields", scorer.fields.astype(int))
+    text += _array("double", "bufgym_networks", scorer.networks)
+    sizes = ", ".join(map(str, (inputs, scorer.context, scorer.first, scorer.second, scorer.size)))
+    text += f"static const struct bufgym_scorer bufgym_scorer = {{{sizes}, bufgym_fields, bufgym_networks}};\n"
+    scratch = (
+        "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
+        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{learned.CONTEXT}];\n"
+        f"    double rows[{learned.SLOTS}][BUFGYM_CAPACITY + 1];\n"
+    )
+    return {
+        "WEIGHTS": text,
+        "SCRATCH": scratch,
+        "SLOT_FIELDS": _enum(learned.SLOT_NAMES),
+        "CONTEXT_FIELDS": _enum(learned.CONTEXT_NAMES),
+    }
+
+
+def _part(name: str) -> str:
+    return (_PARTS / name).read_text(encoding="utf-8")
+
+
+def _filled(text: str, numbers: dict[str, Any]) -> str:
+    """Replace each @NAME@, also inside inserted text."""
+    while re.search("@[A-Z_]+@", text):
+        text = re.sub("@([A-Z_]+)@", lambda found: str(numbers[found[1]]), text)
+    return text
+
+
+def _comment(text: str) -> str:
+    """Escape text for a comment or an inserted line."""
+    return printable(text).replace("*/", "* /").replace("@", "(at)")
+
+
+def _array(kind: str, name: str, numbers: Iterable[Any]) -> str:
+    """Write ``static const kind name[] = {...};`` with numbers exact to the last bit."""
+    words = _lines(repr(float(number) if kind == "double" else int(number)) for number in numbers)
+    return f"static const {kind} {name}[] = {{\n    {words}\n}};\n"
+
+
+def _lines(words: Iterable[str]) -> str:
+    """Join the words with commas, five in a line."""
+    found = list(words)
+    return ",\n    ".join(", ".join(found[k : k + 5]) for k in range(0, len(found), 5))
+
+
+def _enum(names: Iterable[str]) -> str:
+    return f"enum {{\n    {_lines(f'BUFGYM_{name.upper()}' for name in names)}\n}};"

@@ -1,0 +1,10 @@
+"""ROS 2: a relay with an uplink ruled by a policy, and a publisher with a policy's queue for your own node.
+
+The relay needs no change of any node. ``bufgym ros2 send`` subscribes on the robot and sends over one uplink of
+``bufgym_live.robot``. ``bufgym ros2 receive`` republishes at the other end. ``Publisher`` replaces
+``node.create_publisher`` in your own node, and sends to the same receiver.
+"""
+
+from bufgym_live.robot.ros2.publisher import Publisher
+
+__all__ = ["Publisher"]

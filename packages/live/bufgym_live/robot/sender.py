@@ -1,0 +1,154 @@
+"""The sending end: sends a ``PolicyQueue``'s messages, reports when each has left, and reconnects by itself."""
+
+import asyncio
+import os
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import Final, Literal
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.robot.channels import Channel
+from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, STREAM_BYTES, Frame, FrameError
+from bufgym_live.robot.path_window import PathWindow
+from bufgym_live.robot.queue import Item, PolicyQueue
+from bufgym_live.robot.tasks import until_one_ends
+
+Leaves = Literal["sent", "acked", "written"]
+"""Event at which a message has left.
+
+"sent": the system wants more bytes, because it has sent nearly all of them. Where a library's socket is not found,
+    the receiver's acks say when the next message is due (``PathWindow``).
+"acked": the receiver has acked it. With the queue's ``window`` this is Robofleet's n_T.
+"written": this system has taken it. That hides a queue in the system's buffers, and serves to measure what that costs.
+"""
+
+RETRY_S: Final = 0.5
+PATIENCE_S: Final = 20.0  # Time for the receiver's answer to the greeting
+_MOST_UNACKED: Final = 256  # limit on messages that await the receiver's ack, where they count as left before it
+
+
+class Sender:
+    """Sends the queue's messages in order, each once.
+
+    After a broken connection it reconnects and resumes where the receiver says. Memory holds the queue and the messages
+    that the receiver has not acked: those in flight, or at most the queue's window.
+    """
+
+    def __init__(self, queue: PolicyQueue, connect: Callable[[], Awaitable[Channel]], leaves: Leaves = "sent") -> None:
+        """``connect`` makes a new connection to the receiver at each call."""
+        if leaves not in ("sent", "acked", "written"):
+            raise BufgymError(f"leaves = {leaves!r}: must be 'sent', 'acked' or 'written'")
+        self.queue = queue
+        self.connected = asyncio.Event()
+        """Set while the receiver has answered on this connection."""
+        self.faults: deque[str] = deque(maxlen=100)
+        """Reasons of the last 100 ends of a connection."""
+        self._connect, self._leaves = connect, leaves
+        self._stream = os.urandom(STREAM_BYTES)
+        self._unacked: deque[Item] = deque()
+        self._acked = asyncio.Event()
+        self._window = PathWindow()
+        self._max_body_bytes = 0
+        self._next = 0  # the number of the message that the queue hands out next
+        self._left = 0  # messages reported to the queue as left
+        self._said_goodbye = False  # then the receiver may hang up before we know that our goodbye was sent
+
+    async def run(self) -> None:
+        """Send until the queue is closed and all its messages are acked, or until cancelled.
+
+        Raises:
+            BufgymError: a message is larger than the receiver takes.
+        """
+        while True:
+            try:
+                channel = await asyncio.wait_for(self._connect(), PATIENCE_S)
+            except (OSError, TimeoutError) as error:
+                self._note(error)
+                await asyncio.sleep(RETRY_S)
+                continue
+            try:
+                await self._greet(channel)
+                self.connected.set()
+                self.queue.left_bytes = channel.left_bytes
+                await self._converse(channel)
+                return
+            except (OSError, TimeoutError) as error:
+                self._note(error)
+            finally:
+                self.queue.left_bytes = lambda: None
+                self.connected.clear()
+                channel.close()
+            await asyncio.sleep(RETRY_S)
+
+    def _note(self, error: Exception) -> None:
+        self.faults.append(f"{type(error).__name__}: {error}")
+
+    async def _greet(self, channel: Channel) -> None:
+        """Name the stream; skip messages that the receiver already has."""
+        first = self._unacked[0].number if self._unacked else self._next
+        asked_s = time.monotonic()
+        await channel.send(Frame(GREETING, first, body=self._stream))
+        answer = await asyncio.wait_for(channel.receive(), PATIENCE_S)
+        self._window = PathWindow(time.monotonic() - asked_s)
+        if answer.kind != GREETING or answer.seq < 1:
+            raise FrameError(f"frame of kind {answer.kind}: must be the answer to the greeting, and take messages")
+        self._max_body_bytes = answer.seq
+        while self._unacked and self._unacked[0].number < answer.number:
+            self._take_ack()
+
+    async def _converse(self, channel: Channel) -> None:
+        """Send and take acks until all is done."""
+        try:
+            await until_one_ends(self._send_all(channel), self._take_acks(channel))
+        except (OSError, TimeoutError):
+            if not self._said_goodbye:
+                raise
+
+    async def _send_all(self, channel: Channel) -> None:
+        for unacked in list(self._unacked):
+            await self._send(channel, unacked)
+        while (item := await self.queue.aget()) is not None:
+            self._unacked.append(item)
+            self._next = item.number + 1
+            await self._send(channel, item)
+            while len(self._unacked) >= _MOST_UNACKED:
+                await self._an_ack()
+        while self._unacked:
+            await self._an_ack()
+        self._said_goodbye = True
+        await channel.send(Frame(GOODBYE, 0))
+
+    async def _send(self, channel: Channel, item: Item) -> None:
+        if len(item.message) > self._max_body_bytes:
+            raise BufgymError(
+                f"message {item.seq} of {len(item.message)} bytes: the receiver takes at most {self._max_body_bytes}"
+            )
+        self._window.sends(item.number, time.monotonic())
+        await channel.send(Frame(DATA, item.number, item.seq, item.at_us, item.x, item.topic, item.message))
+        if self._leaves == "sent" and not await channel.until_wanted():
+            while len(self._unacked) >= self._window.messages:
+                await self._an_ack()
+        if self._leaves != "acked":
+            self._leave(item)
+
+    async def _an_ack(self) -> None:
+        self._acked.clear()
+        await self._acked.wait()
+
+    async def _take_acks(self, channel: Channel) -> None:
+        while True:
+            frame = await channel.receive()
+            if frame.kind != ACK or not self._unacked or frame.number != self._unacked[0].number:
+                raise FrameError(f"frame of kind {frame.kind}, number {frame.number}: must be the next ack")
+            self._window.acked(frame.number, self._unacked[0].size_bytes, time.monotonic())
+            self._take_ack()
+
+    def _take_ack(self) -> None:
+        self._leave(self._unacked.popleft())
+        self._acked.set()
+
+    def _leave(self, item: Item) -> None:
+        if item.number >= self._left:
+            self._left = item.number + 1
+            self.queue.gone()

@@ -1,0 +1,200 @@
+"""Who is at the other end: tokens of a local issuer whose keys change, certificates, TLS."""
+
+import datetime
+import ipaddress
+import json
+import ssl
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from refusal_cases import refuse
+from relay_cases import client, relay, settings, wait
+from websockets.exceptions import WebSocketException
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.relay import identity
+from bufgym_live.relay.config import Rule, Tls, Tokens
+
+jwt = pytest.importorskip("jwt")
+x509 = pytest.importorskip("cryptography.x509")
+from cryptography.hazmat.primitives import hashes, serialization  # noqa: E402
+from cryptography.hazmat.primitives.asymmetric import ec  # noqa: E402
+
+ISSUER = "https://issuer.test"
+ANNA = Rule(email="anna@x.org", send=True, receive=True)
+
+
+class Issuer:
+    """Signs tokens; its key set is a file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / "jwks.json"
+        self.keys: dict[str, Any] = {}
+        self.rotate("one")
+
+    def rotate(self, kid: str) -> None:
+        """From now on only this key."""
+        self.keys[kid] = ec.generate_private_key(ec.SECP256R1())
+        public = json.loads(jwt.algorithms.ECAlgorithm.to_jwk(self.keys[kid].public_key()))
+        self.file.write_text(json.dumps({"keys": [{**public, "kid": kid, "alg": "ES256", "use": "sig"}]}))
+        self.kid = kid
+
+    def token(self, kid: str = "", algorithm: str = "ES256", key: Any = None, **changed: Any) -> str:
+        kid = kid or self.kid
+        claims = {"iss": ISSUER, "aud": "fleet", "exp": time.time() + 60, "email": "anna@x.org"}
+        claims |= {"email_verified": True, **changed}
+        claims = {name: value for name, value in claims.items() if value is not None}
+        key = None if algorithm == "none" else key or self.keys[kid]
+        return str(jwt.encode(claims, key, algorithm, headers={"kid": kid}))
+
+    @property
+    def tokens(self) -> Tokens:
+        return Tokens(ISSUER, "fleet", str(self.file))
+
+
+@pytest.fixture
+def issuer(tmp_path: Path) -> Issuer:
+    return Issuer(tmp_path)
+
+
+async def test_a_token_names_who_it_is(issuer: Issuer) -> None:
+    async with relay(settings(rules=(ANNA,), tokens=issuer.tokens)) as server:
+        async with client(server.port) as nobody:
+            assert nobody.welcome["code"] == "unauthorized"
+        async with client(server.port, token=issuer.token()) as anna:
+            assert anna.welcome["identity"] == {"address": "127.0.0.1", "email": "anna@x.org"}
+        async with client(server.port, token=issuer.token(email="bob@x.org")) as bob:
+            assert bob.welcome["why"] == "no rule allows anything to this identity"
+        # A token ends, and with it the connection: this one is still let in, but only just.
+        async with client(server.port, token=issuer.token(exp=time.time() - issuer.tokens.leeway_s / 2)) as anna:
+            await wait("the token's end", anna.socket.wait_closed())
+            assert anna.socket.close_reason == "the token has expired"
+
+
+async def test_keys_change(issuer: Issuer) -> None:
+    """The key set is read again for a key that it did not have, and after a while; a key that has gone is no good."""
+    now_s = 1_000.0
+    verifier = identity.Verifier(issuer.tokens, clock=lambda: now_s)
+    old = issuer.token()
+    assert (await verifier.email(old))[0] == "anna@x.org"
+    issuer.rotate("two")
+    with pytest.raises(BufgymError, match="unknown key 'two'"):
+        await verifier.email(issuer.token())  # it was just read
+    now_s += 2 * identity.AGAIN_S
+    assert (await verifier.email(issuer.token()))[0] == "anna@x.org"
+    with pytest.raises(BufgymError, match="unknown key 'one'"):
+        await verifier.email(old)
+    issuer.file.write_text("{}")
+    assert (await verifier.email(issuer.token()))[0] == "anna@x.org"
+    now_s += 2 * identity.KEYS_AGE_S
+    with pytest.raises(BufgymError, match="the issuer's keys cannot be read"):
+        await verifier.email(issuer.token())
+
+
+SHARED = "a secret of thirty-two bytes and more"
+
+
+@pytest.mark.parametrize(
+    "claims",
+    [
+        *({"exp": end} for end in (1.0, None)),
+        *({"aud": audience} for audience in ("shop", None)),
+        *({"email": email} for email in (None, ["anna@x.org"])),
+        *({"email_verified": verified} for verified in (False, "false", "true", 1, None)),
+        *({"nbf": 2**33}, {"iss": "https://other.test"}, {"algorithm": "none"}, {"algorithm": "HS256", "key": SHARED}),
+        {"key": ec.generate_private_key(ec.SECP256R1())},
+        *("", "a.b.c", "." * 3, "x" * 20_000, "e30.e30.", "\u0000"),
+    ],
+    ids=lambda claims: str(claims)[:30],
+)
+async def test_what_is_no_proof(claims: dict[str, Any] | str, issuer: Issuer) -> None:
+    verifier = identity.Verifier(issuer.tokens)
+    assert (await verifier.email(issuer.token()))[0] == "anna@x.org"
+    with pytest.raises(BufgymError, match="token"):
+        await verifier.email(claims if isinstance(claims, str) else issuer.token(**claims))
+
+
+async def test_the_keys_come_over_http_no_more_often_than_they_may(issuer: Issuer) -> None:
+    asked = []
+
+    class Keys(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(issuer.file.read_bytes())
+
+        def log_message(self, *_: object) -> None: ...
+
+    with HTTPServer(("127.0.0.1", 0), Keys) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        tokens = Tokens(ISSUER, "fleet", f"http://127.0.0.1:{server.server_port}/jwks.json")
+        verifier = identity.Verifier(tokens, clock=lambda: 0.0)
+        for _ in range(5):
+            assert await verifier.email(issuer.token())
+        for k in range(20):
+            issuer.keys[f"forged {k}"] = issuer.keys["one"]
+            with pytest.raises(BufgymError, match="unknown key"):
+                await verifier.email(issuer.token(f"forged {k}"))
+        server.shutdown()
+    assert asked == ["/jwks.json"]
+    refuse("must be an https address", identity.Verifier, Tokens(ISSUER, "fleet", "http://issuer.test/jwks.json"))
+
+
+HERE = x509.IPAddress(ipaddress.ip_address("127.0.0.1"))
+
+
+class Authority:
+    """Signs certificates; all in one folder."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+        self.key = ec.generate_private_key(ec.SECP256R1())
+        self.certificate = self._signed(name, self.key.public_key(), x509.BasicConstraints(ca=True, path_length=None))
+        self.file = folder / f"{name}.pem"
+        self.file.write_bytes(self.certificate.public_bytes(serialization.Encoding.PEM))
+
+    def _signed(self, name: str, public: Any, *extensions: Any) -> Any:
+        subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+        mine = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, self.name)])
+        now, hour = datetime.datetime.now(datetime.UTC), datetime.timedelta(hours=1)
+        builder = x509.CertificateBuilder(mine, subject, public, x509.random_serial_number(), now - hour, now + hour)
+        for extension in extensions:
+            builder = builder.add_extension(extension, critical=False)
+        return builder.sign(self.key, hashes.SHA256())
+
+    def issue(self, name: str, alternative: Any) -> tuple[str, str]:
+        """(certificate, key), the paths."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        certificate = self._signed(name, key.public_key(), x509.SubjectAlternativeName([alternative]))
+        paths = self.folder / f"{name}.pem", self.folder / f"{name}.key"
+        paths[0].write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+        form, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        paths[1].write_bytes(key.private_bytes(serialization.Encoding.PEM, form, plain))
+        return str(paths[0]), str(paths[1])
+
+
+async def test_a_certificate_names_who_it_is(tmp_path: Path) -> None:
+    authority, stranger = Authority(tmp_path, "authority"), Authority(tmp_path, "stranger")
+    certificate, key = authority.issue("server", HERE)
+
+    def context(issuer: Authority | None) -> ssl.SSLContext:
+        one = ssl.create_default_context(cafile=str(authority.file))
+        if issuer is not None:
+            one.load_cert_chain(*issuer.issue("anna", x509.RFC822Name("anna@x.org")))
+        return one
+
+    async with relay(settings(rules=(ANNA,), tls=Tls(certificate, key, str(authority.file)))) as server:
+        async with client(server.port, tls=context(authority)) as anna:
+            assert anna.welcome["identity"]["email"] == "anna@x.org"
+        async with client(server.port, tls=context(None)) as nobody:
+            assert nobody.welcome["code"] == "unauthorized"
+        for tls in (context(stranger), None):  # without TLS nothing is said at all
+            with pytest.raises((OSError, WebSocketException)):
+                async with client(server.port, tls=tls):
+                    pass
+    refuse("tls", identity.server_context, Tls(certificate, str(tmp_path / "missing.key")))

@@ -1,0 +1,232 @@
+"""Robots and viewers at one relay: who gets what, and what is refused."""
+
+import asyncio
+import contextlib
+import subprocess
+import sys
+import threading
+import urllib.request
+from http.client import HTTPConnection
+from pathlib import Path
+
+import fleet_demo
+import pytest
+from cli_cases import fails
+from loop_cases import beside
+from refusal_cases import refuse
+from relay_cases import Client, Corner, client, nothing, relay, settings, until, wait
+
+from bufgym.ground import processes
+from bufgym.policies import Policy, registry
+from bufgym_live.relay import policies
+from bufgym_live.relay import server as serving
+from bufgym_live.relay.config import Limits, Rule
+from bufgym_live.relay.wire import Message
+
+
+def test_a_relay_listens_before_the_compiler_is_imported() -> None:
+    """Robots come back to one that was killed as soon as it listens; its default rule needs no compiler at all."""
+    queue = "p.new_queue(p.warm('robofleet'), 8).put(b'', 1, topic=0)"
+    program = f"import sys; from bufgym_live.relay import policies as p, server; {queue}; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == "False"
+
+
+async def test_a_message_goes_to_each_subscriber_but_its_sender(corner: Corner) -> None:
+    async with corner.client(name="robot") as robot, corner.client() as viewer:
+        assert robot.welcome["op"] == "welcome" and robot.welcome["default_policy"] == "drop-oldest"
+        topic = corner.topic("odom")
+        for one in (robot, viewer):
+            assert (await one.subscribe(f"^{topic}"))["op"] == "subscribed"
+        await robot.put(topic, b"12", encoding="cdr", type="nav_msgs/msg/Odometry", seq=4, stamp_us=9)
+        await robot.put("/elsewhere")
+        assert await viewer.next() == Message(topic, b"12", "cdr", "nav_msgs/msg/Odometry", "robot", 4, 9)
+        assert await nothing(robot, viewer)
+        await viewer.say("unsubscribe", id="a")
+        assert await nothing(viewer)
+        await robot.put(topic)
+        assert await nothing(robot, viewer)
+
+
+async def test_json_and_binary_are_the_same_message(corner: Corner) -> None:
+    async with corner.client(name="page", form="json") as page, corner.client() as robot:
+        a, b = corner.topic("a"), corner.topic("b")
+        await page.subscribe(f"^{a}$")
+        await robot.subscribe(f"^{b}$")
+        await robot.put(a, b"\x01\xff", encoding="jpeg", stamp_us=5)
+        said = await page.next()
+        assert [said[name] for name in ("op", "data", "encoding")] == ["message", "Af8=", "jpeg"]
+        assert said["sender"] == corner.address
+        await page.say("publish", topic=b, data={"x": [1, 2.5]}, stamp_us=7)
+        assert await robot.next() == Message(b, b'{"x":[1,2.5]}', "json", sender="page", stamp_us=7)
+
+
+async def test_what_two_subscriptions_match_comes_once(corner: Corner) -> None:
+    async with corner.client() as viewer, corner.client() as robot:
+        topic = corner.topic("ab")
+        await viewer.subscribe("/a", id="one")
+        await viewer.subscribe(f"^{topic}$", id="two")
+        await robot.put(topic)
+        assert (await viewer.next()).topic == topic and await nothing(robot, viewer)
+
+
+async def test_each_refusal_says_why() -> None:
+    """At most two topics, one subscription, 200 kB a message, and a message in 1,000 s once 20 have come."""
+    limits = Limits(topics=2, subscriptions=1, messages_per_s=20, message_bytes=200_000)
+    rules = (Rule(address="127.0.0.0/8", send=True, receive=True, topic="/open/.*"),)
+    async with relay(settings(limits=limits, rules=rules)) as server, client(server.port) as one:
+        server.hub.clock = lambda: 0.0
+        for topic, code in (("/shut", "unauthorized"), ("/open/a", None), ("/open/b", None), ("/open/c", "too_many")):
+            await one.say("publish", topic=topic, data=1)
+            assert [(said["topic"], said["code"]) for said in await one.rest()] == ([(topic, code)] if code else [])
+        for id, code in (("a", None), ("b", "too_many")):
+            assert (await one.subscribe("a", id)).get("code") == code
+        for _ in range(40):  # 6 of 20 are used up
+            await one.say("publish", topic="/open/a", data=1)
+        assert {said["code"] for said in await one.rest()} == {"too_fast"}  # told now and then
+        server.hub.audit.flush()
+        written = [entry for entry in server.hub.audit.recent if entry.get("code") == "too_fast"]
+        assert sum(entry.get("times", 1) for entry in written) == 40 - 14
+        await one.put("/open/a", bytes(200_001))
+        await wait("the end of a connection beyond the limit", one.socket.wait_closed())
+
+
+async def test_sixty_robots_come_from_one_address() -> None:
+    """By the default limits, each with ten topics of ten messages at once, and two subscriptions; more are refused."""
+
+    async def robot(stack: contextlib.AsyncExitStack, k: int) -> Client:
+        one = await stack.enter_async_context(client(server.port, session=f"r{k}"))
+        assert one.welcome["op"] == "welcome"
+        for id in ("command", "stop"):
+            assert (await one.subscribe(f"^/robots/{k}/{id}$", id))["op"] == "subscribed"
+        for name in 10 * [f"/robots/{k}/{topic}" for topic in range(10)]:
+            await one.put(name)
+        return one
+
+    async with relay() as server, contextlib.AsyncExitStack() as stack:
+        for one in await asyncio.gather(*(robot(stack, k) for k in range(60))):
+            assert await one.rest() == []
+        assert server.hub.received >= 6_000 and server.hub.audit.refused == 0
+        for k in range(60, 128):
+            await stack.enter_async_context(client(server.port, session=f"r{k}"))
+        async with client(server.port) as one:
+            assert one.welcome["code"] == "too_many"
+
+
+async def test_a_flood_of_json_waits_and_others_are_served() -> None:
+    """Of 40 texts of 9,500 bytes at 10,000 a second one is parsed each second; another's requests are answered."""
+    limits = Limits(json_bytes_per_s=10_000)
+    async with relay(settings(limits=limits)) as server, client(server.port, local="127.0.0.3") as flood:
+
+        async def send() -> None:
+            for k in range(40):
+                if k % 2:
+                    await flood.put("/a", b'"%s"' % bytes(9_998).replace(b"\0", b"a"), encoding="json")
+                else:
+                    await flood.say("publish", topic="/a", data="a" * 9_440)
+
+        async with beside(send()), client(server.port) as other:
+            await until("the first", lambda: server.hub.received > 0)
+            for _ in range(5):
+                await other.put("/b")
+                await other.rest()
+            assert server.hub.received < 40
+
+
+async def test_it_answers_monitors() -> None:
+    """Of 5 messages beyond 20 at a time, the counts are those of the audit log. A stranger's address gets none."""
+
+    def get(port: int, path: str, local: str = "127.0.0.1") -> tuple[int, str]:
+        with contextlib.closing(HTTPConnection("127.0.0.1", port, 60, (local, 0))) as asking:
+            asking.request("GET", path)
+            answer = asking.getresponse()
+            return answer.status, answer.read().decode()
+
+    rules = (Rule(address="127.0.0.1", send=True, receive=True), Rule(address="127.0.0.2", send=True))
+    async with relay(settings(limits=Limits(messages_per_s=20), rules=rules)) as server:
+        server.hub.clock = lambda: 0.0
+        async with client(server.port) as robot:
+            for _ in range(25):
+                await robot.put("/a")
+            await robot.rest()
+            server.hub.audit.flush()
+            counts = await asyncio.to_thread(get, server.port, "/metrics")
+        assert counts[0] == 200 and counts[1].endswith("# EOF\n")
+        for line in ("connections 1.0", "held 0.0", "received_total 20.0", 'refused_total{code="too_fast"} 5.0'):
+            assert f"\nbufgym_relay_{line}\n" in counts[1]
+        assert (await asyncio.to_thread(get, server.port, "/metrics", "127.0.0.2"))[0] == 403
+        assert await asyncio.to_thread(get, server.port, "/healthz", "127.0.0.2") == (200, "ok\n")
+        assert (await asyncio.to_thread(get, server.port, "/healthz", "127.0.0.3"))[0] == 403
+
+
+async def test_the_relay_tells_how_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "TICK_S", 0.01)
+    async with relay() as server, client(server.port) as viewer:
+        await viewer.subscribe("^/relay/status$")
+        status = await viewer.next()
+        assert status.sender == "relay" and b'"connections": 1' in bytes(status.payload)
+
+
+# The demonstration's page does not wait for the compiler, and the commands name what is wrong.
+
+
+async def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler, compiled = threading.Event(), policies.compiled
+
+    def slowly(chosen: Policy) -> Policy:
+        assert compiler.wait(60), "waited 60 s for the page"
+        return compiled(chosen)
+
+    monkeypatch.setattr(fleet_demo, "compiled", slowly)
+    async with fleet_demo.running(1, policy="drop-oldest", fades=False) as port, client(port) as viewer:
+        try:
+
+            def page() -> bytes:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as answer:
+                    return bytes(answer.read())
+
+            assert b"<html" in (await asyncio.to_thread(page)).lower()
+            await viewer.subscribe("^/robots/")
+            assert await nothing(viewer)
+        finally:
+            compiler.set()
+        assert (await viewer.next()).topic.startswith("/robots/robot-1/")
+
+
+def test_what_is_not_kept_another_process_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, code = list[tuple[str, ...]](), 0
+
+    def compiling(*words: str) -> int:
+        asked.append(words)
+        return code
+
+    monkeypatch.setattr(policies, "kept", lambda chosen: False)
+    monkeypatch.setattr(policies, "compiling", compiling)
+    assert policies.compiled(registry.get("afr")).name == "afr"
+    code = -2  # Ctrl-C
+    refuse("policy afr: stopped while it was compiled", policies.compiled, registry.get("afr"))
+    assert asked == 2 * [("bufgym_live.relay.policies", "fill_cache", "afr")]
+
+
+def test_a_call_in_another_process(capfd: pytest.CaptureFixture[str]) -> None:
+    """It finds what this one finds, and its exit code comes back."""
+    assert processes.compiling("os", "system", "echo found") == 0
+    assert capfd.readouterr().out == "found\n"
+    assert processes.compiling("sys", "exit", "wrong") == 1
+    assert capfd.readouterr().err == "wrong\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "naming"),
+    [
+        (["--config", "none"], "none"),
+        (["--bag", "none"], "none"),
+        (["--ros", "2"], "--ros needs --config"),
+        ([], "needs --bag or --ros"),
+    ],
+)
+def test_the_command_names_what_is_wrong(
+    words: list[str], naming: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fails(["relay", "robot", *words], naming, capsys)

@@ -1,0 +1,139 @@
+"""ROS 2: the relay and the publisher. Nodes run where rclpy is; what the relay says of a topic everywhere."""
+
+import asyncio
+import importlib.util
+import json
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from cli_cases import fails
+from hypothesis import given
+from hypothesis import strategies as st
+from live_cases import VALIDATE, as_simulated
+from refusal_cases import refuse
+from ros1_cases import played
+
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
+from bufgym.scenario import read_client
+from bufgym_live.robot import replay
+from bufgym_live.robot.frames import FrameError
+from bufgym_live.robot.log import of, read_log
+from bufgym_live.robot.ros2 import relay
+from bufgym_live.robot.ros2.names import Published, parse
+from bufgym_live.robot.ros2.relay import RosSender
+
+REPO = Path(__file__).resolve().parents[4]
+NO_ROS = not JIT or importlib.util.find_spec("rclpy") is None
+in_ros = pytest.mark.skipif(NO_ROS, reason="needs rclpy (extra ros2), and compiled decisions")
+
+
+def run(*words: object) -> str:
+    where = {**os.environ, "PYTHONPATH": str(REPO), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return played(where, *words)
+
+
+@in_ros
+@pytest.mark.nightly
+def test_the_relay_over_a_fade_is_as_good_as_the_simulator() -> None:
+    """6 s with a fade of 1.5 s. Over 20 s, quiet machine: 98 % of the simulator's QoI."""
+    cells = run(REPO / "examples/ros2/fade.py", "--queues", "afr", "--seconds", 6).splitlines()[-1].split("|")
+    print(cells)
+    assert float(cells[3]) > 0.7 * float(cells[6])  # through the relay, in the simulator
+
+
+@in_ros
+@pytest.mark.nightly
+def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None:
+    numbers = [str(k) for k in range(100)]
+    seen = json.loads(run(REPO / "packages/live/tests/robot/ros2_session.py", tmp_path).splitlines()[-1])
+    pictures = seen["came"].pop("camera")
+    assert len(pictures) >= 90 and pictures == [number for number in numbers if number in pictures]  # best effort
+    assert seen["came"] == {"status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
+    assert seen["told"][1] == "/commands: std_msgs/msg/String, reliable"
+    assert seen["best_effort"] and seen["by"] == "bufgym_receive" and seen["faults"] == []
+    log = read_log(tmp_path / "log.mcap")
+    assert log[0]["policy"] == "fifo" and replay(log).differences == ()
+    # 2 m of motion at a scene scale of 2 m, compared 30 times a second at most.
+    moved = [record["x"] for record in of(log, "put") if record["topic"] == 0]
+    assert moved[0] < 0.1 and 0.85 < moved[-1] <= 1.0
+
+
+@in_ros
+@pytest.mark.nightly
+def test_an_episode_through_the_relay_is_that_of_the_simulator(tmp_path: Path) -> None:
+    run(*VALIDATE, "ros2", "--out", tmp_path)
+    assert as_simulated(tmp_path)
+
+
+def test_a_topic_goes_with_each_of_its_messages() -> None:
+    topic = Published("/arm/camera", "sensor_msgs/msg/Image", reliable=False, transient_local=True, depth=15)
+    assert parse(memoryview(topic.head() + b"image")) == (topic, b"image")
+    assert len(topic.head()) == 5 + len("/arm/camera") + len("sensor_msgs/msg/Image")
+
+
+@given(st.binary(max_size=60))
+def test_what_is_no_message_of_a_relay_ends_the_connection(body: bytes) -> None:
+    refuse("no message of a relay", parse, b"\x03\x05\0\0\x01" + b"/a;" + body, kind=FrameError)
+
+
+def test_topics_that_cannot_be_relayed() -> None:
+    """Names that are none, a type that is not installed, and what moves without odometry."""
+    wrong = [("camera", "a/msg/B"), ("/a//b", "a/msg/B"), ("/a", "os"), ("/a", "../os/msg/B"), ("/a", "a/srv/B")]
+    for name, kind in wrong:
+        refuse("must", Published, name, kind)
+    with pytest.raises(BufgymError, match=r"topic /a: messages of no_such_msgs/msg/B, which is not installed here"):
+        _ = Published("/a", "no_such_msgs/msg/B").message_class
+    with pytest.raises(BufgymError, match=r"topic 'pointcloud': moves, which needs a topic with odometry"):
+        RosSender(read_client(REPO / "examples" / "client.toml"), "127.0.0.1", 1)
+
+
+async def test_a_topic_is_subscribed_again_when_its_publisher_comes_back_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A camera goes, comes back best effort, and stays; a topic of a type that is not here stops no other."""
+    camera, odd = Published("/camera", "a/msg/B"), Published("/odd", "no_such_msgs/msg/B")
+    seen = [None, camera, None, *[replace(camera, reliable=False)] * 2]
+    made: list[Published] = []
+    gone: list[Published] = []
+    told: list[str] = []
+    ended = asyncio.Event()
+
+    def published(node: Any, name: str, but_not: str) -> Published | None:
+        if name == "/camera" and not seen:
+            ended.set()
+        return odd if name == "/odd" else seen.pop(0) if seen else None
+
+    def found(topic: Published) -> list[Published]:
+        if topic is odd:
+            _ = topic.message_class
+        made.append(topic)
+        return [topic]
+
+    monkeypatch.setattr(relay, "published", published)
+    monkeypatch.setattr(relay, "LOOK_S", 0.0)
+    node = SimpleNamespace(destroy_subscription=gone.append)
+    looking = asyncio.create_task(relay.look(node, ["/odd", "/camera"], found, "me", told.append))
+    await asyncio.wait_for(ended.wait(), 10)
+    looking.cancel()
+    assert [topic.reliable for topic in made] == [True, False] and gone == [camera]
+    assert told == ["/odd: left out: topic /odd: messages of no_such_msgs/msg/B, which is not installed here"]
+
+
+def test_the_command_names_what_is_wrong(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config = tmp_path / "client.toml"
+    config.write_text('[[topic]]\nname = "camera"\nrate_hz = 30\nsize_bytes = 1000\n')
+    fails(["ros2", "send", "--config", "none.toml"], "none.toml", capsys)
+    fails(["ros2", "send", "--config", str(config), "--to", "robot"], "robot: must be HOST:PORT", capsys)
+    fails(["ros2", "send", "--config", str(config), "--policies", "oracle"], "oracle", capsys)
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    for words in (["receive", "--port", "0"], ["send", "--config", str(config)]):
+        fails(["ros2", *words], "bufgym_live.robot.ros2 needs rclpy", capsys)
+    fails([*VALIDATE[1:], "ros2"], "bufgym_live.robot.ros2 needs rclpy", capsys)

@@ -1,0 +1,205 @@
+"""The header in C: compiled with gcc, it decides as Python does, on a million decisions; a robot in C++ uses it."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_cases import fails, shown
+from refusal_cases import refuse
+
+from bufgym import policies
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.kernel import JIT
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.policies import Policy, guided, learned
+from bufgym.policies.learned import NAMES
+from bufgym.scenario import Episode, messages
+from bufgym.sim import run
+from bufgym.sim.metrics import received
+from bufgym.traces import Trace
+from bufgym_live.robot.c import CALL, SUPPORTED, header, random_episode, recorded
+from tests.core.weight_cases import random_weights
+
+REPO = Path(__file__).resolve().parents[3]
+EXPONENTIAL = qoi.exponential()
+SETTINGS = [
+    (8, EXPONENTIAL, None),
+    (15, qoi.saturating(4.0), None),
+    (5, qoi.tabulated([0, 1, 3, 10], [0, 0.5, 0.8, 1]), None),
+    (12, EXPONENTIAL, 400_000),
+]
+"""L, V, B"""
+FLAGS = ["-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+
+DRIVER = """
+#define BUFGYM_PARITY
+#include "policy.h"
+#include <stdio.h>
+
+/* Plays the calls in a file; prints bufgym_parity(), how many decisions there were, and how many differ. */
+int main(int words, char **files)
+{
+    static struct bufgym_call calls[4096];
+    static struct bufgym_queue q;
+    FILE *file = words > 1 ? fopen(files[1], "rb") : 0;
+    size_t k, n;
+    int decisions = 0, differ = 0;
+    while (file && (n = fread(calls, sizeof calls[0], 4096, file)) > 0)
+        for (k = 0; k < n; k++) {
+            differ += bufgym_play(&q, &calls[k]) != calls[k].decision;
+            decisions += calls[k].kind == BUFGYM_ARRIVAL;
+        }
+    printf("%d %d %d", bufgym_parity(), decisions, differ);
+    return 0;
+}
+"""
+
+
+def compiled(folder, compiler, standard, source, text, *flags):
+    """The program of this source and this header; skips where there is no compiler."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed")
+    (folder / "policy.h").write_text(text, encoding="utf-8")
+    program = folder / "program"
+    words = [compiler, f"-std={standard}", *FLAGS, *flags, "-I", folder, source, "-o", program, "-lm"]
+    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def assert_equal(text, expected):
+    """Without pytest's own search for what differs, which takes minutes."""
+    assert [pair for pair in zip(text.splitlines(), expected.splitlines(), strict=True) if pair[0] != pair[1]] == []
+
+
+def output(program, *words, text=""):
+    return subprocess.run([program, *words], input=text, capture_output=True, text=True, check=True).stdout
+
+
+def driver(folder, text, *flags):
+    (folder / "driver.c").write_text(DRIVER, encoding="utf-8")
+    return compiled(folder, "gcc", "c99", folder / "driver.c", text, *flags)
+
+
+def every_field() -> Policy:
+    """A random agent of two layers that reads every field there is."""
+    return learned.policy("every-field", random_weights(NAMES, 7, 5, seed=3))
+
+
+def every_output() -> Policy:
+    """A random agent that changes every number of the rule it guides."""
+    return guided.linear("every-output", 0.4 * np.random.default_rng(4).normal(size=guided.GuidedWeights.SHAPE))
+
+
+AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
+AGENTS |= {"every-field": every_field(), "every-output": every_output()}
+
+
+def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, flags=("-O0",)):
+    """(parity, decisions, how many differ) of a recorded run that is played again in C."""
+    calls = recorded(policy, episodes, L, value, B)
+    assert calls.dtype == CALL
+    calls.tofile(folder / "calls")
+    program = driver(folder, header(policy, L, value, B), *flags)
+    return tuple(map(int, output(program, folder / "calls").split()))
+
+
+def check(folder, policy, decisions, settings, flags):
+    for k, (L, value, B) in enumerate(settings):
+        rng = np.random.default_rng(k)
+        n = 1_000 if JIT else 40
+        episodes = [random_episode(rng, n, B) for _ in range(decisions // n if JIT else 2)]
+        parity, made, differ = play_in_c(folder, policy, L, episodes, value, B, flags=flags)
+        assert (parity, differ) == (0, 0), (L, value.name, B, made)
+        assert made >= n * len(episodes)
+
+
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("name", [*SUPPORTED, *AGENTS])
+def test_it_decides_in_c_as_in_python(name, whole, tmp_path):
+    """A million decisions in the night."""
+    most = (250_000 if name in AGENTS else 20_000, SETTINGS, []) if whole else (2_000, SETTINGS[3:], ["-O0"])
+    check(tmp_path, AGENTS.get(name) or policies.get(name), *most)
+
+
+def test_with_a_window_several_messages_are_in_the_socket(tmp_path):
+    """Three in flight, acks 50 ms late: the socket holds more than one message, and the header knows of all."""
+    rng = np.random.default_rng(5)
+    drawn = [random_episode(rng, 40) for _ in range(30 if JIT else 2)]
+    episodes = [Episode(e.arrivals, e.link, window=3, ack_delay_us=50_000) for e in drawn]
+    assert play_in_c(tmp_path, AGENTS["every-field"], 6, episodes) == (0, 40 * len(episodes), 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "other"),
+    [
+        ("afr", "<= 2.0 / 3.0", "<= 0.2"),
+        ("learned", "bufgym_v[] = {\n    0.0, -0.48", "bufgym_v[] = {\n    0.0, -0.08"),
+        ("min-motion-gap", ": gaps.before_x + gaps.after_x;", ": gaps.before_x;"),
+    ],
+)
+def test_parity_finds_another_number(name, number, other, tmp_path):
+    text = header(policies.get(name), 8, EXPONENTIAL)
+    assert text.count(number) == 1
+    assert output(driver(tmp_path, text)).startswith("0 ")
+    assert not output(driver(tmp_path, text.replace(number, other))).startswith("0 ")
+
+
+@pytest.mark.parametrize("name", ["afr", "learned"])
+def test_the_robot_delivers_what_the_simulator_says(name, tmp_path):
+    """8 MB/s but for a standstill from second 4 to 8; 230 kB frames at 30 Hz."""
+    policy = policies.get(name)
+    robot = compiled(tmp_path, "g++", "c++17", REPO / "examples" / "robot.cpp", header(policy, 8, EXPONENTIAL))
+    frames = 360 if JIT else 150
+    at_us = 33_333 * np.arange(frames)
+    arrivals = "".join(f"{us} 230000 {k}\n" for k, us in enumerate(at_us))
+    link = Link(Trace.steps([(4, 8e6), (4, 0), (12, 8e6)], after="stop"))
+    senders = run(policy, [Episode(messages(at_us, 230_000), link)], 8, EXPONENTIAL)
+    came = received(senders, 0)
+    lines = output(robot, "-", text=arrivals).splitlines()
+    assert len(lines) == frames + 1
+    x = senders.episodes[0].arrivals["x"][came["seq"]] if came.dtype.names else senders.episodes[0].arrivals["x"][came]
+    assert lines[-1] == f"delivered {len(came)}, H = {EXPONENTIAL.information(x):.3f}"
+    if frames == 360:
+        assert output(robot) == "\n".join(lines) + "\n"  # what it makes up by itself
+    assert (REPO / "examples" / "robot.cpp").read_text(encoding="utf-8").count("\n") <= 75
+
+
+def test_the_command_writes_the_header(tmp_path, capsys):
+    out, agent = tmp_path / "policy.h", REPO / "agents" / "pretrained" / "learned.safetensors"
+    words = ["even-reject:beta=1.25", "--to", "c", "--out", out, "--capacity", 6, "--value", "saturating:4"]
+    assert shown(["export", *words], capsys) == f"wrote {out}\n"
+    text = out.read_text(encoding="utf-8")
+    assert_equal(text, header(policies.get("even-reject:beta=1.25"), 6, qoi.saturating(4)))
+    assert "#define BUFGYM_CAPACITY 6 " in text and "bufgym_parameters[] = {\n    1.25\n}" in text and "@" not in text
+    shown(["export", agent, out, "--to", "c"], capsys)
+    assert_equal(out.read_text(encoding="utf-8"), header(policies.get("learned"), 16, EXPONENTIAL))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("codel --to c --out {}", "policy codel: has no C; known: afr, afr-paper, decimate, "),
+        ("learned-scheduler {} --to c", ", and learned agents for one queue"),
+        ("afr --to c", "export needs --out"),
+        ("afr {} --to c --name mine", "--name belongs to --to safetensors"),
+        ("model.zip {} --capacity 4 --name a", "--capacity belongs to --to c"),
+        ("model.zip {}", "--name must be given"),
+        ("afr {}/nowhere/policy.h --to c", "policy.h: cannot be written: No"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys):
+    fails(["export", *words.replace("{}", str(tmp_path / "policy.h")).split()], message, capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_has_c_is_a_drop_rule_of_the_registry():
+    for policy in map(policies.get, SUPPORTED):
+        assert policy.compile and policy.ranked
+        assert not (policy.schedules or policy.drops_at_dequeue)
+    with pytest.raises(BufgymError, match="policy codel: is asked when the socket is free"):
+        recorded(policies.get("codel"), [random_episode(np.random.default_rng(0), 5)], 4, EXPONENTIAL)
+    refuse("policy afr: has no C", header, Policy("afr", lambda buffer, arrival, memory: -1), 8, EXPONENTIAL)

@@ -1,0 +1,64 @@
+"""What each algorithm of ``train.py`` reaches after some seconds: the table of docs/guide/hyperparameters.md.
+
+python -m studies.hyperparameters --env bufgym/Uplink-v0 --seconds 10 60 --algorithms evolve ppo
+
+Each run has as many steps as fit into its seconds, because the learning rate falls over the steps of a run: a pilot
+says how many. The score is that of the kept weights, which are the best on validation, on the held-out episodes.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+PILOTS = {
+    "evolve": ("evolve", 4_000_000),
+    "guided-ppo": ("guided-ppo", 200_000),
+    "ppo": ("ppo", 100_000),
+    "ppo-unmasked": ("ppo --unmasked", 100_000),
+    "dqn": ("dqn", 100_000),
+}
+"""Algorithm -> its command, and the steps of its pilot."""
+ENVS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
+
+
+def trained(env: str, words: str, steps: int) -> tuple[float, dict[str, Any]]:
+    """The seconds that training took, and the results by policy, with the agent as ``agent``."""
+    folder = Path("runs") / "hyperparameters"
+    shutil.rmtree(folder, ignore_errors=True)
+    command = [sys.executable, "train.py", *words.split(), "--env", env, "--steps", str(steps), "--name", folder.name]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)}: {done.stderr[-500:]}")
+    found = json.loads((folder / "results.json").read_text())
+    by_name = {entry["policy"]: entry for entry in found["scores"]}
+    return found["training_s"]["0"], {**by_name, "agent": by_name[found["agent"]]}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--env", default=ENVS[0], choices=ENVS)
+    parser.add_argument("--seconds", type=float, nargs="+", default=[10.0, 60.0])
+    parser.add_argument("--algorithms", nargs="+", default=list(PILOTS), choices=list(PILOTS))
+    options = parser.parse_args()
+    print(f"{options.env}: score of the kept weights on held-out episodes; 0 is Drop Oldest, 1 the clairvoyant")
+    for name in options.algorithms:
+        words, pilot = PILOTS[name]
+        took_s, _ = trained(options.env, words, pilot)
+        rate = pilot / took_s
+        for seconds in options.seconds:
+            took_s, scores = trained(options.env, words, round(rate * seconds))
+            score, (low, high) = scores["agent"]["score"], scores["agent"]["score_95"]
+            beside = ", ".join(f"{rule} {scores[rule]['score']:.3f}" for rule in ("afr", "target-gap", "gap-price"))
+            print(
+                f"{name:13} {seconds:4.0f} s: {score:6.3f} [{low:.3f}, {high:.3f}] after {rate * seconds:,.0f} steps, "
+                f"{took_s:.0f} s; {beside}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""The documented programs of ``studies`` and ``website`` run as they are documented, each at its shortest."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parent.parent
+SHORT = {
+    "studies.relay_load load": "--robots 2 --viewers 1 --seconds 1 --slow --flood",
+    "studies.relay_load idle": "--connections 20",
+    "studies.relay_load page": "--robots 2 --seconds 1",
+    "studies.relay_mesh": "--robots 3 --viewers 3 --seconds 3",
+    "studies.relay_others": "--robots 2 --viewers 1 --seconds 1",
+    "studies.hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms evolve",
+}
+"""Program and verb -> the options that make it short."""
+NEEDS = {
+    "studies.relay_load page": "chromium",
+    "studies.relay_mesh": "nats-server",
+    "studies.relay_others": "mosquitto",
+}
+ELSEWHERE = {
+    "studies.fit": "studies/test_fit_page.py",
+    "studies.fit_sizes": "studies/test_fit_sizes.py",
+    "studies.on_task": "studies/test_on_task.py",
+    "studies.peers": "needs the other packages",
+    "studies.perf": "studies/test_perf.py",
+    "studies.round_trips": "packages/live/tests/robot/test_round_trip.py",
+    "studies.scheduling": "agents/test_scheduling.py",
+    "studies.shipped": "studies/test_shipped.py",
+    "studies.sizes": "needs a recording, and PyAV",
+    "studies.tune": "studies/test_tune.py",
+    "website.films": "website/test_gallery.py",
+    "website.row": "needs the folder of a suite's run",
+    "website.shares": "needs the folder of a suite's run",
+}
+"""Programs that another test runs, or none."""
+
+
+def test_each_documented_program_is_here() -> None:
+    pages = [*(REPO / "website").glob("*.py"), *(REPO / "studies").glob("*.*"), *(REPO / "docs").rglob("*.md")]
+    written = "\n".join(path.read_text(encoding="utf-8") for path in pages)
+    told = set(re.findall(r"python -m ((?:studies|website)\.\w+)", written))
+    assert told == {words.split()[0] for words in SHORT} | set(ELSEWHERE)
+    verbs = set(re.findall(r"python -m (studies\.relay_load \w+)", written))
+    assert verbs == {words for words in SHORT if words.startswith("studies.relay_load")}
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("words", SHORT)
+def test_it_runs(words: str) -> None:
+    needed = NEEDS.get(words)
+    if needed and not shutil.which(needed):
+        pytest.skip(f"no {needed} here")
+    command = [sys.executable, "-m", *shlex.split(f"{words} {SHORT[words]}")]
+    done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()
