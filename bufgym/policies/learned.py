@@ -153,3 +153,22 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
         policy = replace(policy, on_arrival=on_arrival_by_rule, memory=REMEMBERED, work=work, reads_rate=True)
     reads_rate = policy.reads_rate or not on_link.isdisjoint(weights.fields)
     return replace(policy, reads_rate=reads_rate, about=summary, source=source)
+
+
+def seen(memory: Memory, weights: Weights, capacity: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What policies that know the rule saw at their last decision with L = ``capacity``.
+
+    Args:
+        memory: float64[n, entries], theirs.
+        weights: say which fields they read.
+        capacity: L.
+
+    Returns:
+        (float64[n, context fields], float64[n, L + 1, slot fields]), fields in the order of ``weights.fields``.
+    """
+    first, second = weights.widths
+    begin = RULE_SCRATCH + chains.COLUMNS * (capacity + 1) + 2 * len(weights.fields) - len(weights.context)
+    begin += 2 * first + second
+    rows = memory[:, begin + ALL_CONTEXT :][:, : ALL_SLOTS * (capacity + 1)].reshape(-1, ALL_SLOTS, capacity + 1)
+    context = [begin + weights.CONTEXT_NAMES.index(name) for name in weights.context]
+    return memory[:, context], rows[:, [*map(weights.SLOT_NAMES.index, weights.slot)]].swapaxes(1, 2)
