@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from bufgym import scenario as scenarios
-from bufgym.ground.errors import BufgymError, unknown, unknown_argument
+from bufgym.envs.observation import MaskKeys
+from bufgym.ground.errors import BufgymError, UnknownArgumentError, unknown
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
@@ -18,6 +19,15 @@ INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
 nothing. At an episode's end the summary is always there."""
 RENDER_MODES = ("ansi", "rgb_array")
+MASKS = {
+    "rllib": ("observations", "action_mask"),
+    "tianshou": ("obs", "mask"),
+    "pettingzoo": ("observation", "action_mask"),
+}
+"""Library -> its keys of the observation and of the action mask in it."""
+
+
+_CHOICES = {"info": INFOS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,17 +51,20 @@ class Options:
     pool: int | None = None
     num_threads: int = 1
     render_mode: str | None = None
+    mask_in_observation: bool | str | Sequence[str] = False
+    mask_dtype: str = "int8"
 
     def __post_init__(self) -> None:
-        if self.info not in INFOS:
-            raise BufgymError(f"info = {self.info!r}: must be one of {', '.join(map(repr, INFOS))}")
+        for name, known in _CHOICES.items():
+            if (given := getattr(self, name)) not in known:
+                raise BufgymError(f"{name} = {given!r}: must be one of {', '.join(map(repr, known))}")
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
         if not isinstance(self.bound, bool | np.bool_):
             raise BufgymError(f"bound = {self.bound!r}: must be True or False")
-        if self.render_mode is not None and self.render_mode not in RENDER_MODES:
-            raise BufgymError(f"render_mode = {self.render_mode!r}: must be one of {list(RENDER_MODES)}")
         whole("num_threads", self.num_threads, 1)
+        if self.mask_keys and self.acts_guided:
+            raise BufgymError(f"mask_in_observation: actions = {GUIDED!r} have no mask")
 
     @property
     def acts_guided(self) -> bool:
@@ -73,6 +86,19 @@ class Options:
         """Whether ``info`` has the action mask in every step."""
         return self.info != "none" and not self.acts_guided
 
+    @property
+    def mask_keys(self) -> MaskKeys | None:
+        """Keys of an observation that holds the action mask; None if it does not."""
+        asked = self.mask_in_observation
+        if isinstance(asked, bool):
+            beside = None if self.observation != "flat" else "observation"
+            return MaskKeys(beside, "action_mask", self.mask_dtype) if asked else None
+        keys = MASKS.get(asked) if isinstance(asked, str) else asked
+        if not isinstance(keys, Sequence) or len({*map(str, keys)}) != 2 or len(keys) != 2:
+            rule = f"must be True, False, two names of keys or one of {', '.join(map(repr, MASKS))}"
+            raise BufgymError(f"mask_in_observation = {asked!r}: {rule}")
+        return MaskKeys(keys[0], keys[1], self.mask_dtype)
+
     def check_without_own_queue(self, what: str) -> None:
         """Refuse options for one queue on a link of its own where the sender has ``what`` instead."""
         if self.bound:
@@ -85,6 +111,7 @@ class Options:
 
 
 _NAMES = tuple(field.name for field in fields(Options))
+_OF_BATCHES = ("max_episode_steps", "autoreset_mode")
 
 
 def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
@@ -94,7 +121,10 @@ def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
     known = parameters(spec)
     for name in arguments:
         if name not in known:
-            raise unknown_argument(
-                f"{type(spec).__name__}.__init__", name, [*known, *_NAMES, "max_episode_steps", "autoreset_mode"]
+            ours = str(unknown("argument", name, [*known, *_NAMES, *_OF_BATCHES]))
+            if name in _OF_BATCHES:
+                ours = f"a batch takes it; Gymnasium's SyncVectorEnv by vector_kwargs={{{name!r}: ...}}"
+            raise UnknownArgumentError(
+                f"{type(spec).__name__}.__init__() got an unexpected keyword argument {name!r}: {ours}"
             )
     return scenarios.get(spec, **arguments), Options(**options)

@@ -132,14 +132,15 @@ class Rows:
         """The fields to observe; without slot fields where none is, as a step computes those for every message."""
         options, several_topics = self.options, bool(self.scenario.topics)
         if options.sees_guided:
-            return ObservationForm(options.observation, (), INPUT_FIELDS, self.capacity)
+            return ObservationForm(options.observation, (), INPUT_FIELDS, self.capacity, mask=options.mask_keys)
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if several_topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if several_topics else ())
         context = [field.name for field in context_fields]
         chosen = context if isinstance(options.fields, str) and options.fields == "compact" else options.fields
         if not self.keeps_slots and chosen and all(name in context or own_field(name) for name in chosen):
             slot_fields = ()
-        return ObservationForm(options.observation, slot_fields, context_fields, self.capacity, chosen)
+        form = options.observation
+        return ObservationForm(form, slot_fields, context_fields, self.capacity, chosen, options.mask_keys)
 
     def __len__(self) -> int:
         return len(self.senders)
@@ -249,7 +250,10 @@ class Rows:
 
     def observation(self, i: int | None = None) -> Observation:
         """The present observation of all rows, as views of ``output``; of row ``i`` alone, as a copy."""
-        return self.form.of(self.output.flat) if i is None else self._handed.of(self.output.flat[i])
+        if i is None:
+            return self.form.masked(self.form.of(self.output.flat), self.output.action_mask)
+        observation = self._handed.of(self.output.flat[i])
+        return self.form.masked(observation, self.output.action_mask[i].copy()) if self.form.mask else observation
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""

@@ -63,6 +63,11 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,
       and at an episode's end its summary; "none" has only this summary.
+    - ``mask_in_observation``: whether observations hold the action mask, for libraries that look for it there. True
+      puts ``action_mask`` beside the fields. Two names, or the library they belong to, make a nested dict: "rllib"
+      (``observations``, ``action_mask``), "tianshou" (``obs``, ``mask``), "pettingzoo" (``observation``,
+      ``action_mask``). A "flat" observation is always nested, by True as for "pettingzoo".
+    - ``mask_dtype``: "int8" or "bool", of the mask in observations; in ``info`` it is int8, which Gymnasium samples by.
     - ``render_mode``: "ansi" or "rgb_array".
     - ``bound``: whether the last ``info`` also has ``clairvoyant``, ``regret`` and ``score``, for one queue only. The
       clairvoyant is the best H or an upper bound of it. The score is 0 for Drop Oldest and 1 for the clairvoyant, NaN

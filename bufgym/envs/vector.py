@@ -25,8 +25,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     apart.
 
     ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
-    ``autoreset_mode``: one of Gymnasium's. ``num_threads``: threads that share the rows of a step, by default 1; they
-    do not change results. ``arguments``: the others of ``SenderEnv``.
+    ``autoreset_mode``: one of Gymnasium's, or its value or name ("SameStep", "SAME_STEP").
+    ``num_threads``: threads that share the rows of a step, by default 1; they do not change results. ``arguments``: the
+    others of ``SenderEnv``.
 
     ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do. A sequence seeds row by row.
     ``reset`` takes two options. ``reset_mask``, bool[n], selects rows. ``episodes`` has an entry for each row: an
@@ -55,11 +56,11 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"max_episode_steps = {max_episode_steps}: must be >= 1, or None for no limit")
         if rows.options.info == "steady":
             raise BufgymError("info = 'steady': is for recorders of a single environment; a batch has 'full'")
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
+        modes = {text: mode for mode in AutoresetMode for text in (mode, mode.value, mode.name)}
+        if autoreset_mode not in list(modes):
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
-            raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}") from None
+            raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}")
+        self.autoreset_mode = modes[autoreset_mode]
         self.render_mode = rows.options.render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.rows = rows
@@ -191,7 +192,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _observed(self) -> Observation:
         """The present observation; a dict of its own each time."""
-        return self._views.copy() if self._views else self.rows.observation()
+        if not self._views:
+            return self.rows.observation()
+        return self.rows.form.masked(self._views.copy(), self.rows.output.action_mask)
 
     def _new_buffers(self) -> Any:
         """(New arrays for a step, the views that are its observation, its info), and all these arrays."""

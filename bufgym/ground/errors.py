@@ -61,12 +61,6 @@ def unknown(what: str, name: object, known: Iterable[str], also: str = "", place
     return BufgymError(f"{place and f'{place}: '}unknown {what} {name!r}; {hint}")
 
 
-def unknown_argument(function: str, name: str, known: Iterable[str]) -> UnknownArgumentError:
-    """The error for a keyword argument of ``function`` that is not among those ``known``."""
-    hint = str(unknown("argument", name, known)).partition("; ")[2]
-    return UnknownArgumentError(f"{function}() got an unexpected keyword argument {name!r}; {hint}")
-
-
 def where(
     path: str | PathLike[str], line: int | None, value: object | None, rule: str, *, field: str | None = None
 ) -> str:
