@@ -232,8 +232,12 @@ def _compare_on_suite(
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
     players = _with_rival(entrants, rival, tasks.TASKS[suites.get(suite).kind])
+    registered = {*policies.names(), *policies.names(named_only=True)}
     for policy in players:
-        _check_known_by_name(policy)
+        base = policy.name.partition(":")[0]
+        if base not in registered or policies.get(base).on_arrival is not policy.on_arrival:
+            rule = "register it to run it on a suite, whose processes know it by name"
+            raise BufgymError(f"policy {policy.name}: {rule}")
     of_the_sweep = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}
     names = tuple(policy.name for policy in players)
     sweep = Sweep(suite, names, capacities=capacities, seeds=seeds, **of_the_sweep)
@@ -245,15 +249,8 @@ def _compare_on_suite(
         rows = sweeps.run_sweep(sweep, place, **how)
         finished, summary = report.run_of(place, "" if rival is None else rival.name)
     forms = tables.plain(finished, summary), tables.markdown(finished, summary), tables.html(summary)
-    page = partial(report.page_of_run, finished)
-    return Comparison(rows, f"suite {suite}", table.unranked_among(players), sweep.task.layout, page, *forms)
-
-
-def _check_known_by_name(policy: Policy) -> None:
-    base = policy.name.partition(":")[0]
-    registered = {*policies.names(), *policies.names(named_only=True)}
-    if base not in registered or policies.get(base).on_arrival is not policy.on_arrival:
-        raise BufgymError(f"policy {policy.name}: register it to run it on a suite, whose processes know it by name")
+    unranked, page = table.unranked_among(players), partial(report.page_of_run, finished)
+    return Comparison(rows, f"suite {suite}", unranked, sweep.task.layout, page, *forms)
 
 
 def _with_rival(entrants: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:

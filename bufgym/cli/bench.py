@@ -148,19 +148,10 @@ def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], com
     from bufgym.benchmark.tasks import TASKS
     from bufgym.scenario import suites
 
-    found = suites.get(suite.suite or "")
-    arguments = {
-        "seeds": who.seeds,
-        "split": suite.split or "test",
-        "data": suite.data,
-        "policy_file": who.policy_file,
-        "changes": changes,
-        "jobs": suite.jobs,
-        "backend": suite.backend or "loky",
-        "address": suite.address,
-        "command": command,
-    }
-    return Experiment(found.name, TASKS[found.kind], arguments)
+    frozen = suites.get(suite.suite or "")
+    arguments = {name: value for name, value in given(suite).items() if name != "suite"}
+    arguments |= {"seeds": who.seeds, "policy_file": who.policy_file, "changes": changes, "command": command}
+    return Experiment(frozen.name, TASKS[frozen.kind], arguments)
 
 
 def _on_scenario(options: ScenarioOptions, buffer: BufferOptions, asked_seeds: int | None) -> Experiment:
