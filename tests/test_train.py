@@ -17,7 +17,7 @@ from agents.callbacks import Curve, checkpoints
 from agents.dqn import MaskedDQN
 from agents.evaluation import SlotModel
 from agents.held_out import FixedEpisodes
-from agents.learner import learner_of
+from agents.learner import Learner, learner_of
 from agents.objectives import guided
 from agents.report import verdict
 from agents.settings import (
@@ -28,6 +28,7 @@ from agents.settings import (
     Evolve,
     FullBuffer,
     GuidedPPO,
+    Settings,
     SingleDecisions,
     SlotEnvironment,
     Suites,
@@ -36,6 +37,7 @@ from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
+from bufgym.policies.weights import save
 from bufgym.scenario import suites
 
 SHARED: dict[str, Any] = {"name": "tiny", "steps": 512, "validate_every": 250_000, "validation_episodes": 2}
@@ -177,6 +179,38 @@ def test_a_slot_network_is_kept_as_a_policy_that_decides_as_it_does() -> None:
     at_overflow = dataclasses.replace(TINY, environment=dataclasses.replace(ON, decide_at="overflow"))
     others = (at_overflow, dataclasses.replace(TINY, unmasked=True))
     assert [learner_of(other).weights_of(model) for other in others] == [None, None]  # type: ignore[attr-defined]
+
+
+@dataclasses.dataclass(frozen=True)
+class Still(Settings):
+    """Keep the rule."""
+
+    algo = "still"
+    learner = "test_train:StillTheRule"
+    steps: int = 1
+
+
+class StillTheRule(Learner[Still]):
+    """Learns nothing: its agent is gap-price, with weights of zero."""
+
+    def train_seed(self, folder: Path, seed: int, line: int = 0) -> runs.Run:
+        home, objective = folder / f"seed-{seed}", self.objective(folder, seed)
+        save(home / runs.MODEL, objective.start(), self.notes(seed, "still"))
+        run = runs.Run(seed, home, 0.0, [], [], runs.MODEL, objective.best)
+        return dataclasses.replace(run, validation=[(0, 0.0, *objective.validate(self.agent(run)))])
+
+
+def test_a_new_learner_is_a_class_and_its_settings(monkeypatch: Patch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(train, "main", asked.append)
+    train.add_command(Still)
+    with pytest.raises(SystemExit):
+        train.typed(["still", "--capacity=3", "--duration-s=1", "--validation-episodes=2", "--name=tiny"])
+    assert asked == [Still(environment=dataclasses.replace(GUIDED, episodes=200), name="tiny", validation_episodes=2)]
+    (run,) = learner_of(asked[0]).train(runs.prepare(asked[0]))
+    judges = FixedEpisodes(asked[0].environment, "validation", 2)
+    assert run.merit == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
+    assert policies.load(run.model).name == "still"
 
 
 SPLITS = ("test", "validation")
