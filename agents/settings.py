@@ -316,5 +316,32 @@ class DQN(OnSlots):
     """Decisions between two copies of the network to the target network."""
 
 
-ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, GuidedPPO)
+@dataclass(frozen=True)
+class Hindsight(Settings):
+    """Learn from the clairvoyant what each decision costs, on the slots of the buffer; messages of equal size."""
+
+    algo = "hindsight"
+    learner = "agents.hindsight:HindsightLearner"
+    kinds = ("environment", "queue")
+    steps: Natural = 250_000
+    """Decisions to learn from, for each seed."""
+    width: Count = 32
+    """Hidden units a layer."""
+    num_envs: Count = 64
+    """Environments side by side."""
+    rule_share: Share = 0.125
+    """Share of the environments that the rule plays."""
+    batch_size: Batch = 2048
+    """Decisions of one gradient step."""
+    gradient_steps: Count = 2
+    """Gradient steps after each decision of all environments."""
+    learning_rate: Positive = 1e-3
+    """At the start; falls linearly to a twentieth."""
+    room: Count = 400_000
+    """Decisions kept to learn from; at 8 slots they take about 200 MB."""
+    checkpoint_every: Count = 50_000
+    """Steps."""
+
+
+ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, GuidedPPO, Hindsight)
 """Commands of ``train.py``. A new learner is a file with a ``Learner`` (``agents.learner``) and an entry here."""
