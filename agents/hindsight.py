@@ -6,7 +6,7 @@ so far. That needs no critic, no discount and no exploration. By the performance
 episode add up to what the student lost of it. This is AggreVaTe [ross2014reinforcement], with a clairvoyant oracle as
 in [choudhury2018data].
 
-A student that plays badly sees bad states alone, in which much is lost whatever it does. Four things keep it from there:
+A student that plays badly sees bad states alone, where much is lost whatever it does. Four things keep it from there:
 
 - It begins as the rule ``gap-price``: a network of zeros, added to ``PRIOR`` for what the rule chooses.
 - Its rows are at different moments of their episodes, and some of them are played by the rule.

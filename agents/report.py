@@ -16,11 +16,10 @@ import numpy as np
 from agents.evaluation import Agent, EvaluationSet, sweep_for, test_rows
 from agents.figure import draw
 from agents.held_out import fixed_episodes, summarise
-from agents.page import written
 from agents.runs import Run, write_notes
 from agents.settings import Settings
 from bufgym.benchmark import summary
-from bufgym.benchmark.bootstrap import Interval
+from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import decimal, equal_rows_notes, unranked_among, with_equal_rows
@@ -228,7 +227,7 @@ def table(
             continue
         low, high = entry["minus_agent_95"]
         difference = "" if name == agent else f"{entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
-        score = written(Interval(entry["score"], *entry["score_95"]), ".3f")
+        score = _text(Interval(entry["score"], *entry["score_95"]), ".3f")
         numbers = [decimal(entry[column] * factor, digits) for _, column, factor, digits in COLUMNS]
         label = f"> {name}" if name == agent else name
         blocks[name in unranked].append([label, score, *numbers, difference])
@@ -304,8 +303,13 @@ def standings(result: Scores) -> str:
     for standing in result.standings:
         name = standing.policy if standing.ranked else f"{standing.policy} (not ranked)"
         iqm = "-" if math.isnan(standing["iqm"].value) else f"{standing['iqm'].value:.3f}"
-        score, regret = written(standing["score"], ".3f"), written(standing["regret"], ".2%")
-        lines.append([name, score, regret, iqm, written(standing["improvement"], ".2f")])
+        score, regret = (_text(standing["score"], ".3f"), _text(standing["regret"], ".2%"))
+        lines.append([name, score, regret, iqm, _text(standing["improvement"], ".2f")])
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
     note = f"{result.counted} of {total} cells (scenario, L) count; score: 0 is {BASELINE}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])
+
+
+def _text(interval: Interval, form: str) -> str:
+    """An interval as text such as 1.03 [1.01, 1.05]."""
+    return " ".join(filter(None, written(interval, lambda number: format(number, form))))

@@ -3,8 +3,6 @@
 The types hold the limits of single options, which are read from text once, and each class the rules of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, ClassVar, Literal
 

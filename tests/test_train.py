@@ -14,7 +14,6 @@ from train_cases import DropOldest, KilledError, columns, in_a_folder_of_its_own
 import train
 from agents import held_out, ppo, runs
 from agents.callbacks import Curve, checkpoints
-from agents.dqn import MaskedDQN
 from agents.evaluation import SlotModel
 from agents.held_out import FixedEpisodes
 from agents.learner import learner_of
@@ -167,18 +166,6 @@ def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: Any) -> None
     assert any(outcome.dropped for outcome in outcomes)
 
 
-def test_a_slot_network_is_kept_as_a_policy_that_decides_as_it_does() -> None:
-    """The same episodes in torch and compiled, before anything was learned and afterwards."""
-    learner: Any = learner_of(TINY)
-    run = learner.train_seed(runs.prepare(TINY), 0)
-    test = FixedEpisodes(ON, "test", 3)
-    model = ppo.MaskablePPO.load(run.folder / "model.zip")
-    assert run.file == runs.MODEL and test.play(learner.agent(run)) == test.play(SlotModel(model, 3))
-    at_overflow = dataclasses.replace(TINY, environment=dataclasses.replace(ON, decide_at="overflow"))
-    others = (at_overflow, dataclasses.replace(TINY, unmasked=True))
-    assert [learner_of(other).weights_of(model) for other in others] == [None, None]  # type: ignore[attr-defined]
-
-
 SPLITS = ("test", "validation")
 
 
@@ -241,26 +228,6 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
     assert all((first[key] == again[key]).all() for key in first)
     other = weights(dataclasses.replace(arguments, seed=1), "other")
     assert not all((first[key] == other[key]).all() for key in first)
-
-
-def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
-    arguments = LEARNERS["dqn"]
-    folder = runs.prepare(arguments)
-    models = []
-    for steps in (256, 512):
-        learner_of(dataclasses.replace(arguments, steps=steps)).train_seed(folder, 0)
-        model = MaskedDQN.load(checkpoints(folder / "seed-0")[-1])
-        counts = {int(state["step"]) for state in model.policy.optimizer.state_dict()["state"].values()}
-        assert model.num_timesteps == steps and counts == {model._n_updates}
-        models.append(model)
-    assert models[1]._n_updates > models[0]._n_updates > 0
-
-
-def test_batches_divide_the_experience() -> None:
-    assert ppo.even_batch(32_768, 4_096) == 4_096
-    assert ppo.even_batch(34_560, 4_096) == 3_840  # nine of them: eight would be too large
-    assert ppo.even_batch(100, 4_096) == 100
-    refuse("batch_size = 4: num_envs x n_steps = 7 decisions", ppo.even_batch, 7, 4)
 
 
 POSITIVE = (

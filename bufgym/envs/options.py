@@ -18,6 +18,8 @@ ACTIONS = ("slots", GUIDED)  # What an action is: the slot that goes, or numbers
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
 nothing. At an episode's end the summary is always there."""
+MASKS = ("valid", "plausible")
+"""Actions that the mask shows: all valid ones, or those of them that a good rule chooses among (``plausible``)."""
 RENDER_MODES = ("ansi", "rgb_array")
 MASKS = {
     "rllib": ("observations", "action_mask"),
@@ -44,6 +46,7 @@ class Options:
     decide_at: str = "arrival"
     reward: str | Mapping[str, float] = "retained"
     actions: str = "slots"
+    mask: str = "valid"
     fields: str | Sequence[str] | None = None
     observation: str = "dict"
     info: str = "full"
@@ -60,6 +63,8 @@ class Options:
                 raise BufgymError(f"{name} = {given!r}: must be one of {', '.join(map(repr, known))}")
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
+        if self.mask not in MASKS:
+            raise BufgymError(f"mask = {self.mask!r}: must be one of {', '.join(map(repr, MASKS))}")
         if not isinstance(self.bound, bool | np.bool_):
             raise BufgymError(f"bound = {self.bound!r}: must be True or False")
         whole("num_threads", self.num_threads, 1)
@@ -105,6 +110,8 @@ class Options:
             raise BufgymError(
                 f"bound = True: the clairvoyant is known for one queue on a link of its own, not for {what}"
             )
+        if self.mask == "plausible":
+            raise BufgymError(f"mask = 'plausible': the plausible actions are known for one queue, not for {what}")
         if self.acts_guided or self.sees_guided:
             name = "actions" if self.acts_guided else "fields"
             raise BufgymError(f"{name} = {GUIDED!r}: the rule serves one queue on a link of its own, not {what}")

@@ -18,6 +18,7 @@ from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
+from bufgym.envs.plausible import keep_plausible
 from bufgym.envs.step import step_rows
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.threads import Threads
@@ -207,6 +208,8 @@ class Rows:
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
         step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self._guide)
+        if self.options.mask == "plausible":
+            keep_plausible(self.senders.batch, rows, self.output.action_mask)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""

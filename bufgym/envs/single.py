@@ -58,6 +58,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``actions``: "slots", as above, or "guided" (one queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule
       gap-price for this decision, by the table ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is
       no mask, and no invalid action.
+    - ``mask``: "valid", or "plausible" (one queue) for the few valid actions that a good rule chooses among: accept,
+      reject, evict what leaves one of the two smallest gaps, evict the head when its turn is near. The others stay
+      valid, and do what they say.
     - ``fields``: names of the fields to observe, your own included; by default all of the tables. "compact" means
       all of the context's. "guided" means ``bufgym.policies.guided.INPUTS``, which lie in [-4, 4].
     - ``observation``: "dict", "flat" or "slots".

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bufgym.envs.options import Options
 from bufgym.envs.rows import Rows
 from bufgym.model import qoi
 from bufgym.scenario import Uplink
@@ -26,7 +27,7 @@ SCENARIO = Uplink(traces=(LINK,), rate_hz=10, duration_s=FRAMES / 10, size_bytes
 def played() -> tuple[Any, Any, Any]:
     """Delivered and retained rewards and the QoI held afterwards, float64[sequences, steps], of all sequences."""
     sequences = np.array(list(product(range(L + 2), repeat=FRAMES)))
-    rows = Rows(len(sequences), SCENARIO, L)
+    rows = Rows(len(sequences), SCENARIO, Options(capacity=L))
     rows.reset(np.arange(len(rows)), [draw(SCENARIO, 0)] * len(rows))
     rewards, held = [], []
     for actions in sequences.T:

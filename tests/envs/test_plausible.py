@@ -2,13 +2,18 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from refusal_cases import refuse
 
 from bufgym import policies
+from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.envs.expert.player import Player
+from bufgym.envs.options import Options
 from bufgym.envs.plausible import NEAR, keep_plausible
 from bufgym.envs.rows import Rows
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import named
 from bufgym.scenario import Interruption, Uplink
 from bufgym.scenario.uplink import uplink_over_lte
@@ -27,7 +32,7 @@ def plausible(rows: Rows) -> Any:
 
 def begun(scenario: Any, L: int, n: int = 1) -> Rows:
     """Rows at their first decision."""
-    rows = Rows(n, scenario, L)
+    rows = Rows(n, scenario, Options(capacity=L))
     for i in range(n):
         rows.seed(i, np.random.default_rng(i))
     rows.reset(np.arange(n))
@@ -85,3 +90,24 @@ def test_the_rule_chooses_among_them() -> None:
         kept.append(bool(plausible(rows)[0, action]))
         rows.step(np.array([action]))
     assert len(kept) > 800 and np.mean(kept) > 0.995
+
+
+def test_environments_show_them_if_asked() -> None:
+    """Beside an environment that shows all valid actions, in the same states; a batch shows the same."""
+    made: dict[str, Any] = {"scenario": SWITCHING, "capacity": 6}
+    valid, few = SenderEnv(**made), SenderEnv(**made, mask="plausible")
+    batch = SenderVectorEnv(1, **made, mask="plausible")
+    (_, shown), (_, info), (_, infos) = (env.reset(seed=3) for env in (valid, few, batch))
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        assert info["action_mask"].tolist() == plausible(valid.rows)[0].tolist() == infos["action_mask"][0].tolist()
+        action = int((rng.random(8) * shown["action_mask"]).argmax())
+        shown, info = valid.step(action)[4], few.step(action)[4]
+        infos = batch.step(np.array([action]))[4]
+    assert shown["qoi"] == info["qoi"] and shown["invalid"] == info["invalid"] == 0
+
+
+def test_what_it_is_not_for() -> None:
+    refuse("mask = 'few': must be one of 'valid', 'plausible'", SenderEnv, SWITCHING, mask="few")
+    with pytest.raises(BufgymError, match="known for one queue, not for several topics"):
+        gym.make("bufgym/Topics-v0", mask="plausible")
