@@ -14,16 +14,13 @@ from numpy.typing import NDArray
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.kernel import kernel, stretch
-from bufgym.model.observe import Field
 from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
 from bufgym.sim.state import Batch
 from bufgym.sim.view import arrival_of, view
 
 GUIDED = "guided"
 ACTIONS = ("slots", GUIDED)  # What an action is: the slot that goes, or numbers of the rule
-INPUT_FIELDS = tuple(
-    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
-)
+INPUT_FIELDS = tuple(INPUTS.values())
 """Fields observed with ``fields="guided"``."""
 
 
