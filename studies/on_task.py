@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cma_es import Evolution, evaluation_here
+from agents.cma_es import Search, evaluation_here
 from agents.objectives.objective import Objective
 from agents.page import command, publish, table
 from bufgym import policies
@@ -96,7 +96,7 @@ class Task(Objective):
 def evolved(reward: str, L: int, seed: int, generations: int) -> Policy:
     """The agent after so many generations."""
     task = Task(reward, L, seed)
-    state = Evolution.around(task.start(), task.sigma, seed)
+    state = Search.around(task.start(), task.sigma, seed)
     for _ in range(generations):
         state.generation(evaluation_here(task))
     return state.agent.policy(task.name)

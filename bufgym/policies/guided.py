@@ -116,7 +116,7 @@ def declared(name: str, meaning: str, function: Function, low: float = -4.0, hig
     return Field(name, "context", "link", "see its meaning", meaning, function, low, high)
 
 
-_INPUTS = (
+INPUT_FIELDS = (
     declared("short", "lg(rate over 0.1 s, rate over 2 s)",
              lambda buffer, known: lg(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)),
     declared("medium", "lg(rate over 0.5 s, rate over 2 s)",
@@ -147,12 +147,12 @@ _INPUTS = (
              "1 on a measured steady link, in bursts if there are two places, and until the link has carried anything",
              lambda buffer, known: 1.0 if known.is_plain else 0.0),
 )  # fmt: skip
-INPUTS = {field.name: field for field in _INPUTS}
+INPUTS = {field.name: field for field in INPUT_FIELDS}
 """The inputs by name, in their order."""
 N_INPUTS = len(INPUTS)
 WORK = (chains.SCRATCH[0] + N_INPUTS + N_OUTPUTS + NUMBERS, chains.SCRATCH[1])
 """``Policy.work``: the rule's own, then inputs, outputs and numbers, at the memory's end."""
-write_inputs = writer(_INPUTS, "buffer, known")
+write_inputs = writer(INPUT_FIELDS, "buffer, known")
 
 
 @kernel
@@ -292,7 +292,7 @@ class GuidedWeights:
     LAYERS: ClassVar[int] = 0
     SHAPE: ClassVar[tuple[int, int]] = (2 * N_OUTPUTS, N_INPUTS)
     LIGHT: ClassVar[tuple[int, int]] = (N_OUTPUTS, N_INPUTS)
-    TABLE: ClassVar[list[Any]] = [described(_INPUTS), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
+    TABLE: ClassVar[list[Any]] = [described(INPUT_FIELDS), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
     """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
 
     @property

@@ -37,7 +37,7 @@ FEATURES = {
     "late": "its age over its topic's deadline, at most 2; 0 without a deadline",
     "queued": "log of 1 + the messages of its topic in the queue",
 }
-_INPUTS = (
+INPUT_FIELDS = (
     declared("one", "always 1", lambda buffer: 1.0),
     declared("fill", "2 fill level - 1", lambda buffer: 2 * fill(buffer) - 1),
     declared("load", "lg(long rate x arrival period, mean bytes of an arrival)",
@@ -52,8 +52,8 @@ _INPUTS = (
     declared("in_flight", "2 in_flight / n_T - 1", lambda buffer: 2 * buffer.in_flight / buffer.window - 1),
     declared("window", "1 - 2 / n_T", lambda buffer: 1 - 2 / buffer.window),
 )  # fmt: skip
-INPUTS = {field.name: field for field in _INPUTS}
-write_inputs = writer(_INPUTS, "buffer")
+INPUTS = {field.name: field for field in INPUT_FIELDS}
+write_inputs = writer(INPUT_FIELDS, "buffer")
 N_FEATURES, N_INPUTS = len(FEATURES), len(INPUTS)
 DROPS, ROOM = N_FEATURES, 2 * N_FEATURES
 OUTPUTS = (*(f"send_{name}" for name in FEATURES), *(f"drop_{name}" for name in FEATURES), "room")
@@ -136,7 +136,7 @@ class SchedulerWeights(GuidedWeights):
     CONTEXT_NAMES = tuple(INPUTS)
     NETWORKS = ("scheduler",)
     SHAPE = LIGHT = (N_OUTPUTS, N_INPUTS)
-    TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), described(_INPUTS), OUTPUTS, PLAIN]
+    TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), described(INPUT_FIELDS), OUTPUTS, PLAIN]
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights, for any topics and every L."""

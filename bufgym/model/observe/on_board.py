@@ -30,6 +30,7 @@ def demand(buffer: Buffer, arrival: Any) -> float:
     return 1e6 * mean_bytes(buffer, arrival) / max(buffer.period_us, 1.0)
 
 
+@kernel
 def time_to_free(buffer: Buffer, arrival: Any) -> float:
     """Time until the message in transmission has left, beside the arrival period."""
     if buffer.left_bytes == 0:
@@ -44,6 +45,7 @@ def carried(buffer: Buffer, arrival: Any) -> float:
     return float(buffer.long_rate_bytes_per_s * max(buffer.period_us, 1.0))
 
 
+@kernel
 def size_spread(buffer: Buffer, arrival: Any) -> float:
     """Standard deviation of the natural logarithm of bytes, at most 1."""
     n, newcomer = len(buffer.slots) + 1, math.log(max(arrival.size_bytes, 1))
@@ -68,13 +70,13 @@ ON_BOARD_FIELDS = (
           lambda buffer, arrival: squash(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)),
     Field("time_to_free", "context", "link", "g/(g+r), r = arrival period",
           "time until the message in transmission has left, at the rate over 0.1 s; 1 where that is 0",
-          time_to_free),
+          lambda buffer, arrival: time_to_free(buffer, arrival)),
     Field("newcomer_bytes", "context", "link", "g/(g+r), r = bytes that the link carries in an arrival period",
           "the newcomer's bytes; the link's rate is that over 2 s: 0.5 = just keeps up, 1 = nothing carried yet",
           lambda buffer, arrival: squash(1e6 * arrival.size_bytes, carried(buffer, arrival))),
     Field("size_spread", "context", "queue", "standard deviation, at most 1",
           "spread of the natural logarithm of bytes, over the queued messages and the newcomer: 0 = all alike",
-          size_spread),
+          lambda buffer, arrival: size_spread(buffer, arrival)),
     Field("load", "context", "link", "g/(g+r), r = rate over 2 s", "the bytes that arrive, kept or not, "
           "a running mean over about 8 arrivals: more than 0.5 = the link falls behind",
           lambda buffer, arrival: squash(1e6 * buffer.arrival_bytes, carried(buffer, arrival))),
