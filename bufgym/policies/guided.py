@@ -97,7 +97,7 @@ class Known(NamedTuple):
 
     size: float  # mean bytes of the queue and the newcomer
     newcomer_bytes: float
-    count: int  # s + 1
+    messages: int  # s + 1, the newcomer being one
     rate: float  # the rule's link rate r, bytes/us
     head_age_us: int  # time from the head's arrival to the newcomer's, us; 0 for an empty queue
     come: float  # motion since the message dequeued last
@@ -129,8 +129,8 @@ INPUT_FIELDS = (
     declared("spread", "2 (sd - 0.6), sd being that of the logarithm of the rate over 0.5 s, in the last 10 s",
              lambda buffer, known: min(2 * (math.sqrt(known.log_rate_variance) - 0.6), MOST)),
     declared("head_age", "lg(r x the head's age + 0.1 size, (s + 1) size): 0.1 alone for an empty queue",
-             lambda buffer, known: lg(known.rate * known.head_age_us + 0.1 * known.size, known.count * known.size)),
-    declared("newcomer", "lg(come, (s + 1) g)", lambda buffer, known: lg(known.come, known.count * known.gap)),
+             lambda buffer, known: lg(known.rate * known.head_age_us + 0.1 * known.size, known.messages * known.size)),
+    declared("newcomer", "lg(come, (s + 1) g)", lambda buffer, known: lg(known.come, known.messages * known.gap)),
     declared("stall", "log(1 + r x time since a message was dequeued / size) - 0.5",
              lambda buffer, known: min(math.log(1 + known.rate * max(buffer.stalled_us, 0) / known.size) - 0.5, MOST)),
     declared("size_spread", "2 min(1, standard deviation of the logarithm of bytes over the last arrivals)",
@@ -141,7 +141,7 @@ INPUT_FIELDS = (
              lambda buffer, known: 0.0 if known.has_target else 1.0),
     declared("one", "always 1", lambda buffer, known: 1.0),
     declared("head_gap", "lg(the gap left if the head goes, g); 0 for an empty queue",
-             lambda buffer, known: lg(known.head_gap, known.gap) if known.count > 1 else 0.0),
+             lambda buffer, known: lg(known.head_gap, known.gap) if known.messages > 1 else 0.0),
     declared("share", "a, the share of price-dp in the plain rule", lambda buffer, known: known.share),
     declared("plain",
              "1 on a measured steady link, in bursts if there are two places, and until the link has carried anything",
@@ -184,7 +184,7 @@ def inputs(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, o
     known = Known(
         size=mean_bytes(buffer, arrival),
         newcomer_bytes=float(arrival.size_bytes),
-        count=s + 1,
+        messages=s + 1,
         rate=rate,
         head_age_us=arrival.arrival_us - buffer.slots[0].arrival_us if s > 0 else 0,
         come=come,

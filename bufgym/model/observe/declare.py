@@ -51,9 +51,12 @@ def writer(fields: Sequence[Field], facts: str, first: int = 0) -> Any:
     It puts the i-th field's number at index ``first + i``. ``facts`` are the names of the functions' arguments.
     """
     into, index = ("column, rows", "rows[{}, column]") if fields[0].per == "slot" else ("row", "row[{}]")
-    lines = [f"{index.format(i)} = field_{i}({facts})" for i in range(first, first + len(fields))]
-    names = {"__name__": __name__, **{f"field_{i}": kernel(field.function) for i, field in enumerate(fields, first)}}
-    exec("\n    ".join([f"def write({facts}, {into}):", *lines]), names)
+    names: dict[str, Any] = {"__name__": __name__}
+    lines = [f"def write({facts}, {into}):"]
+    for i, field in enumerate(fields, first):
+        names[f"field_{i}"] = kernel(field.function)
+        lines.append(f"    {index.format(i)} = field_{i}({facts})")
+    exec("\n".join(lines), names)
     return kernel(names["write"])
 
 
