@@ -14,15 +14,9 @@ from bufgym.envs.options import GUIDED, Options
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel, stretch
-from bufgym.model.observe import Field
-from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
+from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
 from bufgym.sim.state import Batch
 from bufgym.sim.view import arrival_of, view
-
-INPUT_FIELDS = tuple(
-    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
-)
-"""Fields observed with ``fields="guided"``."""
 
 
 class Guide(NamedTuple):

@@ -131,6 +131,11 @@ class ObservationForm:
         """The observation, an array or a dict of the caller's own, with a view of the mask if this form has one."""
         return observation if self.mask is None else self.mask.put(observation, mask.view(self.mask.dtype))
 
+    @property
+    def own_places(self) -> list[Place]:
+        """Places of the fields that are observed only because they are named."""
+        return [place for place in self.places if place.first >= self.table_numbers]
+
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
         first, end, fields, width = self._first_context, self.table_numbers, self._slot_fields, self._width

@@ -18,7 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import at, compile_for, kernel, named, stretch
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
-from bufgym.model.observe import OwnField, OwnTerm
+from bufgym.model.observe import Field, OwnTerm
 from bufgym.policies.registry import view_type
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch, batch_type
@@ -94,7 +94,7 @@ def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.floa
 
 def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, row: NDArray[np.float32]) -> None:
     """Write a field into a row of numbers by calling its function, compiled or not, from Python."""
-    field, first = cast(OwnField, place.field), place.first
+    field, first = place.field, place.first
     if field.per == "context":
         row[first] = field.function(buffer, arrival)
     else:
@@ -106,7 +106,7 @@ def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, 
     check_bounds(field, row[first : first + place.entries])
 
 
-def check_bounds(field: OwnField, numbers: NDArray[np.float32]) -> None:
+def check_bounds(field: Field, numbers: NDArray[np.float32]) -> None:
     """Raise a BufgymError if the field is outside its registered bounds."""
     inside = (numbers >= np.float32(field.low)) & (numbers <= np.float32(field.high))  # False for NaN
     if not inside.all():
@@ -118,8 +118,9 @@ class OwnFields:
     """Your own fields that a form observes, filled after each step."""
 
     def __init__(self, form: ObservationForm) -> None:
-        self._places = [(place, place.field) for place in form.places if isinstance(place.field, OwnField)]
-        self._compiled = [_compiled("field", field.per, field) if field.compile else None for _, field in self._places]
+        self._places = form.own_places
+        fields = [place.field for place in self._places]
+        self._compiled = [_compiled("field", field.per, field) if field.compile else None for field in fields]
 
     def __bool__(self) -> bool:
         return bool(self._places)
@@ -127,10 +128,10 @@ class OwnFields:
     def write(self, batch: Batch, output: StepOutput) -> None:
         """Write each field of every row that waits for a decision; other rows are 0 already."""
         records = named(batch)
-        for (place, field), compiled in zip(self._places, self._compiled, strict=True):
+        for place, compiled in zip(self._places, self._compiled, strict=True):
             if compiled is not None:
                 compiled(batch, place.first, output.flat)
-                check_bounds(field, output.flat[:, place.first : place.first + place.entries])
+                check_bounds(place.field, output.flat[:, place.first : place.first + place.entries])
                 continue
             for i in np.flatnonzero(batch.senders["waiting"] != NOTHING_WAITS).tolist():
                 arriving = bool(batch.senders["waiting"][i] == ARRIVAL_WAITS)
@@ -276,7 +277,7 @@ def _writer(kind: str, several: bool) -> Any:
     return compile_for(signature, loops[kind])
 
 
-def _compiled(what: str, kind: str, own: OwnField | OwnTerm) -> Callable[..., None]:
+def _compiled(what: str, kind: str, own: Field | OwnTerm) -> Callable[..., None]:
     """The loop of ``_writer`` over this field's or term's function."""
     try:
         function = compile_for(_types()[kind], own.function)

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym.envs.guided import INPUT_FIELDS, Guiding
+from bufgym.envs.guided import Guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import Options
 from bufgym.envs.output import StepOutput
@@ -35,6 +35,7 @@ from bufgym.model.observe import (
     terms_for,
 )
 from bufgym.oracle.measure import MEASURED, measured
+from bufgym.policies.guided import INPUT_FIELDS
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
