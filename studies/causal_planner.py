@@ -48,7 +48,7 @@ from bufgym.sim.metrics import outcome
 from bufgym.sim.state import ARRIVAL_WAITS, new_batch
 from bufgym.traces.generate.lte import LTE_MODES
 from bufgym.traces.generate.shipped import SHIPPED_LTE
-from studies.futures import DriveSeen, Hidden, Links, LinkSeen, prior
+from studies.futures import DriveSeen, Hidden, Links, LinkSeen, prior, rates
 
 NAME = "causal-planner"
 RIVALS = ("afr", "drop-oldest", "target-gap", "learned")
@@ -57,7 +57,7 @@ KEPT = 15
 TIE = 1e-9
 """Values closer than this are equal: they sum the same gaps in another order."""
 AFTER_ONE = 4
-"""Arrivals of a future, at least, for each message that the mean link sends; more than so many are thinned out."""
+"""Arrivals of a future for each message that a mean link sends, at least. Where there are more, some are left out."""
 ROOM, STEPS = 1 << 16, 64  # Initial room for the staircases of all futures, and of one message
 
 
@@ -83,7 +83,7 @@ class CausalPlanner:
         rng = np.random.default_rng(seed)
         self._planning, self._scenario, self._capacity = planning, scenario, capacity
         self._link, self._drive = LinkSeen(links, rng), DriveSeen(rng) if scenario.motion else None
-        messages_per_s = np.mean([trace.mean_bytes_per_s for trace in scenario.traces]) / scenario.size_bytes
+        messages_per_s = rates(links).mean() / scenario.size_bytes
         self._stride = max(1, int(scenario.rate_hz / messages_per_s / AFTER_ONE))
         n, messages = planning.futures, 2 + round(planning.horizon_s * scenario.rate_hz)
         self._batch = new_batch(n, capacity, messages, 1, scenario.value.array)
@@ -232,7 +232,7 @@ def main(
     episodes: Natural = 0,
     futures: Count = 32,
     horizon_s: Positive = 20.0,
-    told: bool = True,
+    untold: bool = False,
     out: Path = Path("results/causal-planner"),
 ) -> None:
     """Score the planner beside rules and `learned`, with paired 95 % intervals over links (of uplink over episodes).
@@ -243,13 +243,13 @@ def main(
         episodes: number of episodes of uplink, of links of lte-v2; 0: all.
         futures: number of futures drawn.
         horizon_s: how far they reach, s.
-        told: whether the planner knows when the stream ends.
+        untold: whether the planner does not know when the stream ends.
         out: folder for the rows; a run goes on where it was stopped.
     """
     cases, law = TASKS[task]
-    planning = Planning(futures, horizon_s, told)
+    planning = Planning(futures, horizon_s, not untold)
     links = prior(law, np.random.default_rng(0))
-    folder = out / f"{task}-{futures}-{horizon_s:g}s-{'told' if told else 'untold'}"
+    folder = out / f"{task}-{futures}-{horizon_s:g}s-{'untold' if untold else 'told'}"
     folder.mkdir(parents=True, exist_ok=True)
     rows, decisions = [], 0
     for case in cases(capacities, episodes):

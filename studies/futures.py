@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.traces import MotionSettings
-from bufgym.traces.generate.driving import _PHASES, _STOP_CHANCE, _TURN_CHANCE
-from bufgym.traces.generate.lte import _CEILING, LTE_MODES, MAX_FADE_S, LteMode
+from bufgym.traces.generate.driving import PHASES, STOP_CHANCE, TURN_CHANCE
+from bufgym.traces.generate.lte import CEILING, LTE_MODES, MAX_FADE_S, LteMode
 
 Reals = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ SAME = 2e-4
 JITTER = 0.01
 """Standard deviation of the noise on the log of a particle's "fair" rate after each second, until it is known."""
 LEAST_US = 5_000  # Time of transmission from which on a rate is measured, us
-_TOP = math.log(_CEILING)
+_TOP = math.log(CEILING)
 
 
 class Hidden(NamedTuple):
@@ -141,7 +141,7 @@ class Belief:
         if rate and abs(rate - self._highest) <= SAME * rate:
             # No two seconds have the same rate but at the ceiling.
             self._known = True
-            old = old._replace(unit=np.full(PARTICLES, math.log(rate / _CEILING)))
+            old = old._replace(unit=np.full(PARTICLES, math.log(rate / CEILING)))
         self._highest = max(self._highest, rate or 0.0)
         old = looped(old, rng)
         new = old if first else next_second(old, rng)
@@ -197,7 +197,6 @@ class LinkSeen:
         self._belief, self._rng = Belief(before, rng), rng
         self._rate: float | None = None  # of the present second, bytes/s, once seen
         self._ends_us: float | None = None  # when that second ends, once a change was seen
-        self._began_us = 0.0  # since when no change was seen
         self._mixed: tuple[float, float, float, float] | None = None  # start, end, rate and earlier rate of a change
         self._counted = False  # whether the belief is at the present second
 
@@ -227,16 +226,14 @@ class LinkSeen:
 
     def carried(self, now_us: int, times_us: Reals, count: int) -> NDArray[np.int64]:
         """int64[count, times]: bytes that the link carries from now until each of these times, in futures of it."""
-        seconds = 3 + int((times_us[-1] - now_us) // 1e6)
-        found = self._belief.futures(count, seconds)
+        seconds, behind = 3 + int((times_us[-1] - now_us) // 1e6), int(self._ends_us is not None and not self._counted)
+        found = self._belief.futures(count, seconds + behind)[:, behind:]
         if self._rate is not None:
             found[:, 0] = self._rate
-        elif self._counted is False and self._ends_us is not None:
-            found = self._belief.futures(count, seconds + 1)[:, 1:]
         if self._ends_us is not None:
             left_us = np.full(count, self._ends_us - now_us)
         else:
-            left_us = self._rng.random(count) * max(1e6 - (now_us - self._began_us), 1e3)
+            left_us = self._rng.random(count) * (1e6 - now_us if now_us < 1e6 else 1e6)
         knots = np.concatenate([np.zeros((count, 1)), left_us[:, None] + 1e6 * np.arange(seconds)], axis=1)
         total = np.concatenate([np.zeros((count, 1)), np.cumsum(found * np.diff(knots) / 1e6, axis=1)], axis=1)
         after_us = times_us - now_us
@@ -245,12 +242,12 @@ class LinkSeen:
 
 # Kinds of phases, their ranges of motion per second, and of their lengths, s.
 _SCALE = MotionSettings()
-_KINDS = list(_PHASES)
+_KINDS = list(PHASES)
 _PACES = [
     tuple(speed / _SCALE.scene_scale_m + turn / _SCALE.fov_deg for speed, turn in zip(speeds, turns, strict=True))
-    for speeds, turns, _ in _PHASES.values()
+    for speeds, turns, _ in PHASES.values()
 ]
-_LENGTHS = [lengths for _, _, lengths in _PHASES.values()]
+_LENGTHS = [lengths for _, _, lengths in PHASES.values()]
 
 
 class DriveSeen:
@@ -282,7 +279,7 @@ class DriveSeen:
             return cruise
         if self._pace > _PACES[cruise][1]:
             return turn
-        return turn if self._rng.random() < _TURN_CHANCE / (1 - _STOP_CHANCE) else cruise
+        return turn if self._rng.random() < TURN_CHANCE / (1 - STOP_CHANCE) else cruise
 
     def moved(self, now_us: int, times_us: Reals, count: int) -> Reals:
         """float64[count, times]: motion from now until each of these times, in futures of the drive."""
@@ -300,9 +297,9 @@ class DriveSeen:
         x.append(self._pace * (knots[-1] - now_us) / 1e6)
         while knots[-1] < until_us:
             uniform, cruises = rng.random(), _KINDS[kind] == "cruise"
-            following = "turn" if uniform < _TURN_CHANCE else "stop" if uniform < _TURN_CHANCE + _STOP_CHANCE else ""
+            following = "turn" if uniform < TURN_CHANCE else "stop" if uniform < TURN_CHANCE + STOP_CHANCE else ""
             kind = _KINDS.index(following if cruises and following else "cruise")
-            speeds, turns, lengths = (low + (high - low) * rng.random() for low, high in _PHASES[_KINDS[kind]])
+            speeds, turns, lengths = (low + (high - low) * rng.random() for low, high in PHASES[_KINDS[kind]])
             knots.append(knots[-1] + 1e6 * lengths)
             x.append(x[-1] + lengths * (speeds / _SCALE.scene_scale_m + turns / _SCALE.fov_deg))
         return knots, x

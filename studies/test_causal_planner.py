@@ -1,5 +1,6 @@
 """The causal planner: laws of its futures, what it learns from what a robot sees, and its values."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,13 @@ import pytest
 
 pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
 
-from bufgym.benchmark.run import draw  # noqa: E402
-from bufgym.ground.kernel import JIT  # noqa: E402
-from bufgym.policies import Policy  # noqa: E402
-from bufgym.scenario import Episode, Uplink  # noqa: E402
-from bufgym.sim import outcome, run  # noqa: E402
-from bufgym.traces import Trace, drive_motion, synthetic_lte  # noqa: E402
-from studies import causal_planner, futures  # noqa: E402
+from bufgym.benchmark.run import draw
+from bufgym.ground.kernel import JIT
+from bufgym.policies import Policy
+from bufgym.scenario import Episode, Uplink
+from bufgym.sim import outcome, run
+from bufgym.traces import Trace, drive_motion, synthetic_lte
+from studies import causal_planner, futures
 
 TRAIN = [("train", 9e6)]
 planned = pytest.mark.skipif(not JIT, reason="without compilation a plan takes seconds")
@@ -39,18 +40,24 @@ def test_futures_follow_the_generators_law() -> None:
 
 
 def test_the_filter_forecasts_better_than_the_last_rate_and_than_the_mean() -> None:
-    trace = rates_of(synthetic_lte(5000, 300, 9e6, "train"))
+    """Over 600 s of two links: squared errors a second ahead, and how often the rate falls between the quartiles."""
     links = futures.prior([(mode, mean) for mode in ("walk", "train") for mean in (5e6, 9e6)], np.random.default_rng(0))
-    belief = futures.Belief(links, np.random.default_rng(1))
-    errors = []
-    for now, then in zip(trace[:-1], trace[1:], strict=True):
-        belief.second(float(now))
-        forecast = belief.futures(200, 2)
-        assert forecast[:, 0] == pytest.approx(np.full(200, now), rel=1e-9)  # the present second's rate is known
-        errors.append([abs(guess - then) for guess in (np.median(forecast[:, 1]), now, trace.mean())])
-    found, last, mean = np.mean(errors[20:], axis=0)
-    assert found < last
-    assert found < mean
+    errors, between = [], []
+    for seed in (5000, 5001):
+        trace = rates_of(synthetic_lte(seed, 300, 9e6, "train"))
+        belief = futures.Belief(links, np.random.default_rng(seed))
+        for now, then in itertools.pairwise(trace):
+            belief.second(float(now))
+            forecast = belief.futures(200, 2)
+            # The present rate is known, but for the noise on a particle at the ceiling.
+            assert forecast[:, 0] == pytest.approx(np.full(200, now), rel=5 * futures.JITTER)
+            low, high = np.quantile(forecast[:, 1], [0.25, 0.75])
+            between.append(low <= then <= high)
+            errors.append([(guess - then) ** 2 for guess in (forecast[:, 1].mean(), now, trace.mean())])
+    found, last, mean = np.mean(errors, axis=0)
+    assert found < 0.95 * last
+    assert found < 0.7 * mean
+    assert np.mean(between) == pytest.approx(0.5, abs=0.07)
 
 
 def test_a_breakdown_ends_and_the_unseen_seconds_widen_the_belief() -> None:
