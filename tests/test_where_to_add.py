@@ -119,10 +119,10 @@ def hello(name: str) -> None:
     """Greet."""
     print(f"hello, {name}")
 '''
-FIELD = '''
+FIELD = """
     Field("half_full", "context", "queue", "flag", "1 where half of the places are taken",
           lambda buffer, arrival: float(2 * len(buffer.slots) >= buffer.capacity)),
-'''
+"""
 TERM = """
 @built_in("starved", unit="steps")
 def starved(step: Any, memory: Any) -> float:
