@@ -54,10 +54,10 @@ def look(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -> 
 @kernel
 def reads(fields: NDArray[np.float64], begin: int, end: int) -> bool:
     """Whether any of ``fields`` is in this part of the observation."""
+    found = False
     for field in fields:
-        if begin <= field < end:
-            return True
-    return False
+        found = found or begin <= field < end
+    return found
 
 
 @kernel

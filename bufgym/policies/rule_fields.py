@@ -31,7 +31,7 @@ RULE_SLOT_FIELDS = tuple(
         ("rule_merged", _RATIO, "lg(gap left if it is dropped, 2 g)", -MOST, MOST),
         ("rule_before", _RATIO, "lg(gap before it, g)", -MOST, MOST),
         ("rule_after", _RATIO, "lg(gap after it, g)", -MOST, MOST),
-        ("rule_preference", "g", "target-gap's preference for dropping it: 1 - the discounted gap left / g", -MOST, MOST),
+        ("rule_preference", "g", "target-gap's preference for dropping it: 1 - discounted gap left / g", -MOST, MOST),
         ("rule_advantage", "price-dp's unit", "price-dp's advantage of dropping it", -MOST, MOST),
         ("rule_loss", _RATIO, "lg(V lost if it is dropped, price-dp's unit)", -MOST, MOST),
         ("rule_head", "g", "how much nearer to g the gap after dropping it is; 0 but for a head whose turn is near",
@@ -41,14 +41,15 @@ RULE_SLOT_FIELDS = tuple(
 )  # fmt: skip
 """In the order in which ``observe_rule`` writes them."""
 RULE_FIELDS = tuple(
-    Field(f"guided_{name}", "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
+    Field(f"guided_{name}", "context", "link", "see its meaning", meaning, -4.0, 4.0)
+    for name, meaning in INPUTS.items()
 ) + tuple(
     Field(name, "context", "link", "share" if name == "rule_to_free" else "0 or 1", meaning)
     for name, meaning in (
         ("rule_soon", "1 if the socket is free before so many arrivals that target-gap asks the head"),
         ("rule_to_free", "time until the socket is free beside the arrival period, as ``time_to_free``"),
         ("rule_room", "1 if there is room for the newcomer"),
-        ("rule_busy", "1 if the socket is busy"),
+        ("rule_idle", "1 if the socket is idle"),
         ("rule_accepts", "1 if the rule accepts the newcomer"),
     )
 )
@@ -71,7 +72,7 @@ def observe_rule(
     context[N_INPUTS] = 1.0 if soon else 0.0
     context[N_INPUTS + 1] = time_to_free(buffer, arrival)
     context[N_INPUTS + 2] = 1.0 if has_space(buffer, arrival) else 0.0
-    context[N_INPUTS + 3] = 1.0 if buffer.busy else 0.0
+    context[N_INPUTS + 3] = 0.0 if buffer.busy else 1.0
     a = price_dp.share(rule, BASE)
     if a > 0:
         chosen = price_dp.decide(buffer, arrival, rule, BASE, a)
