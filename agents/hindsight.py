@@ -6,12 +6,15 @@ so far. That needs no critic, no discount and no exploration. By the performance
 episode add up to what the student lost of it. This is AggreVaTe [ross2014reinforcement], with a clairvoyant oracle as
 in [choudhury2018data].
 
-A student that plays badly sees bad states alone, where much is lost whatever it does. Four things keep it from there:
+A student that plays badly sees bad states alone. One that rejects all it can sees no harm in it there, as the
+clairvoyant could still mend everything in the next moment. Four things keep it from there:
 
-- It begins as the rule ``gap-price``: a network of zeros, added to ``PRIOR`` for what the rule chooses.
-- Its rows are at different moments of their episodes, and some of them are played by the rule.
-- Not the student's latest weights play, but their running mean. It is what validation judges, too.
-- Validation says which weights are kept.
+- It begins as the rule ``gap-price``: a network of zeros, added to ``PRIOR`` for what the rule chooses. It never
+  rejects at an idle socket (``IDLE``).
+- It learns once it has seen states of many episodes. Its rows are at different moments of theirs.
+- The best student so far, by whole training episodes, is the *leader*. Leader and rule play a part of the rows, as in
+  DAgger's mixture [ross2011reduction], so good states never end, and a student that fell finds its way back.
+- Students are running means of the weights. The leader is what validation judges, so what is kept never falls.
 """
 
 from __future__ import annotations
@@ -20,14 +23,17 @@ import copy
 import math
 import sys
 import time
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from agents.held_out import split_scenario
+from agents.hindsight_network import CONTEXT, SLOT, Student, mean_regret
 from agents.learner import Learner
 from agents.mixed_env import Cell, cells
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
@@ -36,70 +42,21 @@ from bufgym.envs import SenderVectorEnv, expert
 from bufgym.envs.expert.player import Player
 from bufgym.ground.files import replaced
 from bufgym.policies import learned, weights
-from bufgym.policies.learned import Network, Weights
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
+from bufgym.policies.learned import Weights
 
-CONTEXT, SLOT = [field.name for field in RULE_FIELDS], [field.name for field in RULE_SLOT_FIELDS]
 ACCEPTS, DROPS = CONTEXT.index("rule_accepts"), SLOT.index("rule_drops")
-PRIOR = 3.0
-"""Score of what the rule chooses, before learning. A larger one hides what the rest is worth."""
-SCALE = 10.0
-"""The network's output is multiplied by it, so that small steps of few weights reach large scores."""
 MEAN = 0.995
 """Weight of the past in the running mean of the weights, at each gradient step."""
 LEAST_RATE = 0.05
 """The learning rate at the end, beside that at the start."""
 REGRET = 100.0
 """Factor on the regrets: Adam's least step is then far below any gradient."""
-FIRST = 2_048
+FIRST = 16_384
 """Decisions before the first gradient step."""
-
-
-class Scorer(nn.Module):
-    """One network of a slot scorer, with two hidden layers; its output begins at ``prior``'s field alone."""
-
-    def __init__(self, width: int, prior: str) -> None:
-        super().__init__()
-        inputs = len(CONTEXT) + len(SLOT)
-        self.first, self.second, self.out = nn.Linear(inputs, width), nn.Linear(width, width), nn.Linear(width, 1)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-        skip = torch.zeros(inputs)
-        skip[[*CONTEXT, *SLOT].index(prior)] = PRIOR
-        self.register_buffer("skip", skip)
-
-    def forward(self, slots: Tensor, context: Tensor) -> Tensor:
-        """Scores [n, candidates] of ``slots`` [n, candidates, slot fields] in a ``context`` [n, context fields]."""
-        c = len(CONTEXT)
-        weight = self.first.weight
-        # The context's part is the same for all candidates.
-        common = nn.functional.linear(context, weight[:, :c], self.first.bias)
-        h = torch.relu(nn.functional.linear(slots, weight[:, c:]) + common[:, None])
-        h = torch.relu(self.second(h))
-        prior = slots @ self.skip[c:] + (context @ self.skip[:c])[:, None]
-        return SCALE * self.out(h)[..., 0] + prior
-
-    def network(self) -> Network:
-        """The same as numbers."""
-        numbers = {name: tensor.detach().numpy() for name, tensor in self.state_dict().items()}
-        layers = tuple((numbers[f"{k}.weight"].T.copy(), numbers[f"{k}.bias"].copy()) for k in ("first", "second"))
-        scale = np.float32(SCALE)
-        return Network(numbers["skip"].copy(), scale * numbers["out.bias"], layers, scale * numbers["out.weight"][0])
-
-
-class Student(nn.Module):
-    """Scores of all L + 2 actions: to drop each slot, to reject, to accept."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.drop, self.accept = Scorer(width, "rule_drops"), Scorer(width, "rule_accepts")
-
-    def forward(self, slots: Tensor, context: Tensor) -> Tensor:
-        return torch.cat([self.drop(slots, context), self.accept(slots[:, -1:], context)], dim=1)
-
-    def weights(self) -> Weights:
-        """The weights as in a file."""
-        return Weights((*CONTEXT, *SLOT), self.drop.network(), self.accept.network())
+CHECK = 10_000
+"""Decisions from one comparison with the leader to the next."""
+CURVE = 32
+"""Updates from one row of the curve to the next."""
 
 
 class Lesson(NamedTuple):
@@ -138,46 +95,61 @@ class Lessons:
 
 
 class Rows:
-    """n environments of one cell that a student plays, a ``share`` of them left to the rule."""
+    """n environments of one cell, each played by the rule, the leader or the student.
 
-    def __init__(self, cell: Cell, n: int, student: Weights, share: float, seed: int) -> None:
+    Args:
+        cell: the links and L.
+        n: rows.
+        start: the weights at which all begin.
+        shares: of the rows, those that the rule and the leader play.
+        rng: for episodes, and for who plays which row.
+    """
+
+    def __init__(
+        self, cell: Cell, n: int, start: Weights, shares: tuple[float, float], rng: np.random.Generator
+    ) -> None:
         self.env = SenderVectorEnv(
             n, cell.scenario, cell.capacity, decide_at="arrival", autoreset_mode="SameStep", info="mask"
         )
-        self.env.reset(seed=seed)
-        self._senders, self._weights, self.capacity = self.env.rows.senders, student, cell.capacity
-        self._player = Player(learned.policy("student", student), n)
+        self.env.reset(seed=int(rng.integers(2**31)))
+        self._senders, self._start, self.capacity = self.env.rows.senders, start, cell.capacity
         self._clairvoyant = expert.clairvoyant(self.env)
-        self._led = np.arange(n) < math.ceil(share * n)
+        place = (rng.permutation(n) + rng.random()) / n
+        self._ruled = place < shares[0]
+        led = place < sum(shares)
+        self._players = [(Player(learned.policy("player", start), n), np.flatnonzero(who)) for who in (led, ~led)]
 
-    def _rule(self, slots: NDArray[Any], context: NDArray[Any]) -> NDArray[np.int64]:
-        """The rule's actions, by the fields that show them."""
-        drops = np.where(slots[:, -1, DROPS] > 0, self.capacity, slots[:, :-1, DROPS].argmax(axis=1))
-        return np.where(context[:, ACCEPTS] > 0, self.capacity + 1, drops)
-
-    def _observe(self, student: Weights) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[Any]]:
-        """The student's actions, and the slots and context that it sees."""
-        self._player.rewrite(student.parameters())
-        actions = self._player.actions(self._senders)
-        context, slots = learned.seen(self._player.memory, self._weights, self.capacity)
-        return actions, slots.astype(np.float32), context.astype(np.float32)
+    def _observe(self, *weights: Weights) -> tuple[NDArray[np.int64], Lesson]:
+        """Everyone's actions, and what is seen, by the weights of leader and student; no regrets yet."""
+        n, L = self.env.num_envs, self.capacity
+        actions = np.zeros(n, np.int64)
+        shapes = (n, L + 1, len(SLOT)), (n, len(CONTEXT)), (n, L + 2)
+        seen = Lesson(*(np.zeros(shape, np.float32) for shape in shapes))
+        for (player, rows), now in zip(self._players, weights, strict=True):
+            if len(rows):
+                player.rewrite(now.parameters())
+                actions[rows] = player.actions(self._senders, rows)[rows]
+                context, slots = learned.seen(player.memory[rows], self._start, L)
+                seen.context[rows], seen.slots[rows] = context, slots
+        drops = np.where(seen.slots[:, -1, DROPS] > 0, L, seen.slots[:, :-1, DROPS].argmax(axis=1))
+        ruled = np.where(seen.context[:, ACCEPTS] > 0, L + 1, drops)
+        return np.where(self._ruled, ruled, actions), seen
 
     def scatter(self, longest: int, rng: np.random.Generator) -> None:
         """Let the rule play until rows are at different moments of their episodes."""
         begin = rng.integers(longest, size=self.env.num_envs)
         for moment in range(longest):
-            _, slots, context = self._observe(self._weights)
-            self.env.step(self._rule(slots, context))
+            self.env.step(self._observe(self._start, self._start)[0])
             if (begin == moment).any():
                 self.env.reset(options={"reset_mask": begin == moment})
 
-    def step(self, student: Weights) -> Lesson:
+    def step(self, leader: Weights, student: Weights) -> Lesson:
         """Play one decision in every row."""
-        actions, slots, context = self._observe(student)
-        regret = self._clairvoyant.regrets().astype(np.float32)
-        lesson = Lesson(slots, context, np.where(np.isnan(regret), np.float32(np.inf), regret))
-        self.env.step(np.where(self._led, self._rule(slots, context), actions))
-        return lesson
+        actions, seen = self._observe(leader, student)
+        regret = self._clairvoyant.regrets()
+        seen.regret[:] = np.where(np.isnan(regret), np.inf, regret)
+        self.env.step(actions)
+        return seen
 
 
 def padded(lesson: Lesson, capacity: int) -> Lesson:
@@ -190,11 +162,57 @@ def padded(lesson: Lesson, capacity: int) -> Lesson:
     return Lesson(slots, lesson.context, np.insert(lesson.regret, [at] * missing, np.inf, axis=1))
 
 
-def mean_regret(scores: Tensor, regret: Tensor) -> Tensor:
-    """The mean of sum_a p(a) regret(a), p being the softmax of the scores of valid actions."""
-    valid = torch.isfinite(regret)
-    chances = torch.softmax(scores.masked_fill(~valid, -math.inf), dim=1)
-    return (chances * regret.masked_fill(~valid, 0)).sum(dim=1).mean()
+class School:
+    """The state of one seed's learning, as in a checkpoint."""
+
+    def __init__(self, settings: Hindsight, seconds: float) -> None:
+        self.settings, self.longest = settings, seconds
+        self.student = Student(settings.width)
+        """The latest weights."""
+        self.mean, self.leader = copy.deepcopy(self.student), copy.deepcopy(self.student)
+        """Their running mean, which plays; and the best such mean."""
+        self.optimizer = torch.optim.Adam(self.student.parameters(), settings.learning_rate)
+        self.steps, self.seconds = 0, 0.0
+        self.best = math.inf
+        """Fitness of the leader, the less the better."""
+
+    def learn(self, lessons: Sequence[Tensor]) -> float:
+        """Make one gradient step; return the mean regret."""
+        left = 1 - max(self.steps / self.settings.steps, self.seconds / self.longest)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.settings.learning_rate * max(LEAST_RATE, left)
+        slots, context, regret = lessons
+        loss = mean_regret(self.student(slots, context), regret)
+        self.optimizer.zero_grad()
+        (REGRET * loss).backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        with torch.no_grad():
+            for average, latest in zip(self.mean.parameters(), self.student.parameters(), strict=True):
+                average.lerp_(latest, 1 - MEAN)
+        return float(loss.detach())
+
+    def compare(self, fitness: Callable[[Weights], float]) -> None:
+        """Let the student lead if it is the best so far."""
+        now = fitness(self.mean.weights())
+        if now <= self.best:
+            self.leader, self.best = copy.deepcopy(self.mean), now
+
+    def save(self, path: Path) -> None:
+        """Write the state, whole or not at all."""
+        state = {name: getattr(self, name).state_dict() for name in self.PARTS}
+        with replaced(path) as unfinished:
+            torch.save({**state, **{name: getattr(self, name) for name in self.NUMBERS}}, unfinished)
+
+    def load(self, path: Path) -> None:
+        """Read the state; no code is run."""
+        state = torch.load(path, weights_only=True)
+        for name in self.PARTS:
+            getattr(self, name).load_state_dict(state[name])
+        for name in self.NUMBERS:
+            setattr(self, name, state[name])
+
+    PARTS = ("student", "mean", "leader", "optimizer")
+    NUMBERS = ("steps", "seconds", "best")
 
 
 class HindsightLearner(Learner[Hindsight]):
@@ -207,73 +225,59 @@ class HindsightLearner(Learner[Hindsight]):
             return [Cell("", split_scenario(on)[0], on.capacity)]
         return [c for suite in chosen.suite for c in cells(suite, "train", chosen.capacities_of(suite), chosen.data)]
 
-    def train_seed(self, folder: Any, seed: int, line: int = 0) -> Run:
-        """Train one seed; a resumed one has its weights, their mean and its optimizer, and begins to collect anew."""
+    def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
+        """Train one seed; a resumed one has its state of learning, and begins to collect anew."""
         torch.set_num_threads(1)
         settings, home = self.settings, folder / f"seed-{seed}"
         home.mkdir(exist_ok=True)
-        objective, checkpoint = self.objective(folder, seed), home / "student.pt"
+        objective, checkpoint = self.objective(folder, seed), home / "hindsight.pt"
         torch.manual_seed(seed)
-        student = Student(settings.width)
-        mean = copy.deepcopy(student)
-        optimizer = torch.optim.Adam(student.parameters(), settings.learning_rate)
-        steps, seconds = 0, 0.0
+        school = School(settings, self.seconds)
         if checkpoint.exists():
-            saved = torch.load(checkpoint, weights_only=True)
-            steps, seconds = saved["steps"], saved["seconds"]
-            for part, state in ((student, "student"), (mean, "mean"), (optimizer, "optimizer")):
-                part.load_state_dict(saved[state])
+            school.load(checkpoint)
         # Every session has a seed of its own, by its first step: the episodes before a kill do not come again.
-        rng = np.random.default_rng([seed, steps])
+        rng = np.random.default_rng([seed, school.steps])
         mixed = self.cells()
         n, L = math.ceil(settings.num_envs / len(mixed)), max(cell.capacity for cell in mixed)
-        lessons = Lessons(settings.room, L)
-        curve = Record(home / "curve.csv", ("steps", "seconds", "regret"), steps)
-        validations = Validations(home, objective.columns, objective.best, settings, steps)
-        bar, report, saved_at, spent = seed_bar(settings.steps, steps, seed, line), "", steps, seconds
-        began = time.perf_counter()
-        groups = [Rows(c, n, mean.weights(), settings.rule_share, int(rng.integers(2**31))) for c in mixed]
-        if steps < settings.steps:
+        shares = settings.rule_share, (1 - settings.rule_share) * settings.leader_share
+        start, lessons = Student(settings.width).weights(), Lessons(settings.room, L)
+        groups = [Rows(cell, n, start, shares, rng) for cell in mixed]
+        curve = Record(home / "curve.csv", ("steps", "seconds", "regret"), school.steps)
+        validations = Validations(home, objective.columns, objective.best, settings, school.steps)
+        bar = seed_bar(settings.steps, school.steps, seed, line)
+        before, began, saved, checked = school.seconds, time.perf_counter(), school.steps, school.steps
+        if school.steps < settings.steps:
             for rows in groups:
                 rows.scatter(rows.env.rows.senders.batch.arrivals.shape[1], rng)
         while True:
-            ended = steps >= settings.steps or seconds >= self.seconds
-            if validations.due(steps, last=ended):
-                agent = mean.weights()
-                measures = objective.validate(weights.policy_of(objective.name, agent))
-                if validations.add(steps, seconds, measures):
+            ended = school.steps >= settings.steps or school.seconds >= self.seconds
+            if ended or school.steps - checked >= CHECK or school.best == math.inf:
+                checked = school.steps
+                school.compare(lambda agent: objective.fitness(learned.policy(objective.name, agent), 0))
+            if validations.due(school.steps, last=ended):
+                agent = school.leader.weights()
+                measures = objective.validate(learned.policy(objective.name, agent))
+                if validations.add(school.steps, school.seconds, measures):
                     weights.save(home / MODEL, agent, self.notes(seed, settings.algo))
                 report = objective.message.format(*measures)
                 bar.set_postfix_str(report, refresh=False)
                 if not sys.stderr.isatty():
-                    print(f"seed {seed}: {steps:,} of {settings.steps:,} steps, {report}", flush=True)
-            if ended or steps - saved_at >= settings.checkpoint_every:
-                saved_at = steps
-                parts = {"student": student, "mean": mean, "optimizer": optimizer}
-                states = {name: part.state_dict() for name, part in parts.items()}
-                with replaced(checkpoint) as unfinished:
-                    torch.save({"steps": steps, "seconds": seconds, **states}, unfinished)
+                    print(f"seed {seed}: {school.steps:,} of {settings.steps:,} steps, {report}", flush=True)
+            if ended or school.steps - saved >= settings.checkpoint_every:
+                saved = school.steps
+                school.save(checkpoint)
             if ended:
                 break
-            playing = mean.weights()
+            playing = school.leader.weights(), school.mean.weights()
             for rows in groups:
-                lessons.add(padded(rows.step(playing), L), rng)
-            steps += n * len(groups)
-            if lessons.count >= FIRST:
-                left = max(LEAST_RATE, 1 - max(steps / settings.steps, seconds / self.seconds))
-                for group in optimizer.param_groups:
-                    group["lr"] = settings.learning_rate * left
+                lessons.add(padded(rows.step(*playing), L), rng)
+            school.steps += n * len(groups)
+            if lessons.count >= min(FIRST, settings.room):
                 for _ in range(settings.gradient_steps):
-                    slots, context, regret = lessons.draw(settings.batch_size, rng)
-                    loss = mean_regret(student(slots, context), regret)
-                    optimizer.zero_grad()
-                    (REGRET * loss).backward()
-                    optimizer.step()
-                    with torch.no_grad():
-                        for average, latest in zip(mean.parameters(), student.parameters(), strict=True):
-                            average.lerp_(latest, 1 - MEAN)
-                curve.append(steps, seconds, float(loss.detach()))
-            seconds = round(spent + time.perf_counter() - began, 3)
-            bar.update(steps - bar.n)
+                    regret = school.learn(lessons.draw(settings.batch_size, rng))
+                if school.steps % (CURVE * n * len(groups)) == 0:
+                    curve.append(school.steps, school.seconds, regret)
+            school.seconds = round(before + time.perf_counter() - began, 3)
+            bar.update(school.steps - bar.n)
         bar.close()
-        return Run(seed, home, seconds, curve.rows, validations.rows, MODEL, objective.best)
+        return Run(seed, home, school.seconds, curve.rows, validations.rows, MODEL, objective.best)

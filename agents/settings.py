@@ -331,6 +331,8 @@ class Hindsight(Settings):
     """Environments side by side."""
     rule_share: Share = 0.125
     """Share of the environments that the rule plays."""
+    leader_share: Share = 0.4
+    """Share of the others that the best student so far plays."""
     batch_size: Batch = 2048
     """Decisions of one gradient step."""
     gradient_steps: Count = 2

@@ -54,10 +54,10 @@ def look(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -> 
 @kernel
 def reads(fields: NDArray[np.float64], begin: int, end: int) -> bool:
     """Whether any of ``fields`` is in this part of the observation."""
-    for field in fields:  # noqa: SIM110  (kernels have no generators)
-        if begin <= field < end:
-            return True
-    return False
+    found = False
+    for field in fields:
+        found = found or begin <= field < end
+    return found
 
 
 @kernel

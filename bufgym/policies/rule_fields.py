@@ -73,8 +73,8 @@ _STATE_FIELDS = (
           lambda buffer, arrival, soon, accepts: time_to_free(buffer, arrival)),
     Field("rule_room", "context", "link", "0 or 1", "1 if there is room for the newcomer",
           lambda buffer, arrival, soon, accepts: 1.0 if has_space(buffer, arrival) else 0.0),
-    Field("rule_busy", "context", "link", "0 or 1", "1 if the socket is busy",
-          lambda buffer, arrival, soon, accepts: 1.0 if buffer.busy else 0.0),
+    Field("rule_idle", "context", "link", "0 or 1", "1 if the socket is idle",
+          lambda buffer, arrival, soon, accepts: 0.0 if buffer.busy else 1.0),
     Field("rule_accepts", "context", "link", "0 or 1", "1 if the rule accepts the newcomer",
           lambda buffer, arrival, soon, accepts: 1.0 if accepts else 0.0),
 )  # fmt: skip
