@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.held_out import FIRST_SEED, split_scenario
-from agents.page import command, publish, table, written
 from agents.settings import Environment
 from bufgym import policies
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
@@ -49,6 +48,7 @@ from bufgym.sim.state import ARRIVAL_WAITS, new_batch
 from bufgym.traces.generate.lte import LTE_MODES
 from bufgym.traces.generate.shipped import SHIPPED_LTE
 from studies.futures import DriveSeen, Hidden, Links, LinkSeen, prior, rates
+from studies.page import command, publish, table, written
 
 NAME = "causal-planner"
 RIVALS = ("afr", "drop-oldest", "target-gap", "learned")
