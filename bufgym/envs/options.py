@@ -21,7 +21,7 @@ nothing. At an episode's end the summary is always there."""
 MASKS = ("valid", "plausible")
 """Actions that the mask shows: all valid ones, or those of them that a good rule chooses among (``plausible``)."""
 RENDER_MODES = ("ansi", "rgb_array")
-MASKS = {
+MASK_KEYS = {
     "rllib": ("observations", "action_mask"),
     "tianshou": ("obs", "mask"),
     "pettingzoo": ("observation", "action_mask"),
@@ -98,9 +98,9 @@ class Options:
         if isinstance(asked, bool):
             beside = None if self.observation != "flat" else "observation"
             return MaskKeys(beside, "action_mask", self.mask_dtype) if asked else None
-        keys = MASKS.get(asked) if isinstance(asked, str) else asked
+        keys = MASK_KEYS.get(asked) if isinstance(asked, str) else asked
         if not isinstance(keys, Sequence) or len({*map(str, keys)}) != 2 or len(keys) != 2:
-            rule = f"must be True, False, two names of keys or one of {', '.join(map(repr, MASKS))}"
+            rule = f"must be True, False, two names of keys or one of {', '.join(map(repr, MASK_KEYS))}"
             raise BufgymError(f"mask_in_observation = {asked!r}: {rule}")
         return MaskKeys(keys[0], keys[1], self.mask_dtype)
 
