@@ -87,6 +87,11 @@ class Options:
         return self.info in ("full", "steady")
 
     @property
+    def is_steady(self) -> bool:
+        """Whether ``info`` has the same entries in every step, the summary so far among them."""
+        return self.info == "steady"
+
+    @property
     def shows_mask(self) -> bool:
         """Whether ``info`` has the action mask in every step."""
         return self.info != "none" and not self.acts_guided

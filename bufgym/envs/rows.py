@@ -97,6 +97,7 @@ class Rows:
         if several_topics:
             options.check_without_own_queue("several topics")
         self.scenario, self.options = scenario, options
+        self._shows_all, self._shows_mask, self._is_steady = options.shows_all, options.shows_mask, options.is_steady
         self.senders = Senders(
             n,
             options.capacity,
@@ -126,8 +127,10 @@ class Rows:
 
         self.form = self._observed()
         self.observation_space, self._handed = self.form.space, Handed(self.form)
+        self._puts_mask = self.form.mask is not None
         self._own_fields = OwnFields(self.form)
-        self._has_own = bool(self._own_fields) or bool(self._own_terms)
+        self._sums_here = bool(own_terms)
+        self._has_own = bool(self._own_fields) or self._sums_here
         self.output = self.new_output()
 
     def _observed(self) -> ObservationForm:
@@ -215,7 +218,7 @@ class Rows:
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""
         rewards = self.output.rewards
-        if self._own_terms:
+        if self._sums_here:
             rewards[:] = 0.0
             # Term by term, as the kernels add them: a matrix product may round differently.
             for weight, terms in zip(self.weights, self.output.reward_terms.T, strict=True):
@@ -235,21 +238,17 @@ class Rows:
 
     def info(self, i: int, ended: bool) -> dict[str, Any]:
         """Gymnasium's info of row ``i`` after a reset or a step; see ``INFOS``."""
-        options = self.options
-        info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if options.shows_mask else {}
-        if not (options.shows_all or ended):
+        info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self._shows_mask else {}
+        if not (self._shows_all or ended):
             return info
-        if options.shows_all:
+        if self._shows_all:
             info["qoi"] = self.output.qoi.item(i)
             info["invalid"] = self.output.invalid.item(i)
             info["reward_terms"] = dict(zip(self._term_names, self.output.reward_terms[i].tolist(), strict=True))
-        steady = options.info == "steady"
-        if ended or steady:
+        if ended or self._is_steady:
             info |= {name: number.item() for name, number in self.summary(i).items()}
-        if options.bound and ended:
-            info |= measured(self.senders, i, info["qoi"])
-        elif options.bound and steady:
-            info |= dict.fromkeys(MEASURED, math.nan)
+            if self.options.bound:
+                info |= measured(self.senders, i, info["qoi"]) if ended else dict.fromkeys(MEASURED, math.nan)
         return info
 
     def observation(self, i: int | None = None) -> Observation:
@@ -257,7 +256,7 @@ class Rows:
         if i is None:
             return self.form.masked(self.form.of(self.output.flat), self.output.action_mask)
         observation = self._handed.of(self.output.flat[i])
-        return self.form.masked(observation, self.output.action_mask[i].copy()) if self.form.mask else observation
+        return self.form.masked(observation, self.output.action_mask[i].copy()) if self._puts_mask else observation
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""
