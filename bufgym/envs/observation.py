@@ -32,6 +32,32 @@ class Place(NamedTuple):
     entries: int
 
 
+class MaskKeys(NamedTuple):
+    """Keys of an observation that holds the action mask.
+
+    Fields:
+        observation: key of what else is observed; None if the mask lies beside the fields.
+        mask: key of the mask.
+        dtype: "int8" or "bool".
+    """
+
+    observation: str | None
+    mask: str
+    dtype: str
+
+    def put(self, observation: Any, mask: Any) -> Any:
+        """One dict of both; with the mask beside the fields, the ``observation`` itself, a dict of the caller's own."""
+        if self.observation is not None:
+            return {self.observation: observation, self.mask: mask}
+        observation[self.mask] = mask
+        return observation
+
+    def space(self, observation: Any, actions: int) -> spaces.Dict:
+        """The space of the observation with the mask of so many ``actions``."""
+        both = self.put(observation, spaces.Box(0, 1, (actions,), np.dtype(self.dtype).type))
+        return both if self.observation is None else spaces.Dict(OrderedDict(both))
+
+
 class ObservationForm:
     """The observed fields of a queue of L = ``capacity`` messages, and the form of the observation.
 
@@ -43,9 +69,10 @@ class ObservationForm:
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
-    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views; where
-    ``is_row``, the row itself.
-    ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
+    your own come last. ``has_slots`` says whether rows hold slot fields of the tables. Where ``is_view``, an
+    observation is a dict of views; where ``is_row``, the row itself.
+    ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row. Where ``mask`` has keys,
+    ``masked`` puts the action mask into an observation.
     """
 
     def __init__(
@@ -55,6 +82,7 @@ class ObservationForm:
         context_fields: Sequence[Field],
         capacity: int,
         chosen: Sequence[str] | None = None,
+        mask: MaskKeys | None = None,
     ) -> None:
         if form not in FORMS:
             raise BufgymError(f"observation = {form!r}: must be one of {', '.join(map(repr, FORMS))}")
@@ -72,7 +100,7 @@ class ObservationForm:
                 own[found.name], names[k] = found, found.name
         if not names:
             raise BufgymError("fields: choose at least one field to observe")
-        self.form = form
+        self.form, self.has_slots = form, bool(slot_fields)
         self._width = capacity + 1
         self._slot_fields, self._context_fields = len(slot_fields), len(context_fields)
         self._first_context = self._slot_fields * self._width
@@ -96,7 +124,12 @@ class ObservationForm:
         low, high = np.zeros((2, self.numbers), np.float32)
         for field, first, entries in self.places:
             low[first : first + entries], high[first : first + entries] = field.low, field.high
-        self.space = _space(self.of(low), self.of(high))
+        self.mask, space = mask, _space(self.of(low), self.of(high))
+        self.space: Any = space if mask is None else mask.space(space, capacity + 2)
+
+    def masked(self, observation: Observation, mask: NDArray[np.int8]) -> Observation:
+        """The observation, an array or a dict of the caller's own, with a view of the mask if this form has one."""
+        return observation if self.mask is None else self.mask.put(observation, mask.view(self.mask.dtype))
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
