@@ -196,6 +196,9 @@ class OwnTerms:
         self._memory = [np.zeros((n, max(1, len(term.memory)))) for term in terms]
         self._compiled = [_compiled("reward term", "term", term) if term.compile else None for term in terms]
         self._marks = np.zeros((n, 4), np.int64)
+        for term in terms:
+            if term.prepare is not None:
+                term.prepare()
 
     def __bool__(self) -> bool:
         return bool(self._terms)
@@ -209,13 +212,16 @@ class OwnTerms:
 
     def write(self, batch: Batch, output: StepOutput) -> None:
         """Write each term of the step that all rows have just taken."""
-        records, ended = named(batch), output.terminated
+        ended = output.terminated
         for k, term in enumerate(self._terms):
             column, parameters, compiled = self._first + k, self._parameters[k], self._compiled[k]
             if compiled is not None:
                 compiled(batch, self._marks, ended, self._memory[k], parameters, column, output.reward_terms)
             else:
-                for i in range(len(ended)):
+                output.reward_terms[:, column] = 0.0
+                asked = np.flatnonzero(ended | (not term.at_end)).tolist()
+                records = named(batch) if asked else None
+                for i in asked:
                     step = _read_only_step(records, i, self._marks, bool(ended[i]), parameters)
                     output.reward_terms[i, column] = term.function(step, self._memory[k][i])
             if not np.isfinite(output.reward_terms[:, column]).all():

@@ -51,6 +51,10 @@ class OwnTerm(RewardTerm):
     ``TOPIC_REWARD_TERMS``."""
     compile: bool = False
     """As in ``Field``."""
+    at_end: bool = False
+    """Whether the function runs only in the step that ends the episode; the term is 0 in all others."""
+    prepare: Callable[[], object] | None = None
+    """Called once for each environment that names the term, as it is made: work that no step should wait for."""
     built_in: bool = False
     """Whether it is bufgym's own, whose name stays taken."""
 
@@ -117,6 +121,8 @@ def reward_term(
     memory: Mapping[str, float] | None = None,
     one_queue: bool = False,
     compile: bool = False,
+    at_end: bool = False,
+    prepare: Callable[[], object] | None = None,
     built_in: bool = False,
 ) -> Callable[[Function], Function]:
     """Register the decorated function ``f(step, memory)`` as the reward term ``name``; it comes back unchanged.
@@ -126,14 +132,17 @@ def reward_term(
     ``memory`` is float64[entries] for each sender and episode. The other arguments are as in ``OwnTerm`` and ``field``.
 
     Raises:
-        BufgymError: the name is taken or no name, or the function does not take two arguments.
+        BufgymError: the name is taken or no name, the function does not take two arguments, or ``at_end`` and
+            ``compile`` are both asked for.
     """
     _check_name("reward term", name, (known.name for known in REWARD_TERMS), OWN_TERMS)
+    if at_end and compile:
+        raise BufgymError(f"reward term {name!r}: at_end = True: is for plain Python, so compile must be False")
 
     def add(function: Function) -> Function:
         _check_function("reward term", name, function, 2)
         settings: Any = {"parameters": dict(parameters or {}), "memory": dict(memory or {}), "one_queue": one_queue}
-        settings |= {"compile": compile, "built_in": built_in}
+        settings |= {"compile": compile, "at_end": at_end, "prepare": prepare, "built_in": built_in}
         OWN_TERMS[name] = OwnTerm(name, unit, modules.first_line(function), function=function, **settings)
         return function
 
