@@ -87,10 +87,9 @@ class CausalPlanner:
         self._stride = max(1, int(scenario.rate_hz / messages_per_s / AFTER_ONE))
         n, messages = planning.futures, 2 + round(planning.horizon_s * scenario.rate_hz)
         self._batch = new_batch(n, capacity, messages, 1, scenario.value.array)
-        numbers, pool = np.zeros((5, n, messages), np.int64), (np.zeros(ROOM, np.int64), np.zeros(ROOM))
-        c, between, idle, begin, stop = numbers
-        link = np.zeros((n, 3), np.int64)
-        self._ahead = Ahead(c, between, idle, link, begin, stop, *pool, np.zeros(ROOM, np.int32))
+        c, between, idle, begin, stop = np.zeros((5, n, messages), np.int64)
+        latest, gain, follow = np.zeros(ROOM, np.int64), np.zeros(ROOM), np.zeros(ROOM, np.int32)
+        self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, latest, gain, follow)
         self._steps = [np.zeros((2, STEPS), kind) for kind in (np.int64, np.float64, np.int32)]
         self._work, self._values = new_work(capacity, messages), np.zeros((n, capacity + 2))
         self._mask = np.zeros((n, capacity + 2), np.int8)
@@ -139,7 +138,7 @@ class CausalPlanner:
             find_idle(c, sizes, limit, limit, between, idle)
             while (end := find_steps(batch, self._ahead, i, place, *self._steps)) < 0:
                 if end == NO_ROOM:
-                    pool = (np.resize(array, 2 * len(array)) for array in self._ahead[6:])
+                    pool: list[NDArray[Any]] = [np.resize(array, 2 * len(array)) for array in self._ahead[6:]]
                     self._ahead = Ahead(*self._ahead[:6], *pool)
                 else:
                     self._steps = [np.zeros((2, 2 * array.shape[1]), array.dtype) for array in self._steps]

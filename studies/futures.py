@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,8 @@ class Hidden(NamedTuple):
 
     def take(self, chosen: NDArray[np.int64]) -> Hidden:
         """These rows."""
-        return Hidden(*(column[chosen] for column in self))
+        rows: list[NDArray[Any]] = [column[chosen] for column in self]
+        return Hidden(*rows)
 
 
 _MODES = list(LTE_MODES.values())
