@@ -21,7 +21,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from agents.page import command
+from studies.page import command
 from bufgym.cli.options import Count
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import PACKAGE

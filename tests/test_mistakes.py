@@ -16,7 +16,7 @@ from refusal_cases import refuse
 
 import bufgym
 from agents.report import Trained, agent_name
-from bufgym import papers, policies, scenario, traces
+from bufgym import policies, scenario, traces
 from bufgym.benchmark.rows import read_rows
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
@@ -163,7 +163,7 @@ def test_results_without_bare_nan(tmp_path: Path) -> None:
     """JSON has no NaN: no regret is null."""
     run: Any = SimpleNamespace(seed=0, seconds=1.0, merit=1.0)
     settings: Any = SimpleNamespace(algo="evolve", values={})
-    trained = Trained(settings, tmp_path, [run], [], {})
+    trained = Trained(settings, tmp_path, [run], [])
     scores = [{"policy": name, "qoi": 1.0, "regret": math.nan} for name in [agent_name(run), "drop-oldest"]]
     trained.save(tmp_path, scores=scores, held_out="")
     text = (tmp_path / "results.json").read_text(encoding="utf-8")
@@ -220,8 +220,6 @@ def mistakes() -> Iterator[tuple[str, Callable[[str], Any]]]:
     for name in suites.SUITES:
         yield name, suites.get
         yield name, lambda wrong: bufgym.compare("afr", wrong)
-    for name in papers.FIGURES:
-        yield name, papers.figure
     for name in LTE:
         yield name, lambda wrong: scenario.get("lte", **{wrong: 1})
         yield name, lambda wrong: bufgym.compare("afr", "lte", **{wrong: 1})

@@ -111,7 +111,7 @@ def test_every_hint_names_an_extra_that_there_is() -> None:
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
         name = project["name"]
         extras |= {extra if name == "bufgym" else f"{name}[{extra}]" for extra in project["optional-dependencies"]}
-    places, named = {"install": 0, "needs": 1, "library": 1}, set()
+    places, named = {"install": 0, "needs": 1, "library": 1, "missing": 2}, set()
     sources = [REPO / "bufgym", *(REPO / "packages").glob("*/bufgym_*")]
     for path in sorted(path for folder in sources for path in folder.rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
