@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, stays
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, newcomer_stays
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
     ON_BOARD_FIELDS,
@@ -74,7 +74,7 @@ def choose(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -
             freed_bytes += buffer.slots[k].size_bytes
         if dropped > best:
             best, decision = dropped, k
-    if not stays(buffer, arrival, own <= best, freed_bytes):
+    if not newcomer_stays(buffer, arrival, own <= best, freed_bytes):
         best, decision = own, REJECT
     if has_space(buffer, arrival):
         common = begin(scorer, KEEP, scratch)
