@@ -214,6 +214,17 @@ ROWS = {
         "from bufgym.scenario import suites\n"
         "assert [len(suites.get('halves-v1').settings(split)) for split in suites.SPLITS] == [2, 2, 2]",
     ),
+    "an option of environments": Addition(
+        {},
+        {
+            "bufgym/envs/options.py": ("    bound: bool", "    sloth: int = 0\n    bound: bool"),
+            "bufgym/envs/rows.py": (
+                "        self._own_fields =",
+                "        self.sloth = options.sloth\n        self._own_fields =",
+            ),
+        },
+        "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.rows.sloth == 3",
+    ),
     "a trace format": Addition(
         {},
         {
