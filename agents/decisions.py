@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 from abc import abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -19,18 +19,26 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.callbacks import Budget, Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
 from agents.evaluation import Agent, SlotModel
-from agents.learner import Learner, S
+from agents.learner import Learner
 from agents.runs import MODEL, Numbers, Run, Validations
+from agents.settings import OnSlots, SingleDecisions
 from bufgym.policies import weights
 
+Decisions = TypeVar("Decisions", bound=SingleDecisions)
 
-class DecisionLearner(Learner[S]):
+
+class DecisionLearner(Learner[Decisions]):
     """An algorithm of stable-baselines3."""
 
-    algorithm: Any
-    """Its class, by which its file is read."""
-    env_options: dict[str, Any]
-    """Options of the environment that it trains in."""
+    @property
+    @abstractmethod
+    def algorithm(self) -> Any:
+        """Its class, by which its file is read."""
+
+    @property
+    @abstractmethod
+    def env_options(self) -> dict[str, Any]:
+        """Options of the environment that it trains in."""
 
     @abstractmethod
     def make(self, env: VecEnv) -> Any:
@@ -46,15 +54,11 @@ class DecisionLearner(Learner[S]):
 
     def env(self, folder: Path, seed: int = 0) -> VecEnv:
         """The batch of environments to train on."""
-        return self.objective(folder, seed).env(self.env_options)
+        return self.objective(folder, seed).env(self.settings.num_envs, self.settings.reward, **self.env_options)
 
     def agent_of(self, model: Any, name: str) -> Agent:
         """The agent of a model, by its name."""
-        found = self.weights_of(model)
-        if found is not None:
-            return weights.policy_of(name, found)
-        on = self.settings.on
-        return SlotModel(model, on.slots, on.decide_at)
+        return weights.policy_of(name, self.weights_of(model))
 
     def agent(self, run: Run) -> Agent:
         """A policy if the run kept a file of weights, or its model."""
@@ -98,3 +102,21 @@ class DecisionLearner(Learner[S]):
             weights.save(home / MODEL, found, self.notes(seed, settings.algo))
         file = "model.zip" if found is None else MODEL
         return Run(seed, home, spent, curve.record.rows, validations.rows, file, validations.choose)
+
+
+Slots = TypeVar("Slots", bound=OnSlots)
+
+
+class SlotLearner(DecisionLearner[Slots]):
+    """An algorithm that chooses among slots."""
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """When it is asked."""
+        return {"decide_at": self.settings.decide_at}
+
+    def agent_of(self, model: Any, name: str) -> Agent:
+        """A policy where the model's weights are one, else the model."""
+        compiled = self.weights_of(model) is not None
+        on, decide_at = self.settings.on, self.settings.decide_at
+        return super().agent_of(model, name) if compiled else SlotModel(model, on.slots, decide_at)

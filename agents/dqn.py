@@ -22,8 +22,8 @@ from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
-from agents.decisions import DecisionLearner
 from agents import settings as options
+from agents.decisions import SlotLearner
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 
 INVALID = -1e9
@@ -115,15 +115,10 @@ class MaskedDQN(DQN):
         self.logger.record("train/loss", np.mean(losses))
 
 
-class SlotDQN(DecisionLearner[options.DQN]):
+class SlotDQN(SlotLearner[options.DQN]):
     """Double DQN that chooses a slot."""
 
     algorithm = MaskedDQN
-
-    @property
-    def env_options(self) -> dict[str, Any]:
-        """When it is asked."""
-        return {"decide_at": self.settings.on.decide_at}
 
     def make(self, env: VecEnv) -> MaskedDQN:
         """Make an untrained Q network.

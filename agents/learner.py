@@ -56,7 +56,7 @@ class Learner(ABC, Generic[S]):
         return weights.load(run.model)
 
     def notes(self, seed: int, name: str) -> dict[str, Any]:
-        """What the file of weights of a policy of this name says about its making."""
+        """Notes on its making, for the file of weights of a policy of this name."""
         suite = ",".join(self.settings.suites.suite)
         return {"name": name, "suite": suite, "seeds": [seed], "algo": self.settings.algo}
 

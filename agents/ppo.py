@@ -9,7 +9,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.decisions import DecisionLearner
+from agents.decisions import SlotLearner
 from agents.settings import PPO, ActorCritic
 from bufgym.ground.errors import BufgymError
 from bufgym.policies.weights import MAX_WIDTH
@@ -17,18 +17,13 @@ from bufgym.sb3 import weights_of
 from bufgym.sb3.networks import policy_of
 
 
-class SlotPPO(DecisionLearner[PPO]):
+class SlotPPO(SlotLearner[PPO]):
     """PPO that chooses a slot; with the slot network its agent is a compiled policy, which serves every L."""
 
     @property
     def algorithm(self) -> Any:
         """MaskablePPO, or PPO without masks."""
         return sb3.PPO if self.settings.unmasked else MaskablePPO
-
-    @property
-    def env_options(self) -> dict[str, Any]:
-        """When it is asked."""
-        return {"decide_at": self.settings.on.decide_at}
 
     def make(self, env: VecEnv) -> Any:
         """Make an untrained actor and critic."""
@@ -40,7 +35,7 @@ class SlotPPO(DecisionLearner[PPO]):
         """The slot network's weights if it is asked at every arrival, as a policy is, and needs no mask of torch."""
         settings = self.settings
         scores_slots = settings.network == "slots" and not settings.unmasked and settings.width <= MAX_WIDTH
-        return weights_of(model) if scores_slots and settings.on.decide_at == "arrival" else None
+        return weights_of(model) if scores_slots and settings.decide_at == "arrival" else None
 
 
 def ppo_arguments(settings: ActorCritic, env: VecEnv, n_steps: int) -> dict[str, Any]:

@@ -16,14 +16,13 @@ import numpy as np
 from agents.evaluation import Agent, EvaluationSet, sweep_for, test_rows
 from agents.figure import draw
 from agents.held_out import fixed_episodes, summarise
-from agents.page import written
 from agents.runs import Run, write_notes
 from agents.settings import Settings
 from bufgym.benchmark import summary
-from bufgym.benchmark.bootstrap import Interval
+from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
-from bufgym.benchmark.table import apart, decimal, same, told_once
+from bufgym.benchmark.table import decimal, equal_rows_notes, unranked_among, with_equal_rows
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
 from bufgym.ground.tables import aligned
@@ -155,8 +154,8 @@ def report_environment(trained: Trained) -> Report:
         agents += trained.beside.agents
     outcomes = test.play_fixed() | {name: test.play(agent) for name, agent in zip(names, agents, strict=True)}
     rows = test.rows(outcomes)
-    entries, alike = summarise(outcomes, rows, best), same(rows)
-    unranked = apart(map(registry.get, registry.names()))
+    entries, alike = summarise(outcomes, rows, best), with_equal_rows(rows)
+    unranked = unranked_among(map(registry.get, registry.names()))
     print(table(entries, best, alike, unranked))
     print(verdict(entries, best, trained.best.seconds))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
@@ -228,14 +227,14 @@ def table(
             continue
         low, high = entry["minus_agent_95"]
         difference = "" if name == agent else f"{entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
-        score = written(Interval(entry["score"], *entry["score_95"]), ".3f")
+        score = _text(Interval(entry["score"], *entry["score_95"]), ".3f")
         numbers = [decimal(entry[column] * factor, digits) for _, column, factor, digits in COLUMNS]
         label = f"> {name}" if name == agent else name
         blocks[name in unranked].append([label, score, *numbers, difference])
     lines = aligned([head, *blocks[0], *blocks[1]])
     lines.insert(1 + len(blocks[0]), "-" * max(map(len, lines)))
     notes = [f"note: {name} does not compete: {unranked[name]}" for name in unranked if name not in others]
-    return "\n".join([*lines, "score: 0 is Drop Oldest, 1 the clairvoyant", *notes, *told_once(alike)])
+    return "\n".join([*lines, "score: 0 is Drop Oldest, 1 the clairvoyant", *notes, *equal_rows_notes(alike)])
 
 
 def report_suites(trained: Trained) -> Report:
@@ -273,7 +272,7 @@ def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, An
     rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
     rows += [row for own in agents.values() for row in own]
     write_rows(rows, home / "rows.csv")
-    result = scores(rows, apart(map(registry.get, registry.names())))
+    result = scores(rows, unranked_among(map(registry.get, registry.names())))
     print(standings(result))
     qoi: dict[str, list[float]] = {}
     for row in rows:
@@ -290,7 +289,7 @@ def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, An
     )
     # Without a discriminative cell, there are no scores to draw.
     ranked = {s.policy: s["score"] for s in result.standings if s.ranked and math.isfinite(s["score"].value)}
-    bars, twins = _drawn(ranked, same(rows))
+    bars, twins = _drawn(ranked, with_equal_rows(rows))
     # By the last column the agent was chosen.
     curves = {agent_name(run): np.array(run.validation)[:, [1, -1]] for run in runs}
     labels = ("training, s", "regret over AFR's, on validation")
@@ -304,8 +303,13 @@ def standings(result: Scores) -> str:
     for standing in result.standings:
         name = standing.policy if standing.ranked else f"{standing.policy} (not ranked)"
         iqm = "-" if math.isnan(standing["iqm"].value) else f"{standing['iqm'].value:.3f}"
-        score, regret = written(standing["score"], ".3f"), written(standing["regret"], ".2%")
-        lines.append([name, score, regret, iqm, written(standing["improvement"], ".2f")])
+        score, regret = (_text(standing["score"], ".3f"), _text(standing["regret"], ".2%"))
+        lines.append([name, score, regret, iqm, _text(standing["improvement"], ".2f")])
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
     note = f"{result.counted} of {total} cells (scenario, L) count; score: 0 is {BASELINE}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])
+
+
+def _text(interval: Interval, form: str) -> str:
+    """An interval as text such as 1.03 [1.01, 1.05]."""
+    return " ".join(filter(None, written(interval, lambda number: format(number, form))))

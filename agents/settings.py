@@ -3,8 +3,6 @@
 The types hold the limits of single options, which are read from text once, and each class the rules of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -51,6 +49,11 @@ class Environment:
         if "Uplink" not in self.env and (self.size_bytes, self.duration_s) != (RGBD_BYTES, Uplink.duration_s):
             raise BufgymError(f"{self.env}: its messages have no size and its episodes no length to set")
 
+    @property
+    def slots(self) -> int:
+        """Slots that an agent observes."""
+        return self.capacity
+
 
 @dataclass(frozen=True)
 class SlotEnvironment(Environment):
@@ -59,17 +62,19 @@ class SlotEnvironment(Environment):
     decide_at: Literal["arrival", "overflow"] = "arrival"
     """When the agent is asked: at every arrival, or only when the buffer is full."""
 
-    @property
-    def slots(self) -> int:
-        """Slots that an agent observes."""
-        return self.capacity
+
+@dataclass(frozen=True)
+class FullBuffer(SlotEnvironment):
+    """The same, where the agent is asked only when the buffer is full, unless it is told otherwise."""
+
+    decide_at: Literal["arrival", "overflow"] = "overflow"
+    """When the agent is asked: at every arrival, or only when the buffer is full."""
 
 
 @dataclass(frozen=True)
 class Suites:
     """Suites to train on instead of an environment."""
 
-    decide_at: ClassVar[str] = "arrival"
     suite: Names = ()
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
     validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
@@ -209,7 +214,8 @@ class SingleDecisions(Settings):
     width: Count = 32
     """Hidden units a layer."""
     num_envs: Count = 256
-    batch_size: Batch = 2048
+    """Environments side by side."""
+    batch_size: Batch = 1024
     """Decisions of one gradient step."""
     learning_rate: Positive = 1e-3
     """At the start; falls linearly to 0."""
@@ -225,8 +231,8 @@ class ActorCritic(SingleDecisions):
 
     n_steps: Count = 32
     """Steps in each environment between updates."""
-    epochs: Count = 4
-    """Passes over each batch of experience."""
+    epochs: Count = 3
+    """Passes over the decisions of an update."""
     gae_lambda: Share = 0.9
     entropy: Least0 = 0.0
     """Weight of the entropy bonus."""
@@ -245,6 +251,8 @@ class GuidedPPO(ActorCritic):
     """Steps in each environment between updates."""
     batch_size: Batch = 4096
     """Decisions of one gradient step."""
+    epochs: Count = 4
+    """Passes over the decisions of an update."""
 
 
 @dataclass(frozen=True)
@@ -255,6 +263,11 @@ class OnSlots(SingleDecisions):
     network: Literal["slots", "plain"] = "slots"
     """One small network for every slot, or one over all numbers at once."""
 
+    @property
+    def decide_at(self) -> str:
+        """When the agent is asked; on suites at every arrival."""
+        return "arrival" if self.suites.suite else self.environment.decide_at
+
 
 @dataclass(frozen=True)
 class PPO(OnSlots, ActorCritic):
@@ -263,6 +276,12 @@ class PPO(OnSlots, ActorCritic):
     algo = "ppo"
     learner = "agents.ppo:SlotPPO"
     kinds = ("environment", "queue", "fleet")
+    steps: Natural = 600_000
+    """Decisions to learn from, for each seed."""
+    num_envs: Count = 64
+    """Environments side by side. Many small updates learn more than few large ones."""
+    batch_size: Batch = 512
+    """Decisions of one gradient step."""
     learning_rate: Positive = 2e-3
     """At the start; falls linearly to 0."""
     unmasked: bool = False
@@ -282,8 +301,7 @@ class DQN(OnSlots):
     algo = "dqn"
     learner = "agents.dqn:SlotDQN"
     kinds = ("environment", "queue")
-    batch_size: Batch = 1024
-    """Decisions of one gradient step."""
+    environment: Annotated[FullBuffer, FLAT] = FullBuffer()
     learning_rate: Positive = 5e-4
     """At the start; falls linearly to 0."""
     train_freq: Count = 8

@@ -31,11 +31,12 @@ ENVIRONMENTS = {
         "many topics over one uplink: what to drop, and what to send next (Robofleet)",
         {"capacity": 32},
     ),
-} | {entry.name: entry.load() for entry in _entry_points(group="bufgym.environments")}
-"""Id -> (name of the scenario, its description, arguments that differ from the usual): the core's own, and those that
-installed packages declare as entry points of the group ``bufgym.environments``."""
+}
+"""Id -> (name of the scenario, its description, arguments that differ from the usual). Installed packages declare more
+of them, as entry points of the group ``bufgym.environments``."""
 
-for _id, (_scenario, _, _options) in ENVIRONMENTS.items():
+_others = {entry.name: entry.load() for entry in _entry_points(group="bufgym.environments")}
+for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
     if _id not in _gym.registry:
         _gym.register(
             _id,
@@ -46,4 +47,6 @@ for _id, (_scenario, _, _options) in ENVIRONMENTS.items():
             kwargs={"scenario": _scenario, **_options},
         )
 
-__getattr__ = _on_demand(__name__)
+__getattr__ = _on_demand(
+    __name__, {"Comparison": "benchmark.compare", "compare": "benchmark.compare", "make_policy": "benchmark.compare"}
+)

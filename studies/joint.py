@@ -20,11 +20,11 @@ import cma
 import numpy as np
 
 from agents.families import Family, Run, divided
-from agents.page import command, publish, table, written
 from bufgym import policies
 from bufgym.policies import weights
 from bufgym.policies.guided import GuidedWeights
 from studies.families import families
+from studies.page import command, publish, table, written
 
 FOLDER = Path("runs/joint")
 SIGMA, LEAST, POPULATION, MEMORY, GENERATIONS = 0.03, 0.02, 16, 40, 110

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from agents.cma_es import Search, evaluation_here
 from agents.objectives.objective import Objective
-from agents.page import command, publish, table
 from bufgym import policies
 from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.policies import Policy
 from bufgym.sim import Senders
 from bufgym_papers.perception import worth
+from studies.page import command, publish, table
 
 TEST_LINKS = 2
 """Number of shipped links for tests alone, the last ones."""

@@ -1,8 +1,8 @@
 """The table of message sizes that bufgym ships, measured by encoding the frames of a recording.
 
-``python -m studies.sizes FOLDER traces/sizes/7scenes.csv`` needs ``packages/papers[perception]`` and PyAV
-(``pip install av``). A line of the table is a frame: ``motion``, x since the first frame in millionths of a view, by the true poses;
-the bytes of its depth by RVL, of its grey picture by JPEG of quality 50 and 90, and by H.264 (x264, crf 23, no B
+``python -m studies.sizes FOLDER traces/sizes/7scenes.csv`` needs ``packages/papers[perception]`` and PyAV (``pip
+install av``). A line of the table is a frame: ``motion``, x since the first frame in millionths of a view, by the true
+poses; the bytes of its depth by RVL, of its grey picture by JPEG of quality 50 and 90, and by H.264 (x264, crf 23, no B
 frames, no look-ahead, an I frame every 30), each at the size in which the recording is stored.
 """
 

@@ -123,7 +123,10 @@ def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for beams in (1785, 1803):
         refuse(f"beams = {beams}: 7260 bytes would need a frame_id of", Reproduction(beams=beams).simulate)
     stores.cache_clear()
-    for library, encoding, extra in (("rosbags.typesys", "cdr", "ros"), ("flatbuffers", "robofleet", "robofleet")):
+    for library, encoding, extra in (
+        ("rosbags.typesys", "cdr", "ros"),
+        ("flatbuffers", "robofleet", "bufgym-live[robofleet]"),
+    ):
         monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
         refuse(re.escape(f"needs {library}: {install(extra)}"), encode, "PoseStamped", content("PoseStamped"), encoding)
         assert len(encode("PoseStamped", content("PoseStamped"), "json")) > 0  # which needs neither

@@ -1,6 +1,7 @@
 """The house rules: paths are relative, importing stays cheap, hints name extras. `lint-imports` knows the layers."""
 
 import ast
+import importlib
 import importlib.metadata
 import re
 import subprocess
@@ -64,6 +65,15 @@ def output_of(program: str) -> str:
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+@pytest.mark.parametrize("room", ["bufgym", "bufgym.model", "bufgym.envs", "bufgym.benchmark"])
+def test_every_public_name_of_a_room_is_found_where_the_room_says(room: str) -> None:
+    module = importlib.import_module(room)
+    for name in set(module.__all__) - {"FleetEnv", "parallel_env"}:  # these need PettingZoo
+        assert getattr(module, name) is not None
+    with pytest.raises(AttributeError, match=f"module '{room}' has no attribute 'no_such_name'"):
+        getattr(module, "no_such_name")  # noqa: B009  (mypy knows that it is missing)
 
 
 def test_importing_bufgym_imports_nothing_heavy() -> None:

@@ -11,6 +11,7 @@ import bufgym
 from bufgym import scenario
 from bufgym.model.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
 from bufgym.scenario import FleetScenario
+from bufgym_papers.environments import MAPPING
 from website.films import FILMS
 from website.markdown import code, parameters, table
 
@@ -39,8 +40,8 @@ HISTORY = {
 }
 """Every environment's versions, newest first."""
 
-SCENARIOS = bufgym.ENVIRONMENTS | bufgym.ON_TASKS
-"""Id -> (name of the scenario, description)."""
+SCENARIOS = bufgym.ENVIRONMENTS | {"bufgym/Mapping-v0": MAPPING}
+"""Id -> (name of the scenario, description, its arguments)."""
 
 
 TOPICS = """\

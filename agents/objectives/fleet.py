@@ -7,7 +7,7 @@ The search begins at the rule ``gap-price`` and moves its numbers (``bufgym.poli
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -116,17 +116,17 @@ class FleetObjective(Objective):
         """Compute ``mean_gain``."""
         return mean_gain(policy, episodes)
 
-    def env(self, options: Mapping[str, Any]) -> VecEnv:
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
         """Robots as rows, each rewarded for its own information, at the middle L; a slot network serves the others."""
-        settings, chosen = self.settings, self.settings.suites
+        chosen = self.settings.suites
         fleet, capacities = fleet_of(chosen, "train"), chosen.capacities_of(chosen.suite[0])
         batch = FleetVecEnv(
-            max(1, settings.num_envs // fleet.robots),
+            max(1, num_envs // fleet.robots),
             fleet.robots,
             fleet.uplink,
             capacities[len(capacities) // 2],
             reward="own",
-            term=settings.reward,
+            term=reward,
             autoreset_mode="SameStep",
         )
         return GymVecEnv(batch)

@@ -7,7 +7,7 @@ The search begins at the rule, with weights of zero, and goes in small steps: re
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -75,11 +75,11 @@ class GuidedObjective(Objective):
         # By QoI, which orders agents like the score, and is known even if nothing can be gained.
         return self.judges.score(outcomes), float(np.mean([outcome.qoi for outcome in outcomes]))
 
-    def env(self, options: Mapping[str, Any]) -> VecEnv:
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
         """Rows of the training links."""
-        on, settings = self.settings.environment, self.settings
-        known = {"scenario": split_scenario(on)[0], "capacity": on.capacity, "reward": settings.reward}
-        return make_vec_env(on.env, settings.num_envs, **known, **options)
+        on = self.settings.environment
+        scenario = split_scenario(on)[0]
+        return make_vec_env(on.env, num_envs, scenario=scenario, capacity=on.capacity, reward=reward, **options)
 
     def lines_to_beat(self) -> dict[str, float]:
         """Drop Oldest, AFR and the best rule written by hand."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +73,8 @@ class Objective(ABC):
         """The measures of an agent on the validation episodes; it is a policy where no model plays."""
         return (self.measure(agent, self.judges),)
 
-    def env(self, options: Mapping[str, Any]) -> VecEnv:
-        """Environments to learn from single decisions in, made with a learner's options."""
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
+        """Environments to learn from single decisions in; ``options`` are those of the learner's actions."""
         raise NotImplementedError
 
     def lines_to_beat(self) -> dict[str, float]:

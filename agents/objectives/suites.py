@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -60,14 +59,14 @@ class SuitesObjective(Objective):
         """The verdict on the validation splits."""
         return self.judges.play(agent)
 
-    def env(self, options: Mapping[str, Any]) -> VecEnv:
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
         """Whole train splits, about as many rows of each scenario at each L."""
         chosen = self.settings.suites
         mixed = [
             cell for suite in chosen.suite for cell in cells(suite, "train", chosen.capacities_of(suite), chosen.data)
         ]
-        size = math.ceil(self.settings.num_envs / len(mixed))
-        return GymVecEnv(MixedEnv(mixed, [size] * len(mixed), reward=self.settings.reward, **options))
+        size = math.ceil(num_envs / len(mixed))
+        return GymVecEnv(MixedEnv(mixed, [size] * len(mixed), reward=reward, **options))
 
     def report(self, trained: Trained) -> Report:
         """A score on each suite, as ``bufgym bench`` computes it."""

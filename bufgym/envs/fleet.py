@@ -1,7 +1,7 @@
 """``pettingzoo.ParallelEnv``: robots that share one cell, each with a send buffer of its own."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium as gym
@@ -10,9 +10,9 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym.envs.fleet_rows import FleetRows
+from bufgym.envs.fleet_rows import fleet_rows
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import OPTIONS, check_render_mode
+from bufgym.envs.options import RENDER_MODES, Options
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import needs
 from bufgym.scenario import FleetScenario, Uplink
@@ -62,7 +62,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     metadata = {
         "name": "bufgym_fleet_v0",
-        "render_modes": ["ansi", "rgb_array"],
+        "render_modes": list(RENDER_MODES),
         "is_parallelizable": True,
         "render_fps": 10,
     }
@@ -71,24 +71,15 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         self,
         robots: int = 4,
         scenario: str | Uplink | FleetScenario = "lte",
-        capacity: int = 8,
+        capacity: int = Options.capacity,
         *,
-        reward: str = "team",
-        term: str | Mapping[str, float] = "retained",
-        max_bytes: int | None = None,
-        fields: Sequence[str] | None = None,
-        observation: str = "dict",
-        info: str = "full",
         mask_in_observation: bool = False,
-        render_mode: str | None = None,
-        **parameters: Any,
+        **arguments: Any,
     ) -> None:
-        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        fleet = FleetScenario.of(robots, scenario, **parameters)
-        if mask_in_observation and observation == "flat":
+        self.rows = fleet_rows(1, FleetScenario.of(robots, scenario), capacity=capacity, **arguments)
+        if mask_in_observation and self.rows.options.observation == "flat":
             raise BufgymError("mask_in_observation: an observation 'flat' has no place for it; 'dict' and 'slots' have")
-        options = {name: value for name, value in locals().items() if name in ("term", *OPTIONS)}
-        self.rows = FleetRows(1, fleet, capacity, **options)
+        self.render_mode = self.rows.options.render_mode
         self.mask_in_observation = mask_in_observation
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []

@@ -43,8 +43,8 @@ class ObservationForm:
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
-    your own come last. Without slot fields, so is the row. Where ``is_view``, an observation is a dict of views; where
-    ``is_row``, the row itself.
+    your own come last. ``has_slots`` says whether rows hold slot fields of the tables. Where ``is_view``, an
+    observation is a dict of views; where ``is_row``, the row itself.
     ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row.
     """
 
@@ -72,7 +72,7 @@ class ObservationForm:
                 own[found.name], names[k] = found, found.name
         if not names:
             raise BufgymError("fields: choose at least one field to observe")
-        self.form = form
+        self.form, self.has_slots = form, bool(slot_fields)
         self._width = capacity + 1
         self._slot_fields, self._context_fields = len(slot_fields), len(context_fields)
         self._first_context = self._slot_fields * self._width
@@ -124,46 +124,48 @@ def _space(low: Observation, high: Observation) -> Any:
     return spaces.Dict(OrderedDict((name, spaces.Box(low[name], high[name])) for name in low))
 
 
-Thing = TypeVar("Thing")
+Buffers = TypeVar("Buffers")
 
 
-class Reused(Generic[Thing]):
-    """Makes things out of arrays. One is taken again once nobody outside holds an array of it or a view of one.
+class BufferPool(Generic[Buffers]):
+    """Arrays for results, used again once the caller has let go of them, so that a step allocates nothing.
 
-    So what a caller still holds is never written again.
+    Python counts the references to an array. As long as there are more to one of the arrays, or to a view of it, than
+    when it was made, the caller holds it, and it is not written again. Without the pool a step of the single
+    environment takes 9.4 us in place of 4.5, and one of 64 rows 25 us in place of 12.
     """
 
-    def __init__(self, make: Callable[[], tuple[Thing, Sequence[NDArray[Any]]]]) -> None:
-        """``make`` returns a new thing, and its arrays with all views of them that it hands out."""
+    def __init__(self, make: Callable[[], tuple[Buffers, Sequence[NDArray[Any]]]]) -> None:
+        """``make`` returns new buffers, and their arrays with all views of them that are handed out."""
         self._make = make
-        self._made: list[tuple[Thing, Sequence[NDArray[Any]], list[int]]] = []
+        self._pool: list[tuple[Buffers, Sequence[NDArray[Any]], list[int]]] = []
 
-    def take(self) -> Thing:
-        """A thing that nobody holds, with any content."""
-        for thing, arrays, free in self._made:
-            if list(map(sys.getrefcount, arrays)) == free:
-                return thing
-        thing, arrays = self._make()
-        # A caller that collects them holds them all.
-        self._made = [*self._made[1 - _KEPT :], (thing, arrays, list(map(sys.getrefcount, arrays)))]
-        return thing
+    def take(self) -> Buffers:
+        """Buffers that nobody holds, with any content."""
+        for buffers, arrays, references_when_free in self._pool:
+            if list(map(sys.getrefcount, arrays)) == references_when_free:
+                return buffers
+        buffers, arrays = self._make()
+        # The oldest leave the pool, as a caller that collects results holds them all.
+        self._pool = [*self._pool[1 - _POOLED :], (buffers, arrays, list(map(sys.getrefcount, arrays)))]
+        return buffers
 
 
-_KEPT = 4  # Most things to keep
+_POOLED = 4  # Most buffers in a pool
 
 
 class Handed:
-    """Hands out observations of one row. Making a dict of twenty views costs more than a step, so they are reused."""
+    """Hands out observations of one row. Making a dict of twenty views costs more than a step, so a pool holds them."""
 
     def __init__(self, form: ObservationForm) -> None:
         self._form = form
-        self._reused = Reused(self._new)
+        self._pool = BufferPool(self._new)
 
     def of(self, row: NDArray[np.float32]) -> Observation:
         """The observation of this row of numbers, which is copied."""
         if self._form.form != "dict":
             return row.copy() if self._form.is_row else self._form.of(row.copy())
-        numbers, views = self._reused.take()
+        numbers, views = self._pool.take()
         numbers[:] = row
         return views.copy()
 

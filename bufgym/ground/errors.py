@@ -24,12 +24,22 @@ def printable(text: object) -> str:
 
 
 class BufgymError(ValueError):
-    """A value that bufgym cannot work with; the message names the value and the broken rule, on one line."""
+    """A value that bufgym cannot work with; the message names the value and the broken rule, on one line.
+
+    It is a ``ValueError``, and so are the errors below.
+    """
 
     def __init__(self, message: object = "") -> None:
         text = printable(message)
         # The message begins with the place and ends with the rule; the value between may be as long as a file.
         super().__init__(text if len(text) <= _MOST_MESSAGE else f"{text[:1000]}...{text[-500:]}")
+
+
+class UnknownArgumentError(BufgymError, TypeError):
+    """A keyword argument that nothing takes; also a ``TypeError``, whose message begins with Python's own words.
+
+    So a library that tries an argument and leaves it out at Python's error goes on.
+    """
 
 
 class TraceError(BufgymError):
@@ -49,6 +59,12 @@ def unknown(what: str, name: object, known: Iterable[str], also: str = "", place
     close = difflib.get_close_matches(str(name), names, 1)
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{also}"
     return BufgymError(f"{place and f'{place}: '}unknown {what} {name!r}; {hint}")
+
+
+def unknown_argument(function: str, name: str, known: Iterable[str]) -> UnknownArgumentError:
+    """The error for a keyword argument of ``function`` that is not among those ``known``."""
+    hint = str(unknown("argument", name, known)).partition("; ")[2]
+    return UnknownArgumentError(f"{function}() got an unexpected keyword argument {name!r}; {hint}")
 
 
 def where(

@@ -139,7 +139,7 @@ def test_pictures_have_a_line_and_a_bar_for_every_robot():
     before, after = (int((frame == (0xE0, 0xA1, 0x00)).all(axis=-1).sum()) for frame in shown)
     assert after > before + 500  # the legend has the colour, too
     assert (image.rows.senders.batch.senders["next"] == 8).all()  # drawing changes nothing
-    envs = FleetVecEnv(1, 2, "lte", L, parameters=PARAMETERS, render_mode="rgb_array")
+    envs = FleetVecEnv(1, 2, "lte", L, **PARAMETERS, render_mode="rgb_array")
     envs.reset(seed=0)
     assert [frame.shape for frame in envs.render()] == [(400, 800, 3)] * 2
     with pytest.warns(UserWarning, match="render_mode"):
@@ -173,7 +173,7 @@ def apart(robots=2):
 
 
 def batch():
-    envs = FleetVecEnv(2, 2, parameters=PARAMETERS)
+    envs = FleetVecEnv(2, 2, **PARAMETERS)
     envs.reset(seed=0)
     return envs
 
@@ -195,7 +195,7 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
 @pytest.mark.parametrize("reward", ["team", "own"])
 def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
     cells, robots = 2, 3
-    envs = FleetVecEnv(cells, robots, "lte", L, reward=reward, num_threads=2, parameters=PARAMETERS)
+    envs = FleetVecEnv(cells, robots, "lte", L, reward=reward, num_threads=2, **PARAMETERS)
     fleets = [FleetEnv(robots, "lte", L, reward=reward, **PARAMETERS) for _ in range(cells)]
     seen, info = envs.reset(seed=11)
     each = [fleet.reset(seed=11 + c * robots) for c, fleet in enumerate(fleets)]
@@ -227,7 +227,7 @@ def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
 
 
 def test_cells_can_be_given_and_begun_one_by_one():
-    envs = FleetVecEnv(2, 2, "lte", L, autoreset_mode=AutoresetMode.DISABLED, parameters=PARAMETERS)
+    envs = FleetVecEnv(2, 2, "lte", L, autoreset_mode=AutoresetMode.DISABLED, **PARAMETERS)
     given = FleetScenario.of(2, "lte", **PARAMETERS).draw(Streams.seeded(4))
     envs.reset(seed=0, options={"episodes": [None, given]})
     assert envs.rows.senders.episodes[3].arrivals is given.arrivals[1]

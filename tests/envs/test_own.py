@@ -169,7 +169,7 @@ def test_a_batch_is_its_rows() -> None:
 
 def test_a_fleet_has_them_too() -> None:
     rewarded: dict[str, Any] = {"term": {"delay": 1.0, "dropped": 0.1}, "reward": "own"}
-    envs = FleetVecEnv(2, 3, capacity=3, fields=CHOSEN, parameters={"duration_s": 1.0}, **rewarded)
+    envs = FleetVecEnv(2, 3, capacity=3, fields=CHOSEN, duration_s=1.0, **rewarded)
     envs.reset(seed=1)
     done = np.zeros(6, np.bool_)
     while not done.any():

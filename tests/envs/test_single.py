@@ -208,6 +208,17 @@ def test_info_is_built_as_far_as_asked(info: str, always: set[str]) -> None:
     assert {name: last[name] for name in summary} == summary and last["qoi"] == pytest.approx(1 + 3 * (1 - 0.618))
 
 
+def test_a_library_that_tries_an_argument_sees_pythons_own_error() -> None:
+    """As TorchRL does: it passes ``frameskip`` and leaves it out at Python's words."""
+    for make_one in (gym.make, gym.make_vec):
+        with pytest.raises(
+            TypeError, match=r"^Uplink\.__init__\(\) got an unexpected keyword argument 'frameskip'; known"
+        ):
+            make_one("bufgym/Uplink-v0", frameskip=1)
+    with pytest.raises(ValueError, match="'capacty'; did you mean 'capacity'"):
+        SenderEnv(capacty=3)
+
+
 WHOLE = r"must be a whole number in 0\.\.5 \(L = 4\)"
 
 

@@ -21,11 +21,13 @@ lte-v1 topics-v1 fleet-v1 lte-synthetic-0 drive-0 exponential:0.5 exponential:2 
 /dev/null /dev/zero . out.csv out.png out csv mahimahi validation test uniform client.toml link.csv Uplink-v0 -- -o"""
 VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", "\udcff"]
 
-WORK = """benchmark.run.run benchmark.sweep.run_sweep benchmark.leaderboard.make
-benchmark.leaderboard.validate robot.cost.measure traces.datasets.fetch.fetch_dataset
-papers.commands._text cli.play.play robot.commands.send robot.commands.receive robot.commands.link
-robot.ros2.commands.send robot.ros2.commands.receive relay.commands.serve relay.commands.robot
-relay.commands.foxglove robot.cost.cost robot.validate.validate envs.expert.dataset.make"""
+WORK = """bufgym.benchmark.run.run bufgym.benchmark.sweep.run_sweep bufgym.benchmark.leaderboard.make
+bufgym.benchmark.leaderboard.validate bufgym_live.robot.cost.measure bufgym.traces.datasets.fetch.fetch_dataset
+bufgym_papers.figures.commands._text bufgym.cli.play.play bufgym_live.robot.commands.send
+bufgym_live.robot.commands.receive bufgym_live.robot.commands.link bufgym_live.robot.ros2.commands.send
+bufgym_live.robot.ros2.commands.receive bufgym_live.relay.commands.serve bufgym_live.relay.commands.robot
+bufgym_live.relay.commands.foxglove bufgym_live.robot.cost.cost bufgym_live.robot.validate.validate
+bufgym.envs.expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 
 
@@ -36,7 +38,7 @@ def leave_out_work() -> None:
         raise BufgymError("left out")
 
     for path in WORK.split():
-        module, name = f"bufgym.{path}".rsplit(".", 1)
+        module, name = path.rsplit(".", 1)
         room = importlib.import_module(module)
         # A command keeps its options.
         setattr(room, name, functools.wraps(getattr(room, name))(left_out))

@@ -143,6 +143,7 @@ def test_what_is_cited_is_in_the_references() -> None:
 
 def test_unknown_names_and_unusable_options_are_refused() -> None:
     for name, options, says in (
+        ("afr-fig55", {}, "unknown figure 'afr-fig55'; did you mean 'afr-fig5'"),
         ("afr-fig5", {"rums": 3}, "afr-fig5: unknown option 'rums'; did you mean 'runs'"),
         ("afr-fig5", {"runs": 0}, "must be|need"),
         ("afr-views", {"turn_degrees": 0}, "must be|need"),
@@ -239,13 +240,13 @@ def test_no_recording_and_no_library(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for folder, says in ((tmp_path, r"depth\.txt \(TUM\)"), (tmp_path / "desk", "no such folder")):
         refuse(says, open_sequence, folder)
     monkeypatch.setitem(sys.modules, "rvl", None)
-    refuse(r"bufgym needs rvl: pip install .*perception", library, "rvl")
+    refuse(r"bufgym needs rvl: pip install .*perception", library, "rvl", "bufgym-papers[perception]")
 
 
 def test_the_size_of_a_frame() -> None:
     # An even wall costs a nibble for each of 307 200 pixels, 150 kB; where nothing was measured, nearly none.
     grey = np.full((480, 640), 90, np.uint8)
-    picture = len(library("cv2").imencode(".jpg", grey, [1, 50])[1])
+    picture = len(library("cv2", "bufgym-papers[perception]").imencode(".jpg", grey, [1, 50])[1])
     wall = encoded_bytes(np.full((480, 640), 1.5, np.float32), grey)
     assert 0 <= wall - picture - 640 * 480 // 2 < 32
     assert encoded_bytes(np.zeros((480, 640), np.float32), grey) - picture < 32

@@ -49,7 +49,7 @@ def _is_ours(request: Request | None) -> bool:
     return request is not None and request.path.partition("?")[0] == wire.PATH
 
 
-class Door:
+class Admission:
     """Admission of connections to the handshake."""
 
     def __init__(self, hub: Hub) -> None:
@@ -104,9 +104,9 @@ class Door:
 class Accepted(ServerConnection):
     """A TCP connection, from its first byte on."""
 
-    def __init__(self, door: Door, *arguments: Any, **settings: Any) -> None:
+    def __init__(self, admission: Admission, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
-        self._door = door
+        self._admission = admission
         self.address = ""
         self._waits = False
 
@@ -114,7 +114,7 @@ class Accepted(ServerConnection):
         super().connection_made(transport)
         try:
             self.address = plain_address(transport.get_extra_info("peername")[0])
-            self._door.enter(self)
+            self._admission.enter(self)
         except (TypeError, IndexError):  # the peer has gone already
             self.transport.abort()
             return
@@ -126,20 +126,20 @@ class Accepted(ServerConnection):
         tcp = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
             set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
-            if self._door.hub.config.small_buffers:
+            if self._admission.hub.config.small_buffers:
                 little_unsent(tcp)
 
     def greeted(self) -> None:
         """Note that the client has said hello, or has gone."""
         if self._waits:
             self._waits = False
-            self._door.waiting[self.address] -= 1
-            if not self._door.waiting[self.address]:
-                del self._door.waiting[self.address]
+            self._admission.waiting[self.address] -= 1
+            if not self._admission.waiting[self.address]:
+                del self._admission.waiting[self.address]
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self in self._door.open:
-            self._door.open.remove(self)
+        if self in self._admission.open:
+            self._admission.open.remove(self)
             if self.response is None:
                 fault = self.protocol.handshake_exc
                 self.refused("wrong", f"{type(fault).__name__}: {fault}" if fault else "no whole request in time")
@@ -148,7 +148,7 @@ class Accepted(ServerConnection):
 
     def refused(self, code: str, why: object) -> None:
         """Log why it was not let in."""
-        self._door.hub.audit.repeated(what="connection", code=code, address=self.address, why=str(why))
+        self._admission.hub.audit.repeated(what="connection", code=code, address=self.address, why=str(why))
 
 
 class Server:
@@ -162,7 +162,7 @@ class Server:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.hub = Hub(config)
-        self._door = Door(self.hub)
+        self._admission = Admission(self.hub)
         self._verifier = None if config.tokens is None else Verifier(config.tokens)
         self._tls = None if config.tls is None else server_context(config.tls)
         self._server: WebSocketServer | None = None
@@ -190,7 +190,7 @@ class Server:
                 self.config.port,
                 select_subprotocol=self._subprotocol,
                 process_request=self._request,
-                create_connection=cast(type[Accepted], partial(Accepted, self._door)),  # it is called, no more
+                create_connection=cast(type[Accepted], partial(Accepted, self._admission)),  # it is called, no more
                 compression=None,  # pictures are compressed; and a small message may unpack to a large one
                 max_size=HELLO_BYTES,
                 max_queue=2,
@@ -259,7 +259,7 @@ class Server:
     def _request(self, socket: ServerConnection, request: Request) -> Response | None:
         """Deny a request, answer it with a page, or let it become a WebSocket."""
         assert isinstance(socket, Accepted)
-        refused = self._door.refusal(socket.address, request)
+        refused = self._admission.refusal(socket.address, request)
         if refused is not None:
             socket.refused(refused.code, refused)
             return pages.response(HTTPStatus.FORBIDDEN, f"{refused}\n")

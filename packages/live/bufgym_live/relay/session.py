@@ -39,11 +39,11 @@ _PASSING: Final = ("store_full", "too_fast")  # Codes of refusals after which it
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
 
 
-class _HomeError(Exception):
+class HomeIsBack(Exception):  # noqa: N818  (nothing is wrong)
     """The first relay is back, and this connection is to another."""
 
 
-class Wish(NamedTuple):
+class SubscriptionRequest(NamedTuple):
     """A subscription that is asked of the relay."""
 
     pattern: re.Pattern[str]
@@ -112,7 +112,7 @@ class Session:
         self._wanted = asyncio.Event()
         self._received = [0, 0]
         """Number of the last no_drop message received from home and from the relay that stands in."""
-        self._subscriptions: dict[str, Wish] = {}
+        self._subscriptions: dict[str, SubscriptionRequest] = {}
         self._confirmed: set[str] = set()
         self._connection: Any = None
         self._tasks = Tasks()
@@ -161,7 +161,7 @@ class Session:
         chosen = {"policy": policy, "capacity": capacity, "durable": durable or None}
         fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
         try:
-            self._subscriptions[id] = Wish(re.compile(pattern), on_message, fields)
+            self._subscriptions[id] = SubscriptionRequest(re.compile(pattern), on_message, fields)
         except re.error as error:
             raise BufgymError(f"subscription {pattern!r}: no regular expression: {error}") from None
         self.ready.clear()
@@ -180,14 +180,8 @@ class Session:
         try:
             while True:
                 try:
-                    async with asyncio.timeout(PATIENCE_S):
-                        self._connection = await self._connect()
-                        await self._greet()
-                    backoff.connected()
-                    if not self.stands_in:
-                        self._home.connected()
-                    await until_one_ends(*self._works())
-                except _HomeError:
+                    await self._serve_one_connection(backoff)
+                except HomeIsBack:
                     self._at = 0
                     continue
                 except RefusedError as refused:
@@ -198,19 +192,30 @@ class Session:
                     # A relay that refuses this address says why in its HTTP answer.
                     page = getattr(getattr(error, "response", None), "body", None) or b""
                     self.note(f"{type(error).__name__}: {error} {page.decode(errors='replace')}".strip())
-                finally:
-                    self.connected.clear()
-                    self.ready.clear()
-                    self._confirmed.clear()
-                    if self._connection is not None:
-                        self._connection.transport.abort()
-                        self._connection = None
                 self._at = (self._at + 1) % len(self._addresses)
                 if not self.stands_in:
                     await asyncio.sleep(backoff.delay_s())
         finally:
             self._unanswered.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
+
+    async def _serve_one_connection(self, backoff: Backoff) -> None:
+        """Connect to the relay whose turn it is, and work until the connection ends."""
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                self._connection = await self._connect()
+                await self._greet()
+            backoff.connected()
+            if not self.stands_in:
+                self._home.connected()
+            await until_one_ends(*self._works())
+        finally:
+            self.connected.clear()
+            self.ready.clear()
+            self._confirmed.clear()
+            if self._connection is not None:
+                self._connection.transport.abort()
+                self._connection = None
 
     def note(self, fault: str) -> None:
         """Report a fault, once however often it comes in a row."""
@@ -263,7 +268,7 @@ class Session:
         self._confirm()
 
     @property
-    def _asked(self) -> list[Wish]:
+    def _asked(self) -> list[SubscriptionRequest]:
         """The subscriptions that this relay is asked for."""
         return [one for one in self._subscriptions.values() if not (self.stands_in and "durable" in one.fields)]
 
@@ -281,7 +286,7 @@ class Session:
             with contextlib.suppress(OSError, TimeoutError):
                 async with asyncio.timeout(PATIENCE_S):
                     (await address.reached(self._addresses[0])).close()
-                raise _HomeError
+                raise HomeIsBack
 
     def _left_bytes(self) -> int | None:
         connection = self._connection

@@ -114,7 +114,7 @@ def replay(log: str, /, *, policy_file: PolicyFile = None) -> None:
     Args:
         log: Log of send --log.
     """
-    from bufgym import robot
+    from bufgym_live import robot
 
     load_policies(policy_file)
     played = robot.replay(log)

@@ -149,7 +149,7 @@ async def test_slow_handshakes_keep_nobody_out() -> None:
                 assert one.welcome["op"] == "welcome"
             server.hub.audit.flush()
             assert server.hub.audit.refused == 20
-        await until("the ends of all", lambda: not server._door.waiting)
+        await until("the ends of all", lambda: not server._admission.waiting)
         server.hub.audit.flush()
         assert server.hub.audit.refused == 60  # none of them had said a whole request
         async with client(server.port, local="127.0.0.2") as one:

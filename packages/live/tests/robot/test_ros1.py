@@ -42,7 +42,7 @@ def test_a_policy_in_an_untouched_node(ros: dict[str, str]) -> None:
 
 
 def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, str], tmp_path: Path) -> None:
-    seen = json.loads(played(ros, REPO / "tests" / "robot" / "ros1_session.py", tmp_path).splitlines()[-1])
+    seen = json.loads(played(ros, Path(__file__).with_name("ros1_session.py"), tmp_path).splitlines()[-1])
     assert seen["came"] == {topic: [str(k) for k in range(60)] for topic in seen["came"]}
     assert {topic: sorted(kinds) for topic, kinds in seen["kinds"].items()} == {
         "chosen": ["PolicyConnection"] * 2,
@@ -71,7 +71,7 @@ def test_an_episode_through_a_node_is_that_of_the_simulator(ros: dict[str, str],
 
 def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, "rospy", None)
-    refuse(r"bufgym\.robot\.ros1 needs rospy: .* python3-rospy", ros1.install, "afr")
+    refuse(r"bufgym_live\.robot\.ros1 needs rospy: .* python3-rospy", ros1.install, "afr")
     fails([*VALIDATE[1:], "ros1"], "bufgym_live.robot.ros1 needs rospy", capsys)
 
 

@@ -31,19 +31,19 @@ def reproduce(
         live: robofleet-fig3 to -fig7 on real sockets too.
         out: Where pictures go.
     """
-    from bufgym import papers
+    from bufgym_papers import figures
 
     if live and claims is not None:
         raise BufgymError("--live: not with --claims, whose numbers are simulated")
     if data is not None and not data.is_dir():
         raise BufgymError(f"{data}: no such folder (--data)")
     if not names and claims is None:
-        print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(papers.FIGURES.items())))
+        print("figures (bufgym reproduce NAME..., or all)\n" + columns(list(figures.FIGURES.items())))
         return
     for name in names:
-        if name != "all" and name not in papers.FIGURES:
-            raise unknown("figure", name, ["all", *papers.FIGURES])
-    chosen = list(papers.FIGURES) if "all" in names else list(dict.fromkeys(names))
+        if name != "all" and name not in figures.FIGURES:
+            raise unknown("figure", name, ["all", *figures.FIGURES])
+    chosen = list(figures.FIGURES) if "all" in names else list(dict.fromkeys(names))
     if claims is not None:
         _claims(claims, chosen, out, data)
         return
@@ -64,15 +64,15 @@ def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:
 
 def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -> str:
     """Make the figure; if it was not named, leave it out where it can't be made, such as without a library."""
-    from bufgym import papers
+    from bufgym_papers import figures
 
-    needs = papers.NEEDS_DATA.get(name)
+    needs = figures.NEEDS_DATA.get(name)
     if needs is not None and data is None and not named:
         return f"{name}: left out; it needs a folder of recordings (--data DIR) with {needs}"
     try:
         if live:
-            return papers.run_live(name, out, partial(_steps, name))
-        return papers.run(name, out, **({"data": data} if name in papers.TAKES_DATA else {}))
+            return figures.run_live(name, out, partial(_steps, name))
+        return figures.run(name, out, **({"data": data} if name in figures.TAKES_DATA else {}))
     except BufgymError as error:
         if named:
             raise
