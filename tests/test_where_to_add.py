@@ -36,34 +36,22 @@ def newest_two(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return 0 if len(buffer.slots) >= 2 else ACCEPT
 '''
 STEADY = '''
-from dataclasses import dataclass, field
-from typing import ClassVar
-
 import numpy as np
 
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.model.qoi import Value
-from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
 
 
-@dataclass(frozen=True)
 class Halves:
     """A message every second over a link that carries one in two."""
 
-    count: int = 20
-    value: Value = field(default_factory=qoi.exponential)
-    topics: ClassVar[tuple[Topic, ...]] = ()
-
-    @property
-    def max_messages(self) -> int:
-        return self.count
+    value, topics, max_messages = qoi.exponential(), (), 20
 
     def draw(self, streams: Streams) -> Episode:
-        return Episode(messages(np.arange(self.count) * 1_000_000, 1000), Link(Trace.steps([(60.0, 500.0)])))
+        return Episode(messages(np.arange(20) * 1_000_000, 1000), Link(Trace.steps([(60.0, 500.0)])))
 '''
 SUITE = """
 def _halves(split: str, data: str | None = None) -> dict[str, Setting]:
