@@ -3,17 +3,15 @@
 Results are in runs/NAME/. After a kill, the same command with ``--resume`` goes on from the last checkpoint.
 """
 
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import App
 
 from agents.runs import prepare
-from agents.settings import ALGORITHMS, FLAT, Evolve, GuidedPPO, Settings
+from agents.settings import ALGORITHMS, FLAT, PPO, Evolve, Hindsight, Settings, SlotEnvironment
 from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
@@ -24,12 +22,12 @@ BEFORE = {"guided": "evolve", "maskable-ppo": "ppo", "ppo": "ppo --unmasked", "d
 
 
 @app.default
-def _evolve_beside(*, settings: Annotated[Evolve, FLAT] = Evolve()) -> None:  # noqa: B008
+def _three_ways(*, settings: Annotated[Evolve, FLAT] = Evolve()) -> None:  # noqa: B008
     """Train an agent on a bufgym environment, or on a whole suite, and evaluate it on held-out episodes.
 
-    Without a command: evolve, and then, in an environment, guided-ppo for no longer, to compare.
+    Without a command: evolve. In an environment also hindsight and ppo, for about a minute each, to compare.
     """
-    main(settings, beside=settings.kind == "environment")
+    main(settings, others_of(settings) if settings.kind == "environment" else ())
 
 
 def add_command(algorithm: type[Settings]) -> None:
@@ -46,35 +44,35 @@ for each in ALGORITHMS:
     add_command(each)
 
 
-def main(settings: Settings, beside: bool = False) -> None:
-    """Train, evaluate, report; with ``beside`` PPO on the same actions too, for no longer than evolution took."""
+def main(settings: Settings, others: Sequence[Settings] = ()) -> None:
+    """Train by these settings, and by others of the same environment; evaluate, report, keep the best agent."""
     folder = prepare(settings)
     # Only once the settings are known to be good: torch takes seconds to load.
     from agents.learner import learner_of
     from agents.report import Trained, keep
 
-    def trained(settings: Settings, home: Path, seconds: float = math.inf, **more: Any) -> Trained:
-        learner = learner_of(settings, seconds)
+    def trained(settings: Settings) -> Trained:
+        home = folder / settings.algo if others else folder
+        home.mkdir(exist_ok=True)
+        learner = learner_of(settings)
         runs = learner.train(home)
-        return Trained(settings, home, runs, [learner.agent(run) for run in runs], **more)
+        return Trained(settings, folder, runs, [learner.agent(run) for run in runs], lines=lines)
 
     with locked(folder):
         objective = learner_of(settings).objective(folder, settings.seed)
         lines = objective.lines_to_beat()
-        done = trained(settings, folder, lines=lines)
-        if beside:
-            home, seconds = folder / "ppo", max(run.seconds for run in done.runs)
-            home.mkdir(exist_ok=True)
-            print(f"PPO on the same actions, for at most {seconds:.0f} s")
-            done = replace(done, beside=trained(other_of(settings), home, seconds))
-        keep(done, objective.report)
+        done = sorted(map(trained, (settings, *others)), key=lambda way: way.best.merit, reverse=True)
+        keep(replace(done[0], beside=done[1:]), objective.report)
 
 
-def other_of(settings: Settings) -> GuidedPPO:
-    """PPO on guided actions, with the settings that evolution has too."""
-    shared = ("environment", "validation_episodes", "name", "resume", "seeds", "seed")
-    steps = min(settings.steps, GuidedPPO.steps)
-    return GuidedPPO(steps=steps, **{name: getattr(settings, name) for name in shared})
+def others_of(settings: Settings) -> list[Settings]:
+    """The other ways to an agent, with the settings that evolution has too, each for about a minute of one core."""
+    shared = {name: getattr(settings, name) for name in ("validation_episodes", "name", "resume", "seeds", "seed")}
+    slots = SlotEnvironment(**vars(settings.environment))
+    return [
+        Hindsight(steps=min(settings.steps, 110_000), environment=settings.environment, **shared),
+        PPO(steps=min(settings.steps, 450_000), environment=slots, **shared),
+    ]
 
 
 def typed(words: Sequence[str]) -> None:

@@ -45,7 +45,7 @@ def draw(
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     for name, curve in curves.items():
-        style = "x:" if "PPO" in name else "o-"
+        style = "x:" if "agent by" in name else "o-"
         left.plot(*curve.T, style, markersize=3, color=None if len(curves) > 2 else "tab:orange", label=name)
     for (name, level), colour in zip((lines or {}).items(), _LINES, strict=False):
         left.axhline(level, color=colour, linestyle="--", linewidth=1, label=f"{name} {level:.3f}")

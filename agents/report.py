@@ -58,8 +58,8 @@ class Trained:
     """The agent that each run kept."""
     lines: Mapping[str, float] = field(default_factory=dict)
     """The validation scores to beat."""
-    beside: Trained | None = None
-    """PPO's agents on the same actions."""
+    beside: Sequence[Trained] = ()
+    """What other algorithms made of the same environment."""
 
     @property
     def best(self) -> Run:
@@ -101,8 +101,7 @@ def keep(trained: Trained, report: Callable[[Trained], Report]) -> None:
     shutil.copyfile(best.model, folder / best.model.name)
     seeds, notes, contents = report(trained)
     write_notes(folder, trained.settings, seeds, notes)
-    beside = trained.beside.runs if trained.beside else ()
-    seconds = ", ".join(f"{run.seconds:.0f}" for run in (*trained.runs, *beside))
+    seconds = ", ".join(f"{run.seconds:.0f}" for way in (trained, *trained.beside) for run in way.runs)
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
     print("\n".join(["next:", *NEXT.get(best.model.suffix, ())]).format(model=folder / best.model.name))
 
@@ -149,15 +148,15 @@ def report_environment(trained: Trained) -> Report:
     test = fixed_episodes(settings, "test")
     names = {agent_name(run): run for run in trained.runs}
     agents = [*trained.agents]
-    if trained.beside:
-        names |= {f"agent by PPO (seed {run.seed})": run for run in trained.beside.runs}
-        agents += trained.beside.agents
+    for way in trained.beside:
+        names |= {f"agent by {way.settings.algo} (seed {run.seed})": run for run in way.runs}
+        agents += way.agents
     outcomes = test.play_fixed() | {name: test.play(agent) for name, agent in zip(names, agents, strict=True)}
     rows = test.rows(outcomes)
     entries, alike = summarise(outcomes, rows, best), with_equal_rows(rows)
     unranked = unranked_among(map(registry.get, registry.names()))
     print(table(entries, best, alike, unranked))
-    print(verdict(entries, best, trained.best.seconds))
+    print(verdict(entries, best, trained.best.seconds, trained.settings.algo))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = trained.save(trained.folder, held_out=held_out, scores=entries)
@@ -175,14 +174,15 @@ def report_environment(trained: Trained) -> Report:
     return [trained.best.seed], notes, "model, figure and numbers"
 
 
-def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float) -> str:
+def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float, algo: str) -> str:
     """One sentence: the distance of the agent's score from AFR, the best rules and other agents.
 
     It is level with a policy where the 95 % interval of the difference in QoI has 0 in it.
     """
     known, rules = {entry["policy"]: entry for entry in entries}, by_hand()
     best = next(name for name in known if name in rules)  # the best first, as all entries are
-    by_ppo = [name for name in known if name.startswith("agent by PPO")][:1]
+    others = [name for name in known if name.startswith("agent by ")]
+    first = {name.partition(" (")[0]: name for name in reversed(others)}.values()  # the best seed of each algorithm
     rivals = {
         "afr": "AFR",
         best: f"the best rule written by hand, {best},",
@@ -190,14 +190,14 @@ def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float) -> st
         "learned": "learned",
     }
     told = []
-    for name, label in {**rivals, **{name: name for name in by_ppo}}.items():
+    for name, label in {**rivals, **{name: name for name in first}}.items():
         if name not in known:
             continue
         low, high = known[name]["minus_agent_95"]
         ahead = known[agent]["score"] - known[name]["score"]
         where = "above" if high < 0 else "below" if low > 0 else "level with"
         told.append(f"{where} {label}" + (f" by {abs(ahead):.3f}" if where != "level with" else f" ({ahead:+.3f})"))
-    return f"after {seconds:.0f} s {agent} scores {known[agent]['score']:.3f}: {', '.join(told)}"
+    return f"after {seconds:.0f} s {agent}, by {algo}, scores {known[agent]['score']:.3f}: {', '.join(told)}"
 
 
 def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:

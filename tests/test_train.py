@@ -27,6 +27,7 @@ from agents.settings import (
     Evolve,
     FullBuffer,
     GuidedPPO,
+    Hindsight,
     SingleDecisions,
     SlotEnvironment,
     Suites,
@@ -93,19 +94,20 @@ def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, cap
     monkeypatch.setattr(guided, "PARTS", 2)
     monkeypatch.setattr(guided, "EPISODES", 2)
     on = Environment(capacity=8, duration_s=3.0, episodes=3)
-    train.main(Evolve(environment=on, **{**SHARED, "steps": 3_000, "validate_every": 3_000}), beside=True)
+    evolve = Evolve(environment=on, **{**SHARED, "steps": 3_000, "validate_every": 3_000})
+    train.main(evolve, train.others_of(evolve))
     folder = Path("runs/tiny")
-    # PPO begins there as well, and is given as much time.
-    (_, ppo), *_ = columns(folder / "ppo" / "seed-0" / "validation.csv", "steps", "qoi")
+    # So does one that the clairvoyant teaches.
+    (_, taught), *_ = columns(folder / "hindsight" / "seed-0" / "validation.csv", "steps", "qoi")
     found = policies.load(folder / "ppo" / "seed-0" / runs.MODEL)
-    (_, first), *_ = columns(folder / "seed-0" / "validation.csv", "steps", "qoi")
+    (_, first), *_ = columns(folder / "evolve" / "seed-0" / "validation.csv", "steps", "qoi")
     judges, test = FixedEpisodes(on, "validation", 2), FixedEpisodes(on, "test", 3)
-    assert first == ppo == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
+    assert first == taught == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
     agent = policies.load(folder / "model.safetensors")
     rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["scores"]
     told = {row["policy"]: row["qoi"] for row in rows}
     assert told["agent (seed 0)"] == np.mean([o.qoi for o in test.play(agent)])
-    assert told["agent by PPO (seed 0)"] == np.mean([o.qoi for o in test.play(found)])
+    assert told["agent by ppo (seed 0)"] == np.mean([o.qoi for o in test.play(found)])
     assert "the best rule written by hand, " in capsys.readouterr().out
 
 
@@ -284,13 +286,13 @@ def test_the_command_of_a_run_gives_its_settings_again() -> None:
         assert made == [dataclasses.replace(expected, cluster=None) if isinstance(expected, Evolve) else expected]
 
 
-def test_without_words_evolve_runs_and_ppo_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_words_three_ways_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     """``python train.py``, the command of ``make train``."""
     asked: list[Any] = []
-    monkeypatch.setattr(train, "main", lambda settings, beside=False: asked.append((settings, beside)))
+    monkeypatch.setattr(train, "main", lambda settings, others=(): asked.append((settings, others)))
     with pytest.raises(SystemExit):
         train.typed([])
-    assert asked == [(Evolve(), True)]
+    assert asked == [(Evolve(), [Hindsight(steps=110_000), PPO(steps=450_000)])]
 
 
 def test_the_verdict_says_how_far_above_whom() -> None:
@@ -299,9 +301,11 @@ def test_the_verdict_says_how_far_above_whom() -> None:
 
     entries = [
         *(entry("learned", 0.75, 0.1, 0.3), entry("a", 0.7, 0.0, 0.0), entry("min-gap", 0.69, -0.2, 0.1)),
-        *(entry("agent by PPO (seed 1)", 0.6, -2.0, -1.0), entry("afr", 0.4, -5.0, -4.0)),
+        *(entry("agent by ppo (seed 1)", 0.6, -2.0, -1.0), entry("agent by ppo (seed 0)", 0.5, -3.0, -1.0)),
+        entry("afr", 0.4, -5.0, -4.0),
     ]
-    assert verdict(entries, "a", 61.4) == (
-        "after 61 s a scores 0.700: above AFR by 0.300, level with the best rule written by hand, min-gap, (+0.010), "
-        "below learned by 0.050, above agent by PPO (seed 1) by 0.100"
+    assert verdict(entries, "a", 61.4, "evolve") == (
+        "after 61 s a, by evolve, scores 0.700: above AFR by 0.300, "
+        "level with the best rule written by hand, min-gap, (+0.010), "
+        "below learned by 0.050, above agent by ppo (seed 1) by 0.100"
     )
