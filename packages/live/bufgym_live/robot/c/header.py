@@ -60,9 +60,7 @@ def write(
     return Path(out)
 
 
-def header(
-    policy: Policy, capacity: int, value: Value, max_bytes: int | None = None, prefix: str = "bufgym"
-) -> str:
+def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None, prefix: str = "bufgym") -> str:
     """Make the policy's C99 header for L up to ``capacity`` and B = ``max_bytes`` with V = ``value``.
 
     All its names begin with ``prefix``, its macros with the same in capitals.

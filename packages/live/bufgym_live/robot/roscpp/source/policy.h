@@ -31,6 +31,7 @@ struct Policy
   const char *parameters;  // as JSON
   std::unique_ptr<Queue> (*make)(int64_t now_us, int capacity);
 };
+extern const Policy policies[];                // in policies.cpp, the last one without a name
 const Policy *find(const std::string &name);  // null if there is none
 std::string known();                          // all names, in one line
 

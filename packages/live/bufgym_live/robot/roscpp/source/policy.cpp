@@ -5,6 +5,22 @@
 
 namespace bufgym
 {
+const Policy *find(const std::string &name)
+{
+  for (const Policy *policy = policies; policy->name; policy++)
+    if (name == policy->name)
+      return policy;
+  return nullptr;
+}
+
+std::string known()
+{
+  std::string names;
+  for (const Policy *policy = policies; policy->name; policy++)
+    names += (names.empty() ? "" : ", ") + std::string(policy->name);
+  return names;
+}
+
 Value v;
 
 bool set_value(const std::string &text)
