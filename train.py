@@ -3,14 +3,17 @@
 Results are in runs/NAME/. After a kill, the same command with ``--resume`` goes on from the last checkpoint.
 """
 
+import math
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
 
 from cyclopts import App
 
 from agents.runs import prepare
-from agents.settings import DQN, FLAT, PPO, Evolve, GuidedPPO, Settings
+from agents.settings import ALGORITHMS, FLAT, Evolve, GuidedPPO, Settings
 from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
@@ -29,41 +32,49 @@ def _evolve_beside(*, settings: Annotated[Evolve, FLAT] = Evolve()) -> None:  # 
     main(settings, beside=settings.kind == "environment")
 
 
-@app.command
-def evolve(*, settings: Annotated[Evolve, FLAT] = Evolve()) -> None:  # noqa: B008
-    """CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue)."""
-    main(settings)
+def add_command(algorithm: type[Settings]) -> None:
+    """Make a command of an algorithm; its options are the settings."""
+
+    def command(*, settings: Annotated[algorithm, FLAT] = algorithm()) -> None:  # type: ignore[valid-type, call-arg]  # noqa: B008
+        main(settings)
+
+    command.__doc__ = algorithm.__doc__
+    app.command(command, name=algorithm.algo)
 
 
-@app.command
-def ppo(*, settings: Annotated[PPO, FLAT] = PPO()) -> None:  # noqa: B008
-    """PPO on the slots of the buffer, with action masks."""
-    main(settings)
-
-
-@app.command
-def dqn(*, settings: Annotated[DQN, FLAT] = DQN()) -> None:  # noqa: B008
-    """Double DQN on the slots of the buffer, with action masks: PPO's learning rate and batch divided by four."""
-    main(settings)
-
-
-@app.command
-def guided_ppo(*, settings: Annotated[GuidedPPO, FLAT] = GuidedPPO()) -> None:  # noqa: B008
-    """PPO on the numbers of the rule gap-price, in an environment."""
-    main(settings)
+for each in ALGORITHMS:
+    add_command(each)
 
 
 def main(settings: Settings, beside: bool = False) -> None:
-    """Train, evaluate, report; with ``beside`` PPO on the same actions too, to compare."""
+    """Train, evaluate, report; with ``beside`` PPO on the same actions too, for no longer than evolution took."""
     folder = prepare(settings)
     # Only once the settings are known to be good: torch takes seconds to load.
-    from agents import report, training
+    from agents.learner import learner_of
+    from agents.report import Trained, keep
+
+    def trained(settings: Settings, home: Path, seconds: float = math.inf, **more: Any) -> Trained:
+        learner = learner_of(settings, seconds)
+        runs = learner.train(home)
+        return Trained(settings, home, runs, [learner.agent(run) for run in runs], **more)
 
     with locked(folder):
-        lines = report.lines_to_beat(settings)
-        runs = training.train_all(settings, folder)
-        others = training.train_beside(settings, folder, runs) if beside else []
-        report.report(report.Trained(settings, folder, runs, others, lines))
+        objective = learner_of(settings).objective(folder, settings.seed)
+        lines = objective.lines_to_beat()
+        done = trained(settings, folder, lines=lines)
+        if beside:
+            home, seconds = folder / "ppo", max(run.seconds for run in done.runs)
+            home.mkdir(exist_ok=True)
+            print(f"PPO on the same actions, for at most {seconds:.0f} s")
+            done = replace(done, beside=trained(other_of(settings), home, seconds))
+        keep(done, objective.report)
+
+
+def other_of(settings: Settings) -> GuidedPPO:
+    """PPO on guided actions, with the settings that evolution has too."""
+    shared = ("environment", "validation_episodes", "name", "resume", "seeds", "seed")
+    steps = min(settings.steps, GuidedPPO.steps)
+    return GuidedPPO(steps=steps, **{name: getattr(settings, name) for name in shared})
 
 
 def typed(words: Sequence[str]) -> None:

@@ -142,3 +142,14 @@ class Progress(BetweenUpdates):
 
     def _on_training_end(self) -> None:
         self.bar.close()
+
+
+class Budget(BetweenUpdates):
+    """Ends the training after so many seconds."""
+
+    def __init__(self, seconds: float, curve: Curve) -> None:
+        super().__init__()
+        self.seconds, self.curve = seconds, curve
+
+    def _on_step(self) -> bool:
+        return self.curve.spent() < self.seconds

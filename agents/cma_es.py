@@ -23,7 +23,8 @@ from typing import Any
 import cma
 import numpy as np
 
-from agents.cluster import connected
+from agents.cluster import connected, running
+from agents.learner import Learner
 from agents.objectives import OBJECTIVES
 from agents.objectives.objective import Objective, Vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
@@ -89,7 +90,7 @@ def _evaluated(objective: Objective, candidate: GuidedWeights, part: int) -> tup
 
 
 @dataclass
-class Evolution:
+class Search:
     """The state of one seed's evolution, as in a checkpoint."""
 
     like: GuidedWeights
@@ -106,11 +107,11 @@ class Evolution:
     """Time spent training, s."""
 
     @staticmethod
-    def around(like: GuidedWeights, sigma: float, seed: int) -> Evolution:
+    def around(like: GuidedWeights, sigma: float, seed: int) -> Search:
         """A new search around these weights."""
         begin = like.weight.reshape(-1).astype(np.float64)
         options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9}
-        return Evolution(like, cma.CMAEvolutionStrategy(begin, sigma, options), begin)
+        return Search(like, cma.CMAEvolutionStrategy(begin, sigma, options), begin)
 
     def weights(self, vector: Vector) -> GuidedWeights:
         """The agent with these numbers."""
@@ -133,46 +134,51 @@ class Evolution:
         return float(np.min(fitness))
 
 
-def train(settings: Evolve, folder: Path, seed: int, line: int = 0) -> Run:
-    """Evolve one seed until ``settings.steps`` decisions were rolled out, from its last checkpoint if there is one.
+class Evolution(Learner[Evolve]):
+    """CMA-ES on the numbers of a rule."""
 
-    The agent with the best validation, the same measure on other episodes, is kept as ``model.safetensors``.
-    """
-    home = folder / f"seed-{seed}"
-    home.mkdir(exist_ok=True)
-    objective = OBJECTIVES[settings.kind](settings, folder, seed)
-    checkpoint = home / "evolution.pkl"  # only from your own run: pickles run code when they are read
-    if checkpoint.exists():
-        state: Evolution = pickle.loads(checkpoint.read_bytes())
-    else:
-        state = Evolution.around(objective.start(), objective.sigma, seed)
-    curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), state.steps)
-    validations = Validations(home, objective.columns, objective.best, settings, state.steps)
-    began = time.perf_counter() - state.seconds
-    bar = seed_bar(settings.steps, state.steps, seed, line)
-    with evaluation(settings, folder, seed, objective) as evaluate:
-        while True:
-            if validations.due(state.steps):
-                measures = objective.validate(state.agent.policy(objective.name))
-                if validations.add(state.steps, state.seconds, measures):
-                    notes = {
-                        "name": objective.name,
-                        "suite": ",".join(settings.suites.suite),
-                        "seeds": [seed],
-                        "algo": settings.algo,
-                    }
-                    weights.save(home / MODEL, state.agent, notes)
-                report = objective.message.format(*measures)
-                bar.set_postfix_str(report, refresh=False)
-                if not sys.stderr.isatty():
-                    print(f"seed {seed}: {state.steps:,} of {settings.steps:,} steps, {report}", flush=True)
-            if state.steps >= settings.steps:
-                break
-            fitness = state.generation(evaluate)
-            state.seconds = round(time.perf_counter() - began, 3)
-            curve.append(state.steps, state.seconds, fitness)
-            with replaced(checkpoint) as unfinished:
-                unfinished.write_bytes(pickle.dumps(state))
-            bar.update(state.steps - bar.n)
-    bar.close()
-    return Run(seed, home, state.seconds, curve.rows, validations.rows, MODEL, objective.best)
+    def train(self, folder: Path) -> list[Run]:
+        """Train every seed; with a cluster all seeds share it."""
+        if self.settings.cluster is None:
+            return super().train(folder)
+        with running(self.settings.cluster) as cluster:
+            return super(Evolution, Evolution(replace(self.settings, cluster=cluster), self.seconds)).train(folder)
+
+    def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
+        """Evolve one seed until ``settings.steps`` decisions were rolled out, from its last checkpoint if any.
+
+        The agent with the best validation, the same measure on other episodes, is kept as ``model.safetensors``.
+        """
+        settings, home = self.settings, folder / f"seed-{seed}"
+        home.mkdir(exist_ok=True)
+        objective = self.objective(folder, seed)
+        checkpoint = home / "evolution.pkl"  # only from your own run: pickles run code when they are read
+        if checkpoint.exists():
+            state: Search = pickle.loads(checkpoint.read_bytes())
+        else:
+            state = Search.around(objective.start(), objective.sigma, seed)
+        curve = Record(home / "curve.csv", ("steps", "seconds", "fitness"), state.steps)
+        validations = Validations(home, objective.columns, objective.best, settings, state.steps)
+        began = time.perf_counter() - state.seconds
+        bar = seed_bar(settings.steps, state.steps, seed, line)
+        with evaluation(settings, folder, seed, objective) as evaluate:
+            while True:
+                ended = state.steps >= settings.steps or state.seconds >= self.seconds
+                if validations.due(state.steps, last=ended):
+                    measures = objective.validate(state.agent.policy(objective.name))
+                    if validations.add(state.steps, state.seconds, measures):
+                        weights.save(home / MODEL, state.agent, self.notes(seed, objective.name))
+                    report = objective.message.format(*measures)
+                    bar.set_postfix_str(report, refresh=False)
+                    if not sys.stderr.isatty():
+                        print(f"seed {seed}: {state.steps:,} of {settings.steps:,} steps, {report}", flush=True)
+                if ended:
+                    break
+                fitness = state.generation(evaluate)
+                state.seconds = round(time.perf_counter() - began, 3)
+                curve.append(state.steps, state.seconds, fitness)
+                with replaced(checkpoint) as unfinished:
+                    unfinished.write_bytes(pickle.dumps(state))
+                bar.update(state.steps - bar.n)
+        bar.close()
+        return Run(seed, home, state.seconds, curve.rows, validations.rows, MODEL, objective.best)

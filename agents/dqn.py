@@ -16,10 +16,14 @@ from numpy.typing import NDArray
 from stable_baselines3 import DQN
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.torch_layers import CombinedExtractor
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
 from torch import Tensor, nn
 from torch.nn import functional
 
+from agents import settings as options
+from agents.decisions import SlotLearner
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 
 INVALID = -1e9
@@ -72,11 +76,6 @@ class MaskedDQNPolicy(DQNPolicy):
         return super()._get_constructor_parameters() | {"width": self.width}
 
 
-def dqn_policy_of(network: str, width: int) -> dict[str, Any]:
-    """``MaskedDQNPolicy``'s arguments for "slots" or "plain"."""
-    return {"width": width} if network == "slots" else {"width": 0, "net_arch": [2 * width, 2 * width]}
-
-
 class MaskedDQN(DQN):
     """Double DQN that never tries an invalid action, as its network knows the masks.
 
@@ -114,3 +113,35 @@ class MaskedDQN(DQN):
             losses.append(loss.item())
         self._n_updates += gradient_steps
         self.logger.record("train/loss", np.mean(losses))
+
+
+class SlotDQN(SlotLearner[options.DQN]):
+    """Double DQN that chooses a slot."""
+
+    algorithm = MaskedDQN
+
+    def make(self, env: VecEnv) -> MaskedDQN:
+        """Make an untrained Q network.
+
+        It explores little: a message dropped at random is missing for the rest of the episode.
+        """
+        settings, width = self.settings, self.settings.width
+        plain = {"width": 0, "net_arch": [2 * width, 2 * width]}
+        return MaskedDQN(
+            MaskedDQNPolicy,
+            env,
+            learning_rate=LinearSchedule(settings.learning_rate, 0.0, 1.0),
+            buffer_size=max(settings.buffer_size, env.num_envs),
+            learning_starts=settings.learning_starts,
+            batch_size=settings.batch_size,
+            gamma=settings.gamma,
+            train_freq=(settings.train_freq, "step"),
+            gradient_steps=settings.gradient_steps,
+            target_update_interval=max(settings.target_update_interval, env.num_envs),
+            exploration_initial_eps=0.1,
+            exploration_final_eps=0.01,
+            exploration_fraction=0.5,
+            stats_window_size=env.num_envs,
+            policy_kwargs={"width": width} if settings.network == "slots" else plain,
+            device="cpu",
+        )

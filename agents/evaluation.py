@@ -16,7 +16,7 @@ import numpy as np
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from agents.mixed_env import MixedEnv, cells
+from agents.mixed_env import Cell, MixedEnv, cells
 from agents.settings import Settings
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import by_trace, draw
@@ -42,20 +42,43 @@ def qoi_of(policy: Policy, senders: Senders, episodes: Sequence[Episode]) -> Num
     return np.asarray(sender["delivered_gain"] + (sender["transmitted"] > 0), np.float64)
 
 
-def play(agent: Any, env: MixedEnv, episodes: Sequence[Episode]) -> list[Outcome]:
-    """The outcome of each episode (one a row) under a learner's most likely action at every decision.
+class SlotModel(NamedTuple):
+    """A model of stable-baselines3 that chooses among slots, in torch.
 
-    ``agent`` is a model of stable-baselines3, or has its ``predict``.
+    ``model`` needs ``predict`` alone. ``slots`` is how many it observes, ``decide_at`` when it is asked.
     """
-    masked = takes_masks(agent)
-    env.load(episodes)
-    actions = np.zeros(env.num_envs, np.int64)
-    while (live := ~env.ended()).any():
-        observation = {name: column[live] for name, column in env.observation().items()}
-        masks = {"action_masks": env.action_masks()[live]} if masked else {}
-        actions[live], _ = agent.predict(observation, deterministic=True, **masks)
-        env.act(actions)
-    return [outcome(rows.senders, i) for rows in env.groups for i in range(len(rows))]
+
+    model: Any
+    slots: int
+    decide_at: str = "arrival"
+
+    def play(self, cells: Sequence[Cell], sizes: Sequence[int], episodes: Sequence[Episode]) -> list[Outcome]:
+        """The outcome of each episode (one a row) under the most likely action at every decision."""
+        masked, env = takes_masks(self.model), MixedEnv(cells, sizes, self.slots, decide_at=self.decide_at)
+        env.load(episodes)
+        actions = np.zeros(env.num_envs, np.int64)
+        while (live := ~env.ended()).any():
+            observation = {name: column[live] for name, column in env.observation().items()}
+            masks = {"action_masks": env.action_masks()[live]} if masked else {}
+            actions[live], _ = self.model.predict(observation, deterministic=True, **masks)
+            env.act(actions)
+        return [outcome(rows.senders, i) for rows in env.groups for i in range(len(rows))]
+
+
+Agent = Policy | SlotModel
+"""What a learner makes: a policy, compiled and for every L, or a model for the L that it was trained for."""
+
+
+def play(agent: Agent, cells: Sequence[Cell], sizes: Sequence[int], episodes: Sequence[Episode]) -> list[Outcome]:
+    """The outcome of each episode, ``sizes[c]`` of them in cell c, one cell after the other."""
+    if isinstance(agent, SlotModel):
+        return agent.play(cells, sizes, episodes)
+    ends = np.cumsum(sizes).tolist()
+    outcomes = []
+    for cell, size, end in zip(cells, sizes, ends, strict=True):
+        senders = run(agent, episodes[end - size : end], cell.capacity, cell.scenario.value)
+        outcomes += [outcome(senders, i) for i in range(size)]
+    return outcomes
 
 
 class Verdict(NamedTuple):
@@ -93,18 +116,9 @@ class EvaluationSet:
         """[rows]: this column of a fixed policy's rows."""
         return np.array([self._fixed[*_name(key), policy][column] for key in self._keys], np.float64)
 
-    def play(self, agent: Any, padded_slots: int) -> list[Outcome]:
-        """Outcomes of an agent that observes so many slots, in every row."""
-        return play(agent, MixedEnv(self.cells, self._sizes, padded_slots), self._episodes)
-
-    def run(self, policy: Policy) -> list[Outcome]:
-        """Outcomes of a policy in every row."""
-        ends = np.cumsum(self._sizes).tolist()
-        outcomes = []
-        for c, size, end in zip(self.cells, self._sizes, ends, strict=True):
-            senders = run(policy, self._episodes[end - size : end], c.capacity, c.scenario.value)
-            outcomes += [outcome(senders, i) for i in range(size)]
-        return outcomes
+    def play(self, agent: Agent) -> list[Outcome]:
+        """Outcomes of an agent in every row."""
+        return play(agent, self.cells, self._sizes, self._episodes)
 
     def verdict(self, outcomes: Sequence[Outcome]) -> Verdict:
         """An agent's outcomes against Drop Oldest, AFR and the clairvoyant; the sweep must have both policies."""
@@ -169,17 +183,10 @@ class ValidationSets:
                 for suite in settings.suites.suite
             ]
 
-    def play(self, agent: Any, padded_slots: int) -> Verdict:
+    def play(self, agent: Agent) -> Verdict:
         """An agent's verdict, averaged over the suites."""
-        return _mean([evaluation.verdict(evaluation.play(agent, padded_slots)) for evaluation in self._sets])
-
-    def run(self, policy: Policy) -> Verdict:
-        """A policy's verdict, averaged over the suites."""
-        return _mean([evaluation.verdict(evaluation.run(policy)) for evaluation in self._sets])
-
-
-def _mean(verdicts: Sequence[Verdict]) -> Verdict:
-    return Verdict(*np.mean(verdicts, axis=0).tolist())
+        verdicts = [evaluation.verdict(evaluation.play(agent)) for evaluation in self._sets]
+        return Verdict(*np.mean(verdicts, axis=0).tolist())
 
 
 def test_rows(settings: Settings, policies: Sequence[Policy]) -> list[Row]:

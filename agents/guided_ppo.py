@@ -13,11 +13,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from agents.callbacks import BetweenUpdates, Curve
+from agents.decisions import DecisionLearner
+from agents.ppo import ppo_arguments
+from agents.settings import GuidedPPO
 from bufgym.policies import guided
 from bufgym.policies.guided import GuidedWeights
 
@@ -52,23 +57,36 @@ class GuidedPolicy(ActorCriticPolicy):
         self.log_std.requires_grad_(False)
 
 
-def weights_of(model: PPO) -> GuidedWeights:
-    """The actor's weights."""
-    policy: Any = model.policy
-    weight: NDArray[np.float32] = policy.action_net.weight.detach().numpy()
-    return GuidedWeights((weight * guided.SCALES[:, None]).astype(np.float32))
+class Narrowing(BetweenUpdates):
+    """Narrows the actions over so many steps."""
 
-
-class Budget(BetweenUpdates):
-    """Ends the training after so many seconds, and narrows the actions over its steps."""
-
-    def __init__(self, seconds: float, curve: Curve, steps: int) -> None:
+    def __init__(self, steps: int) -> None:
         super().__init__()
-        self.seconds, self.curve, self.steps = seconds, curve, steps
-
-    def _on_step(self) -> bool:
-        return self.curve.spent() < self.seconds
+        self.steps = steps
 
     def _on_rollout_start(self) -> None:
         policy: Any = self.model.policy
         nn.init.constant_(policy.log_std, math.log(np.interp(self.num_timesteps / self.steps, (0, 1), SPREADS)))
+
+
+class GuidedLearner(DecisionLearner[GuidedPPO]):
+    """PPO on the rule's numbers; its agent is a compiled policy."""
+
+    algorithm = PPO
+    env_options = OPTIONS
+
+    def make(self, env: VecEnv) -> PPO:
+        """Make an actor that is still the rule, and a critic."""
+        settings = self.settings
+        n_steps = min(settings.n_steps, max(1, settings.steps // env.num_envs))
+        arguments = ppo_arguments(settings, env, n_steps)
+        return PPO(GuidedPolicy, env, policy_kwargs={"width": settings.width}, **arguments)
+
+    def weights_of(self, model: Any) -> GuidedWeights:
+        """The actor's weights."""
+        weight: NDArray[np.float32] = model.policy.action_net.weight.detach().numpy()
+        return GuidedWeights((weight * guided.SCALES[:, None]).astype(np.float32))
+
+    def callbacks(self, curve: Curve) -> list[BaseCallback]:
+        """The usual ones, and ``Narrowing``."""
+        return [*super().callbacks(curve), Narrowing(self.settings.steps)]

@@ -11,9 +11,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.evaluation import play
-from agents.mixed_env import Cell, MixedEnv
-from agents.settings import Environment, Settings, SlotEnvironment
+from agents.evaluation import Agent, play
+from agents.mixed_env import Cell
+from agents.settings import Environment, Settings
 from bufgym import scenario as scenarios
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, percentile_interval, times_drawn
 from bufgym.benchmark.rows import Row
@@ -21,10 +21,9 @@ from bufgym.benchmark.run import draw
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.tasks.queue import best
 from bufgym.oracle import BASELINE, normalised_score, regret
-from bufgym.policies import Policy, registry
+from bufgym.policies import registry
 from bufgym.scenario import Scenario, Uplink
-from bufgym.sim import run
-from bufgym.sim.metrics import Outcome, outcome
+from bufgym.sim.metrics import Outcome
 
 HELD_OUT_TRACES = 2
 FIRST_SEED = {"validation": 2_000_000_000, "test": 1_000_000_000}
@@ -52,23 +51,16 @@ class FixedEpisodes:
         # With uniform draws for policies that randomise.
         self.episodes = [draw(self.scenario, FIRST_SEED[split] + i) for i in range(count)]
         self._plans = [best(episode, self.capacity, self.scenario) for episode in self.episodes]
-        self._base = math.fsum(result.qoi for result in self.run(BASELINE))
+        self._base = math.fsum(result.qoi for result in self.play(registry.get(BASELINE)))
         self._best = math.fsum(plan.qoi for plan in self._plans)
 
-    def run(self, policy: str | Policy) -> list[Outcome]:
-        """Outcomes of a policy."""
-        senders = run(registry.get(policy), self.episodes, self.capacity, self.scenario.value)
-        return [outcome(senders, i) for i in range(len(self.episodes))]
+    def play(self, agent: Agent) -> list[Outcome]:
+        """Outcomes of an agent."""
+        return play(agent, [Cell("", self.scenario, self.capacity)], [len(self.episodes)], self.episodes)
 
-    def run_fixed(self) -> dict[str, list[Outcome]]:
+    def play_fixed(self) -> dict[str, list[Outcome]]:
         """Outcomes of every registered policy of one queue, by name."""
-        return {name: self.run(name) for name in registry.names(for_topics=False)}
-
-    def play(self, agent: Any, on: Environment) -> list[Outcome]:
-        """Outcomes of a learner that is asked when ``on`` says."""
-        assert isinstance(on, SlotEnvironment)
-        cell = Cell("", self.scenario, self.capacity)
-        return play(agent, MixedEnv([cell], [len(self.episodes)], decide_at=on.decide_at), self.episodes)
+        return {name: self.play(registry.get(name)) for name in registry.names(for_topics=False)}
 
     def score(self, outcomes: Sequence[Outcome]) -> float:
         """0 for Drop Oldest, 1 for the clairvoyant; NaN where the two are equal."""

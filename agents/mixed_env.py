@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from bufgym.envs.options import Options
 from bufgym.envs.rows import Rows
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Episode, Scenario, suites
@@ -71,7 +72,7 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"{self.padded_slots} padded slots: a cell has L = {largest}")
 
         def rows(cell: Cell, size: int) -> Rows:
-            return Rows(size, cell.scenario, cell.capacity, decide_at=decide_at, reward=reward)
+            return Rows(size, cell.scenario, Options(capacity=cell.capacity, decide_at=decide_at, reward=reward))
 
         self.groups = [rows(cell, size) for cell, size in zip(cells, sizes, strict=True)]
         self.num_envs = sum(sizes)

@@ -7,30 +7,27 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agents import training
-from agents.evaluation import EvaluationSet, sweep_for, test_rows
+from agents.evaluation import Agent, EvaluationSet, sweep_for, test_rows
 from agents.figure import draw
 from agents.held_out import fixed_episodes, summarise
-from agents.objectives import fleet, topics
-from agents.page import written
-from agents.runs import MODEL, Run, write_notes
+from agents.runs import Run, write_notes
 from agents.settings import Settings
 from bufgym.benchmark import summary
-from bufgym.benchmark.bootstrap import Interval
+from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
-from bufgym.benchmark.table import apart, decimal, same, told_once
+from bufgym.benchmark.table import decimal, equal_rows_notes, unranked_among, with_equal_rows
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.files import shipped
 from bufgym.ground.tables import aligned
 from bufgym.oracle import BASELINE
-from bufgym.policies import Policy, load, registry, weights
+from bufgym.policies import Policy, registry
 
 COLUMNS = (
     ("QoI", "qoi", 1, 3),
@@ -42,19 +39,6 @@ COLUMNS = (
     ("age ms", "mean_age_s", 1000, 0),
 )
 """(heading, Outcome field, unit factor, digits)"""
-
-
-def lines_to_beat(settings: Settings) -> dict[str, float]:
-    """The validation scores of Drop Oldest, AFR and the best rule written by hand in an environment, as printed."""
-    if settings.kind != "environment":
-        return {}
-    episodes = fixed_episodes(settings, "validation")
-    scores = {name: episodes.score(episodes.run(name)) for name in by_hand()}
-    best = max(scores, key=lambda name: scores[name])
-    lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "afr", best))}
-    told = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
-    print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {told}", flush=True)
-    return lines
 
 
 def by_hand() -> list[str]:
@@ -70,10 +54,12 @@ class Trained:
     settings: Settings
     folder: Path
     runs: Sequence[Run]
-    beside: Sequence[Run]
-    """PPO's agents on the same actions."""
-    lines: Mapping[str, float]
+    agents: Sequence[Agent]
+    """The agent that each run kept."""
+    lines: Mapping[str, float] = field(default_factory=dict)
     """The validation scores to beat."""
+    beside: Trained | None = None
+    """PPO's agents on the same actions."""
 
     @property
     def best(self) -> Run:
@@ -109,13 +95,14 @@ def _without_nan(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def report(trained: Trained) -> None:
-    """Evaluate the agents of all seeds; print and save the results, and keep the best agent with its notes."""
+def keep(trained: Trained, report: Callable[[Trained], Report]) -> None:
+    """Keep the best agent with its notes; print and save a report on the agents of all seeds."""
     best, folder = trained.best, trained.folder
     shutil.copyfile(best.model, folder / best.model.name)
-    seeds, notes, contents = REPORTS[trained.settings.kind](trained)
+    seeds, notes, contents = report(trained)
     write_notes(folder, trained.settings, seeds, notes)
-    seconds = ", ".join(f"{run.seconds:.0f}" for run in (*trained.runs, *trained.beside))
+    beside = trained.beside.runs if trained.beside else ()
+    seconds = ", ".join(f"{run.seconds:.0f}" for run in (*trained.runs, *beside))
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
     print("\n".join(["next:", *NEXT.get(best.model.suffix, ())]).format(model=folder / best.model.name))
 
@@ -135,19 +122,19 @@ NEXT = {
 }
 """What to do with a model, by its kind of file."""
 
-RIVALS: dict[str, Callable[[], list[Policy]]] = {"topics": topics.rivals, "fleet": fleet.rivals}
-"""Kind -> the fixed policies for comparison."""
-
-
 Report = tuple[list[int], dict[str, Any], str]
 """The seeds and scores for the notes of the kept agent, and what the folder holds."""
 
 
-def report_rows(trained: Trained) -> Report:
-    """Write every seed's agent beside the fixed policies on the test split: rows.csv, and the table in results.txt."""
+def report_rows(trained: Trained, rivals: Sequence[Policy]) -> Report:
+    """Write every seed's agent beside the rivals on the test split: rows.csv, and the table in results.txt."""
     settings, folder = trained.settings, trained.folder
-    agents = [dataclasses.replace(weights.load(run.model), name=agent_name(run)) for run in trained.runs]
-    rows = test_rows(settings, [*agents, *RIVALS[settings.kind]()])
+    agents: list[Any] = [
+        dataclasses.replace(agent, name=agent_name(run))
+        for run, agent in zip(trained.runs, trained.agents, strict=True)
+        if isinstance(agent, Policy)
+    ]
+    rows = test_rows(settings, [*agents, *rivals])
     task = TASKS[settings.kind]
     write_rows(rows, folder / "rows.csv", task.layout)
     text = summary.table_of(task.summary(rows)).plain()
@@ -160,17 +147,15 @@ def report_environment(trained: Trained) -> Report:
     """Evaluate all agents and fixed policies on the held-out episodes."""
     settings, best = trained.settings, agent_name(trained.best)
     test = fixed_episodes(settings, "test")
-    outcomes = test.run_fixed()
     names = {agent_name(run): run for run in trained.runs}
-    names |= {f"agent by PPO (seed {run.seed})": run for run in trained.beside}
-    for name, run in names.items():
-        if run.file == MODEL:
-            outcomes[name] = test.run(load(run.model))
-        else:
-            outcomes[name] = test.play(training.load(settings, run), settings.environment)
+    agents = [*trained.agents]
+    if trained.beside:
+        names |= {f"agent by PPO (seed {run.seed})": run for run in trained.beside.runs}
+        agents += trained.beside.agents
+    outcomes = test.play_fixed() | {name: test.play(agent) for name, agent in zip(names, agents, strict=True)}
     rows = test.rows(outcomes)
-    entries, alike = summarise(outcomes, rows, best), same(rows)
-    unranked = apart(map(registry.get, registry.names()))
+    entries, alike = summarise(outcomes, rows, best), with_equal_rows(rows)
+    unranked = unranked_among(map(registry.get, registry.names()))
     print(table(entries, best, alike, unranked))
     print(verdict(entries, best, trained.best.seconds))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
@@ -242,14 +227,14 @@ def table(
             continue
         low, high = entry["minus_agent_95"]
         difference = "" if name == agent else f"{entry['minus_agent']:+.3f} [{low:+.3f}, {high:+.3f}]"
-        score = written(Interval(entry["score"], *entry["score_95"]), ".3f")
+        score = _text(Interval(entry["score"], *entry["score_95"]), ".3f")
         numbers = [decimal(entry[column] * factor, digits) for _, column, factor, digits in COLUMNS]
         label = f"> {name}" if name == agent else name
         blocks[name in unranked].append([label, score, *numbers, difference])
     lines = aligned([head, *blocks[0], *blocks[1]])
     lines.insert(1 + len(blocks[0]), "-" * max(map(len, lines)))
     notes = [f"note: {name} does not compete: {unranked[name]}" for name in unranked if name not in others]
-    return "\n".join([*lines, "score: 0 is Drop Oldest, 1 the clairvoyant", *notes, *told_once(alike)])
+    return "\n".join([*lines, "score: 0 is Drop Oldest, 1 the clairvoyant", *notes, *equal_rows_notes(alike)])
 
 
 def report_suites(trained: Trained) -> Report:
@@ -266,15 +251,6 @@ def report_suites(trained: Trained) -> Report:
     return trained.seeds, notes, contents
 
 
-def agent_rows(settings: Settings, run: Run, evaluation: EvaluationSet) -> list[Row]:
-    """The kept agent's rows on a suite's test split."""
-    if run.file == MODEL:
-        outcomes = evaluation.run(load(run.model))
-    else:
-        outcomes = evaluation.play(training.load(settings, run), settings.suites.slots)
-    return evaluation.benchmark_rows(outcomes, f"agent ({settings.algo})", run.seed)
-
-
 def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, Any], Interval]:
     """Score all agents and fixed policies on the suite's test split, as ``bufgym bench`` does.
 
@@ -289,11 +265,14 @@ def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, An
     sweep = sweep_for(settings, suite, "test", specs, settings.suites.test_seeds or None)
     evaluation = EvaluationSet(sweep, trained.folder / "test" / suite, progress=True)
     home.mkdir(exist_ok=True)
-    agents = {agent_name(run): agent_rows(settings, run, evaluation) for run in runs}
+    agents = {
+        agent_name(run): evaluation.benchmark_rows(evaluation.play(agent), f"agent ({settings.algo})", run.seed)
+        for run, agent in zip(runs, trained.agents, strict=True)
+    }
     rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
     rows += [row for own in agents.values() for row in own]
     write_rows(rows, home / "rows.csv")
-    result = scores(rows, apart(map(registry.get, registry.names())))
+    result = scores(rows, unranked_among(map(registry.get, registry.names())))
     print(standings(result))
     qoi: dict[str, list[float]] = {}
     for row in rows:
@@ -310,7 +289,7 @@ def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, An
     )
     # Without a discriminative cell, there are no scores to draw.
     ranked = {s.policy: s["score"] for s in result.standings if s.ranked and math.isfinite(s["score"].value)}
-    bars, twins = _drawn(ranked, same(rows))
+    bars, twins = _drawn(ranked, with_equal_rows(rows))
     # By the last column the agent was chosen.
     curves = {agent_name(run): np.array(run.validation)[:, [1, -1]] for run in runs}
     labels = ("training, s", "regret over AFR's, on validation")
@@ -324,17 +303,13 @@ def standings(result: Scores) -> str:
     for standing in result.standings:
         name = standing.policy if standing.ranked else f"{standing.policy} (not ranked)"
         iqm = "-" if math.isnan(standing["iqm"].value) else f"{standing['iqm'].value:.3f}"
-        score, regret = written(standing["score"], ".3f"), written(standing["regret"], ".2%")
-        lines.append([name, score, regret, iqm, written(standing["improvement"], ".2f")])
+        score, regret = (_text(standing["score"], ".3f"), _text(standing["regret"], ".2%"))
+        lines.append([name, score, regret, iqm, _text(standing["improvement"], ".2f")])
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
     note = f"{result.counted} of {total} cells (scenario, L) count; score: 0 is {BASELINE}, 1 the clairvoyant"
     return "\n".join([*aligned(lines), note])
 
 
-REPORTS: dict[str, Callable[[Trained], Report]] = {
-    "environment": report_environment,
-    "queue": report_suites,
-    "topics": report_rows,
-    "fleet": report_rows,
-}
-"""Kind of task -> its report."""
+def _text(interval: Interval, form: str) -> str:
+    """An interval as text such as 1.03 [1.01, 1.05]."""
+    return " ".join(filter(None, written(interval, lambda number: format(number, form))))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -27,7 +27,6 @@ FREE |= {"cluster", "backend", "address"}
 """Settings that may differ between a run and its resumption."""
 
 Numbers = tuple[float, ...]
-Some = TypeVar("Some", bound=Settings)
 
 
 @dataclass(frozen=True)
@@ -120,19 +119,19 @@ def pool_of(workers: int) -> concurrent.futures.ProcessPoolExecutor:
     return concurrent.futures.ProcessPoolExecutor(workers, context, end_with, (os.getpid(),))
 
 
-def each_seed(train: Callable[[Some, Path, int, int], Run], settings: Some, folder: Path) -> list[Run]:
-    """Call ``train`` (settings, the run's folder, seed, line of its progress bar) for every seed, a process each."""
+def each_seed(train: Callable[[Path, int, int], Run], settings: Settings, folder: Path) -> list[Run]:
+    """Call ``train`` (the run's folder, seed, line of its progress bar) for every seed, a process each."""
     seeds = range(settings.seed, settings.seed + settings.seeds)
     for seed in seeds:
         (folder / f"seed-{seed}").mkdir(exist_ok=True)
         write_notes(folder / f"seed-{seed}", settings, [seed])
     if len(seeds) == 1:
-        return [train(settings, folder, seeds[0], 0)]
+        return [train(folder, seeds[0], 0)]
     waiting = list(seeds)
     runs: dict[int, Run] = {}
     while waiting:
         with pool_of(min(len(waiting), os.cpu_count() or 1)) as pool:
-            jobs = {seed: pool.submit(train, settings, folder, seed, seed - seeds[0]) for seed in waiting}
+            jobs = {seed: pool.submit(train, folder, seed, seed - seeds[0]) for seed in waiting}
             before = len(waiting)
             for seed, job in jobs.items():
                 try:

@@ -3,8 +3,6 @@
 The types hold the limits of single options, which are read from text once, and each class the rules of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -51,13 +49,26 @@ class Environment:
         if "Uplink" not in self.env and (self.size_bytes, self.duration_s) != (RGBD_BYTES, Uplink.duration_s):
             raise BufgymError(f"{self.env}: its messages have no size and its episodes no length to set")
 
+    @property
+    def slots(self) -> int:
+        """Slots that an agent observes."""
+        return self.capacity
+
 
 @dataclass(frozen=True)
 class SlotEnvironment(Environment):
     """One environment, for an agent that chooses among slots."""
 
-    decide_at: Literal["overflow", "arrival"] = "overflow"
-    """When the agent is asked: only when the buffer is full, or at every arrival."""
+    decide_at: Literal["arrival", "overflow"] = "arrival"
+    """When the agent is asked: at every arrival, or only when the buffer is full."""
+
+
+@dataclass(frozen=True)
+class FullBuffer(SlotEnvironment):
+    """The same, where the agent is asked only when the buffer is full, unless it is told otherwise."""
+
+    decide_at: Literal["arrival", "overflow"] = "overflow"
+    """When the agent is asked: at every arrival, or only when the buffer is full."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +129,8 @@ class Settings:
 
     algo: ClassVar[str]
     """The command of ``train.py``, which names the agents in tables too."""
+    learner: ClassVar[str]
+    """Its ``agents.learner.Learner`` as module:class, imported once the settings are known to be good."""
     kinds: ClassVar[tuple[Kind, ...]] = ("environment",)
     """The tasks it can learn."""
     steps: Natural
@@ -184,6 +197,7 @@ class Evolve(Settings):
     """Evolve an agent by CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue)."""
 
     algo = "evolve"
+    learner = "agents.cma_es:Evolution"
     kinds = ("environment", "queue", "topics", "fleet")
     steps: Natural = 40_000_000
     """Decisions to learn from, for each seed."""
@@ -191,7 +205,7 @@ class Evolve(Settings):
 
 
 @dataclass(frozen=True)
-class Learner(Settings):
+class SingleDecisions(Settings):
     """What all algorithms share that learn from single decisions."""
 
     steps: Natural = 1_500_000
@@ -200,12 +214,10 @@ class Learner(Settings):
     width: Count = 32
     """Hidden units a layer."""
     num_envs: Count = 256
-    n_steps: Count = 128
-    """Steps in each environment between updates."""
-    batch_size: Batch = 4096
-    epochs: Count = 4
-    """Passes over each batch of experience."""
-    learning_rate: Positive = 2e-3
+    """Environments side by side."""
+    batch_size: Batch = 1024
+    """Decisions of one gradient step."""
+    learning_rate: Positive = 1e-3
     """At the start; falls linearly to 0."""
     gamma: Share = 0.9
     """``retained`` pays at once what a decision costs, so a short sight suffices and keeps the noise of motion out."""
@@ -214,9 +226,13 @@ class Learner(Settings):
 
 
 @dataclass(frozen=True)
-class ActorCritic(Learner):
+class ActorCritic(SingleDecisions):
     """What both kinds of PPO share."""
 
+    n_steps: Count = 32
+    """Steps in each environment between updates."""
+    epochs: Count = 3
+    """Passes over the decisions of an update."""
     gae_lambda: Share = 0.9
     entropy: Least0 = 0.0
     """Weight of the entropy bonus."""
@@ -224,25 +240,50 @@ class ActorCritic(Learner):
 
 @dataclass(frozen=True)
 class GuidedPPO(ActorCritic):
-    """Train by PPO on the numbers that evolve sets, in an environment."""
+    """Train by PPO on the numbers of the rule gap-price, which evolve sets, in an environment."""
 
     algo = "guided-ppo"
+    learner = "agents.guided_ppo:GuidedLearner"
     validate_every: Natural = 65_536
     """Steps; two updates, as it is best within half a million decisions. 0: a sixth of all."""
     suites: Annotated[Suites, Parameter(parse=False)] = Suites()
-    learning_rate: Positive = 1e-3
-    """At the start; falls linearly to 0."""
+    n_steps: Count = 128
+    """Steps in each environment between updates."""
+    batch_size: Batch = 4096
+    """Decisions of one gradient step."""
+    epochs: Count = 4
+    """Passes over the decisions of an update."""
 
 
 @dataclass(frozen=True)
-class PPO(ActorCritic):
-    """Train by PPO with action masks, on the slots of the buffer."""
+class OnSlots(SingleDecisions):
+    """What algorithms share that choose among the slots of the buffer."""
 
-    algo = "ppo"
-    kinds = ("environment", "queue", "fleet")
     environment: Annotated[SlotEnvironment, FLAT] = SlotEnvironment()
     network: Literal["slots", "plain"] = "slots"
     """One small network for every slot, or one over all numbers at once."""
+
+    @property
+    def decide_at(self) -> str:
+        """When the agent is asked; on suites at every arrival."""
+        return "arrival" if self.suites.suite else self.environment.decide_at
+
+
+@dataclass(frozen=True)
+class PPO(OnSlots, ActorCritic):
+    """Train by PPO with action masks, on the slots of the buffer."""
+
+    algo = "ppo"
+    learner = "agents.ppo:SlotPPO"
+    kinds = ("environment", "queue", "fleet")
+    steps: Natural = 600_000
+    """Decisions to learn from, for each seed."""
+    num_envs: Count = 64
+    """Environments side by side. Many small updates learn more than few large ones."""
+    batch_size: Batch = 512
+    """Decisions of one gradient step."""
+    learning_rate: Positive = 2e-3
+    """At the start; falls linearly to 0."""
     unmasked: bool = False
     """Without masks: an invalid action does what a queue does."""
 
@@ -254,11 +295,55 @@ class PPO(ActorCritic):
 
 
 @dataclass(frozen=True)
-class DQN(Learner):
+class DQN(OnSlots):
     """Train by double DQN with action masks, on the slots of the buffer."""
 
     algo = "dqn"
+    learner = "agents.dqn:SlotDQN"
     kinds = ("environment", "queue")
-    environment: Annotated[SlotEnvironment, FLAT] = SlotEnvironment()
-    network: Literal["slots", "plain"] = "slots"
-    """One small network for every slot, or one over all numbers at once."""
+    environment: Annotated[FullBuffer, FLAT] = FullBuffer()
+    learning_rate: Positive = 5e-4
+    """At the start; falls linearly to 0."""
+    train_freq: Count = 8
+    """Steps in each environment between updates."""
+    gradient_steps: Count = 8
+    """Gradient steps of an update; at 8, each decision is seen about four times."""
+    buffer_size: Count = 100_000
+    """Decisions in the replay; at 32 slots they take about 250 MB."""
+    learning_starts: Count = 4096
+    """Decisions before the first update."""
+    target_update_interval: Count = 8192
+    """Decisions between two copies of the network to the target network."""
+
+
+@dataclass(frozen=True)
+class Hindsight(Settings):
+    """Learn from the clairvoyant what each decision costs, on the slots of the buffer; messages of equal size."""
+
+    algo = "hindsight"
+    learner = "agents.hindsight:HindsightLearner"
+    kinds = ("environment", "queue")
+    steps: Natural = 250_000
+    """Decisions to learn from, for each seed."""
+    width: Count = 32
+    """Hidden units a layer."""
+    num_envs: Count = 64
+    """Environments side by side."""
+    rule_share: Share = 0.125
+    """Share of the environments that the rule plays."""
+    leader_share: Share = 0.4
+    """Share of the others that the best student so far plays."""
+    batch_size: Batch = 2048
+    """Decisions of one gradient step."""
+    gradient_steps: Count = 2
+    """Gradient steps after each decision of all environments."""
+    learning_rate: Positive = 1e-3
+    """At the start; falls linearly to a twentieth."""
+    room: Count = 400_000
+    """Decisions kept to learn from; at 8 slots they take about 200 MB."""
+    checkpoint_every: Count = 50_000
+    """Steps."""
+
+
+ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, GuidedPPO, Hindsight)
+"""Commands of ``train.py``. A new learner is a file with a ``Learner`` (``agents.learner``) and an entry here."""

@@ -13,8 +13,7 @@ from cli_cases import Capsys, Patch
 from train_cases import KilledError, columns, in_a_folder_of_its_own  # noqa: F401
 
 import train
-from agents import cma_es
-from agents.cma_es import Evolution
+from agents.cma_es import Evolution, Search
 from agents.objectives import topics
 from agents.runs import MODEL, prepare
 from agents.settings import Evolve, Suites
@@ -44,7 +43,7 @@ def client(**more: Any) -> Client:
 
 
 def test_weights_are_a_vector_and_back() -> None:
-    search = Evolution.around(ZERO, 0.1, 0)
+    search = Search.around(ZERO, 0.1, 0)
     vector = np.arange(len(search.average), dtype=float)
     found = search.weights(vector)
     assert isinstance(found, SchedulerWeights) and (found.weight.reshape(-1) == vector).all()
@@ -110,7 +109,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(after: int, short_episodes:
     """Killed after so many fitnesses: in the first generation, and in later ones."""
     whole, killed = Path("whole"), Path("killed")
     whole.mkdir(), killed.mkdir()
-    best = cma_es.train(TINY, whole, seed=2).reached
+    best = Evolution(TINY).train_seed(whole, 2).reached
     true_fitness, left = topics.mean_fitness, [after]
 
     def fitness(policy: policies.Policy, episodes: Any) -> float:
@@ -121,9 +120,9 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(after: int, short_episodes:
 
     monkeypatch.setattr(topics, "mean_fitness", fitness)
     with pytest.raises(KilledError):
-        cma_es.train(TINY, killed, seed=2)
+        Evolution(TINY).train_seed(killed, 2)
     monkeypatch.setattr(topics, "mean_fitness", true_fitness)
-    assert cma_es.train(TINY, killed, seed=2).reached == best
+    assert Evolution(TINY).train_seed(killed, 2).reached == best
     one, other = (folder / "seed-2" / MODEL for folder in (whole, killed))
     assert one.read_bytes() == other.read_bytes()
     ends = [pickle.loads((folder / "seed-2" / "evolution.pkl").read_bytes()) for folder in (whole, killed)]

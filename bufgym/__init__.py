@@ -47,4 +47,6 @@ for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
             kwargs={"scenario": _scenario, **_options},
         )
 
-__getattr__ = _on_demand(__name__)
+__getattr__ = _on_demand(
+    __name__, {"Comparison": "benchmark.compare", "compare": "benchmark.compare", "make_policy": "benchmark.compare"}
+)

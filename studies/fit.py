@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from agents.page import command
 from bufgym.cli.options import Count
 from bufgym.cli.trace_fit import recordings_of
 from bufgym.traces.fit import Rates, autocorrelation, outage_gaps, outage_lengths
@@ -23,6 +22,7 @@ from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.parameters import SHOULDER_S, LinkParameters, read_links
 from bufgym.traces.trace import Float64Array
 from studies.compare_links import KS_DISTANCE, SETS, HeldOut, Row, compare, generated_sets, held_out
+from studies.page import command
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

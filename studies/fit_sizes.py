@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.page import command
 from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath
@@ -22,6 +21,7 @@ from bufgym.traces.formats.workloads import WORKLOAD_HEADERS
 from bufgym.traces.generate.sizes import FLOOR, WINDOW_US, read_sizes, recorded, recorded_sizes, speeds
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+from studies.page import command
 
 LAGS: Final = 30
 LEAST: Final = 100  # Fewer messages say too little

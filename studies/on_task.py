@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cma_es import Evolution, evaluation_here
+from agents.cma_es import Search, evaluation_here
 from agents.objectives.objective import Objective
-from agents.page import command, publish, table
 from bufgym import policies
 from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.policies import Policy
 from bufgym.sim import Senders
 from bufgym_papers.perception import worth
+from studies.page import command, publish, table
 
 TEST_LINKS = 2
 """Number of shipped links for tests alone, the last ones."""
@@ -96,7 +96,7 @@ class Task(Objective):
 def evolved(reward: str, L: int, seed: int, generations: int) -> Policy:
     """The agent after so many generations."""
     task = Task(reward, L, seed)
-    state = Evolution.around(task.start(), task.sigma, seed)
+    state = Search.around(task.start(), task.sigma, seed)
     for _ in range(generations):
         state.generation(evaluation_here(task))
     return state.agent.policy(task.name)

@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from agents.page import command
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import draw
@@ -38,6 +37,7 @@ from bufgym.ground.kernel import JIT
 from bufgym.ground.tables import Table
 from bufgym.sim import Senders
 from studies import yardstick
+from studies.page import command
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"

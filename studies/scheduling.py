@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from agents.page import command, publish, written
 from agents.runs import MODEL, read_settings
 from bufgym import policies
 from bufgym.benchmark.rows import Row, read_rows
@@ -13,6 +12,7 @@ from bufgym.benchmark.score import Standing
 from bufgym.benchmark.summary import Summary, table_of
 from bufgym.benchmark.tasks import TASKS
 from bufgym.ground.errors import BufgymError
+from studies.page import command, publish, written
 
 PAGE = """# Learned scheduling on topics-v1
 

@@ -22,7 +22,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from agents.page import command
 from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.bootstrap import Interval, written
@@ -37,6 +36,7 @@ from bufgym.ground.files import replaced
 from bufgym.ground.tables import Table
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
+from studies.page import command
 
 
 @dataclass(frozen=True)

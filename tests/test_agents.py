@@ -12,9 +12,9 @@ import torch
 from stable_baselines3.common.logger import Logger
 from train_cases import DropOldest
 
-from agents import mixed_env, runs, training
-from agents.dqn import INVALID, valid_actions
-from agents.evaluation import EvaluationSet, sweep_for
+from agents import mixed_env, runs
+from agents.dqn import INVALID, SlotDQN, valid_actions
+from agents.evaluation import EvaluationSet, SlotModel, sweep_for
 from agents.settings import DQN, Evolve, Suites
 from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
@@ -143,9 +143,9 @@ def test_leaving_empty_slots_out_changes_no_score_that_counts() -> None:
 
 @pytest.fixture
 def dqn() -> Iterator[Any]:
-    arguments = DQN(width=8, num_envs=8, n_steps=16, batch_size=64, gamma=0.5)
+    arguments = DQN(width=8, num_envs=8, batch_size=64, gamma=0.5)
     env = GymVecEnv(mixed_env.MixedEnv(MIXED, [4, 4]))
-    model = training.new_dqn(arguments, env)
+    model = SlotDQN(arguments).make(env)
     model.set_random_seed(0)
     yield model
     env.close()
@@ -198,8 +198,8 @@ def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: P
     plan, file = sweep_for(few, "interruption-v1", "validation"), tmp_path / "set" / "manifest.json"
     evaluation = EvaluationSet(plan, tmp_path / "set")
     assert len(evaluation.fixed("afr")) == 12
-    assert evaluation.verdict(evaluation.play(DropOldest(), 8)).score == 0
-    rows = evaluation.benchmark_rows(evaluation.play(DropOldest(), 10), "agent", training_seed=7)  # padded
+    assert evaluation.verdict(evaluation.play(SlotModel(DropOldest(), 8))).score == 0
+    rows = evaluation.benchmark_rows(evaluation.play(SlotModel(DropOldest(), 10)), "agent", training_seed=7)  # padded
     fixed = {(r["scenario"], r["seed"], r["capacity"]): r for r in evaluation.rows if r["policy"] == "drop-oldest"}
     assert len(rows) == len(fixed) == 12
     for row in rows:

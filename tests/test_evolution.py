@@ -13,7 +13,7 @@ import pytest
 from cli_cases import Patch
 from safetensors.numpy import load_file
 
-from agents import cluster, families, joint
+from agents import cluster
 from agents.families import Family, Run, run_of
 from agents.mixed_env import Cell
 from agents.objectives import suites
@@ -27,6 +27,7 @@ from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
+from studies import families, joint
 
 ON = Suites(("interruption-v1",), capacities=(4,), test_seeds=25)
 TINY = Evolve(suites=ON, name="tiny", steps=60_000, validate_every=20_000, validation_episodes=30)
@@ -163,7 +164,7 @@ def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeyp
     joint.main(seed=3, generations=2, out=file)
     found, notes = weights.read_any(file)
     assert isinstance(found, guided.GuidedWeights) and 0 < np.abs(found.weight).max() < 1
-    assert notes["training"] == "python -m agents.joint --seed 3 --generations 2"
+    assert notes["training"] == "python -m studies.joint --seed 3 --generations 2"
     joint.main(file, out=tmp_path / "page.md")
     page = (tmp_path / "page.md").read_text().splitlines()
     own, rule = (family.share(each) for each in (policies.load(file), policies.get("gap-price")))

@@ -2,13 +2,14 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import train_cases  # noqa: F401  (it skips without the extra)
 
 import train
-from agents import training
+from agents.learner import learner_of
 from agents.objectives import fleet
 from agents.settings import PPO, Evolve, Suites
 from bufgym import policies
@@ -89,7 +90,8 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
 
 @pytest.mark.nightly
 def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
-    env = training.fleet_env(BY_PPO)
+    learner: Any = learner_of(BY_PPO)
+    env: Any = learner.env(Path())
     assert env.num_envs == 4 and env.envs.rows.capacity == 4  # two cells of two robots, at the middle L
     train.main(BY_PPO)
     folder = Path("runs/tiny")

@@ -163,7 +163,7 @@ def test_results_without_bare_nan(tmp_path: Path) -> None:
     """JSON has no NaN: no regret is null."""
     run: Any = SimpleNamespace(seed=0, seconds=1.0, merit=1.0)
     settings: Any = SimpleNamespace(algo="evolve", values={})
-    trained = Trained(settings, tmp_path, [run], [], {})
+    trained = Trained(settings, tmp_path, [run], [])
     scores = [{"policy": name, "qoi": 1.0, "regret": math.nan} for name in [agent_name(run), "drop-oldest"]]
     trained.save(tmp_path, scores=scores, held_out="")
     text = (tmp_path / "results.json").read_text(encoding="utf-8")

@@ -1,6 +1,7 @@
 """The house rules: paths are relative, importing stays cheap, hints name extras. `lint-imports` knows the layers."""
 
 import ast
+import importlib
 import importlib.metadata
 import re
 import subprocess
@@ -66,6 +67,15 @@ def output_of(program: str) -> str:
     return done.stdout
 
 
+@pytest.mark.parametrize("room", ["bufgym", "bufgym.model", "bufgym.envs", "bufgym.benchmark"])
+def test_every_public_name_of_a_room_is_found_where_the_room_says(room: str) -> None:
+    module = importlib.import_module(room)
+    for name in set(module.__all__) - {"FleetEnv", "parallel_env"}:  # these need PettingZoo
+        assert getattr(module, name) is not None
+    with pytest.raises(AttributeError, match=f"module '{room}' has no attribute 'no_such_name'"):
+        getattr(module, "no_such_name")  # noqa: B009  (mypy knows that it is missing)
+
+
 def test_importing_bufgym_imports_nothing_heavy() -> None:
     """Numba itself opens scipy where that is installed: what core dependencies bring is not bufgym's doing."""
     before = "import sys, numpy, gymnasium, numba; core = {*sys.modules}; import bufgym"
@@ -101,7 +111,7 @@ def test_every_hint_names_an_extra_that_there_is() -> None:
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
         name = project["name"]
         extras |= {extra if name == "bufgym" else f"{name}[{extra}]" for extra in project["optional-dependencies"]}
-    places, named = {"install": 0, "needs": 1, "library": 1}, set()
+    places, named = {"install": 0, "needs": 1, "library": 1, "missing": 2}, set()
     sources = [REPO / "bufgym", *(REPO / "packages").glob("*/bufgym_*")]
     for path in sorted(path for folder in sources for path in folder.rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

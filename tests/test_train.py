@@ -12,12 +12,25 @@ from refusal_cases import refuse
 from train_cases import DropOldest, KilledError, columns, in_a_folder_of_its_own  # noqa: F401
 
 import train
-from agents import held_out, runs, training
+from agents import held_out, ppo, runs
 from agents.callbacks import Curve, checkpoints
+from agents.evaluation import SlotModel
 from agents.held_out import FixedEpisodes
+from agents.learner import learner_of
 from agents.objectives import guided
 from agents.report import verdict
-from agents.settings import DQN, PPO, Cluster, Environment, Evolve, GuidedPPO, Learner, SlotEnvironment, Suites
+from agents.settings import (
+    DQN,
+    PPO,
+    Cluster,
+    Environment,
+    Evolve,
+    FullBuffer,
+    GuidedPPO,
+    SingleDecisions,
+    SlotEnvironment,
+    Suites,
+)  # fmt: skip
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.ground.errors import BufgymError
@@ -25,22 +38,25 @@ from bufgym.policies import registry
 from bufgym.scenario import suites
 
 SHARED: dict[str, Any] = {"name": "tiny", "steps": 512, "validate_every": 250_000, "validation_episodes": 2}
-SMALL: dict[str, Any] = {**SHARED, "width": 8, "num_envs": 4, "n_steps": 32, "batch_size": 64, "epochs": 1}
-SMALL |= {"checkpoint_every": 128}
+SMALL: dict[str, Any] = {**SHARED, "width": 8, "num_envs": 4, "batch_size": 64, "checkpoint_every": 128}
+UPDATE: dict[str, Any] = {"n_steps": 32, "epochs": 1}
+REPLAYED: dict[str, Any] = {"train_freq": 2, "gradient_steps": 1, "learning_starts": 64, "target_update_interval": 128}
 ON = SlotEnvironment(capacity=3, duration_s=1.0, episodes=3)
-TINY = PPO(environment=ON, **SMALL)
+TINY = PPO(environment=ON, **SMALL, **UPDATE)
 GUIDED = Environment(capacity=3, duration_s=1.0, episodes=3)
 LEARNERS = {
     "ppo": TINY,
     "unmasked": dataclasses.replace(TINY, unmasked=True),
-    "dqn": DQN(environment=ON, **SMALL),
-    "guided-ppo": GuidedPPO(environment=GUIDED, **SMALL),
+    "dqn": DQN(environment=FullBuffer(**vars(ON)), **SMALL, **REPLAYED),
+    "guided-ppo": GuidedPPO(environment=GUIDED, **SMALL, **UPDATE),
 }
 ON_SUITE: dict[str, Any] = {"suites": Suites(("interruption-v1",), capacities=(4, 6), test_seeds=10), "name": "tiny"}
 ON_SUITE |= {"steps": 1_152, "validate_every": 384, "validation_episodes": 60}
-ROWS = {"num_envs": 12, "n_steps": 32, "batch_size": 96, "environment": SlotEnvironment()}
+ROWS = {"num_envs": 12, "batch_size": 96}
 SUITE: dict[str, Any] = {
-    name: dataclasses.replace(learner, **ON_SUITE, **ROWS) for name, learner in LEARNERS.items() if name != "guided-ppo"
+    name: dataclasses.replace(learner, **ON_SUITE, **ROWS, environment=type(learner.environment)())
+    for name, learner in LEARNERS.items()
+    if name != "guided-ppo"
 } | {"evolve": Evolve(**ON_SUITE)}
 """Three updates of 384 decisions: two rows of each of 3 scenarios x 2 capacities, 32 steps each."""
 
@@ -67,7 +83,8 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
     assert notes["scores"]["qoi"] == rows["agent (seed 0)"]["qoi"]
     assert json.loads((folder / "seed-0" / "notes.json").read_text(encoding="utf-8"))["seeds"] == [0]
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "model.zip").exists() and list((folder / "seed-0" / "tensorboard").glob("events*"))
+    assert (folder / ("model.zip" if plain else runs.MODEL)).exists()
+    assert list((folder / "seed-0" / "tensorboard").glob("events*"))
     printed = capsys.readouterr().out
     assert "drop-oldest" in printed and "agent (seed 0)" in printed
 
@@ -83,12 +100,12 @@ def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, cap
     found = policies.load(folder / "ppo" / "seed-0" / runs.MODEL)
     (_, first), *_ = columns(folder / "seed-0" / "validation.csv", "steps", "qoi")
     judges, test = FixedEpisodes(on, "validation", 2), FixedEpisodes(on, "test", 3)
-    assert first == ppo == np.mean([outcome.qoi for outcome in judges.run("gap-price")])
+    assert first == ppo == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
     agent = policies.load(folder / "model.safetensors")
     rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["scores"]
     told = {row["policy"]: row["qoi"] for row in rows}
-    assert told["agent (seed 0)"] == np.mean([o.qoi for o in test.run(agent)])
-    assert told["agent by PPO (seed 0)"] == np.mean([o.qoi for o in test.run(found)])
+    assert told["agent (seed 0)"] == np.mean([o.qoi for o in test.play(agent)])
+    assert told["agent by PPO (seed 0)"] == np.mean([o.qoi for o in test.play(found)])
     assert "the best rule written by hand, " in capsys.readouterr().out
 
 
@@ -103,23 +120,23 @@ def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: Patch) -> None:
 
     with monkeypatch.context() as patch, pytest.raises(KilledError):
         patch.setattr(Curve, "_on_rollout_end", dies_half_way)
-        training.train_seed(TINY, folder, 0)
+        learner_of(TINY).train_seed(folder, 0)
     home = folder / "seed-0"
     # The untrained agent was validated. The third rollout was collected, but not learnt from: it does not count.
     assert [path.stem for path in checkpoints(home)] == ["000000000000", "000000000128", "000000000256"]
     assert curve_of(home) == [128, 256, 384]
-    before = training.MaskablePPO.load(checkpoints(home)[-1])
+    before = ppo.MaskablePPO.load(checkpoints(home)[-1])
     again = dataclasses.replace(TINY, resume=True)
     assert runs.prepare(again) == folder
-    run = training.train_seed(again, folder, 0)
+    run = learner_of(again).train_seed(folder, 0)
     assert curve_of(home) == [128, 256, 384, 512] and run.seconds > 0
-    after = training.MaskablePPO.load(checkpoints(home)[-1])
+    after = ppo.MaskablePPO.load(checkpoints(home)[-1])
     assert (before.num_timesteps, after.num_timesteps) == (256, 512)
     # The optimizer went on counting, two gradient steps an update, and the learning rate on falling.
     assert {int(state["step"]) for state in after.policy.optimizer.state_dict()["state"].values()} == {8}
     assert after.policy.optimizer.param_groups[0]["lr"] < before.policy.optimizer.param_groups[0]["lr"]
     # Once more: there is nothing left to do.
-    assert training.train_seed(again, folder, 0).curve == run.curve
+    assert learner_of(again).train_seed(folder, 0).curve == run.curve
 
 
 def test_a_run_is_not_overwritten_or_mixed_with_another() -> None:
@@ -144,8 +161,8 @@ def test_an_agent_that_acts_like_a_policy_scores_like_it(decide_at: Any) -> None
     """The agent's road (observations, actions, rows) and the policies' own are the same simulation."""
     on = dataclasses.replace(ON, decide_at=decide_at)
     test = held_out.FixedEpisodes(on, "test", 3)
-    outcomes = test.play(DropOldest(), on)
-    assert outcomes == test.run_fixed()["drop-oldest"]
+    outcomes = test.play(SlotModel(DropOldest(), 3, decide_at))
+    assert outcomes == test.play_fixed()["drop-oldest"]
     assert any(outcome.dropped for outcome in outcomes)
 
 
@@ -156,7 +173,7 @@ def test_episodes_are_scored_between_drop_oldest_and_the_clairvoyant() -> None:
     on = dataclasses.replace(ON, duration_s=5.0, episodes=4)
     test, validation = (held_out.fixed_episodes(dataclasses.replace(TINY, environment=on), s) for s in SPLITS)
     assert (len(test.episodes), len(validation.episodes)) == (4, 2)
-    outcomes = {name: test.run(name) for name in ("drop-oldest", "afr", "rosbridge", "clairvoyant")}
+    outcomes = {name: test.play(policies.get(name)) for name in ("drop-oldest", "afr", "rosbridge", "clairvoyant")}
     assert test.score(outcomes["drop-oldest"]) == 0 and test.score(outcomes["clairvoyant"]) == pytest.approx(1)
     entries = {entry["policy"]: entry for entry in held_out.summarise(outcomes, test.rows(outcomes), "afr")}
     low, high = entries["afr"]["score_95"]
@@ -185,21 +202,23 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     home = folder / "seed-0"
     merit = (home / "validation.csv").read_text(encoding="utf-8").splitlines()[0].split(",")[-1]
     validation = {int(steps): value for steps, value in columns(home / "validation.csv", "steps", merit)}
-    model = runs.MODEL if algo == "evolve" else "model.zip"
+    model = runs.MODEL if algo in ("evolve", "ppo") else "model.zip"
     assert (folder / model).read_bytes() == (home / model).read_bytes()
     if algo in LEARNERS:
         assert list(validation) == [0, 384, 768, 1152]
         best = min(validation, key=lambda steps: validation[steps])
-        assert (home / model).read_bytes() == (home / "checkpoints" / f"{best:012d}.zip").read_bytes()
+        assert (home / "model.zip").read_bytes() == (home / "checkpoints" / f"{best:012d}.zip").read_bytes()
     assert results["validation"] == {"0": min(validation.values())}
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert agent in printed and "cells (scenario, L) count" in printed
 
 
-def weights(arguments: Learner, name: str) -> dict[str, np.ndarray]:
-    run = training.train_seed(arguments, runs.prepare(dataclasses.replace(arguments, name=name)), arguments.seed)
-    return {key: tensor.numpy() for key, tensor in training.load(arguments, run).policy.state_dict().items()}
+def weights(arguments: SingleDecisions, name: str) -> dict[str, np.ndarray]:
+    learner: Any = learner_of(arguments)
+    run = learner.train_seed(runs.prepare(dataclasses.replace(arguments, name=name)), arguments.seed)
+    model = learner.algorithm.load(run.folder / "model.zip")
+    return {key: tensor.numpy() for key, tensor in model.policy.state_dict().items()}
 
 
 @pytest.mark.parametrize("algo", LEARNERS)
@@ -209,26 +228,6 @@ def test_the_same_seed_gives_the_same_weights_bit_for_bit(algo: str) -> None:
     assert all((first[key] == again[key]).all() for key in first)
     other = weights(dataclasses.replace(arguments, seed=1), "other")
     assert not all((first[key] == other[key]).all() for key in first)
-
-
-def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
-    arguments = LEARNERS["dqn"]
-    folder = runs.prepare(arguments)
-    models = []
-    for steps in (256, 512):
-        training.train_seed(dataclasses.replace(arguments, steps=steps), folder, 0)
-        model = training.MaskedDQN.load(checkpoints(folder / "seed-0")[-1])
-        counts = {int(state["step"]) for state in model.policy.optimizer.state_dict()["state"].values()}
-        assert model.num_timesteps == steps and counts == {model._n_updates}
-        models.append(model)
-    assert models[1]._n_updates > models[0]._n_updates > 0
-
-
-def test_batches_divide_the_experience() -> None:
-    assert training.even_batch(32_768, 4_096) == 4_096
-    assert training.even_batch(34_560, 4_096) == 3_840  # nine of them: eight would be too large
-    assert training.even_batch(100, 4_096) == 100
-    refuse("batch_size = 4: num_envs x n_steps = 7 decisions", training.even_batch, 7, 4)
 
 
 POSITIVE = (

@@ -119,6 +119,10 @@ def hello(name: str) -> None:
     """Greet."""
     print(f"hello, {name}")
 '''
+FIELD = """
+    Field("half_full", "context", "queue", "flag", "1 where half of the places are taken",
+          lambda buffer, arrival: float(2 * len(buffer.slots) >= buffer.capacity)),
+"""
 TERM = """
 @built_in("starved", unit="steps")
 def starved(step: Any, memory: Any) -> float:
@@ -166,6 +170,16 @@ ROWS = {
         "assert 'newest-two' in bufgym.policies.names()\n"
         "words = '--trace lte-synthetic-0 --seconds 2 --fps 5 --seeds 1 --capacity 2 --no-bound'\n"
         "assert main(['bench', '--policies', 'newest-two', *words.split()]) == 0",
+    ),
+    "an observation field": Addition(
+        {},
+        {"bufgym/model/observe/on_board.py": ("ON_BOARD_FIELDS = (\n", f"ON_BOARD_FIELDS = ({FIELD}")},
+        "env = gym.make('bufgym/Uplink-v0', fields=['half_full', 'occupancy'], capacity=3); env.reset(seed=0)\n"
+        "for _ in range(40):\n"
+        "    seen = env.step(3)[0]\n"
+        "    assert seen['half_full'] == (seen['occupancy'] >= 0.5)\n"
+        "from bufgym.policies.learned import NAMES\n"
+        "assert 'half_full' in NAMES",
     ),
     "a reward term": Addition(
         {},

@@ -73,7 +73,7 @@ def page() -> str:
 
 def trained_by(card: Card) -> str:
     """Find the command that made it, on the page of its results."""
-    found = re.search(r"`(python (?:train\.py|-m agents\.joint) [^`]*)`", _text(card))
+    found = re.search(r"`(python (?:train\.py|-m studies\.joint) [^`]*)`", _text(card))
     assert found is not None
     return found[1]
 

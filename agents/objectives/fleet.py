@@ -9,8 +9,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
 from agents.objectives.objective import Objective
 from agents.settings import Settings, Suites
@@ -18,7 +20,9 @@ from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.sweep import Sweep
+from bufgym.envs import FleetVecEnv
 from bufgym.policies import Policy
+from bufgym.sb3 import GymVecEnv
 from bufgym.scenario import FleetEpisode, FleetScenario, suites
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
@@ -112,7 +116,21 @@ class FleetObjective(Objective):
         """Compute ``mean_gain``."""
         return mean_gain(policy, episodes)
 
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
+        """Robots as rows, each rewarded for its own information, at the middle L; a slot network serves the others."""
+        chosen = self.settings.suites
+        fleet, capacities = fleet_of(chosen, "train"), chosen.capacities_of(chosen.suite[0])
+        batch = FleetVecEnv(
+            max(1, num_envs // fleet.robots),
+            fleet.robots,
+            fleet.uplink,
+            capacities[len(capacities) // 2],
+            reward="own",
+            term=reward,
+            autoreset_mode="SameStep",
+        )
+        return GymVecEnv(batch)
 
-def rivals() -> list[Policy]:
-    """All fixed policies that may run on a fleet."""
-    return [policies.get(name) for name in tasks.TASKS["fleet"].default_policies("")]
+    def rivals(self) -> list[Policy]:
+        """All fixed policies that may run on a fleet."""
+        return [policies.get(name) for name in tasks.TASKS["fleet"].default_policies("")]

@@ -11,15 +11,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
-from agents.evaluation import qoi_of
+from agents.evaluation import Agent, qoi_of
 from agents.held_out import FixedEpisodes, fixed_episodes, split_scenario
 from agents.objectives.objective import Objective
+from agents.report import Report, Trained, by_hand, report_environment
+from bufgym import policies
 from bufgym.benchmark.run import draw
+from bufgym.oracle import BASELINE
 from bufgym.policies import Policy
+from bufgym.sb3 import make_vec_env
 from bufgym.scenario import Episode
 from bufgym.sim import Senders
-from bufgym.sim.metrics import Outcome
 
 PARTS, EPISODES = 18, 100
 """Parts of the training episodes, and episodes in each."""
@@ -65,14 +69,27 @@ class GuidedObjective(Objective):
         """Mean H over all episodes of a part."""
         return float(np.mean([played.qoi(policy) for played in episodes]))
 
-    def validate(self, policy: Policy) -> tuple[float, ...]:
+    def validate(self, agent: Agent) -> tuple[float, ...]:
         """Score and mean H on the validation episodes."""
-        return self._measures(self.judges.run(policy))
-
-    def validate_learner(self, learner: Any) -> tuple[float, ...]:
-        """The same of a learner."""
-        return self._measures(self.judges.play(learner, self.settings.environment))
-
-    def _measures(self, outcomes: Sequence[Outcome]) -> tuple[float, ...]:
+        outcomes = self.judges.play(agent)
         # By QoI, which orders agents like the score, and is known even if nothing can be gained.
         return self.judges.score(outcomes), float(np.mean([outcome.qoi for outcome in outcomes]))
+
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
+        """Rows of the training links."""
+        on = self.settings.environment
+        scenario = split_scenario(on)[0]
+        return make_vec_env(on.env, num_envs, scenario=scenario, capacity=on.capacity, reward=reward, **options)
+
+    def lines_to_beat(self) -> dict[str, float]:
+        """Drop Oldest, AFR and the best rule written by hand."""
+        scores = {name: self.judges.score(self.judges.play(policies.get(name))) for name in by_hand()}
+        best = max(scores, key=lambda name: scores[name])
+        lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "afr", best))}
+        told = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
+        print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {told}", flush=True)
+        return lines
+
+    def report(self, trained: Trained) -> Report:
+        """A table and a figure of all agents and fixed policies on the held-out episodes."""
+        return report_environment(trained)

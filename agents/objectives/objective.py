@@ -1,4 +1,4 @@
-"""The objective of the evolution loop."""
+"""The task of a run: what is trained on, what validation measures, what the report compares."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
 
+from agents.report import Report, Trained, report_rows
 from agents.settings import Settings
 from bufgym.policies import Policy
 from bufgym.policies.guided import N_INPUTS, N_OUTPUTS, GuidedWeights
@@ -67,10 +69,22 @@ class Objective(ABC):
         """Decisions of one candidate on a part."""
         return sum(episodes.decisions for episodes in self.training[part % len(self.training)])
 
-    def validate(self, policy: Policy) -> tuple[float, ...]:
-        """The measures of an agent on the validation episodes."""
-        return (self.measure(policy, self.judges),)
+    def validate(self, agent: Any) -> tuple[float, ...]:
+        """The measures of an agent on the validation episodes; it is a policy where no model plays."""
+        return (self.measure(agent, self.judges),)
 
-    def validate_learner(self, learner: Any) -> tuple[float, ...]:
-        """The same of a learner that chooses among slots, where there are such."""
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
+        """Environments to learn from single decisions in; ``options`` are those of the learner's actions."""
         raise NotImplementedError
+
+    def lines_to_beat(self) -> dict[str, float]:
+        """The validation scores to beat, of fixed policies by name; they are printed as well."""
+        return {}
+
+    def rivals(self) -> list[Policy]:
+        """The fixed policies that agents are compared with on the test split."""
+        raise NotImplementedError
+
+    def report(self, trained: Trained) -> Report:
+        """Compare the agents of all seeds with the fixed policies."""
+        return report_rows(trained, self.rivals())

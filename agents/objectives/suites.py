@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
 
-from agents.evaluation import ValidationSets, Verdict
+from agents.evaluation import Agent, ValidationSets, Verdict
 from agents.families import Family, divided, merged, of_suite
+from agents.mixed_env import MixedEnv, cells
 from agents.objectives.objective import Objective
+from agents.report import Report, Trained, report_suites
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
+from bufgym.sb3 import GymVecEnv
 
 PARTS, RUNS = 8, 60
 """Parts of the training runs, and runs of each suite in a part."""
@@ -50,10 +55,19 @@ class SuitesObjective(Objective):
         """Share of AFR's regret, mean over the suites."""
         return float(np.mean([family.share(policy) for family in episodes]))
 
-    def validate(self, policy: Policy) -> tuple[float, ...]:
+    def validate(self, agent: Agent) -> tuple[float, ...]:
         """The verdict on the validation splits."""
-        return self.judges.run(policy)
+        return self.judges.play(agent)
 
-    def validate_learner(self, learner: Any) -> tuple[float, ...]:
-        """The same of a learner."""
-        return self.judges.play(learner, self.settings.suites.slots)
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
+        """Whole train splits, about as many rows of each scenario at each L."""
+        chosen = self.settings.suites
+        mixed = [
+            cell for suite in chosen.suite for cell in cells(suite, "train", chosen.capacities_of(suite), chosen.data)
+        ]
+        size = math.ceil(num_envs / len(mixed))
+        return GymVecEnv(MixedEnv(mixed, [size] * len(mixed), reward=reward, **options))
+
+    def report(self, trained: Trained) -> Report:
+        """A score on each suite, as ``bufgym bench`` computes it."""
+        return report_suites(trained)

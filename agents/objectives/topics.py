@@ -174,9 +174,8 @@ class TopicsObjective(Objective):
         """Compute ``mean_fitness``."""
         return mean_fitness(policy, episodes)
 
-
-def rivals() -> list[Policy]:
-    """All schedulers but the shipped agent."""
-    shipped = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
-    names = tasks.TASKS["topics"].default_policies("")
-    return [policies.get(name) for name in names if name not in shipped]
+    def rivals(self) -> list[Policy]:
+        """All schedulers but the shipped agent."""
+        shipped = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
+        names = tasks.TASKS["topics"].default_policies("")
+        return [policies.get(name) for name in names if name not in shipped]

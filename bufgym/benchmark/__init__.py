@@ -15,4 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TASKS", "Sweep", "drops", "leaderboard", "read_rows", "report", "run_sweep", "write_rows"]
 
-__getattr__ = on_demand(__name__)
+__getattr__ = on_demand(__name__, {
+    "drops": "drops", "leaderboard": "leaderboard", "report": "report", "read_rows": "rows", "write_rows": "rows",
+    "Sweep": "sweep", "run_sweep": "sweep", "TASKS": "tasks",
+})  # fmt: skip

@@ -12,24 +12,27 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bufgym import policies, scenario
-from bufgym.benchmark import report, sources, table, tasks
+from bufgym import policies
+from bufgym import scenario as scenarios
+from bufgym.benchmark import folder, report, sources, table, tasks
 from bufgym.benchmark import sweep as sweeps
 from bufgym.benchmark.report import tables
-from bufgym.benchmark.rows import Row
+from bufgym.benchmark.rows import Layout, Row, write_rows
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sources import PolicyLike as PolicyLike
 from bufgym.benchmark.sources import make_policy as make_policy
 from bufgym.benchmark.sweep import Sweep
 from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.files import replaced
 from bufgym.ground.libraries import library
 from bufgym.ground.modules import is_named
 from bufgym.policies import Policy
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
 
-KEYWORDS = ("capacity", "seeds", "progress", "about", "against")
-QUEUE = ("max_bytes", "decide_at", "bound")  # Settings of a queue
+KEYWORDS = ("capacity", "seeds", "progress", "about", "label", "against", "out", "form")
+OF_A_QUEUE = ("max_bytes", "decide_at", "bound")
+OF_A_SUITE = ("split", "data", "changes", "policy_file", "jobs", "backend", "address", "command")
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,6 +45,7 @@ class Comparison:
     """The scenario or suite."""
     unranked: Mapping[str, str]
     """The policies that do not compete, with the reasons."""
+    layout: Layout  # the columns of ``rows``
     page: Callable[[str], str]  # the page, for the command that it names
     plain: str  # the table as aligned text
     markdown: str
@@ -66,7 +70,7 @@ class Comparison:
         """Draw each policy's regret as a bar, a colour for each L; Matplotlib's axes. QoI where no regret is known."""
         pyplot = library("matplotlib.pyplot", "plot", "plot")
         axes = pyplot.subplots(layout="constrained")[1] if axes is None else axes
-        entries = table.means(self.rows, alone=self.unranked)
+        entries = table.means(self.rows, self.unranked)
         capacities = list(dict.fromkeys(entry["capacity"] for entry in entries))
         names = list(dict.fromkeys(entry["policy"] for entry in reversed(entries)))
         height = 0.8 / len(capacities)
@@ -74,9 +78,9 @@ class Comparison:
         if any(math.isnan(entry["regret"]) for entry in entries):
             key, scale, label = "qoi", 1, "QoI, mean over the episodes (longer is better)"
         for k, capacity in enumerate(capacities):
-            chosen = [entry for entry in entries if entry["capacity"] == capacity]
-            places = [names.index(entry["policy"]) + (k - (len(capacities) - 1) / 2) * height for entry in chosen]
-            axes.barh(places, [scale * entry[key] for entry in chosen], height, label=f"L = {capacity}")
+            bars = [entry for entry in entries if entry["capacity"] == capacity]
+            lanes = [names.index(entry["policy"]) + (k - (len(capacities) - 1) / 2) * height for entry in bars]
+            axes.barh(lanes, [scale * entry[key] for entry in bars], height, label=f"L = {capacity}")
         axes.set_yticks(range(len(names)), names)
         axes.set_xlabel(label)
         axes.set_title(self.about.partition("\n")[0], fontsize="medium", loc="left")
@@ -87,6 +91,16 @@ class Comparison:
     def report(self, path: str | Path, command: str = "bufgym.compare(...)") -> Path:
         """Write the page of ``bufgym report`` to this file (extra ``report``); return its path."""
         return report.save(self.page(command), Path(path))
+
+    def write_rows(self, path: str | Path) -> Path:
+        """Write the rows to this ``.csv`` or ``.parquet`` file; return its path."""
+        return write_rows(self.rows, path, self.layout)
+
+    def write_table(self, path: Path) -> Path:
+        """Write ``about`` and the table as Markdown to this file; return its path."""
+        with replaced(path) as temporary:
+            temporary.write_text(f"{self.about}\n\n{self.markdown}\n", encoding="utf-8")
+        return path
 
     def __str__(self) -> str:
         return f"{self.about}\n\n{self.plain}"
@@ -105,7 +119,10 @@ def compare(
     seeds: int | Sequence[int] | None = None,
     progress: bool = True,
     about: str = "",
+    label: str = "",
     against: PolicyLike | None = None,
+    out: str | Path | None = None,
+    form: str | None = None,
     **settings: Any,
 ) -> Comparison:
     """Run each policy on the same episodes of a scenario or a suite.
@@ -114,100 +131,135 @@ def compare(
         policies: as ``make_policy`` takes them.
         on: a scenario, its name (see ``bufgym list``), also with parameters as in ``"lte:rate_hz=5"``, a client's
             .toml file, or a suite's name such as ``"outage-v1"``.
-        capacity: L, messages, or several; by default 8, or the suite's.
-        seeds: so many episodes on each trace, or these; by default 10, or the suite's.
+        capacity: L, messages, or several; by default 8, with topics 32, or the suite's.
+        seeds: so many episodes on each trace, or these; by default 10, with topics 5, or the suite's.
         progress: show a bar on stderr, where that is a terminal.
         about: lines that stand above the table and explain it; by default what ``on`` is.
+        label: the scenario's name in the rows; by default the name that ``on`` gives.
         against: a policy that every other is compared with, by the paired difference of their shares of AFR's regret
             (of QoI over Robofleet's with topics, of the gain over AFR with a fleet). It and AFR run too.
+        out: a folder that keeps the rows and the table; a suite's run in it is resumed, any other begins an empty one.
+        form: format of the rows in ``out``, "parquet" or "csv"; by default parquet if pyarrow is installed.
         settings: of a queue, ``max_bytes``, ``decide_at`` and ``bound`` (False leaves out the clairvoyant and all that
-            is measured against it); the others are parameters of a scenario that is named.
+            is measured against it). Of a suite, settings of ``Sweep`` and ``run_sweep``: ``split``, ``data``,
+            ``changes``, ``policy_file``, ``jobs``, ``backend``, ``address`` and ``command``. The others are parameters
+            of a scenario that is named.
 
     Raises:
         BufgymError: an argument is out of its range, or there is no such policy, scenario or suite.
     """
     several = [policies] if isinstance(policies, str | Path | Policy) or callable(policies) else policies
-    chosen = [make_policy(policy) for policy in several]
+    entrants = [make_policy(policy) for policy in several]
     rival = None if against is None else make_policy(against)
-    capacities = [capacity] if isinstance(capacity, int) else list(capacity or ())
+    if not entrants:
+        raise BufgymError("policies = []: need at least one")
+    capacities = (capacity,) if isinstance(capacity, int) else tuple(capacity or ())
     on = os.fspath(on) if isinstance(on, os.PathLike) else on
     if isinstance(on, str) and on in suites.SUITES:
-        if settings:
-            raise BufgymError(f"{', '.join(settings)}: a suite's episodes are frozen")
-        if seeds is not None and not isinstance(seeds, int):
-            raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
-        return on_suite(chosen, on, rival, capacities=tuple(capacities), seeds=seeds, form="csv", progress=progress)
-    if isinstance(on, str) and not (on.partition(":")[0] in scenario.SCENARIOS or on.endswith(".toml") or is_named(on)):
-        raise unknown("scenario or suite", on, [*scenario.SCENARIOS, *suites.SUITES])
-    queue = {name: settings.pop(name) for name in QUEUE if name in settings}
-    stream = scenario.get(on) if isinstance(on, str) else on
-    known = parameters(stream) if isinstance(on, str) else []
+        return _compare_on_suite(
+            entrants, on, rival, capacities, seeds, out=out, form=form, progress=progress, **settings
+        )
+    of_a_queue = {name: settings.pop(name) for name in OF_A_QUEUE if name in settings}
+    label, scenario = label or (on if isinstance(on, str) else ""), _scenario(on, settings)
+    words = {"label": label, "about": about or label or scenarios.about(scenario)}
+    if out is not None:
+        folder.make_empty(Path(out))
+    comparison = _compare_on_scenario(
+        entrants, scenario, rival, capacities, seeds, **words, progress=progress, **of_a_queue
+    )
+    if out is not None:
+        comparison.write_rows(Path(out, f"rows.{form or folder.form_of_rows(Path(out))}"))
+        comparison.write_table(Path(out, "table.md"))
+    return comparison
+
+
+def _scenario(on: Any, settings: dict[str, Any]) -> Any:
+    """The scenario that ``on`` is or names; ``settings`` are parameters of one that is named."""
+    named = isinstance(on, str)
+    if named and not (on.partition(":")[0] in scenarios.SCENARIOS or on.endswith(".toml") or is_named(on)):
+        raise unknown("scenario or suite", on, [*scenarios.SCENARIOS, *suites.SUITES])
+    scenario = scenarios.get(on) if named else on
+    known = parameters(scenario) if named else []
     for name in settings:
         if name not in known:
-            raise unknown("keyword", name, [*KEYWORDS, *QUEUE, *known], place="compare")
-    stream = scenario.get(stream, **settings) if settings else stream
-    label, seeds, capacities = on if isinstance(on, str) else "", 10 if seeds is None else seeds, capacities or [8]
-    return beside(chosen, stream, capacities, seeds, label=label, about=about, rival=rival, progress=progress, **queue)
+            raise unknown("keyword", name, [*KEYWORDS, *OF_A_QUEUE, *OF_A_SUITE, *known], place="compare")
+    return scenarios.get(scenario, **settings) if settings else scenario
 
 
-def beside(
-    chosen: Sequence[Policy],
-    stream: Any,
+def _compare_on_scenario(
+    entrants: Sequence[Policy],
+    scenario: Any,
+    rival: Policy | None,
     capacities: Sequence[int],
-    seeds: int | Sequence[int],
+    seeds: int | Sequence[int] | None,
     *,
-    label: str = "",
-    about: str = "",
-    rival: Policy | None = None,
-    progress: bool = True,
-    **queue: Any,
+    label: str,
+    about: str,
+    progress: bool,
+    **of_a_queue: Any,
 ) -> Comparison:
-    """``compare`` for policies and a scenario that are at hand; ``label`` is the scenario's name in the rows."""
-    task = tasks.of(stream)
-    chosen = _with(chosen, rival, task)
-    added = all(policy.name != task.baseline for policy in chosen)
-    chosen = [*chosen, make_policy(task.baseline)] if added and chosen else chosen
-    played = run(chosen, stream, capacities, seeds, label=label, progress=progress, **queue)
-    unranked, heading = table.apart(chosen), about or label or scenario.about(stream)
-    found = task.summary(played, unranked, "" if rival is None else rival.name)
-    hidden = task.baseline if added and not task.shows_baseline else ""
-    rows, floor = ([row for row in played if (row["policy"] == hidden) == there] for there in (False, True))
-    shown = task.tables(rows, floor, found, unranked, {label: scenario.about(stream)})
-    forms = ["\n\n".join(texts) for texts in zip(*(part.forms() for part in shown), strict=True)]
-    page = partial(report.page_of, played, () if queue else chosen, unranked, stream, heading)
-    return Comparison(rows, heading, unranked, page, *forms)
+    """Run the policies, summarise their rows, and render the summary."""
+    task = tasks.task_for(scenario, **of_a_queue)
+    invited = _with_rival(entrants, rival, task)
+    players = _with_missing(invited, [make_policy(task.baseline)])
+    seeds = task.seeds if seeds is None else seeds
+    played = run(players, scenario, capacities or (task.capacity,), seeds, label=label, progress=progress, **of_a_queue)
+
+    unranked = table.unranked_among(players)
+    summary = task.summary(played, unranked, "" if rival is None else rival.name)
+
+    hidden = "" if task.shows_baseline or players == invited else task.baseline
+    rendered = [part.forms() for part in task.tables(played, summary, scenario, unranked, hidden)]
+    forms = ["\n\n".join(texts) for texts in zip(*rendered, strict=True)]
+    page = partial(report.page_of_rows, task, played, players, unranked, scenario, about)
+    rows = [row for row in played if row["policy"] != hidden]
+    return Comparison(rows, about, unranked, task.layout, page, *forms)
 
 
-def _with(chosen: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
-    """The policies, then the ones that a comparison with ``rival`` needs."""
-    more = [] if rival is None else [rival, make_policy(task.reference)]
-    known = {policy.name for policy in chosen}
-    return [*chosen, *({policy.name: policy for policy in more if policy.name not in known}.values())]
-
-
-def on_suite(
-    chosen: Sequence[Policy], suite: str, rival: Policy | None = None, folder: Path | None = None, **how: Any
+def _compare_on_suite(
+    entrants: Sequence[Policy],
+    suite: str,
+    rival: Policy | None,
+    capacities: tuple[int, ...],
+    seeds: int | Sequence[int] | None,
+    *,
+    out: str | Path | None,
+    **how: Any,
 ) -> Comparison:
-    """``compare`` for policies that are at hand and a suite, whose processes know them by name.
-
-    ``folder`` keeps the run. ``how`` has further settings of the ``Sweep``, and arguments of ``run_sweep``.
-    """
-    chosen = _with(chosen, rival, tasks.TASKS[suites.get(suite).kind])
+    """Run the policies by name in the suite's processes, read the summary of the run's folder, and render it."""
+    if frozen := [name for name in how if name not in (*OF_A_SUITE, "form", "progress")]:
+        raise BufgymError(f"{', '.join(frozen)}: a suite's episodes are frozen")
+    if seeds is not None and not isinstance(seeds, int):
+        raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
+    players = _with_rival(entrants, rival, tasks.TASKS[suites.get(suite).kind])
     registered = {*policies.names(), *policies.names(named_only=True)}
-    for policy in chosen:
+    for policy in players:
         base = policy.name.partition(":")[0]
         if base not in registered or policies.get(base).on_arrival is not policy.on_arrival:
-            raise BufgymError(
-                f"policy {policy.name}: register it to run it on a suite, whose processes know it by name"
-            )
-    settings = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}
-    sweep = Sweep(suites.get(suite).name, tuple(policy.name for policy in chosen), **settings)
+            rule = "register it to run it on a suite, whose processes know it by name"
+            raise BufgymError(f"policy {policy.name}: {rule}")
+    of_the_sweep = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}
+    names = tuple(policy.name for policy in players)
+    sweep = Sweep(suite, names, capacities=capacities, seeds=seeds, **of_the_sweep)
     # Other processes can't know what a user's own code registered in this one.
-    if sweep.policy_file is None and not all(policy.built_in or sources.made([policy.name]) for policy in chosen):
+    if sweep.policy_file is None and not all(policy.built_in or sources.loaded([policy.name]) for policy in players):
         how["jobs"] = 1
     with tempfile.TemporaryDirectory() as scratch:
-        folder = folder or Path(scratch) / "run"
-        rows = sweeps.run_sweep(sweep, folder, **how)
-        made, found = report.run_of(folder, "" if rival is None else rival.name)
-    shown = tables.plain(made, found), tables.markdown(made, found), tables.html(found)
-    return Comparison(rows, f"suite {sweep.suite}", table.apart(chosen), partial(report.page_for, made), *shown)
+        place = Path(out or Path(scratch, "run"))
+        rows = sweeps.run_sweep(sweep, place, **how)
+        finished, summary = report.run_of(place, "" if rival is None else rival.name)
+    forms = tables.plain(finished, summary), tables.markdown(finished, summary), tables.html(summary)
+    unranked, page = table.unranked_among(players), partial(report.page_of_run, finished)
+    return Comparison(rows, f"suite {suite}", unranked, sweep.task.layout, page, *forms)
+
+
+def _with_rival(entrants: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:
+    """The entrants, then the policies that a comparison with ``rival`` needs."""
+    return _with_missing(entrants, [] if rival is None else [rival, make_policy(task.reference)])
+
+
+def _with_missing(entrants: Sequence[Policy], needed: Sequence[Policy]) -> list[Policy]:
+    """The entrants, then those of ``needed`` that are not among them by name."""
+    present = {policy.name for policy in entrants}
+    missing = {policy.name: policy for policy in needed if policy.name not in present}
+    return [*entrants, *missing.values()]

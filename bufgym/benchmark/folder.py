@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.benchmark.checked_json import check, read_object
-from bufgym.benchmark.rows import Row, read_rows
+from bufgym.benchmark.rows import Row, has_pyarrow, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import replaced
@@ -128,6 +128,22 @@ def claim(out: Path, manifest: dict[str, Any]) -> None:
                 f"{file}: {key} is {_short(held.get(key))}, but this run has {_short(manifest[key])};"
                 " choose another --out (finished rows are never mixed)"
             )
+
+
+def make_empty(out: Path) -> None:
+    """Make the folder for a run that is not a suite's; raise an error if rows are in it, which are never written
+    over."""
+    out.mkdir(parents=True, exist_ok=True)
+    if (out / "manifest.json").exists():
+        raise BufgymError(f"{out}: holds the run of a suite; choose another --out (its rows are never written over)")
+    for rows in sorted(out.glob("rows.*")):
+        raise BufgymError(f"{rows}: holds an earlier run's rows; choose another --out, or remove that file")
+
+
+def form_of_rows(out: Path) -> str:
+    """Format of the rows already in the folder, or else the best format available."""
+    held = {file.suffix for pattern in ("rows.*", "parts/*") for file in out.glob(pattern)}
+    return "csv" if not has_pyarrow() or (".csv" in held and ".parquet" not in held) else "parquet"
 
 
 def read_manifest(path: Path) -> Mapping[str, Any]:

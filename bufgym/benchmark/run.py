@@ -40,7 +40,7 @@ def run(
         label: name of the scenario in the rows.
         settings: settings of the task; for one queue ``max_bytes``, ``decide_at`` and ``bound``, see ``QueueTask``.
     """
-    task = tasks.of(scenario, **settings)
+    task = tasks.task_for(scenario, **settings)
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     for name, entries in (("policies", policies), ("capacities", capacities), ("seeds", numbers)):
         if not entries:

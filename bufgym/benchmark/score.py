@@ -61,12 +61,12 @@ class Standing:
     """One policy in one cell, or over all."""
 
     policy: str
-    apart: str  # reason why it does not compete with the others; empty if it does
+    unranked_because: str  # reason why it does not compete with the others; empty if it does
     values: Mapping[str, Interval]  # by the key of a ``summary.Quantity``
 
     @property
     def ranked(self) -> bool:
-        return not self.apart
+        return not self.unranked_because
 
     def __getitem__(self, key: str) -> Interval:
         return self.values[key]

@@ -71,7 +71,7 @@ def make_policy(spec: PolicyLike) -> Policy:
     return policies.get(spec)
 
 
-def made(names: Iterable[str], folder: str | None = None) -> tuple[str, ...]:
+def loaded(names: Iterable[str], folder: str | None = None) -> tuple[str, ...]:
     """The sources in ``folder`` from which this process loaded policies of these names."""
     place, wanted = folder or os.getcwd(), {name.partition(":")[0] for name in names}
     return tuple(source for (home, source), name in _NAMES.items() if home == place and name in wanted)

@@ -157,7 +157,7 @@ def places(summary: Summary, standings: Sequence[Standing] | None = None) -> lis
     for rank, standing in enumerate(summary.overall if standings is None else standings, 1):
         known = standing.ranked and not math.isnan(standing[summary.rank_by].value)
         values = [pair(standing, quantity) for quantity in summary.quantities]
-        found.append(Place(rank if known else None, standing.policy, values, standing.apart))
+        found.append(Place(rank if known else None, standing.policy, values, standing.unranked_because))
     return found
 
 

@@ -23,9 +23,9 @@ from typing import Any
 from bufgym import policies
 from bufgym.benchmark import cluster, folder, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
-from bufgym.benchmark.rows import Row, has_pyarrow, read_rows, write_rows
+from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import by_trace, check_distinct, run
-from bufgym.benchmark.table import apart
+from bufgym.benchmark.table import unranked_among
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__, modules
 from bufgym.ground.errors import BufgymError
@@ -94,7 +94,7 @@ class Sweep:
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         specs = self.specs if task.baseline in self.specs else (*self.specs, task.baseline)
-        files = self.sources or sources.made(specs, self.home)
+        files = self.sources or sources.loaded(specs, self.home)
         complete = replace(
             self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds
         )
@@ -184,7 +184,7 @@ def run_sweep(
     if backend not in BACKENDS:
         raise BufgymError(f"backend = {backend!r}: must be one of {', '.join(BACKENDS)}")
     layout = sweep.task.layout
-    form = form or _form(out)
+    form = form or folder.form_of_rows(out)
     whole, parts = out / f"rows.{form}", out / "parts"
     shards = sweep.shards()
     out.mkdir(parents=True, exist_ok=True)
@@ -227,7 +227,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "episodes": sweep.task.describe([setting.scenario for setting in settings.values()], episodes),
         "command": command,
         "policies": [policy.name for policy in sweep.policies],
-        "unranked": apart(sweep.policies),
+        "unranked": unranked_among(sweep.policies),
         "capacities": list(sweep.capacities),
         "seeds": sweep.seeds,
         "changes": dict(sweep.changes),
@@ -254,12 +254,6 @@ def _fingerprint(scenario: Any) -> str:
     for motion in getattr(stream, "motion", ()):
         digest.update(motion.time_us.tobytes())
     return digest.hexdigest()[:16]
-
-
-def _form(out: Path) -> str:
-    """Format of the rows already in the folder, or else the best format available."""
-    held = {file.suffix for pattern in ("rows.*", "parts/*") for file in out.glob(pattern)}
-    return "csv" if not has_pyarrow() or (".csv" in held and ".parquet" not in held) else "parquet"
 
 
 def _read(file: Path, shard: Shard) -> list[Row]:

@@ -13,7 +13,7 @@ from bufgym.policies import Policy
 
 RunRows = Sequence[Mapping[str, Any]]
 Unranked = Mapping[str, str]
-"""Policies that do not compete, with the reasons, see ``apart``."""
+"""Policies that do not compete, with the reasons, see ``unranked_among``."""
 NOBODY: Unranked = MappingProxyType({})
 NONE = "–"  # No number
 
@@ -91,17 +91,17 @@ UPPER_BOUND = "regret rests on an upper bound of the best QoI, which is not exac
 """The note below them."""
 
 
-def means(rows: RunRows, floor: RunRows = (), alone: Collection[str] = ()) -> list[dict[str, Any]]:
+def means(rows: RunRows, unranked: Collection[str] = ()) -> list[dict[str, Any]]:
     """Average the rows of each policy and capacity, sorted by capacity ascending, then QoI descending.
 
-    Policies in ``alone``, which do not compete, come last within a capacity. None and NaN count as missing, and a mean
-    of missing numbers is NaN. The score is that of the cell, see ``measure.normalised_score``. ``floor`` holds rows of
-    Drop Oldest on the same episodes if it is not among ``rows``.
+    Policies in ``unranked``, which do not compete, come last within a capacity. None and NaN count as missing, and a
+    mean of missing numbers is NaN. The score is that of the cell, see ``measure.normalised_score``; it needs the rows
+    of Drop Oldest.
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["capacity"], row["policy"]), []).append(row)
-    base = {_episode(row): row["qoi"] for row in (*floor, *rows) if row["policy"] == BASELINE}
+    base = {_episode(row): row["qoi"] for row in rows if row["policy"] == BASELINE}
     entries: list[dict[str, Any]] = [
         {
             "policy": policy,
@@ -111,7 +111,7 @@ def means(rows: RunRows, floor: RunRows = (), alone: Collection[str] = ()) -> li
         }
         for (capacity, policy), group in groups.items()
     ]
-    return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in alone, -e["qoi"], e["policy"]))
+    return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in unranked, -e["qoi"], e["policy"]))
 
 
 def _episode(row: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -129,46 +129,48 @@ def _score(group: RunRows, base: Mapping[tuple[Any, ...], float]) -> float:
     return float(normalised_score(*sums))
 
 
-def same(rows: RunRows, alone: Collection[str] = ()) -> dict[str, list[str]]:
+def with_equal_rows(rows: RunRows, unranked: Collection[str] = ()) -> dict[str, list[str]]:
     """Group policies with equal rows: map the first, or Drop Oldest if it is among them, to the others.
 
-    One that is ``alone`` is never grouped with one that competes.
+    An ``unranked`` policy is never grouped with one that competes.
     """
-    fates: dict[str, list[str]] = {}
+    rows_of: dict[str, list[str]] = {}
     for row in rows:
-        fates.setdefault(row["policy"], []).append(repr({**row, "policy": ""}))
+        rows_of.setdefault(row["policy"], []).append(repr({**row, "policy": ""}))
     groups: dict[tuple[Any, ...], list[str]] = {}
-    for name in sorted(fates, key=lambda name: name != BASELINE):
-        groups.setdefault((name in alone, *sorted(fates[name])), []).append(name)
+    for name in sorted(rows_of, key=lambda name: name != BASELINE):
+        groups.setdefault((name in unranked, *sorted(rows_of[name])), []).append(name)
     return {first: others for first, *others in groups.values() if others}
 
 
-def told_once(alike: Mapping[str, Sequence[str]]) -> list[str]:
+def equal_rows_notes(alike: Mapping[str, Sequence[str]]) -> list[str]:
+    """Write a note for each group of ``with_equal_rows``."""
     return [f"note: {', '.join(others)}: the same rows here as {first}" for first, others in alike.items()]
 
 
-def apart(chosen: Iterable[Policy]) -> dict[str, str]:
+def unranked_among(policies: Iterable[Policy]) -> dict[str, str]:
     """The policies that do not compete, with the reasons."""
-    return {policy.name: policy.unranked_because for policy in chosen if not policy.ranked}
+    return {policy.name: policy.unranked_because for policy in policies if not policy.ranked}
 
 
-def of(
+def means_table(
     rows: RunRows,
-    floor: RunRows = (),
-    alone: Unranked = NOBODY,
+    unranked: Unranked = NOBODY,
     intervals: Mapping[tuple[int, str], str] = MappingProxyType({}),
+    hidden: str = "",
 ) -> Table:
-    """Make the table of ``means``, with one line for policies that are the ``same``.
+    """Make the table of ``means``, with one line for policies that have equal rows.
 
-    Score and regret are left out if no row has them. ``floor`` and ``alone``, see ``apart``, are as in ``means``.
-    ``intervals`` has the text behind the score at (L, policy).
+    Score and regret are left out if no row has them. ``intervals`` has the text behind the score at (L, policy). The
+    policy ``hidden`` gets no line; its rows serve the others' scores.
     """
-    alike = same(rows, alone)
-    others = {name for names in alike.values() for name in names}
-    entries = [entry for entry in means(rows, floor, alone) if entry["policy"] not in others]
+    shown = [row for row in rows if row["policy"] != hidden]
+    alike = with_equal_rows(shown, unranked)
+    without_line = {hidden, *(name for names in alike.values() for name in names)}
+    entries = [entry for entry in means(rows, unranked) if entry["policy"] not in without_line]
     bounded = {key for key in ("score", "regret") if any(not math.isnan(entry[key]) for entry in entries)}
     columns = [c for c in COLUMNS if c.key in bounded or c.key not in ("score", "regret")]
-    inexact = any(row.get("certified") is False and row.get("regret") is not None for row in rows)
+    inexact = any(row.get("certified") is False and row.get("regret") is not None for row in shown)
     titles = [REGRET_AT_MOST if c.key == "regret" and inexact else c.title for c in columns]
     by_capacity = [list(block) for _, block in itertools.groupby(entries, lambda entry: entry["capacity"])]
 
@@ -177,6 +179,6 @@ def of(
         return f"{c.write(entry[c.key])} {behind}".rstrip()
 
     blocks = [("", [[written(entry, c) for c in columns] for entry in block]) for block in by_capacity]
-    notes = [f"note: {policy} does not compete: {reason}" for policy, reason in alone.items()]
-    notes += [*told_once(alike), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(rows)]
+    notes = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked.items()]
+    notes += [*equal_rows_notes(alike), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(shown)]
     return Table(titles, blocks, notes)

@@ -42,7 +42,7 @@ def _bound() -> None:
 
 
 def _fleets() -> None:
-    _played(FleetVecEnv(1, 2, "lte", _L, parameters={"duration_s": 1.0}), 2)
+    _played(FleetVecEnv(1, 2, "lte", _L, duration_s=1.0), 2)
     run([policies.get("drop-oldest")], FleetScenario.of(2, "lte", duration_s=1.0), [_L], 1)
 
 

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 from cyclopts import Group, Parameter
 
 from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
 from bufgym.ground.tables import aligned
 from bufgym.ground.units import bytes_of, rate_or_number
 
 if TYPE_CHECKING:
+    from bufgym.benchmark.tasks import Task
     from bufgym.policies import Policy
 
 MAX_EPISODES = 100_000  # Limit on episodes of each trace; memory holds a row for each, times policies and capacities
@@ -102,10 +103,7 @@ class SuiteOptions:
     """Head of the Ray or Dask cluster (default: one on this machine)."""
 
 
-WHO = Group.create_ordered("Who runs")
-
-
-@Parameter(name="*", group=WHO)
+@Parameter(name="*", group=Group.create_ordered("Who runs"))
 @dataclass(frozen=True)
 class WhoOptions:
     policies: list[str] | None = None
@@ -117,6 +115,17 @@ class WhoOptions:
     seeds: Seeds | None = None
     """Episodes on each trace (default: 10; topics: 5; a recording: 1; or the suite's)."""
     policy_file: PolicyFile = None
+    against: str | None = None
+    """Compare every policy with this one, by the paired difference of their shares of AFR's regret (of QoI over
+    Robofleet's with topics, of the gain over AFR with a fleet)."""
+
+    def entrants(self, task: Task, suite: str | None) -> list[Policy]:
+        """The policies of ``--policies``, or those that the task takes, on this suite."""
+        return policies_of(self.policies or task.default_policies(suite or ""))
+
+    def rival(self) -> Policy | None:
+        """The policy of ``--against``."""
+        return None if self.against is None else one_policy(self.against)
 
 
 RESULTS = Group.create_ordered("Where results go", sort_key=1)
@@ -131,13 +140,15 @@ class OutOptions:
     """Format of the rows (default: parquet if it can)."""
     report: str | None = None
     """Write the page to this HTML file: ranking with intervals, charts, one episode (extra 'report')."""
+    by_topic: str | None = None
+    """With several topics: print each topic's numbers under this policy."""
 
     def file(self) -> Path | None:
         """The file of ``--out``; None for a folder or nothing. Another kind of file is an error."""
-        from bufgym.benchmark.rows import checked_target, has_pyarrow
+        from bufgym.benchmark.rows import checked_target
 
-        if self.format == "parquet" and self.out is not None and not has_pyarrow():
-            raise BufgymError(f"--format parquet needs pyarrow: {install('bench')} (or --format csv)")
+        if self.format == "parquet" and self.out is not None:
+            library("pyarrow", "bench", "--format parquet, unlike csv,")
         if self.out is None or not Path(self.out).suffix[1:].isalpha() or Path(self.out).is_dir():
             return None
         file = checked_target(self.out)
@@ -156,24 +167,22 @@ class OutOptions:
             raise BufgymError(f"--report {self.report}: must be FILE.html in a folder that there is")
         return file
 
-    def folder(self) -> Path | None:
-        """The folder of ``--out``, made before the long work, for a run that is not of a suite; None for no folder."""
-        if self.out is None or self.file() is not None:
+    def topic_policy(self, task: Task, players: Sequence[Policy]) -> str | None:
+        """The name of ``--by-topic``; an error if that policy does not run, or not on several topics."""
+        from bufgym.policies import get
+
+        if self.by_topic is None:
             return None
-        folder = Path(self.out)
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / "manifest.json").exists():
-            raise BufgymError(
-                f"{folder}: holds the run of a suite; choose another --out (its rows are never written over)"
-            )
-        for rows in sorted(folder.glob("rows.*")):
-            raise BufgymError(f"{rows}: holds an earlier run's rows; choose another --out, or remove that file")
-        return folder
+        if task.kind != "topics":
+            raise BufgymError("--by-topic needs several topics")
+        name = get(self.by_topic).name
+        if name not in {task.baseline, *(policy.name for policy in players)}:
+            raise BufgymError(f"--by-topic {self.by_topic}: not among the policies that run")
+        return name
 
-
-ByTopic: TypeAlias = Annotated[
-    str | None, Parameter(group=RESULTS, help="With several topics: print each topic's numbers under this policy.")
-]
+    def folder(self) -> Path | None:
+        """The folder of ``--out``; None for a file or nothing."""
+        return None if self.out is None or self.file() is not None else Path(self.out)
 
 
 def given(options: object, *names: str) -> dict[str, Any]:
@@ -234,10 +243,10 @@ def policies_of(texts: Sequence[str] | None) -> list[Policy]:
 def one_policy(text: str, file: str | None = None) -> Policy:
     """The single policy of ``--policies``, after the user's file was run."""
     load_policies(file)
-    chosen = policies_of([text])
-    if len(chosen) != 1:
+    policies = policies_of([text])
+    if len(policies) != 1:
         raise BufgymError(f"--policies {text}: must be one policy")
-    return chosen[0]
+    return policies[0]
 
 
 def load_policies(path: str | None) -> None:

@@ -1,6 +1,5 @@
 """``bufgym play``: a policy decides, in the terminal or in a film."""
 
-import importlib.util
 import os
 import re
 import sys
@@ -9,8 +8,9 @@ from typing import Any
 
 from bufgym.cli.listing import environments
 from bufgym.cli.options import Count, Least0, Natural, PolicyFile, one_policy
-from bufgym.ground.errors import BufgymError, install, unknown
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.files import replaced
+from bufgym.ground.libraries import library
 
 FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}  # Suffix of a film -> Pillow's name of the format
 
@@ -51,8 +51,8 @@ def play(
         raise unknown("environment", env, sorted(known))
     if out is not None and (out.suffix not in FILMS or not out.parent.is_dir()):
         raise BufgymError(f"--out {out}: must end in {' or '.join(FILMS)}, in a folder that exists")
-    if out is not None and importlib.util.find_spec("PIL") is None:
-        raise BufgymError(f"--out needs matplotlib and Pillow: {install('plot')}")
+    if out is not None:
+        library("PIL", "plot", "--out")
     mode = "ansi" if out is None else "rgb_array"
     world: Any = gymnasium.make(id, capacity=capacity, render_mode=mode).unwrapped
     player = Player(policy)

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Group, Parameter
 
 from bufgym.cli.bench import bench
-from bufgym.cli.options import ByTopic, Count, OutOptions, SuiteOptions, WhoOptions, given, refuse
+from bufgym.cli.options import Count, OutOptions, SuiteOptions, WhoOptions, given, refuse
 from bufgym.cli.scenarios import LinkOptions, OwnOptions, SendOptions, SharedOptions, StreamOptions
 from bufgym.ground.errors import BufgymError
 
@@ -21,7 +21,6 @@ def topics(
     send: Annotated[SendOptions, Parameter(group=Group.create_ordered("How the client sends"))] = SendOptions(),
     who: WhoOptions = WhoOptions(),
     out: OutOptions = OutOptions(),
-    by_topic: ByTopic = None,
 ) -> None:
     """Run policies side by side on several topics over one uplink.
 
@@ -30,11 +29,11 @@ def topics(
     """
     if config is None:
         refuse(given(link), "needs --config: a suite's episodes are frozen")
-        suite = _of(suite, "topics", "topics-v1")
+        suite = _suite_of(suite, "topics", "topics-v1")
     else:
         refuse(given(suite), "cannot go with --config")
     stream, shared = StreamOptions(**vars(link)), SharedOptions(**vars(send))
-    bench(suite=suite, stream=stream, own=OwnOptions(config=config), shared=shared, who=who, out=out, by_topic=by_topic)
+    bench(suite=suite, stream=stream, own=OwnOptions(config=config), shared=shared, who=who, out=out)
 
 
 def fleet(
@@ -49,10 +48,10 @@ def fleet(
     Args:
         robots: That share the cell, whose capacity grows with them (default: 16).
     """
-    bench(suite=_of(suite, "fleet", "fleet-v1"), shared=SharedOptions(robots=robots), who=who, out=out)
+    bench(suite=_suite_of(suite, "fleet", "fleet-v1"), shared=SharedOptions(robots=robots), who=who, out=out)
 
 
-def _of(options: SuiteOptions, kind: str, default: str) -> SuiteOptions:
+def _suite_of(options: SuiteOptions, kind: str, default: str) -> SuiteOptions:
     from bufgym.scenario import suites
 
     suite = suites.get(options.suite or default)

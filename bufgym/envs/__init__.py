@@ -20,4 +20,4 @@ if TYPE_CHECKING:
 __all__ = ["FleetEnv", "FleetVecEnv", "ObservationForm", "SenderEnv", "SenderVectorEnv", "parallel_env"]
 
 
-__getattr__ = on_demand(__name__)
+__getattr__ = on_demand(__name__, {"FleetEnv": "fleet", "parallel_env": "fleet", "ObservationForm": "observation"})

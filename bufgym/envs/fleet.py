@@ -1,8 +1,8 @@
 """``pettingzoo.ParallelEnv``: robots that share one cell, each with a send buffer of its own."""
 
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Mapping
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,9 +10,9 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym.envs.fleet_rows import FleetRows
+from bufgym.envs.fleet_rows import fleet_rows
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import OPTIONS, check_render_mode
+from bufgym.envs.options import RENDER_MODES, Options
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import needs
 from bufgym.scenario import FleetScenario, Uplink
@@ -36,8 +36,8 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     **Action, observation** of each robot are as in ``SenderEnv``: actions are ``Discrete(L + 2)``. The observation is
     a Dict with one key for each field of ``bufgym.model.observe`` and holds what that robot has on board.
-    ``infos[agent]["action_mask"]``, int8[L + 2], marks the valid actions; with ``mask_in_observation`` so does
-    ``observation["action_mask"]``. ``state()`` has every field of every robot, for critics that may see them all.
+    ``infos[agent]["action_mask"]``, int8[L + 2], marks the valid actions.
+    ``state()`` has every field of every robot, for critics that may see them all.
 
     **Reward** "team" gives each robot the mean over all robots of ``term``, which is the reward of ``SenderEnv``.
     "own" gives each robot its own. ``infos[agent]["reward_terms"]`` has each robot's own terms in any case.
@@ -52,9 +52,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     - ``capacity``: L of every robot, messages.
     - ``max_bytes``: B, bytes.
     - ``reward``: "team" or "own".
-    - ``term``, ``fields``, ``observation``, ``info``: as ``reward`` and the others in ``SenderEnv``.
-    - ``mask_in_observation``: whether observations have ``action_mask`` too.
-    - ``render_mode``: "ansi" or "rgb_array".
+    - ``term``: as ``reward`` in ``SenderEnv``, and so are its other options, but for ``bound`` and what is guided.
     - any further argument replaces a parameter of the uplink.
 
     ``reset(options={"episode": e})`` plays the ``FleetEpisode`` e; other options are ignored, as in PettingZoo.
@@ -62,7 +60,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     metadata = {
         "name": "bufgym_fleet_v0",
-        "render_modes": ["ansi", "rgb_array"],
+        "render_modes": list(RENDER_MODES),
         "is_parallelizable": True,
         "render_fps": 10,
     }
@@ -71,29 +69,17 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         self,
         robots: int = 4,
         scenario: str | Uplink | FleetScenario = "lte",
-        capacity: int = 8,
-        *,
-        reward: str = "team",
-        term: str | Mapping[str, float] = "retained",
-        max_bytes: int | None = None,
-        fields: Sequence[str] | None = None,
-        observation: str = "dict",
-        info: str = "full",
-        mask_in_observation: bool = False,
-        render_mode: str | None = None,
-        **parameters: Any,
+        capacity: int = Options.capacity,
+        **arguments: Any,
     ) -> None:
-        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        fleet = FleetScenario.of(robots, scenario, **parameters)
-        if mask_in_observation and observation == "flat":
-            raise BufgymError("mask_in_observation: an observation 'flat' has no place for it; 'dict' and 'slots' have")
-        options = {name: value for name, value in locals().items() if name in ("term", *OPTIONS)}
-        self.rows = FleetRows(1, fleet, capacity, **options)
-        self.mask_in_observation = mask_in_observation
+        self.rows = fleet_rows(1, FleetScenario.of(robots, scenario), capacity=capacity, **arguments)
+        self.render_mode = self.rows.options.render_mode
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []
+        self.np_random, _ = seeding.np_random()
         # PettingZoo seeds an agent by seeding its spaces, so each agent has its own.
-        self.observation_spaces: Spaces = {agent: self._space() for agent in self.possible_agents}
+        one = self.rows.observation_space
+        self.observation_spaces: Spaces = {agent: copy.deepcopy(one) for agent in self.possible_agents}
         actions = self.rows.capacity + 2
         self.action_spaces: Spaces = {agent: spaces.Discrete(actions) for agent in self.possible_agents}
         self.state_space = spaces.Box(0.0, 1.0, self.state().shape, np.float32)
@@ -110,7 +96,9 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     ) -> tuple[dict[str, Observation], Infos]:
         rows = self.rows
         if seed is not None:
-            rows.seed(0, seeding.np_random(seed)[0])
+            self.np_random, _ = seeding.np_random(seed)
+        if seed is not None or rows.streams[0] is None:
+            rows.seed(0, self.np_random)
         rows.reset(np.arange(len(rows)), [(options or {}).get("episode")])
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos(False)
@@ -157,19 +145,8 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     def close(self) -> None:
         """Do nothing: no resource is open."""
 
-    def _space(self) -> spaces.Space[Any]:
-        space: Any = copy.deepcopy(self.rows.observation_space)
-        if self.mask_in_observation:
-            space["action_mask"] = spaces.Box(0, 1, (self.rows.capacity + 2,), np.int8)
-        return cast(spaces.Space[Any], space)
-
     def _observations(self) -> dict[str, Observation]:
-        rows = self.rows
-        observations = {agent: rows.observation(i) for i, agent in enumerate(self.possible_agents)}
-        if self.mask_in_observation:
-            for observation, mask in zip(observations.values(), rows.output.action_mask.copy(), strict=True):
-                observation["action_mask"] = mask
-        return observations
+        return {agent: self.rows.observation(i) for i, agent in enumerate(self.possible_agents)}
 
     def _infos(self, terminated: bool) -> Infos:
         return {agent: self.rows.info(i, terminated) for i, agent in enumerate(self.possible_agents)}

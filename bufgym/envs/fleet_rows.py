@@ -1,12 +1,12 @@
 """Rows whose senders are the robots of cells, and the batch of them from which one shared policy learns."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.guided import is_guided
+from bufgym.envs.options import Options, read_arguments
 from bufgym.envs.rows import Rows
 from bufgym.envs.step import step_cells
 from bufgym.envs.vector import SenderVectorEnv
@@ -25,29 +25,17 @@ class FleetRows(Rows):
 
     keeps_slots = True  # for a state of all fields
 
-    def __init__(
-        self,
-        cells: int,
-        scenario: FleetScenario,
-        capacity: int,
-        *,
-        reward: str = "team",
-        term: str | Mapping[str, float] = "retained",
-        **options: Any,
-    ) -> None:
-        """``reward`` is "team" or "own", ``term`` is the reward of ``Rows``, and the rest is as in ``Rows``."""
+    def __init__(self, cells: int, scenario: FleetScenario, options: Options, reward: str) -> None:
+        """``reward`` is "team" or "own"; that of ``options`` is its term."""
         if reward not in ("team", "own"):
             raise BufgymError(
                 f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
             )
-        is_guided(options.get("actions", "slots"), options.get("fields"), "a cell of robots")
-        n = cells * scenario.robots
-        super().__init__(n, scenario.uplink, capacity, reward=term, **options)
-        self.reward = reward
-        self._draw = self.from_pool(scenario.draw)
-        self.robots = scenario.robots
+        options.check_without_own_queue("a cell of robots")
+        super().__init__(cells * scenario.robots, cast(Any, scenario), options)
+        self.reward, self.robots = reward, scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
-        self._threads = Threads(np.arange(cells), whole("num_threads", options.get("num_threads", 1), 1))
+        self._threads = Threads(np.arange(cells), options.num_threads)
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
         """Give row ``i`` streams of its own if it is the first of its cell; other rows need none."""
@@ -82,6 +70,14 @@ class FleetRows(Rows):
         return np.repeat(own.reshape(len(self.fleet), self.robots).mean(axis=1), self.robots)
 
 
+def fleet_rows(
+    cells: int, scenario: FleetScenario, *, reward: str = "team", term: Any = Options.reward, **arguments: Any
+) -> FleetRows:
+    """Make the rows of ``cells`` cells from the arguments of a fleet's environment; see ``FleetEnv``."""
+    uplink, options = read_arguments(scenario.uplink, reward=term, **arguments)
+    return FleetRows(cells, FleetScenario.of(scenario.robots, cast(Uplink, uplink)), options, reward)
+
+
 class FleetVecEnv(SenderVectorEnv):
     """``cells`` cells with N ``robots`` each, as a batch of cells x N environments. Robot r of cell c is row c N + r.
 
@@ -96,7 +92,7 @@ class FleetVecEnv(SenderVectorEnv):
 
     **Action, observation, episode end** of each row and the other arguments are as in ``SenderVectorEnv``, with these
     differences. The robots of a cell begin and end together. ``reset(seed=s)`` seeds cell c with s + c N.
-    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell. ``parameters`` replace the uplink's parameters.
+    ``options["episodes"]`` holds a ``FleetEpisode`` for each cell.
 
     **Reward** "team" gives each robot the mean over its cell of ``term``, the reward of the other environments; "own"
     gives each robot its own. ``info["reward_terms"]`` has each robot's own terms in any case.
@@ -107,13 +103,11 @@ class FleetVecEnv(SenderVectorEnv):
         cells: int = 1,
         robots: int = 4,
         scenario: str | Uplink | FleetScenario = "lte",
-        capacity: int = 8,
-        *,
-        parameters: Mapping[str, Any] | None = None,
-        **options: Any,
+        capacity: int = Options.capacity,
+        **arguments: Any,
     ) -> None:
-        fleet: Any = FleetScenario.of(robots, scenario, **(parameters or {}))
-        super().__init__(whole("cells", cells, 1), fleet, capacity, **options)
+        fleet: Any = FleetScenario.of(robots, scenario)
+        super().__init__(whole("cells", cells, 1), fleet, capacity, **arguments)
 
-    def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
-        return FleetRows(n, scenario, capacity, **options)
+    def _make_rows(self, n: int, scenario: Any, **arguments: Any) -> Rows:
+        return fleet_rows(n, scenario, **arguments)

@@ -4,27 +4,19 @@
 (``bufgym.policies.guided``), which learns of every decision.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bufgym.envs.options import GUIDED, Options
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
-from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel, stretch
-from bufgym.model.observe import Field
-from bufgym.policies.guided import BASE, INPUTS, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
+from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
 from bufgym.sim.state import Batch
 from bufgym.sim.view import arrival_of, view
-
-GUIDED = "guided"
-ACTIONS = ("slots", GUIDED)  # What an action is: the slot that goes, or numbers of the rule
-INPUT_FIELDS = tuple(
-    Field(name, "context", "link", "see its meaning", meaning, -4.0, 4.0) for name, meaning in INPUTS.items()
-)
-"""Fields observed with ``fields="guided"``."""
 
 
 class Guide(NamedTuple):
@@ -68,23 +60,12 @@ def write_guided(batch: Batch, i: int, ended: bool, output: StepOutput, guide: G
         inputs(buffer, arrival, guide.memory[i], guide.base, stretch(output.flat, i, 0, N_INPUTS))
 
 
-def is_guided(actions: str, fields: Any, why_not: str = "") -> bool:
-    """Whether actions or fields are guided; ``why_not`` says why they can't be here."""
-    if not isinstance(actions, str) or actions not in ACTIONS:
-        raise unknown("actions", str(actions), ACTIONS)
-    seen = isinstance(fields, str) and fields == GUIDED
-    if why_not and (actions == GUIDED or seen):
-        name = "actions" if actions == GUIDED else "fields"
-        raise BufgymError(f"{name} = {GUIDED!r}: the rule serves one queue on a link of its own, not {why_not}")
-    return actions == GUIDED or seen
-
-
 class Guiding:
-    """The guided part of n rows with L = ``capacity``."""
+    """The guided part of n rows."""
 
-    def __init__(self, n: int, capacity: int, actions: str, fields: str | Sequence[str] | None) -> None:
-        self.acts, self.sees = actions == GUIDED, fields == GUIDED
-        memory = linear(GUIDED, np.zeros((N_OUTPUTS, N_INPUTS))).new_memory(n, capacity)
+    def __init__(self, n: int, options: Options) -> None:
+        self.acts, self.sees = options.acts_guided, options.sees_guided
+        memory = linear(GUIDED, np.zeros((N_OUTPUTS, N_INPUTS))).new_memory(n, options.capacity)
         self.guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(self.acts), int(self.sees))
         self._nothing = np.zeros(n, np.int64)
         self.action_space = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)

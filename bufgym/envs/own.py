@@ -18,7 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import at, compile_for, kernel, named, stretch
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
-from bufgym.model.observe import OwnField, OwnTerm
+from bufgym.model.observe import Field, OwnTerm
 from bufgym.policies.registry import view_type
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch, batch_type
@@ -94,7 +94,7 @@ def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.floa
 
 def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, row: NDArray[np.float32]) -> None:
     """Write a field into a row of numbers by calling its function, compiled or not, from Python."""
-    field, first = cast(OwnField, place.field), place.first
+    field, first = place.field, place.first
     if field.per == "context":
         row[first] = field.function(buffer, arrival)
     else:
@@ -106,7 +106,7 @@ def write_in_python(place: Place, buffer: Buffer, arrival: Any, arriving: bool, 
     check_bounds(field, row[first : first + place.entries])
 
 
-def check_bounds(field: OwnField, numbers: NDArray[np.float32]) -> None:
+def check_bounds(field: Field, numbers: NDArray[np.float32]) -> None:
     """Raise a BufgymError if the field is outside its registered bounds."""
     inside = (numbers >= np.float32(field.low)) & (numbers <= np.float32(field.high))  # False for NaN
     if not inside.all():
@@ -118,8 +118,9 @@ class OwnFields:
     """Your own fields that a form observes, filled after each step."""
 
     def __init__(self, form: ObservationForm) -> None:
-        self._places = [(place, place.field) for place in form.places if isinstance(place.field, OwnField)]
-        self._compiled = [_compiled("field", field.per, field) if field.compile else None for _, field in self._places]
+        self._places = form.own_places
+        fields = [place.field for place in self._places]
+        self._compiled = [_compiled("field", field.per, field) if field.compile else None for field in fields]
 
     def __bool__(self) -> bool:
         return bool(self._places)
@@ -127,10 +128,10 @@ class OwnFields:
     def write(self, batch: Batch, output: StepOutput) -> None:
         """Write each field of every row that waits for a decision; other rows are 0 already."""
         records = named(batch)
-        for (place, field), compiled in zip(self._places, self._compiled, strict=True):
+        for place, compiled in zip(self._places, self._compiled, strict=True):
             if compiled is not None:
                 compiled(batch, place.first, output.flat)
-                check_bounds(field, output.flat[:, place.first : place.first + place.entries])
+                check_bounds(place.field, output.flat[:, place.first : place.first + place.entries])
                 continue
             for i in np.flatnonzero(batch.senders["waiting"] != NOTHING_WAITS).tolist():
                 arriving = bool(batch.senders["waiting"][i] == ARRIVAL_WAITS)
@@ -195,6 +196,9 @@ class OwnTerms:
         self._memory = [np.zeros((n, max(1, len(term.memory)))) for term in terms]
         self._compiled = [_compiled("reward term", "term", term) if term.compile else None for term in terms]
         self._marks = np.zeros((n, 4), np.int64)
+        for term in terms:
+            if term.prepare is not None:
+                term.prepare()
 
     def __bool__(self) -> bool:
         return bool(self._terms)
@@ -208,13 +212,16 @@ class OwnTerms:
 
     def write(self, batch: Batch, output: StepOutput) -> None:
         """Write each term of the step that all rows have just taken."""
-        records, ended = named(batch), output.terminated
+        ended = output.terminated
         for k, term in enumerate(self._terms):
             column, parameters, compiled = self._first + k, self._parameters[k], self._compiled[k]
             if compiled is not None:
                 compiled(batch, self._marks, ended, self._memory[k], parameters, column, output.reward_terms)
             else:
-                for i in range(len(ended)):
+                output.reward_terms[:, column] = 0.0
+                asked = np.flatnonzero(ended | (not term.at_end)).tolist()
+                records = named(batch) if asked else None
+                for i in asked:
                     step = _read_only_step(records, i, self._marks, bool(ended[i]), parameters)
                     output.reward_terms[i, column] = term.function(step, self._memory[k][i])
             if not np.isfinite(output.reward_terms[:, column]).all():
@@ -276,7 +283,7 @@ def _writer(kind: str, several: bool) -> Any:
     return compile_for(signature, loops[kind])
 
 
-def _compiled(what: str, kind: str, own: OwnField | OwnTerm) -> Callable[..., None]:
+def _compiled(what: str, kind: str, own: Field | OwnTerm) -> Callable[..., None]:
     """The loop of ``_writer`` over this field's or term's function."""
     try:
         function = compile_for(_types()[kind], own.function)

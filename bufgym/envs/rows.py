@@ -3,26 +3,26 @@
 ``Rows`` has a link for each sender; in ``fleet_rows`` the robots of a cell share one.
 """
 
-import inspect
 import math
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym import scenario as scenarios
-from bufgym.envs.guided import INPUT_FIELDS, Guiding, is_guided
+from bufgym.envs.guided import Guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
+from bufgym.envs.options import Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
+from bufgym.envs.plausible import keep_plausible
 from bufgym.envs.step import step_rows
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.threads import Threads
-from bufgym.model.checks import is_number, whole
+from bufgym.model.checks import is_number
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
     OWN_TERMS,
@@ -35,14 +35,11 @@ from bufgym.model.observe import (
     terms_for,
 )
 from bufgym.oracle.measure import MEASURED, measured
+from bufgym.policies.guided import INPUT_FIELDS
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
 from bufgym.sim.senders import Begun
-
-INFOS = ("full", "steady", "mask", "none")
-"""How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
-nothing. At an episode's end the summary is always there."""
 
 
 def reward_weights(
@@ -72,13 +69,6 @@ def reward_weights(
     return np.array(numbers, np.float64), tuple(own.values())
 
 
-def check_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
-    """Check that ``render_mode`` is one of ``known``, and return it."""
-    if render_mode is not None and render_mode not in known:
-        raise BufgymError(f"render_mode = {render_mode!r}: must be one of {known}")
-    return render_mode
-
-
 NO_ACTIONS: NDArray[np.int64] = np.zeros(0, np.int64)
 """Argument of ``step_rows`` and ``step_cells`` where episodes begin."""
 
@@ -102,72 +92,60 @@ class Rows:
 
     keeps_slots = False  # whether slot fields are computed even where none is observed
 
-    def __init__(
-        self,
-        n: int,
-        scenario: str | Scenario,
-        capacity: int,
-        *,
-        max_bytes: int | None = None,
-        decide_at: str = "arrival",
-        reward: str | Mapping[str, float] = "retained",
-        actions: str = "slots",
-        fields: str | Sequence[str] | None = None,
-        observation: str = "dict",
-        info: str = "full",
-        bound: bool = False,
-        num_threads: int = 1,
-        pool: int | None = None,
-        **parameters: Any,
-    ) -> None:
-        if info not in INFOS:
-            raise BufgymError(f"info = {info!r}: must be one of {', '.join(map(repr, INFOS))}")
-        self.shows_all, self.is_steady = info in ("full", "steady"), info == "steady"
-        self.shows_mask = info != "none" and actions == "slots"
-        self.scenario = scenarios.get(scenario, (*OPTIONS, *CALLED), **parameters)
-        topics = self.scenario.topics
+    def __init__(self, n: int, scenario: Scenario, options: Options) -> None:
+        several_topics = bool(scenario.topics)
+        if several_topics:
+            options.check_without_own_queue("several topics")
+        self.scenario, self.options = scenario, options
+        self._shows_all, self._shows_mask, self._is_steady = options.shows_all, options.shows_mask, options.is_steady
         self.senders = Senders(
             n,
-            capacity,
-            self.scenario.value,
-            max_messages=self.scenario.max_messages,
-            max_bytes=max_bytes,
-            decide_at=decide_at,
-            topics=topics,
+            options.capacity,
+            scenario.value,
+            max_messages=scenario.max_messages,
+            max_bytes=options.max_bytes,
+            decide_at=options.decide_at,
+            topics=scenario.topics,
         )
         self.capacity = self.senders.capacity
-        if not isinstance(bound, bool | np.bool_):
-            raise BufgymError(f"bound = {bound!r}: must be True or False")
-        self.bound = bool(bound)
-        if bound and topics:
-            raise BufgymError("bound = True: the clairvoyant is known for one queue, not for several topics")
-        self.weights, own_terms = reward_weights(reward, bool(topics))
-        self.terms = terms_for(bool(topics)) + own_terms
-        self._term_names = [term.name for term in self.terms]
-        slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if topics else ())
-        context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if topics else ())
-        guided = is_guided(actions, fields, "several topics" if topics else "")
-        self.guiding = Guiding(n, self.capacity, actions, fields) if guided else None
+        self.streams: list[Streams | None] = [None] * n
+        self._draw: Callable[[Streams], Any] = scenario.draw
+        if options.pool is not None:
+            self._draw = Pool(scenario.draw, options.pool)
+        self._threads = Threads(np.arange(n), options.num_threads)
+
+        self.guiding = Guiding(n, options) if options.acts_guided or options.sees_guided else None
         self._guide = self.guiding and self.guiding.guide
-        self._acts = self.guiding if self.guiding and self.guiding.acts else None
-        if self.guiding and self.guiding.sees:
-            slot_fields, context_fields, fields = (), INPUT_FIELDS, None
-        context = [field.name for field in context_fields]
-        fields = context if isinstance(fields, str) and fields == "compact" else fields
-        self._has_slots = self.keeps_slots or not all(name in context or own_field(name) for name in fields or [""])
-        tables = slot_fields if self._has_slots else (), context_fields
-        self.form = ObservationForm(observation, *tables, self.capacity, fields)
-        self.observation_space, self._handed = self.form.space, Handed(self.form)
+        self._acts = self.guiding if options.acts_guided else None
         self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.capacity + 2)
-        self.streams, self._pool_size = cast(list[Streams | None], [None] * n), pool
-        self._draw = self.from_pool(self.scenario.draw)
+
+        self.weights, own_terms = reward_weights(options.reward, several_topics)
+        self.terms = terms_for(several_topics) + own_terms
+        self._term_names = [term.name for term in self.terms]
         self.rewarded = np.zeros((n, len(self.terms)))
-        self._own_fields = OwnFields(self.form)
         self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
-        self._sums_here = bool(self._own_terms)
+
+        self.form = self._observed()
+        self.observation_space, self._handed = self.form.space, Handed(self.form)
+        self._puts_mask = self.form.mask is not None
+        self._own_fields = OwnFields(self.form)
+        self._sums_here = bool(own_terms)
         self._has_own = bool(self._own_fields) or self._sums_here
         self.output = self.new_output()
-        self._threads = Threads(np.arange(n), whole("num_threads", num_threads, 1))
+
+    def _observed(self) -> ObservationForm:
+        """The fields to observe; without slot fields where none is, as a step computes those for every message."""
+        options, several_topics = self.options, bool(self.scenario.topics)
+        if options.sees_guided:
+            return ObservationForm(options.observation, (), INPUT_FIELDS, self.capacity, mask=options.mask_keys)
+        slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if several_topics else ())
+        context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if several_topics else ())
+        context = [field.name for field in context_fields]
+        chosen = context if isinstance(options.fields, str) and options.fields == "compact" else options.fields
+        if not self.keeps_slots and chosen and all(name in context or own_field(name) for name in chosen):
+            slot_fields = ()
+        form = options.observation
+        return ObservationForm(form, slot_fields, context_fields, self.capacity, chosen, options.mask_keys)
 
     def __len__(self) -> int:
         return len(self.senders)
@@ -184,12 +162,8 @@ class Rows:
             np.zeros(n),
             np.zeros(n, np.int64),
             np.zeros(n, np.bool_),
-            np.full(1, self._has_slots, np.int64),
+            np.full(1, self.form.has_slots, np.int64),
         )
-
-    def from_pool(self, draw: Callable[[Streams], Any]) -> Callable[[Streams], Any]:
-        """Return ``draw``, or with a pool a function that takes episodes from it."""
-        return draw if self._pool_size is None else Pool(draw, self._pool_size)
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
         """Give row ``i`` streams of its own, derived from the generator that Gymnasium seeded."""
@@ -238,6 +212,8 @@ class Rows:
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
         step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self._guide)
+        if self.options.mask == "plausible":
+            keep_plausible(self.senders.batch, rows, self.output.action_mask)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""
@@ -262,24 +238,25 @@ class Rows:
 
     def info(self, i: int, ended: bool) -> dict[str, Any]:
         """Gymnasium's info of row ``i`` after a reset or a step; see ``INFOS``."""
-        info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self.shows_mask else {}
-        if not (self.shows_all or ended):
+        info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self._shows_mask else {}
+        if not (self._shows_all or ended):
             return info
-        if self.shows_all:
+        if self._shows_all:
             info["qoi"] = self.output.qoi.item(i)
             info["invalid"] = self.output.invalid.item(i)
             info["reward_terms"] = dict(zip(self._term_names, self.output.reward_terms[i].tolist(), strict=True))
-        if ended or self.is_steady:
+        if ended or self._is_steady:
             info |= {name: number.item() for name, number in self.summary(i).items()}
-        if self.bound and ended:
-            info |= measured(self.senders, i, info["qoi"])
-        elif self.bound and self.is_steady:
-            info |= dict.fromkeys(MEASURED, math.nan)
+            if self.options.bound:
+                info |= measured(self.senders, i, info["qoi"]) if ended else dict.fromkeys(MEASURED, math.nan)
         return info
 
     def observation(self, i: int | None = None) -> Observation:
         """The present observation of all rows, as views of ``output``; of row ``i`` alone, as a copy."""
-        return self.form.of(self.output.flat) if i is None else self._handed.of(self.output.flat[i])
+        if i is None:
+            return self.form.masked(self.form.of(self.output.flat), self.output.action_mask)
+        observation = self._handed.of(self.output.flat[i])
+        return self.form.masked(observation, self.output.action_mask[i].copy()) if self._puts_mask else observation
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""
@@ -333,9 +310,3 @@ class Rows:
             self.seed(i, seeding.np_random()[0])
             return self._next_episode(i)
         return self._draw(streams), streams.policy
-
-
-OPTIONS = tuple(inspect.getfullargspec(Rows).kwonlyargs)
-"""Names of the options of every environment."""
-CALLED = ("capacity", "render_mode", "max_episode_steps", "autoreset_mode")
-"""Names of further arguments of environments and of ``gym.make``."""

@@ -1,6 +1,5 @@
 """``gymnasium.Env``: one sender."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -8,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation
-from bufgym.envs.rows import NUMBERED, OPTIONS, Rows, check_entries, check_render_mode
+from bufgym.envs.options import RENDER_MODES, Options, read_arguments
+from bufgym.envs.rows import NUMBERED, Rows, check_entries
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Scenario
 
@@ -58,11 +58,19 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``actions``: "slots", as above, or "guided" (one queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule
       gap-price for this decision, by the table ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is
       no mask, and no invalid action.
+    - ``mask``: "valid", or "plausible" (one queue) for the few valid actions that a good rule chooses among: accept,
+      reject, evict what leaves one of the two smallest gaps, evict the head when its turn is near. The others stay
+      valid, and do what they say.
     - ``fields``: names of the fields to observe, your own included; by default all of the tables. "compact" means
       all of the context's. "guided" means ``bufgym.policies.guided.INPUTS``, which lie in [-4, 4].
     - ``observation``: "dict", "flat" or "slots".
     - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,
       and at an episode's end its summary; "none" has only this summary.
+    - ``mask_in_observation``: whether observations hold the action mask, for libraries that look for it there. True
+      puts ``action_mask`` beside the fields. Two names, or the library they belong to, make a nested dict: "rllib"
+      (``observations``, ``action_mask``), "tianshou" (``obs``, ``mask``), "pettingzoo" (``observation``,
+      ``action_mask``). A "flat" observation is always nested, by True as for "pettingzoo".
+    - ``mask_dtype``: "int8" or "bool", of the mask in observations; in ``info`` it is int8, which Gymnasium samples by.
     - ``render_mode``: "ansi" or "rgb_array".
     - ``bound``: whether the last ``info`` also has ``clairvoyant``, ``regret`` and ``score``, for one queue only. The
       clairvoyant is the best H or an upper bound of it. The score is 0 for Drop Oldest and 1 for the clairvoyant, NaN
@@ -81,28 +89,11 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     after the end of the episode.
     """
 
-    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
 
-    def __init__(
-        self,
-        scenario: str | Scenario = "lte",
-        capacity: int = 8,
-        *,
-        max_bytes: int | None = None,
-        decide_at: str = "arrival",
-        reward: str | Mapping[str, float] = "retained",
-        actions: str = "slots",
-        fields: str | Sequence[str] | None = None,
-        observation: str = "dict",
-        info: str = "full",
-        render_mode: str | None = None,
-        bound: bool = False,
-        pool: int | None = None,
-        **parameters: Any,
-    ) -> None:
-        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        options = {name: value for name, value in locals().items() if name in OPTIONS}
-        self.rows = Rows(1, scenario, capacity, **options, **parameters)
+    def __init__(self, scenario: str | Scenario = "lte", capacity: int = Options.capacity, **arguments: Any) -> None:
+        self.rows = Rows(1, *read_arguments(scenario, capacity=capacity, **arguments))
+        self.render_mode = self.rows.options.render_mode
         self.observation_space = self.rows.observation_space
         self.action_space = self.rows.action_space
         self._action = np.zeros(1, np.int64)

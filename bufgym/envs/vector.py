@@ -10,8 +10,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.observation import Observation, Reused
-from bufgym.envs.rows import Rows, check_entries, check_render_mode
+from bufgym.envs.observation import BufferPool, Observation
+from bufgym.envs.options import RENDER_MODES, Options, read_arguments
+from bufgym.envs.rows import Rows, check_entries
 from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
@@ -24,8 +25,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     apart.
 
     ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
-    ``autoreset_mode``: one of Gymnasium's. ``num_threads``: threads that share the rows of a step, by default 1; they
-    do not change results. ``options``: the other arguments of ``SenderEnv``.
+    ``autoreset_mode``: one of Gymnasium's, or its value or name ("SameStep", "SAME_STEP").
+    ``num_threads``: threads that share the rows of a step, by default 1; they do not change results. ``arguments``: the
+    others of ``SenderEnv``.
 
     ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do. A sequence seeds row by row.
     ``reset`` takes two options. ``reset_mask``, bool[n], selects rows. ``episodes`` has an entry for each row: an
@@ -37,32 +39,31 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     from a step are never written again while anyone holds them.
     """
 
-    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self,
         num_envs: int = 1,
         scenario: str | Scenario = "lte",
-        capacity: int = 8,
+        capacity: int = Options.capacity,
         *,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        **options: Any,
+        **arguments: Any,
     ) -> None:
-        rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity, **options)
+        rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity=capacity, **arguments)
         if max_episode_steps is not None and max_episode_steps < 1:
             raise BufgymError(f"max_episode_steps = {max_episode_steps}: must be >= 1, or None for no limit")
-        if rows.is_steady:
+        if rows.options.is_steady:
             raise BufgymError("info = 'steady': is for recorders of a single environment; a batch has 'full'")
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
+        modes = {text: mode for mode in AutoresetMode for text in (mode, mode.value, mode.name)}
+        if autoreset_mode not in list(modes):
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
-            raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}") from None
-        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
+            raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}")
+        self.autoreset_mode = modes[autoreset_mode]
+        self.render_mode = rows.options.render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.rows = rows
+        self.rows, self._puts_mask = rows, rows.form.mask is not None
         self.num_envs = len(rows)
         self.max_episode_steps = max_episode_steps
         self.single_observation_space = rows.observation_space
@@ -72,13 +73,13 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done, self._any_done = np.zeros(self.num_envs, np.bool_), False
         self._every_row = np.ones(self.num_envs, np.bool_)
-        self._handed = Reused(self._new_handed)
+        self._buffers = BufferPool(self._new_buffers)
         self._renew_output()
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
 
-    def _make_rows(self, n: int, scenario: Any, capacity: int, **options: Any) -> Rows:
-        return Rows(n, scenario, capacity, **options)
+    def _make_rows(self, n: int, scenario: Any, **arguments: Any) -> Rows:
+        return Rows(n, *read_arguments(scenario, **arguments))
 
     @property  # type: ignore[misc]
     def np_random(self) -> Any:
@@ -171,7 +172,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             column[at] = of_ended
             last |= {name: column, f"_{name}": done}
         ended = done & rows.output.terminated
-        if rows.bound and ended.any():
+        if rows.options.bound and ended.any():
             for name, column in rows.bounds(ended, rows.output.qoi).items():
                 last |= {name: column, f"_{name}": ended}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
@@ -191,14 +192,17 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _observed(self) -> Observation:
         """The present observation; a dict of its own each time."""
-        return self._views.copy() if self._views else self.rows.observation()
+        if not self._views:
+            return self.rows.observation()
+        views = self._views.copy()
+        return self.rows.form.masked(views, self.rows.output.action_mask) if self._puts_mask else views
 
-    def _new_handed(self) -> Any:
+    def _new_buffers(self) -> Any:
         """(New arrays for a step, the views that are its observation, its info), and all these arrays."""
         rows, output = self.rows, self.rows.new_output()
-        shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.shows_mask else {}
+        shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.options.shows_mask else {}
         terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(rows.terms)}
-        if rows.shows_all:
+        if rows.options.shows_all:
             shown |= {"qoi": output.qoi, "invalid": output.invalid, "reward_terms": self._marked(terms)}
         views = rows.form.of(output.flat) if rows.form.is_view else {}
         return (output, views, self._marked(shown)), [*output, *views.values(), *terms.values()]
@@ -222,7 +226,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _renew_output(self, keep: bool = False) -> None:
         """Let the next step write into arrays that nobody outside holds; ``keep`` copies the last step's results."""
         rows, before = self.rows, self.rows.output
-        rows.output, self._views, self._shown = self._handed.take()
+        rows.output, self._views, self._shown = self._buffers.take()
         if keep and rows.output is not before:
             for new, old in zip(cast(Any, rows.output), before, strict=True):
                 new[...] = old

@@ -24,12 +24,22 @@ def printable(text: object) -> str:
 
 
 class BufgymError(ValueError):
-    """A value that bufgym cannot work with; the message names the value and the broken rule, on one line."""
+    """A value that bufgym cannot work with; the message names the value and the broken rule, on one line.
+
+    It is a ``ValueError``, and so are the errors below.
+    """
 
     def __init__(self, message: object = "") -> None:
         text = printable(message)
         # The message begins with the place and ends with the rule; the value between may be as long as a file.
         super().__init__(text if len(text) <= _MOST_MESSAGE else f"{text[:1000]}...{text[-500:]}")
+
+
+class UnknownArgumentError(BufgymError, TypeError):
+    """A keyword argument that nothing takes; also a ``TypeError``, whose message begins with Python's own words.
+
+    So a library that tries an argument and leaves it out at Python's error goes on.
+    """
 
 
 class TraceError(BufgymError):

@@ -16,7 +16,12 @@ def needs(libraries: str | tuple[str, ...], extra: str, user: str = "bufgym") ->
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in ((libraries,) if isinstance(libraries, str) else libraries):
             raise
-        raise BufgymError(f"{user} needs {error.name}: {install(extra)}") from None
+        raise missing(user, error.name, extra) from None
+
+
+def missing(user: str, library: str | None, extra: str) -> BufgymError:
+    """The error that ``user`` needs a library that is not installed, with the command that installs its extra."""
+    return BufgymError(f"{user} needs {library}: {install(extra)}")
 
 
 def library(name: str, extra: str, user: str = "bufgym") -> Any:

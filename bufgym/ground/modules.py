@@ -6,14 +6,12 @@ leaderboards, results and configurations of clients, therefore never get here.
 
 from __future__ import annotations
 
-import ast
-import functools
 import importlib.util
 import inspect
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -116,22 +114,16 @@ def takes(function: Any, count: int) -> bool:
     return True
 
 
-def on_demand(package: str) -> Callable[[str], Any]:
-    """Make a room's ``__getattr__``: names imported ``if TYPE_CHECKING`` are imported when first asked for."""
+def on_demand(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:
+    """Make a room's ``__getattr__`` (PEP 562), which imports a public name when it is first asked for.
 
-    @functools.cache
-    def places() -> dict[str, str]:
-        """The module of each public name; a module's own name maps to its room."""
-        blocks = [node for node in ast.parse(inspect.getsource(sys.modules[package])).body if isinstance(node, ast.If)]
-        lines = [line for block in blocks for line in block.body if isinstance(line, ast.ImportFrom)]
-        return {name.name: str(line.module) for line in lines for name in line.names}
+    ``places`` maps each name to the room's module that defines it; a module's own name maps to itself.
+    """
 
     def get(name: str) -> Any:
-        place = None if name.startswith("__") else places().get(name)
-        if place is None:
+        if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        if place == package:
-            return importlib.import_module(f"{package}.{name}")
-        return getattr(importlib.import_module(place), name)
+        module = importlib.import_module(f"{package}.{places[name]}")
+        return module if places[name] == name else getattr(module, name)
 
     return get

@@ -13,4 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Buffer", "Link", "Topic", "Value", "observe", "qoi"]
 
-__getattr__ = on_demand(__name__)
+__getattr__ = on_demand(
+    __name__,
+    {"observe": "observe", "qoi": "qoi", "Buffer": "buffer", "Link": "link", "Value": "qoi", "Topic": "topics"},
+)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import records
+from bufgym.ground.kernel import kernel, records
 from bufgym.model.buffer import MAX_CAPACITY, TOPIC
 from bufgym.model.checks import is_number, whole
 from bufgym.model.qoi import Value
@@ -129,3 +129,13 @@ def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArr
     values = v.array if len(arrays) == 1 else np.concatenate(arrays)
     values.flags.writeable = False
     return table, values
+
+
+@kernel
+def age_between(newest_us: float, from_us: float, until_us: float) -> float:
+    """Age of information at the server integrated over a time in which nothing is received, s^2.
+
+    The newest message received so far arrived at ``newest_us``.
+    """
+    from_s, until_s = (from_us - newest_us) / 1e6, (until_us - newest_us) / 1e6
+    return (from_s + until_s) / 2 * (until_s - from_s)

@@ -49,71 +49,22 @@ def find_steps(
 ) -> int:
     """Write the steps of sender ``i``'s episode from ``place`` on; return their end, NO_ROOM or NO_WORK_SPACE.
 
-    ``latest``, ``gain`` and ``follow`` are work space, each [2, room for the steps of one message].
+    ``latest``, ``gain`` and ``follow`` are work space, each [2, room for the steps of one message]. One of the two
+    lists holds the steps found so far, and the other takes them merged with those of the next message.
     """
-    b, room, ends = ahead.link[i, 0], ahead.link[i, 1], ahead.link[i, 2]
-    v = batch.v[batch.senders[i].v_start :]
     for m in range(batch.senders[i].arrivals - 1, -1, -1):
         now, held = 0, 1  # which of the two lists, and its number of steps
         latest[0, 0], gain[0, 0], follow[0, 0] = ALWAYS, 0.0, -1
-        c, x = at(ahead.c, i, m), at(batch.arrivals, i, m).x
-        soonest, reach = c + b, c + (room + 1) * b
-        # V is concave: what follows m best is what follows m + 1 best after the same byte, or one before it. Bytes
-        # that m + 1 cannot end at lie less than a message beyond c: there j could follow m + 1 if c_j is two beyond.
-        furthest = m + 1
-        if m + 1 < batch.senders[i].arrivals:
-            begin, stop = at(ahead.begin, i, m + 1), at(ahead.stop, i, m + 1)
-            for k in range(begin + 1, stop):
-                furthest = max(furthest, ahead.follow[k])
-            c_next = at(ahead.c, i, m + 1)
-            while c_next > c and furthest + 1 < batch.senders[i].arrivals:
-                if at(ahead.c, i, furthest + 1) >= c_next + 2 * b:
-                    break
-                furthest += 1
-            if stop - begin == 1 or ahead.latest[begin + 1] < reach:
-                furthest = batch.senders[i].arrivals  # nothing follows m + 1 best: this is later than any message
-        for j in range(m + 1, min(furthest + 1, batch.senders[i].arrivals)):
-            enough = soonest
-            if at(ahead.between, i, j) > m:
-                if at(ahead.idle, i, j) >= reach:
-                    break  # ``between`` could be sent before every further message, too
-                enough = max(enough, at(ahead.idle, i, j) + 1)
-            c_j = at(ahead.c, i, j)
-            if c_j + b > ends or room == 0:
+        for j in range(m + 1, min(_furthest(batch, ahead, i, m) + 1, batch.senders[i].arrivals)):
+            enough, top = _ends_before(ahead, i, m, j)
+            if top < 0:
                 break
-            top = min(c_j + room * b, ends - b, reach)
-            added = value(v, at(batch.arrivals, i, j).x - x)
-            # Steps of j from the highest one within reach, down to the last that is late enough.
-            begin, stop = at(ahead.begin, i, j), at(ahead.stop, i, j)
-            k = begin
-            while k + 1 < stop and ahead.latest[k + 1] - b >= top:
-                k += 1
-            least = max(enough, c_j) + b
             if top < enough:
                 continue
-            if held + stop - k > latest.shape[1]:
+            if held + at(ahead.stop, i, j) - at(ahead.begin, i, j) > latest.shape[1]:
                 return NO_WORK_SPACE
-            then, kept, old, best = 1 - now, 0, 0, -1.0
-            while True:
-                late = -1
-                if k < stop and ahead.latest[k] >= least:
-                    late = min(ahead.latest[k] - b, top)
-                from_old = old < held and latest[now, old] >= late
-                if not from_old and late < 0:
-                    break
-                if from_old:
-                    e, g, f = latest[now, old], gain[now, old], follow[now, old]
-                    old += 1
-                else:
-                    e, g, f = late, added + ahead.gain[k], np.int32(j)
-                    k += 1
-                if g > best + TIE:
-                    if kept > 0 and latest[then, kept - 1] == e:
-                        kept -= 1
-                    latest[then, kept], gain[then, kept], follow[then, kept] = e, g, f
-                    best = g
-                    kept += 1
-            now, held = then, kept
+            held = _merge(batch, ahead, i, m, j, enough, top, now, held, latest, gain, follow)
+            now = 1 - now
         if place + held > len(ahead.latest):
             return NO_ROOM
         ahead.begin[i, m], ahead.stop[i, m] = place, place + held
@@ -122,6 +73,93 @@ def find_steps(
             ahead.follow[place + k] = follow[now, k]
         place += held
     return place
+
+
+@kernel
+def _furthest(batch: Batch, ahead: Ahead, i: int, m: int) -> int:
+    """The last message that may follow ``m`` best.
+
+    V is concave: what follows m best is what follows m + 1 best after the same byte, or one before it. Bytes that m + 1
+    cannot end at lie less than a message beyond c: there j could follow m + 1 if c_j is two beyond.
+    """
+    arrivals, b = batch.senders[i].arrivals, ahead.link[i, 0]
+    furthest = m + 1
+    if furthest >= arrivals:
+        return furthest
+    begin, stop = at(ahead.begin, i, m + 1), at(ahead.stop, i, m + 1)
+    for k in range(begin + 1, stop):
+        furthest = max(furthest, ahead.follow[k])
+    c, c_next = at(ahead.c, i, m), at(ahead.c, i, m + 1)
+    while c_next > c and furthest + 1 < arrivals:
+        if at(ahead.c, i, furthest + 1) >= c_next + 2 * b:
+            break
+        furthest += 1
+    if stop - begin == 1 or ahead.latest[begin + 1] < c + (ahead.link[i, 1] + 1) * b:
+        return int(arrivals)  # nothing follows m + 1 best: this is later than any message
+    return furthest
+
+
+@kernel
+def _ends_before(ahead: Ahead, i: int, m: int, j: int) -> tuple[int, int]:
+    """First and last byte at which ``m`` may end so that ``j`` follows it; (0, -1) if neither j nor a later one can."""
+    b, room, ends = ahead.link[i, 0], ahead.link[i, 1], ahead.link[i, 2]
+    c, c_j = at(ahead.c, i, m), at(ahead.c, i, j)
+    enough, reach = c + b, c + (room + 1) * b
+    if at(ahead.between, i, j) > m:
+        if at(ahead.idle, i, j) >= reach:
+            return 0, -1  # ``between`` could be sent before every further message, too
+        enough = max(enough, at(ahead.idle, i, j) + 1)
+    if c_j + b > ends or room == 0:
+        return 0, -1
+    return enough, min(c_j + room * b, ends - b, reach)
+
+
+@kernel
+def _merge(
+    batch: Batch,
+    ahead: Ahead,
+    i: int,
+    m: int,
+    j: int,
+    enough: int,
+    top: int,
+    now: int,
+    held: int,
+    latest: Ints,
+    gain: Floats,
+    follow: NDArray[np.int32],
+) -> int:
+    """Merge the ``held`` steps of list ``now`` with those by which ``j`` follows ``m``; return how many remain.
+
+    The other list takes them. Both are walked from the latest byte down, and a step stays if it gains more than those
+    before it.
+    """
+    b, v = ahead.link[i, 0], batch.v[batch.senders[i].v_start :]
+    added = value(v, at(batch.arrivals, i, j).x - at(batch.arrivals, i, m).x)
+    least = max(enough, at(ahead.c, i, j)) + b
+    k, stop = at(ahead.begin, i, j), at(ahead.stop, i, j)
+    while k + 1 < stop and ahead.latest[k + 1] - b >= top:  # the highest step of j within reach
+        k += 1
+    then, kept, old, best = 1 - now, 0, 0, -1.0
+    while True:
+        late = -1
+        if k < stop and ahead.latest[k] >= least:
+            late = min(ahead.latest[k] - b, top)
+        from_old = old < held and latest[now, old] >= late
+        if not from_old and late < 0:
+            return kept
+        if from_old:
+            e, g, f = latest[now, old], gain[now, old], follow[now, old]
+            old += 1
+        else:
+            e, g, f = late, added + ahead.gain[k], np.int32(j)
+            k += 1
+        if g > best + TIE:
+            if kept > 0 and latest[then, kept - 1] == e:
+                kept -= 1
+            latest[then, kept], gain[then, kept], follow[then, kept] = e, g, f
+            best = g
+            kept += 1
 
 
 @kernel

@@ -20,6 +20,7 @@ there the plain rule keeps an early message of each burst, which most outputs me
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import Buffer
+from bufgym.model.observe.declare import Field, Function, writer
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import value
 from bufgym.policies import chains, price_dp, target_gap
@@ -64,25 +66,6 @@ O_THRESHOLD, O_DISCOUNT, O_HEAD, O_BIAS, O_NEAR, O_KAPPA, O_TAIL = range(7)
 O_PRICE_THRESHOLD, O_PRICE_DISCOUNT, O_SHARE = range(7, 10)
 SCALES = np.array([output.scale for output in OUTPUTS])
 
-INPUTS = {
-    "short": "lg(rate over 0.1 s, rate over 2 s)",
-    "medium": "lg(rate over 0.5 s, rate over 2 s)",
-    "load": "lg(r x arrival period, size): how much more the link carries than one message an arrival",
-    "bend": "2 (2 V(g) - V(2 g)) / V(g) - 1: -1 where V is straight, 1 where it is flat",
-    "spread": "2 (sd - 0.6), sd being that of the logarithm of the rate over 0.5 s, in the last 10 s",
-    "head_age": "lg(r x the head's age + 0.1 size, (s + 1) size): 0.1 alone for an empty queue",
-    "newcomer": "lg(come, (s + 1) g)",
-    "stall": "log(1 + r x time since a message was dequeued / size) - 0.5",
-    "size_spread": "2 min(1, standard deviation of the logarithm of bytes over the last arrivals)",
-    "bytes": "lg(the newcomer's bytes, size)",
-    "fill": "2 s / L - 1",
-    "unknown": "1 where the target gap is unknown, otherwise 0",
-    "one": "always 1",
-    "head_gap": "lg(the gap left if the head goes, g); 0 for an empty queue",
-    "share": "a, the share of price-dp in the plain rule",
-    "plain": "1 on a measured steady link, in bursts if there are two places, and until the link has carried anything",
-}
-"""Names and meanings of the inputs, in their order."""
 MOST = 3.0  # Largest input and output, either way
 SPREAD_US = 10e6  # Time over which the spread of the link's rate is measured, us
 SLOW_US = 20e6
@@ -96,9 +79,7 @@ REMEMBERED = {"log_rate": 0.0, "log_rate_variance": 0.0, "slow_rate": 0.0, **pri
 """Memory: mean and variance of the logarithm of the link's rate, bytes/s; its mean over ``SLOW_US``; and what the rule
 remembers."""
 BASE = np.array(list(price_dp.PARAMETERS.values()))  # The rule's numbers as they stand
-NUMBERS, N_INPUTS, N_OUTPUTS = len(BASE), len(INPUTS), len(OUTPUTS)
-WORK = (chains.SCRATCH[0] + N_INPUTS + N_OUTPUTS + NUMBERS, chains.SCRATCH[1])
-"""``Policy.work``: the rule's own, then inputs, outputs and numbers, at the memory's end."""
+NUMBERS, N_OUTPUTS = len(BASE), len(OUTPUTS)
 
 
 @kernel
@@ -109,6 +90,69 @@ def lg(a: float, b: float) -> float:
     if a <= 0 and b <= 0:
         return 0.0
     return MOST if a > 0 else -MOST
+
+
+class Known(NamedTuple):
+    """What the inputs are made of besides the buffer."""
+
+    size: float  # mean bytes of the queue and the newcomer
+    newcomer_bytes: float
+    messages: int  # s + 1, the newcomer being one
+    rate: float  # the rule's link rate r, bytes/us
+    head_age_us: int  # time from the head's arrival to the newcomer's, us; 0 for an empty queue
+    come: float  # motion since the message dequeued last
+    has_target: bool  # whether the target gap is known
+    gap: float  # the target gap g, or come / (s + 1) where it is unknown
+    gain: float  # V(g)
+    head_gap: float  # the gap left if the head goes; 0 for an empty queue
+    log_rate_variance: float  # of the logarithm of the link's rate
+    log_bytes_variance: float  # of the logarithm of bytes
+    share: float  # a, the share of price-dp in the plain rule
+    is_plain: bool  # whether outputs are not to change the rule
+
+
+def declared(name: str, meaning: str, function: Function, low: float = -4.0, high: float = 4.0) -> Field:
+    """Declare an input: a field of the context whose meaning says how it is scaled."""
+    return Field(name, "context", "link", "see its meaning", meaning, function, low, high)
+
+
+INPUT_FIELDS = (
+    declared("short", "lg(rate over 0.1 s, rate over 2 s)",
+             lambda buffer, known: lg(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)),
+    declared("medium", "lg(rate over 0.5 s, rate over 2 s)",
+             lambda buffer, known: lg(buffer.medium_rate_bytes_per_s, buffer.long_rate_bytes_per_s)),
+    declared("load", "lg(r x arrival period, size): how much more the link carries than one message an arrival",
+             lambda buffer, known: lg(known.rate * buffer.period_us, known.size)),
+    declared("bend", "2 (2 V(g) - V(2 g)) / V(g) - 1: -1 where V is straight, 1 where it is flat",
+             lambda buffer, known:
+             2 * (2 * known.gain - value(buffer.v, 2 * known.gap)) / known.gain - 1 if known.gain > 0 else -1.0),
+    declared("spread", "2 (sd - 0.6), sd being that of the logarithm of the rate over 0.5 s, in the last 10 s",
+             lambda buffer, known: min(2 * (math.sqrt(known.log_rate_variance) - 0.6), MOST)),
+    declared("head_age", "lg(r x the head's age + 0.1 size, (s + 1) size): 0.1 alone for an empty queue",
+             lambda buffer, known: lg(known.rate * known.head_age_us + 0.1 * known.size, known.messages * known.size)),
+    declared("newcomer", "lg(come, (s + 1) g)", lambda buffer, known: lg(known.come, known.messages * known.gap)),
+    declared("stall", "log(1 + r x time since a message was dequeued / size) - 0.5",
+             lambda buffer, known: min(math.log(1 + known.rate * max(buffer.stalled_us, 0) / known.size) - 0.5, MOST)),
+    declared("size_spread", "2 min(1, standard deviation of the logarithm of bytes over the last arrivals)",
+             lambda buffer, known: 2 * min(math.sqrt(known.log_bytes_variance), 1.0)),
+    declared("bytes", "lg(the newcomer's bytes, size)", lambda buffer, known: lg(known.newcomer_bytes, known.size)),
+    declared("fill", "2 s / L - 1", lambda buffer, known: 2 * len(buffer.slots) / buffer.capacity - 1),
+    declared("unknown", "1 where the target gap is unknown, otherwise 0",
+             lambda buffer, known: 0.0 if known.has_target else 1.0),
+    declared("one", "always 1", lambda buffer, known: 1.0),
+    declared("head_gap", "lg(the gap left if the head goes, g); 0 for an empty queue",
+             lambda buffer, known: lg(known.head_gap, known.gap) if known.messages > 1 else 0.0),
+    declared("share", "a, the share of price-dp in the plain rule", lambda buffer, known: known.share),
+    declared("plain",
+             "1 on a measured steady link, in bursts if there are two places, and until the link has carried anything",
+             lambda buffer, known: 1.0 if known.is_plain else 0.0),
+)  # fmt: skip
+INPUTS = {field.name: field for field in INPUT_FIELDS}
+"""The inputs by name, in their order."""
+N_INPUTS = len(INPUTS)
+WORK = (chains.SCRATCH[0] + N_INPUTS + N_OUTPUTS + NUMBERS, chains.SCRATCH[1])
+"""``Policy.work``: the rule's own, then inputs, outputs and numbers, at the memory's end."""
+write_inputs = writer(INPUT_FIELDS, "buffer, known")
 
 
 @kernel
@@ -132,30 +176,28 @@ def recall(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -
 @kernel
 def inputs(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, out: NDArray[Any]) -> None:
     """Write ``INPUTS`` into ``out``, once ``recall`` has been called; ``numbers`` are the plain rule's."""
-    rule, s, size = memory[RULE:], len(buffer.slots), mean_bytes(buffer, arrival)
-    rate, long_rate = link_rate(buffer, rule, numbers), buffer.long_rate_bytes_per_s
-    come, g = arrival.x - buffer.dequeued_x, target(buffer, arrival, rule, numbers)
-    known = g > 0
-    if not known:
+    rule, s, come = memory[RULE:], len(buffer.slots), arrival.x - buffer.dequeued_x
+    rate, g = link_rate(buffer, rule, numbers), target(buffer, arrival, rule, numbers)
+    has_target = g > 0
+    if not has_target:
         g = come / (s + 1)
-    v = value(buffer.v, g)
-    out[0] = lg(buffer.short_rate_bytes_per_s, long_rate)
-    out[1] = lg(buffer.medium_rate_bytes_per_s, long_rate)
-    out[2] = lg(rate * buffer.period_us, size)
-    out[3] = 2 * (2 * v - value(buffer.v, 2 * g)) / v - 1 if v > 0 else -1.0
-    out[4] = min(2 * (math.sqrt(memory[LOG_RATE_VARIANCE]) - 0.6), MOST)
-    age_us = arrival.arrival_us - buffer.slots[0].arrival_us if s > 0 else 0
-    out[5] = lg(rate * age_us + 0.1 * size, (s + 1) * size)
-    out[6] = lg(come, (s + 1) * g)
-    out[7] = min(math.log(1 + rate * max(buffer.stalled_us, 0) / size) - 0.5, MOST)
-    out[8] = 2 * min(math.sqrt(rule[VARIANCE]), 1.0)
-    out[9] = lg(float(arrival.size_bytes), size)
-    out[10] = 2 * s / buffer.capacity - 1
-    out[11] = 0.0 if known else 1.0
-    out[12] = 1.0
-    out[13] = lg(gap_left(buffer, arrival, 0), g) if s > 0 else 0.0
-    out[14] = share(rule, numbers)
-    out[15] = 1.0 if steady(buffer) or (bursty(rule) and places(buffer, arrival) > 1) or rate <= 0 else 0.0
+    known = Known(
+        size=mean_bytes(buffer, arrival),
+        newcomer_bytes=float(arrival.size_bytes),
+        messages=s + 1,
+        rate=rate,
+        head_age_us=arrival.arrival_us - buffer.slots[0].arrival_us if s > 0 else 0,
+        come=come,
+        has_target=has_target,
+        gap=g,
+        gain=value(buffer.v, g),
+        head_gap=gap_left(buffer, arrival, 0) if s > 0 else 0.0,
+        log_rate_variance=memory[LOG_RATE_VARIANCE],
+        log_bytes_variance=rule[VARIANCE],
+        share=share(rule, numbers),
+        is_plain=steady(buffer) or (bursty(rule) and places(buffer, arrival) > 1) or rate <= 0,
+    )
+    write_inputs(buffer, known, out)
 
 
 @kernel
@@ -232,6 +274,11 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return follow(buffer, arrival, memory, base, outputs)
 
 
+def described(inputs: Iterable[Field]) -> list[tuple[str, str]]:
+    """(name, meaning) of each input."""
+    return [(field.name, field.meaning) for field in inputs]
+
+
 @dataclass(frozen=True)
 class GuidedWeights:
     """Weights of an agent whose outputs are linear in the inputs, as in a file."""
@@ -245,7 +292,7 @@ class GuidedWeights:
     LAYERS: ClassVar[int] = 0
     SHAPE: ClassVar[tuple[int, int]] = (2 * N_OUTPUTS, N_INPUTS)
     LIGHT: ClassVar[tuple[int, int]] = (N_OUTPUTS, N_INPUTS)
-    TABLE: ClassVar[list[Any]] = [list(INPUTS.items()), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
+    TABLE: ClassVar[list[Any]] = [described(INPUT_FIELDS), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
     """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
 
     @property

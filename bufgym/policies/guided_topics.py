@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, fill, is_first, loss
+from bufgym.model.observe.declare import writer
 from bufgym.model.observe.topics import largest
 from bufgym.model.topics import NO_DEADLINE_US
-from bufgym.policies.guided import GuidedWeights, lg, numbers_of
+from bufgym.policies.guided import GuidedWeights, declared, described, lg, numbers_of
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.robofleet import next_no_drop
 from bufgym.policies.schedulers import fits, make_room, makes_room, topic_of
@@ -36,17 +37,23 @@ FEATURES = {
     "late": "its age over its topic's deadline, at most 2; 0 without a deadline",
     "queued": "log of 1 + the messages of its topic in the queue",
 }
-INPUTS = {
-    "one": "always 1",
-    "fill": "2 fill level - 1",
-    "load": "lg(long rate x arrival period, mean bytes of an arrival)",
-    "trend": "lg(short rate, long rate)",
-    "stall": "log(1 + time since a message was dequeued, s)",
-    "drain": "lg(bytes queued, long rate x 1 s)",
-    "service": "2 service_ratio - 1",
-    "in_flight": "2 in_flight / n_T - 1",
-    "window": "1 - 2 / n_T",
-}
+INPUT_FIELDS = (
+    declared("one", "always 1", lambda buffer: 1.0),
+    declared("fill", "2 fill level - 1", lambda buffer: 2 * fill(buffer) - 1),
+    declared("load", "lg(long rate x arrival period, mean bytes of an arrival)",
+             lambda buffer: lg(buffer.long_rate_bytes_per_s * buffer.period_us, 1e6 * buffer.arrival_bytes)),
+    declared("trend", "lg(short rate, long rate)",
+             lambda buffer: lg(buffer.short_rate_bytes_per_s, buffer.long_rate_bytes_per_s)),
+    declared("stall", "log(1 + time since a message was dequeued, s)",
+             lambda buffer: math.log(1 + max(buffer.stalled_us, 0) / 1e6), high=math.inf),
+    declared("drain", "lg(bytes queued, long rate x 1 s)",
+             lambda buffer: lg(float(buffer.backlog_bytes), buffer.long_rate_bytes_per_s)),
+    declared("service", "2 service_ratio - 1", lambda buffer: 2 * buffer.service_ratio - 1, high=math.inf),
+    declared("in_flight", "2 in_flight / n_T - 1", lambda buffer: 2 * buffer.in_flight / buffer.window - 1),
+    declared("window", "1 - 2 / n_T", lambda buffer: 1 - 2 / buffer.window),
+)  # fmt: skip
+INPUTS = {field.name: field for field in INPUT_FIELDS}
+write_inputs = writer(INPUT_FIELDS, "buffer")
 N_FEATURES, N_INPUTS = len(FEATURES), len(INPUTS)
 DROPS, ROOM = N_FEATURES, 2 * N_FEATURES
 OUTPUTS = (*(f"send_{name}" for name in FEATURES), *(f"drop_{name}" for name in FEATURES), "room")
@@ -62,16 +69,7 @@ LEAST = 1e-3  # added to a gain, a loss, and a time in s, before their logarithm
 @kernel
 def set_numbers(buffer: Buffer, numbers: NDArray[Any], c: NDArray[Any]) -> None:
     """Write the rule's numbers at this moment; ``c`` is room for the inputs."""
-    rate = buffer.long_rate_bytes_per_s
-    c[0] = 1.0
-    c[1] = 2 * fill(buffer) - 1
-    c[2] = lg(rate * buffer.period_us, 1e6 * buffer.arrival_bytes)
-    c[3] = lg(buffer.short_rate_bytes_per_s, rate)
-    c[4] = math.log(1 + max(buffer.stalled_us, 0) / 1e6)
-    c[5] = lg(float(buffer.backlog_bytes), rate)
-    c[6] = 2 * buffer.service_ratio - 1
-    c[7] = 2 * buffer.in_flight / buffer.window - 1
-    c[8] = 1 - 2 / buffer.window
+    write_inputs(buffer, c)
     for o in range(N_OUTPUTS):
         numbers[o] = buffer.parameters[o]
         for i in range(N_INPUTS):
@@ -138,7 +136,7 @@ class SchedulerWeights(GuidedWeights):
     CONTEXT_NAMES = tuple(INPUTS)
     NETWORKS = ("scheduler",)
     SHAPE = LIGHT = (N_OUTPUTS, N_INPUTS)
-    TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), list(INPUTS.items()), OUTPUTS, PLAIN]
+    TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), described(INPUT_FIELDS), OUTPUTS, PLAIN]
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights, for any topics and every L."""

@@ -20,8 +20,11 @@ from bufgym.model.observe import (
     observe_on_board,
     observe_on_board_slots,
 )
+from bufgym.policies import chains
+from bufgym.policies.guided import REMEMBERED
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.scoring import DROP, KEEP, Network, begin, divide, score, unpack
+from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
+from bufgym.policies.scoring import DROP, KEEP, Network, Scorer, Scratch, begin, divide, score, unpack
 
 __all__ = ["NAMES", "Network", "Weights", "policy"]
 
@@ -31,23 +34,36 @@ NAMES = SLOT_NAMES + CONTEXT_NAMES
 SLOTS, CONTEXT = len(SLOT_NAMES), len(CONTEXT_NAMES)
 # Fields beyond these are observed only if they are read.
 TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
+RULE_NAMES = tuple(field.name for field in (*RULE_SLOT_FIELDS, *RULE_FIELDS))
+ALL_SLOTS, ALL_CONTEXT = SLOTS + len(RULE_SLOT_FIELDS), CONTEXT + len(RULE_FIELDS)
+RULE_SCRATCH = len(REMEMBERED) + chains.SCRATCH[0]
 
 
 @kernel
-def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The decision with the highest score."""
-    scorer = unpack(buffer.parameters)
+def look(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -> None:
+    """Observe what the scorer reads, but for what the rule knows."""
+    context, slot = scorer.fields[: scorer.context], scorer.fields[scorer.context :]
+    if reads(context, 0, TABLE) or reads(slot, 0, TABLE_SLOTS):
+        observe(buffer, arrival, scratch.rows[:TABLE_SLOTS], scratch.context[:TABLE])
+    if reads(context, TABLE, CONTEXT):
+        observe_on_board(buffer, arrival, scratch.context[TABLE:CONTEXT])
+    if reads(slot, TABLE_SLOTS, SLOTS):
+        observe_on_board_slots(buffer, arrival, scratch.rows[TABLE_SLOTS:SLOTS])
+
+
+@kernel
+def reads(fields: NDArray[np.float64], begin: int, end: int) -> bool:
+    """Whether any of ``fields`` is in this part of the observation."""
+    found = False
+    for field in fields:
+        found = found or begin <= field < end
+    return found
+
+
+@kernel
+def decide(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -> int:
+    """The decision with the highest score, by what is observed."""
     s, L = len(buffer.slots), buffer.capacity
-    scratch = divide(memory, scorer, CONTEXT, SLOTS, L)
-    observe(buffer, arrival, scratch.rows[:TABLE_SLOTS], scratch.context[:TABLE])
-    for i in range(scorer.context):
-        if scorer.fields[i] >= TABLE:
-            observe_on_board(buffer, arrival, scratch.context[TABLE:])
-            break
-    for i in range(scorer.context, len(scorer.fields)):
-        if scorer.fields[i] >= TABLE_SLOTS:
-            observe_on_board_slots(buffer, arrival, scratch.rows[TABLE_SLOTS:])
-            break
     for i in range(scorer.context):
         scratch.f[i] = scratch.context[int(scorer.fields[i])]
     common = begin(scorer, DROP, scratch)
@@ -69,15 +85,28 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A trained slot scorer."""
-    return decide(buffer, arrival, memory)
+    scorer = unpack(buffer.parameters)
+    scratch = divide(memory, scorer, CONTEXT, SLOTS, buffer.capacity)
+    look(buffer, arrival, scorer, scratch)
+    return decide(buffer, arrival, scorer, scratch)
+
+
+def on_arrival_by_rule(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A trained slot scorer that knows what the rule gap-price knows."""
+    scorer = unpack(buffer.parameters)
+    own = memory[RULE_SCRATCH + chains.COLUMNS * (buffer.capacity + 1) :]
+    scratch = divide(own, scorer, ALL_CONTEXT, ALL_SLOTS, buffer.capacity)
+    observe_rule(buffer, arrival, memory, scratch.rows[SLOTS:], scratch.context[CONTEXT:])
+    look(buffer, arrival, scorer, scratch)
+    return decide(buffer, arrival, scorer, scratch)
 
 
 @dataclass(frozen=True)
 class Weights:
     """A slot scorer for one queue: the fields that it reads, and its networks."""
 
-    SLOT_NAMES: ClassVar[tuple[str, ...]] = SLOT_NAMES
-    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = CONTEXT_NAMES
+    SLOT_NAMES: ClassVar[tuple[str, ...]] = SLOT_NAMES + tuple(field.name for field in RULE_SLOT_FIELDS)
+    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = CONTEXT_NAMES + tuple(field.name for field in RULE_FIELDS)
     NETWORKS: ClassVar[tuple[str, ...]] = ("drop", "accept")
     LAYERS: ClassVar[int] = 2
 
@@ -119,4 +148,27 @@ def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> 
     numbers, (first, second) = tuple(weights.parameters().tolist()), weights.widths
     work = 2 * len(weights.fields) - len(weights.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
     policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_left=True, built_in=True)
-    return replace(policy, reads_rate=not on_link.isdisjoint(weights.fields), about=summary, source=source)
+    if not set(RULE_NAMES).isdisjoint(weights.fields):
+        work = work[0] + len(RULE_FIELDS) + chains.SCRATCH[0], ALL_SLOTS + chains.SCRATCH[1]
+        policy = replace(policy, on_arrival=on_arrival_by_rule, memory=REMEMBERED, work=work, reads_rate=True)
+    reads_rate = policy.reads_rate or not on_link.isdisjoint(weights.fields)
+    return replace(policy, reads_rate=reads_rate, about=summary, source=source)
+
+
+def seen(memory: Memory, weights: Weights, capacity: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What policies that know the rule saw at their last decision with L = ``capacity``.
+
+    Args:
+        memory: float64[n, entries], theirs.
+        weights: say which fields they read.
+        capacity: L.
+
+    Returns:
+        (float64[n, context fields], float64[n, L + 1, slot fields]), fields in the order of ``weights.fields``.
+    """
+    first, second = weights.widths
+    begin = RULE_SCRATCH + chains.COLUMNS * (capacity + 1) + 2 * len(weights.fields) - len(weights.context)
+    begin += 2 * first + second
+    rows = memory[:, begin + ALL_CONTEXT :][:, : ALL_SLOTS * (capacity + 1)].reshape(-1, ALL_SLOTS, capacity + 1)
+    context = [begin + weights.CONTEXT_NAMES.index(name) for name in weights.context]
+    return memory[:, context], rows[:, [*map(weights.SLOT_NAMES.index, weights.slot)]].swapaxes(1, 2)

@@ -97,8 +97,7 @@ def begin(scorer: Scorer, which: int, scratch: Scratch) -> float:
         h[o] = net[weights + n * first + o]
     # Inputs in the outer loop: each is added to all sums side by side.
     for i in range(c):
-        for o in range(first):
-            h[o] += f[i] * net[weights + i * first + o]
+        add(h[:first], f[i], net, weights + i * first)
     return float(score)
 
 
@@ -113,26 +112,32 @@ def score(scorer: Scorer, which: int, common: float, k: int, scratch: Scratch) -
     own = 0.0
     for i in range(n - c):
         own += scratch.skip[i] * slot[i]
-    weights, sums, width = n + 1, first, first
+    weights, sums = n + 1, h[first : 2 * first]
     for o in range(first):
-        h[first + o] = h[o]
+        sums[o] = h[o]
     for i in range(n - c):
-        for o in range(first):
-            h[first + o] += slot[i] * net[weights + (c + i) * first + o]
+        add(sums, slot[i], net, weights + (c + i) * first)
     if first > 0:
         weights += (n + 1) * first
     if second > 0:
-        sums, width = 2 * first, second
+        units, sums = sums, h[2 * first : 2 * first + second]
         for o in range(second):
-            h[sums + o] = net[weights + first * second + o]
+            sums[o] = net[weights + first * second + o]
         for i in range(first):
-            unit = max(h[first + i], 0.0)
-            for o in range(second):
-                h[sums + o] += unit * net[weights + i * second + o]
+            if units[i] > 0:
+                add(sums, units[i], net, weights + i * second)
         weights += (first + 1) * second
-    for o in range(width):
-        own += net[weights + o] * max(h[sums + o], 0.0)
+    for o in range(len(sums)):
+        own += net[weights + o] * max(sums[o], 0.0)
     return common + own
+
+
+@kernel
+def add(sums: NDArray[np.float64], unit: float, net: NDArray[np.float64], begin: int) -> None:
+    """Add ``unit`` times the weights from ``begin`` on to the sums."""
+    at = np.uint64(begin)
+    for o in range(np.uint64(len(sums))):  # an unsigned index is not checked, so many sums are added to at once
+        sums[o] += unit * net[at + o]
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ from bufgym.ground import __version__, strict_json
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_whole, replaced
 from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS
-from bufgym.policies import learned
+from bufgym.policies import learned, price_dp
 from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.registry import Policy
+from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
 from bufgym.policies.scoring import Network
 
 StrPath = str | os.PathLike[str]
@@ -43,9 +44,12 @@ def observation_hash(names: Sequence[str] = ()) -> str:
 
     Fields beside the table count only if they are in ``names``.
     """
-    beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.name in names]
+    by_rule = (*RULE_SLOT_FIELDS, *RULE_FIELDS)
+    beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS, *by_rule) if field.name in names]
     fields = [*FIELDS, *beside]
-    table = [(field.name, field.per, field.unit, field.meaning) for field in fields]
+    table: list[Any] = [(field.name, field.per, field.unit, field.meaning) for field in fields]
+    if set(by_rule) & set(beside):
+        table.append(price_dp.PARAMETERS)
     return hashlib.sha256(json.dumps(table).encode()).hexdigest()
 
 

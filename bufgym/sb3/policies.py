@@ -107,7 +107,7 @@ class _Decisions:
             if field not in known and observe.own_field(field) is None:
                 raise BufgymError(f"model {name}: observes {field!r}, which is no field (bufgym list observations)")
         self.form = ObservationForm(form, per_slot, context, self.capacity, names)
-        self.own = [place for place in self.form.places if isinstance(place.field, observe.OwnField)]
+        self.own = self.form.own_places
         if self.own and self.for_topics:
             raise BufgymError(f"model {name}: observes fields of one's own; with several topics no policy can")
         expected = spaces.flatdim(self.form.space)

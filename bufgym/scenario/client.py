@@ -23,9 +23,9 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics
 from bufgym.scenario.arrivals import messages, read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
-from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes
+from bufgym.scenario.draws import SIZES, derived_generator, place, place_link, shipped, sizes
 from bufgym.scenario.episode import Episode, Streams
-from bufgym.scenario.texts import over
+from bufgym.scenario.texts import links_by_name
 from bufgym.traces import Motion, Trace
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
@@ -142,7 +142,7 @@ class Client:
     def about(self) -> str:
         """Its number of topics, and its links."""
         topics = f"{len(self.topics)} topic{'' if len(self.topics) == 1 else 's'}"
-        return f"{topics} over {over(self.traces, self.scale)}"
+        return f"{topics} over {links_by_name(self.traces, self.scale)}"
 
     @property
     def max_messages(self) -> int:
@@ -201,7 +201,7 @@ class Client:
         independent = sizes(n, stream.size_bytes, stream.size_cv, rng)
         if own == EQUAL:
             return independent
-        return drawn(own, n, stream.size_bytes, beside(rng, SIZES + number), moving)
+        return drawn(own, n, stream.size_bytes, derived_generator(rng, SIZES + number), moving)
 
     def _encoded_bytes(self, arrivals: NDArray[Any], encoding: str) -> NDArray[np.int64]:
         """int64[messages], the messages' bytes in another encoding, by the ratio of each topic."""

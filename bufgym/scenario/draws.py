@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from bufgym import traces
 from bufgym.traces import Motion, Trace
 
-SIZES = 1  # Number of the generator ``beside`` a stream that draws sizes; of robot or stream r: r more
+SIZES = (
+    1  # Number of the generator ``derived_generator`` makes of a stream that draws sizes; of robot or stream r: r more
+)
 
 
-def beside(rng: np.random.Generator, number: int) -> np.random.Generator:
+def derived_generator(rng: np.random.Generator, number: int) -> np.random.Generator:
     """Make another generator from the state of ``rng`` and ``number``; ``rng`` stays where it is."""
     return np.random.default_rng([_state(rng)["state"]["state"], number])
 

@@ -17,7 +17,7 @@ from bufgym.model.topics import Topic
 from bufgym.scenario import registry
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
 from bufgym.scenario.episode import Episode, Streams, check_end, check_link
-from bufgym.scenario.texts import over
+from bufgym.scenario.texts import links_by_name
 from bufgym.scenario.uplink import Uplink
 
 MAX_ROBOTS = 256
@@ -106,7 +106,7 @@ class FleetScenario:
     @property
     def about(self) -> str:
         """The size of the cell, and its links."""
-        return f"{self.robots} robots in a cell over {over(self.uplink.traces, self.uplink.scale[0])}"
+        return f"{self.robots} robots in a cell over {links_by_name(self.uplink.traces, self.uplink.scale[0])}"
 
     @property
     def value(self) -> Value:

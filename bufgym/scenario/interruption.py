@@ -15,7 +15,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages, read_only
 from bufgym.scenario.checks import check_sizes, check_value, rate, up_to
-from bufgym.scenario.draws import SIZES, beside
+from bufgym.scenario.draws import SIZES, derived_generator
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
 from bufgym.traces.generate.sizes import EQUAL, drawn
@@ -124,10 +124,10 @@ class Interruption:
             return known
         if not 1 <= T <= self.t_max:
             raise BufgymError(f"T = {T}: must lie between 1 and t_max = {self.t_max}")
-        self._episodes[T] = self._of(self._table[: T + 2], T, self.max_messages * self.size_bytes)
+        self._episodes[T] = self._over_a_blocked_link(self._table[: T + 2], T, self.max_messages * self.size_bytes)
         return self._episodes[T]
 
-    def _of(self, arrivals: NDArray[Any], T: int, total_bytes: int) -> Episode:
+    def _over_a_blocked_link(self, arrivals: NDArray[Any], T: int, total_bytes: int) -> Episode:
         resumes_us = self.period_us * T + self.period_us // 2
         trace = _blocked_then_open(self.period_us * (self.t_max + 1), total_bytes)
         return Episode(arrivals, Link(trace, offset_us=int(trace.time_us[1]) - resumes_us), 1, T)
@@ -138,8 +138,8 @@ class Interruption:
         if self.sizes == EQUAL:
             return self.episode(T)
         arrivals = self._table[: T + 2].copy()
-        arrivals["size_bytes"] = drawn(self.sizes, T + 2, self.size_bytes, beside(streams.arrival, SIZES))
-        return self._of(read_only(arrivals), T, int(arrivals["size_bytes"].sum()))
+        arrivals["size_bytes"] = drawn(self.sizes, T + 2, self.size_bytes, derived_generator(streams.arrival, SIZES))
+        return self._over_a_blocked_link(read_only(arrivals), T, int(arrivals["size_bytes"].sum()))
 
     @functools.cached_property
     def _episodes(self) -> dict[int, Episode]:

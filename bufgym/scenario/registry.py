@@ -3,7 +3,7 @@
 import ast
 import functools
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -17,7 +17,7 @@ from bufgym.scenario.afr_evaluation import afr_evaluation
 from bufgym.scenario.client import client_over_lte, read_client
 from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
-from bufgym.scenario.texts import rated
+from bufgym.scenario.texts import how_rated
 from bufgym.scenario.uplink import uplink_over_lte
 
 
@@ -92,10 +92,8 @@ def _literal(text: str) -> Any:
         return text
 
 
-def get(spec: str | os.PathLike[str] | Scenario, options: Iterable[str] = (), /, **overrides: Any) -> Scenario:
+def get(spec: str | os.PathLike[str] | Scenario, /, **overrides: Any) -> Scenario:
     """The scenario of that name, or ``spec`` itself, with changed parameters; BufgymError for unknown ones.
-
-    ``options`` are the caller's other arguments, which an unknown parameter may have been meant for.
 
     A name that ends in .toml, or a path, names a client's configuration (``read_client``). ``module:function`` is
     imported (see ``bufgym.ground.modules``); it is a scenario or makes one without arguments. A name may carry
@@ -119,12 +117,12 @@ def get(spec: str | os.PathLike[str] | Scenario, options: Iterable[str] = (), /,
         spec = checked(spec, type(spec).__name__)
     if not overrides:
         return spec
-    return with_parameters(spec, overrides, options)
+    return with_parameters(spec, overrides)
 
 
 def about(scenario: Any) -> str:
     """Lines about a scenario: its own ``about``, or how it is rated where it has none."""
-    return str(getattr(scenario, "about", "") or rated(scenario))
+    return str(getattr(scenario, "about", "") or how_rated(scenario))
 
 
 def parameters(spec: Any) -> list[str]:
@@ -132,13 +130,11 @@ def parameters(spec: Any) -> list[str]:
     return sorted(f.name for f in fields(spec)) if is_dataclass(spec) else []
 
 
-def with_parameters(
-    spec: Scenario, changes: Mapping[str, Any], options: Iterable[str] = (), place: str = ""
-) -> Scenario:
+def with_parameters(spec: Scenario, changes: Mapping[str, Any], place: str = "") -> Scenario:
     """The scenario with changed parameters, if it has all of them; see ``get``. Errors name ``place`` or its class."""
     known = parameters(spec)
     for name in changes:
         if name not in known:
             also = "" if known else " (it is no dataclass)"
-            raise unknown("parameter", name, [*known, *options], also, place or type(spec).__name__)
+            raise unknown("parameter", name, known, also, place or type(spec).__name__)
     return replace(spec, **changes)  # type: ignore[type-var]

@@ -7,22 +7,22 @@ from bufgym.ground.errors import printable
 from bufgym.traces import Motion, Trace
 
 
-def some(names: Sequence[str]) -> str:
+def first_and_last(names: Sequence[str]) -> str:
     """Up to three names, or the first and the last."""
     return printable(", ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}")
 
 
-def over(traces: Sequence[Trace], scale: float = 1.0) -> str:
+def links_by_name(traces: Sequence[Trace], scale: float = 1.0) -> str:
     """The links by name, and the factor on their capacity."""
-    return some([trace.name for trace in traces]) + (f" x {scale:g}" if scale != 1 else "")
+    return first_and_last([trace.name for trace in traces]) + (f" x {scale:g}" if scale != 1 else "")
 
 
-def moved(motions: Sequence[Motion]) -> str:
+def motions_by_name(motions: Sequence[Motion]) -> str:
     """The recordings of motion by name, with the gaps in them."""
     gaps = [f" (gaps bridged: {len(m.gaps)}, the longest {m.longest_gap_s:.1f} s)" if m.gaps else "" for m in motions]
-    return some([m.name + bridged for m, bridged in zip(motions, gaps, strict=True)])
+    return first_and_last([m.name + bridged for m, bridged in zip(motions, gaps, strict=True)])
 
 
-def rated(scenario: Any) -> str:
+def how_rated(scenario: Any) -> str:
     """How the episodes of one queue are rated."""
     return f"QoI = 1 + sum of V(step in x) over the messages received; V = {printable(scenario.value.name)}."

@@ -17,9 +17,9 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import even, messages, read_only
 from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_value, recordings, up_to
-from bufgym.scenario.draws import SIZES, beside, place, place_link, shipped, sizes, skip
+from bufgym.scenario.draws import SIZES, derived_generator, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
-from bufgym.scenario.texts import moved, over, rated
+from bufgym.scenario.texts import how_rated, links_by_name, motions_by_name
 from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
@@ -28,7 +28,7 @@ from bufgym.traces.workload import Workload
 _JITTER_HZ = 30.0
 """Reference rate. At any rate an episode leaves its stream where the jitter of so many messages a second does. So
 motion and all later draws are the same for every ``rate_hz``, ``jitter``, ``sizes`` and ``size_cv``."""
-_TIMES = 0  # Number of the generator ``beside`` the stream that draws the jitter of other rates
+_TIMES = 0  # Number of the generator ``derived_generator`` makes of the stream that draws the jitter of other rates
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ class Uplink:
     @property
     def about(self) -> str:
         """What is sent over which links, and how it is rated."""
-        links = over(self.traces, self.scale[0])
-        source = f"from {moved(self.motion)}" if self.motion else "as recorded"
+        links = links_by_name(self.traces, self.scale[0])
+        source = f"from {motions_by_name(self.motion)}" if self.motion else "as recorded"
         if self.workload is None:
             sent = f"{self.rate_hz:g} messages/s of {self.size_bytes} bytes for {self.duration_s:g} s over {links}"
             places = "from random offsets" if self.random_offset else "from their start"
@@ -134,7 +134,7 @@ class Uplink:
             places += shared
             moves = self.motion or self.workload.x is not None
             x = f"the motion, {source}, in fields of view" if moves else "the number of the message"
-        return f"{sent}, {places}.\n{rated(self)}\nx is {x}."
+        return f"{sent}, {places}.\n{how_rated(self)}\nx is {x}."
 
     @functools.cached_property
     def _links(self) -> tuple[Trace, ...]:
@@ -157,7 +157,7 @@ class Uplink:
         self, rng: np.random.Generator, robot: int = 0, arrival_us: NDArray[np.int64] | None = None
     ) -> NDArray[Any]:
         """MESSAGE[n] of the camera, or of a fleet's robot; at these times if they are given."""
-        own = beside(rng, SIZES + robot) if self.size_cv or self.sizes != EQUAL else rng
+        own = derived_generator(rng, SIZES + robot) if self.size_cv or self.sizes != EQUAL else rng
         if arrival_us is None:
             arrivals = even(self.max_messages, 1e6 / self.rate_hz, self.jitter, self._jitter(rng), int(self.size_bytes))
         else:
@@ -185,7 +185,7 @@ class Uplink:
         n, jitter_draws = self.max_messages, round(_JITTER_HZ * self.duration_s)
         if self.jitter and n == jitter_draws:
             return rng.random(n)
-        draws = beside(rng, _TIMES).random(n) if self.jitter else np.zeros(0)
+        draws = derived_generator(rng, _TIMES).random(n) if self.jitter else np.zeros(0)
         skip(rng, jitter_draws)
         return draws
 

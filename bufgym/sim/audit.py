@@ -36,7 +36,7 @@ def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) ->
     sender, n = batch.senders[i], len(arrivals)
     sent, dropped = 0, 0
     for k in range(n):
-        if not _same(at(batch.arrivals, i, k), item(arrivals, k)):
+        if not _agree(at(batch.arrivals, i, k), item(arrivals, k)):
             return _ARRIVAL
         entry = at(batch.log, i, k)
         if entry.dequeued_us != NEVER:
@@ -48,7 +48,7 @@ def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) ->
     before, queued_bytes = -1, 0
     for k in range(sender.first, sender.first + sender.occupancy):
         message = batch.slots[i, k]
-        if not before < message.seq < n or not _same(message, item(arrivals, message.seq)):
+        if not before < message.seq < n or not _agree(message, item(arrivals, message.seq)):
             return _QUEUED
         before = message.seq
         entry = at(batch.log, i, before)
@@ -84,7 +84,7 @@ def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) ->
 
 
 @kernel
-def _same(a: Any, b: Any) -> bool:
+def _agree(a: Any, b: Any) -> bool:
     """Whether these messages agree in all that an episode gives."""
     if a.seq != b.seq or a.arrival_us != b.arrival_us or a.size_bytes != b.size_bytes or a.topic != b.topic:
         return False

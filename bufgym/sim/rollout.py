@@ -154,18 +154,25 @@ _PAYS_IF_KEPT_S, _PAYS_S = 0.05, 2.0  # time in the rollout for all after which 
 _spent_s: dict[Any, float] = {}
 
 
+def choose_own(policy: Policy, spent_s: float, several: bool, memory: NDArray[np.float64]) -> Any:
+    """The policy's own rollout, if it pays after so many seconds in the one for all; else None."""
+    if not JIT or spent_s <= _PAYS_IF_KEPT_S:
+        return None
+    with suppress(NotKeptError), only_kept() if spent_s < _PAYS_S else nullcontext():
+        kinds = batch_type(several), cast(Any, numba).typeof(memory)
+        return own_rollout(policy.compiled, policy.hears_departures).compile(kinds)
+    return None
+
+
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
     """Run every sender to its end under ``policy``, compiled if the policy is."""
     if not policy.compile:
         python_rollout(batch, shares, memory, policy)
         return
-    functions, hears, several = policy.compiled, policy.hears_departures, bool(batch.several)
-    spent_s, own = _spent_s.get(functions, 0.0), None
-    if JIT and shares is None and spent_s > _PAYS_IF_KEPT_S:
-        with suppress(NotKeptError), only_kept() if spent_s < _PAYS_S else nullcontext():
-            own = own_rollout(functions, hears).compile((batch_type(several), cast(Any, numba).typeof(memory)))
+    several, spent_s = bool(batch.several), _spent_s.get(policy.compiled, 0.0)
+    own = choose_own(policy, spent_s, several, memory) if shares is None else None
     compiled = own or compiled_rollout(shares is not None, several)
-    arguments = (batch, memory) if own else (batch, shares, memory, *functions, hears)
+    arguments = (batch, memory) if own else (batch, shares, memory, *policy.compiled, policy.hears_departures)
     began_s = perf_counter()
     # Its work at each arrival grows with its memory and the numbers it reads.
     if batch.senders["arrivals"].sum() * (memory.shape[1] + len(batch.parameters)) < _SHORT:
@@ -173,4 +180,4 @@ def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], p
     else:
         interruptible(lambda: compiled(*arguments))
     if not own:
-        _spent_s[functions] = spent_s + perf_counter() - began_s
+        _spent_s[policy.compiled] = spent_s + perf_counter() - began_s

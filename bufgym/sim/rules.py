@@ -13,6 +13,7 @@ from typing import Any
 from bufgym.ground.kernel import at, kernel, stretch
 from bufgym.model.buffer import could_fit, of_topic
 from bufgym.model.qoi import value
+from bufgym.model.topics import age_between
 from bufgym.sim.state import Batch
 
 
@@ -83,8 +84,7 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     until_us = min(until_us, at(batch.arrivals, i, sender.arrivals - 1).arrival_us)
     if rules.arrived == 0 or until_us <= rules.aged_us:
         return
-    from_s, until_s = (rules.aged_us - rules.newest_us) / 1e6, (until_us - rules.newest_us) / 1e6
-    area = (from_s + until_s) / 2 * (until_s - from_s)
+    area = age_between(rules.newest_us, rules.aged_us, until_us)
     rules.aged += area
     sender.aged += rules.weight * area
     rules.aged_us = until_us

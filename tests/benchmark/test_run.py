@@ -15,7 +15,7 @@ import bufgym
 from bufgym import oracle, policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
-from bufgym.benchmark.tasks.queue import choose, timeline
+from bufgym.benchmark.tasks.queue import row_to_show, timeline
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.model import qoi
@@ -166,8 +166,8 @@ def test_the_episode_shown_is_the_one_that_costs_drop_oldest_most_at_the_middle_
     given += [("drop-oldest", 4, 2, None), ("afr", 4, 3, 0.8), ("drop-oldest", 8, 0, 0.7)]
     names = ("policy", "capacity", "seed", "regret")
     rows = [dict(zip(names, cells, strict=True), scenario="s", trace="t") for cells in given]
-    assert choose(rows) == choose(rows[::-1]) == rows[2]
-    assert choose(rows[3:4]) is None
+    assert row_to_show(rows) == row_to_show(rows[::-1]) == rows[2]
+    assert row_to_show(rows[3:4]) is None
 
 
 ENDINGS = ["csv", "parquet"]

@@ -292,21 +292,21 @@ def test_the_score_leads_and_is_computed_on_sums() -> None:
     free = [scored("rosbridge", seed, 12.0, regret=None) for seed in (0, 1)]
     entries = {entry["policy"]: entry["score"] for entry in table.means([*BASE, *MINE, *free])}
     assert entries["mine"] == 4 / 11 and entries["drop-oldest"] == 0 and math.isnan(entries["rosbridge"])
-    made = table.of([*BASE, *MINE, *free], alone={"rosbridge": "its queue is unbounded"})
+    made = table.means_table([*BASE, *MINE, *free], unranked={"rosbridge": "its queue is unbounded"})
     assert made.plain().split("\n")[1].split()[:4] == ["mine", "8", "0.364", "6.500"]
-    assert "score" not in table.of(MINE).plain()
-    assert table.of(MINE, BASE).plain().split("\n")[1].split()[2] == "0.364"
-    assert "drop-oldest" not in table.of(MINE, BASE).plain()
+    assert "score" not in table.means_table(MINE).plain()
+    assert table.means_table([*BASE, *MINE], hidden="drop-oldest").plain().split("\n")[1].split()[2] == "0.364"
+    assert "drop-oldest" not in table.means_table([*BASE, *MINE], hidden="drop-oldest").plain()
 
 
 def test_policies_that_no_row_tells_apart_are_one_line() -> None:
     twins = [{**entry, "policy": name} for entry in BASE for name in ("ros-keep-last", "near")]
     twins[-1] |= {"delivered": 2}
     rows = [*twins, *BASE, *MINE]
-    assert table.same(rows) == {"drop-oldest": ["ros-keep-last"]}
-    lines = table.of(rows).plain().split("\n")
+    assert table.with_equal_rows(rows) == {"drop-oldest": ["ros-keep-last"]}
+    lines = table.means_table(rows).plain().split("\n")
     assert [line.split()[0] for line in lines[1:4]] == ["mine", "drop-oldest", "near"]
-    assert "ros-keep-last" in lines[4] and "| ros-keep-last |" not in table.of(rows).markdown()
+    assert "ros-keep-last" in lines[4] and "| ros-keep-last |" not in table.means_table(rows).markdown()
     # One that does not compete is a line of its own, whatever its rows.
     unbounded = [{**entry, "policy": "rosbridge"} for entry in BASE]
-    assert table.same([*BASE, *unbounded], ["rosbridge"]) == {}
+    assert table.with_equal_rows([*BASE, *unbounded], ["rosbridge"]) == {}

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from refusal_cases import refuse, refused
 
 import bufgym
 from bufgym import policies, scenario
-from bufgym.benchmark import sources
+from bufgym.benchmark import folder, sources
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.ground import files
@@ -179,6 +180,17 @@ def test_the_paired_difference_to_a_policy() -> None:
     assert "minus afr's" in suite.table()
     fleet = FleetScenario(robots=2, uplink=scenario.get("lte", duration_s=5.0))
     assert "minus afr's" in bufgym.compare("min-gap", fleet, against="afr", seeds=1).table()
+
+
+def test_a_comparison_is_kept_in_a_folder_as_the_command_keeps_it(tmp_path: Path) -> None:
+    """A scenario's rows and table; a suite's run, which is resumed. Rows of a folder are never written over."""
+    options: dict[str, Any] = {"capacity": 2, "seeds": 1, "progress": False, "form": "csv"}
+    done = bufgym.compare("afr", "interruption", label="mine", out=tmp_path / "one", t_max=20, **options)
+    assert read_rows(tmp_path / "one" / "rows.csv") == done.rows and done.rows[0]["scenario"] == "mine"
+    assert (tmp_path / "one" / "table.md").read_text().startswith("mine\n\n| policy |")
+    refuse(r"rows\.csv: holds an earlier run's rows", bufgym.compare, "afr", "interruption", out=tmp_path / "one")
+    suite = partial(bufgym.compare, "afr", "interruption-v1", out=tmp_path / "two", split="validation", **options)
+    assert suite().rows == suite().rows and folder.read(tmp_path / "two").manifest["split"] == "validation"
 
 
 def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:

@@ -161,6 +161,78 @@ def test_a_change_recompiles_what_calls_it_and_nothing_else(tmp_path: Path) -> N
     assert "afr" in again and "drop_oldest" not in again
 
 
+LEAF = """
+from typing import NamedTuple
+import numpy as np
+from bufgym.ground.kernel import kernel, records
+
+FACTOR = 2
+CELL = np.dtype([("near", np.int64), ("far", np.int64)])
+
+class Pair(NamedTuple):
+    first: int
+    second: int
+
+@kernel
+def leaf(cells):
+    return cells[0].near * FACTOR
+"""
+BRANCH = """
+from leaf import kernel, leaf
+
+@kernel
+def branch(cells, pair):
+    return leaf(cells) + pair.first
+"""
+ROOT = """
+from branch import branch, kernel
+from leaf import CELL, Pair, records
+
+@kernel
+def root(cells, pair):
+    return branch(cells, pair)
+
+cells = records(1, CELL)
+cells.view("i8")[:] = 10, 20
+print(root(cells, Pair(1, 3)))
+"""
+
+
+AT_NIGHT = [
+    ("FACTOR = 2", "FACTOR = 4", 10 * 4 + 1),
+    ('("near", np.int64), ("far", np.int64)', '("far", np.int64), ("near", np.int64)', 20 * 2 + 1),
+    ('("near", np.int64)', '("near", np.int32), ("gap", np.int32)', 10 * 2 + 1),
+    ("first: int\n    second: int", "second: int\n    first: int", 10 * 2 + 3),
+]
+"""Edits of a constant, of the order and the width of a dtype's fields, and of the order of a tuple's fields."""
+
+
+@needs_compilation
+@pytest.mark.parametrize(
+    ("before", "after", "result"),
+    [
+        ("cells[0].near * FACTOR", "cells[0].near - FACTOR", 10 - 2 + 1),
+        *(pytest.param(*edit, marks=pytest.mark.nightly) for edit in AT_NIGHT),
+    ],
+    ids=["callee two levels down", "constant", "fields of a dtype", "width of a field", "fields of a tuple"],
+)
+def test_a_new_process_never_runs_code_of_an_edited_source(
+    before: str, after: str, result: int, tmp_path: Path
+) -> None:
+    """The edited file is not the one of the kernel that Python calls, whose code alone is kept."""
+    environment = {**os.environ, "PYTHONPATH": str(REPO), "NUMBA_CACHE_DIR": str(tmp_path / "code")}
+
+    def printed(leaf: str) -> int:
+        for name, text in (("leaf", leaf), ("branch", BRANCH), ("root", ROOT)):
+            (tmp_path / f"{name}.py").write_text(text)
+        command = [sys.executable, "-B", str(tmp_path / "root.py")]
+        return int(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+
+    assert LEAF.count(before) == 1
+    assert [printed(LEAF), printed(LEAF.replace(before, after)), printed(LEAF)] == [21, result, 21]
+    assert len(list((tmp_path / "code").rglob("*root*.nbc"))) == 2, "the third run found the first one's code"
+
+
 def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
     """No constant that a kernel reads is told by its address."""
     from bufgym.ground.kernel import closure as module

@@ -42,7 +42,15 @@ def test_pettingzoo_has_nothing_to_say(robots, mask_in_observation, capsys):
 
 # Remarks that are no rules: on observations that are dicts, and on zeros, which a robot sees at the end.
 @pytest.mark.filterwarnings("ignore:Observation")
-@pytest.mark.parametrize("options", [{"mask_in_observation": True}, {"observation": "flat"}, {"info": "none"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"mask_in_observation": True},
+        {"mask_in_observation": "pettingzoo", "observation": "flat"},
+        {"observation": "flat"},
+        {"info": "none"},
+    ],
+)
 def test_pettingzoo_has_nothing_to_say_of_it_turn_by_turn(options):
     def make():
         return parallel_to_aec(parallel_env(robots=3, **SMALL, **options))
@@ -112,6 +120,32 @@ def test_what_a_step_hands_out_is_never_written_again():
     assert all(same(now, then) for now, then in zip(held, copies, strict=True))
 
 
+def test_a_nested_observation_has_the_robots_mask_and_fields():
+    env, plain = FleetEnv(robots=3, mask_in_observation="rllib", **SMALL), FleetEnv(robots=3, **SMALL)
+    (seen, infos), (before, _) = env.reset(seed=4), plain.reset(seed=4)
+    for _ in range(9):
+        for agent in env.agents:
+            assert list(seen[agent]) == ["observations", "action_mask"]
+            assert env.observation_space(agent).contains(seen[agent])
+            assert same(seen[agent]["observations"], before[agent])
+            assert np.array_equal(seen[agent]["action_mask"], infos[agent]["action_mask"])
+        actions = dict.fromkeys(env.agents, 0)
+        (seen, _, _, _, infos), (before, *_) = env.step(actions), plain.step(actions)
+
+
+def test_np_random_is_the_generator_of_the_seed():
+    """As SuperSuit's frame_skip draws from it, without a seed too."""
+    env = FleetEnv(robots=2, **SMALL)
+    assert 1 <= env.np_random.integers(1, 5) < 5
+    drawn = []
+    for _ in range(2):
+        seen, _ = env.reset(seed=6)
+        drawn.append(
+            (env.np_random.random(), seen["robot_1"]["loss"].tolist(), env.reset()[0]["robot_1"]["size"].tolist())
+        )
+    assert drawn[0] == drawn[1]
+
+
 def test_fields_and_state():
     env = FleetEnv(robots=3, fields=["occupancy", "loss"], **SMALL)
     seen, _ = env.reset(seed=0)
@@ -139,7 +173,7 @@ def test_pictures_have_a_line_and_a_bar_for_every_robot():
     before, after = (int((frame == (0xE0, 0xA1, 0x00)).all(axis=-1).sum()) for frame in shown)
     assert after > before + 500  # the legend has the colour, too
     assert (image.rows.senders.batch.senders["next"] == 8).all()  # drawing changes nothing
-    envs = FleetVecEnv(1, 2, "lte", L, parameters=PARAMETERS, render_mode="rgb_array")
+    envs = FleetVecEnv(1, 2, "lte", L, **PARAMETERS, render_mode="rgb_array")
     envs.reset(seed=0)
     assert [frame.shape for frame in envs.render()] == [(400, 800, 3)] * 2
     with pytest.warns(UserWarning, match="render_mode"):
@@ -149,7 +183,8 @@ def test_pictures_have_a_line_and_a_bar_for_every_robot():
 test_bad_input_is_told_apart = refused(
     (lambda: FleetEnv(reward="all"), "reward = 'all': must be 'team'"),
     (lambda: FleetEnv(term="speed"), "unknown term 'speed'"),
-    (lambda: FleetEnv(observation="flat", mask_in_observation=True), "'flat' has no place for it"),
+    (lambda: FleetEnv(bound=True), "bound = True: .*, not for a cell of robots"),
+    (lambda: FleetVecEnv(frameskip=1), "unexpected keyword argument 'frameskip'", TypeError),
     (lambda: begun().step({"robot_0": 0, "robot_1": 1.7}), r"actions\['robot_1'\] = 1.7: must be a whole number"),
     (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),
     (lambda: begun().step({"robot_0": 0, "robot_1": L + 2}), r"actions\['robot_1'\] = 6: must lie in 0..5"),
@@ -173,7 +208,7 @@ def apart(robots=2):
 
 
 def batch():
-    envs = FleetVecEnv(2, 2, parameters=PARAMETERS)
+    envs = FleetVecEnv(2, 2, **PARAMETERS)
     envs.reset(seed=0)
     return envs
 
@@ -195,7 +230,7 @@ def test_without_pettingzoo_the_error_names_the_extra(monkeypatch):
 @pytest.mark.parametrize("reward", ["team", "own"])
 def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
     cells, robots = 2, 3
-    envs = FleetVecEnv(cells, robots, "lte", L, reward=reward, num_threads=2, parameters=PARAMETERS)
+    envs = FleetVecEnv(cells, robots, "lte", L, reward=reward, num_threads=2, **PARAMETERS)
     fleets = [FleetEnv(robots, "lte", L, reward=reward, **PARAMETERS) for _ in range(cells)]
     seen, info = envs.reset(seed=11)
     each = [fleet.reset(seed=11 + c * robots) for c, fleet in enumerate(fleets)]
@@ -227,7 +262,7 @@ def test_rows_of_the_batch_are_the_robots_of_the_fleets(reward):
 
 
 def test_cells_can_be_given_and_begun_one_by_one():
-    envs = FleetVecEnv(2, 2, "lte", L, autoreset_mode=AutoresetMode.DISABLED, parameters=PARAMETERS)
+    envs = FleetVecEnv(2, 2, "lte", L, autoreset_mode=AutoresetMode.DISABLED, **PARAMETERS)
     given = FleetScenario.of(2, "lte", **PARAMETERS).draw(Streams.seeded(4))
     envs.reset(seed=0, options={"episodes": [None, given]})
     assert envs.rows.senders.episodes[3].arrivals is given.arrivals[1]

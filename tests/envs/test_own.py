@@ -167,9 +167,31 @@ def test_a_batch_is_its_rows() -> None:
         assert rewards.tolist() == [step[1] for step in steps]
 
 
+def test_a_term_of_the_end_is_asked_once_an_episode() -> None:
+    """``prepare`` runs as the environment is made; the function sees the last step of each episode alone."""
+    calls: list[Any] = []
+
+    @reward_term("at_end", at_end=True, prepare=lambda: calls.append("ready"))
+    def messages_left(step: Any, memory: Any) -> float:
+        calls.append(step.ended)
+        return len(step.log)
+
+    single: Any = gym.make("bufgym/Uplink-v0", duration_s=1.0, reward="at_end")
+    assert calls == ["ready"]
+    single.reset(seed=0)
+    steps = [single.step(0) for _ in range(30)]
+    assert [reward for _, reward, *_ in steps] == [0.0] * 29 + [30.0] and calls == ["ready", True]
+    batch: Any = gym.make_vec("bufgym/Uplink-v0", 3, duration_s=1.0, reward="at_end")
+    batch.reset(seed=0)
+    for _ in range(30):
+        _, rewards, ended, *_ = batch.step(np.zeros(3, np.int64))
+        assert (rewards == np.where(ended, 30.0, 0.0)).all()
+    assert ended.all() and calls == ["ready", True, "ready", True, True, True]
+
+
 def test_a_fleet_has_them_too() -> None:
     rewarded: dict[str, Any] = {"term": {"delay": 1.0, "dropped": 0.1}, "reward": "own"}
-    envs = FleetVecEnv(2, 3, capacity=3, fields=CHOSEN, parameters={"duration_s": 1.0}, **rewarded)
+    envs = FleetVecEnv(2, 3, capacity=3, fields=CHOSEN, duration_s=1.0, **rewarded)
     envs.reset(seed=1)
     done = np.zeros(6, np.bool_)
     while not done.any():

@@ -208,6 +208,41 @@ def test_info_is_built_as_far_as_asked(info: str, always: set[str]) -> None:
     assert {name: last[name] for name in summary} == summary and last["qoi"] == pytest.approx(1 + 3 * (1 - 0.618))
 
 
+KEYS = {
+    "rllib": ("observations", "action_mask"),
+    "tianshou": ("obs", "mask"),
+    "pettingzoo": ("observation", "action_mask"),
+}
+
+
+@pytest.mark.parametrize("dtype", ["int8", "bool"])
+@pytest.mark.parametrize("form", ["dict", "flat", "slots"])
+@pytest.mark.parametrize("where", [True, ("seen", "may"), *KEYS])
+def test_observations_hold_the_mask_where_a_library_looks_for_it(where: Any, form: str, dtype: str) -> None:
+    plain, env = make(observation=form), make(observation=form, mask_in_observation=where, mask_dtype=dtype)
+    fields, mask = KEYS.get(where, where) if where is not True else ("observation", "action_mask")
+    (before, _), (seen, info) = plain.reset(seed=2), env.reset(seed=2)
+    for action in range(20):
+        assert env.observation_space.contains(seen) and list(seen) == list(env.observation_space)
+        assert seen[mask].dtype == dtype and seen[mask].tolist() == info["action_mask"].tolist()
+        rest = seen[fields] if fields in seen else {name: seen[name] for name in before}
+        assert same(rest, before) if isinstance(before, dict) else np.array_equal(rest, before)
+        assert (where is True and form != "flat") == (fields not in seen)
+        (before, *_), (seen, _, _, _, info) = plain.step(action % 6), env.step(action % 6)
+    check_env(env, skip_render_check=True)
+
+
+def test_a_library_that_tries_an_argument_sees_pythons_own_error() -> None:
+    """As TorchRL does: it passes ``frameskip`` and leaves it out at Python's words."""
+    for make_one in (gym.make, gym.make_vec):
+        with pytest.raises(
+            TypeError, match=r"^Uplink\.__init__\(\) got an unexpected keyword argument 'frameskip': unknown"
+        ):
+            make_one("bufgym/Uplink-v0", frameskip=1)
+    with pytest.raises(ValueError, match="'capacty'; did you mean 'capacity'"):
+        SenderEnv(capacty=3)
+
+
 WHOLE = r"must be a whole number in 0\.\.5 \(L = 4\)"
 
 
@@ -221,6 +256,10 @@ test_wrong_use_is_named = refused(
     (lambda: SenderEnv(decide_at="noon"), "decide_at = 'noon'"),
     (lambda: SenderEnv(max_bytes=0), "max_bytes = 0"),
     (lambda: SenderEnv(render_mode="human"), "render_mode = 'human'"),
+    (lambda: SenderEnv(mask_in_observation="tianshu"), "'tianshu': must be True, False, two names"),
+    (lambda: SenderEnv(mask_in_observation=("mask", "mask")), "two names of keys or one of 'rllib', 'tianshou'"),
+    (lambda: SenderEnv(mask_in_observation=True, actions="guided"), "actions = 'guided' have no mask"),
+    (lambda: SenderEnv(mask_dtype="float32"), "mask_dtype = 'float32': must be one of 'int8', 'bool'"),
     *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}") for a in (1.7, np.array([1]), "1", None)),
     (lambda: begun().step(6), r"action = 6: must lie in 0\.\.5"),
     (lambda: make("interruption").reset(options={"episode": Interruption(t_max=30).episode(30)}), "room for 27"),

@@ -82,6 +82,9 @@ FORMS: list[dict[str, Any]] = [
     {"observation": "flat", "fields": ["loss", "rank", "busy"], "info": "mask"},
     {"observation": "slots", "info": "none"},
     {"observation": "slots", "fields": ["busy"]},
+    {"observation": "slots", "mask_in_observation": True},
+    {"observation": "flat", "mask_in_observation": True},
+    {"mask_in_observation": "rllib", "mask_dtype": "bool"},
 ]
 
 
@@ -268,12 +271,21 @@ def begun() -> SenderVectorEnv:
     return envs
 
 
+@pytest.mark.parametrize("mode", [SAME_STEP, "SameStep", "SAME_STEP"])
+def test_autoreset_in_each_way_that_gymnasium_has(mode: Any) -> None:
+    native = gym.make_vec("bufgym/Uplink-v0", 2, autoreset_mode=mode)
+    kwargs = {"autoreset_mode": native.metadata["autoreset_mode"]}
+    sync = gym.make_vec("bufgym/Uplink-v0", 2, "sync", vector_kwargs=kwargs)
+    assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is SAME_STEP
+
+
 RESET = gym.error.ResetNeeded
 
 
 test_wrong_use_is_named = refused(
     (lambda: SenderVectorEnv(0), "num_envs = 0"),
     (lambda: SenderVectorEnv(autoreset_mode="Sometimes"), "autoreset_mode = 'Sometimes'"),
+    (lambda: gym.make_vec("bufgym/Uplink-v0", 1, "sync", autoreset_mode="SameStep"), "SyncVectorEnv by vector_kwargs"),
     (lambda: SenderVectorEnv(max_episode_steps=0), "max_episode_steps = 0"),
     (lambda: SenderVectorEnv(observation="vector"), "must be one of 'dict', 'flat', 'slots'"),
     (lambda: SenderVectorEnv(info="some"), "must be one of 'full', 'steady', 'mask', 'none'"),

@@ -6,18 +6,19 @@ It reads a folder of ``bufgym bench --suite``. It simulates nothing and takes al
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bufgym import policies
-from bufgym.benchmark import tasks
 from bufgym.benchmark.folder import SuiteRun, read
 from bufgym.benchmark.report import page, tables
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.summary import Summary
+from bufgym.benchmark.table import Unranked
+from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
@@ -25,7 +26,7 @@ from bufgym.policies import Policy
 from bufgym.scenario import about
 from bufgym.scenario.suites import Setting
 
-__all__ = ["markdown", "page_for", "page_of", "run_of", "save", "write"]
+__all__ = ["markdown", "page_of_rows", "page_of_run", "run_of", "save", "write"]
 
 
 def write(folder: str | Path, target: Path | None = None) -> Path:
@@ -46,20 +47,26 @@ def save(text: str, target: Path) -> Path:
     return target
 
 
-def page_of(
-    rows: Sequence[Row], shown: Sequence[Policy], unranked: Mapping[str, str], stream: Any, heading: str, command: str
+def page_of_rows(
+    task: Task,
+    rows: Sequence[Row],
+    players: Sequence[Policy],
+    unranked: Unranked,
+    scenario: Any,
+    heading: str,
+    command: str,
 ) -> str:
-    """The page of rows of one scenario that is no suite's, with an episode of ``shown``. Errors as for ``write``."""
-    task, name = tasks.of(stream), rows[0]["scenario"] or "this stream"
+    """The page of one scenario's rows, with an episode of the ``players``. Errors as for ``write``."""
+    name = rows[0]["scenario"] or "this stream"
     rows = [{**row, "scenario": name} for row in rows]
     manifest = {"task": task.kind, "suite": name, "split": "", "about": heading, "episodes": ""}
     manifest |= {"bufgym": __version__, "made": "", "unranked": unranked, "changes": {}}
-    manifest |= {"scenarios": {name: {"about": about(stream), "value": stream.value.name}}}
-    example = task.example(shown, rows, lambda row: Setting(stream, about(stream))) if shown else None
-    return page_for(SuiteRun(Path(), manifest, rows, Path("rows"), example), command)
+    manifest |= {"scenarios": {name: {"about": about(scenario), "value": scenario.value.name}}}
+    example = task.example(players, rows, lambda row: Setting(scenario, about(scenario)))
+    return page_of_run(SuiteRun(Path(), manifest, rows, Path("rows"), example), command)
 
 
-def page_for(run: SuiteRun, command: str) -> str:
+def page_of_run(run: SuiteRun, command: str) -> str:
     """The page of a run that is at hand, made again by ``command``. Errors as for ``write``."""
     return page.html(*_summed(replace(run, manifest={**run.manifest, "command": command}), None))
 

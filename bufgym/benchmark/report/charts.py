@@ -106,9 +106,9 @@ def _lanes_height(names: Sequence[str]) -> float:
 def ranking(context: Context) -> Chart | None:
     """Draw a dot and an interval for each policy; None if no policy has a value of the ranking quantity."""
     quantities = {quantity.key: quantity for quantity in context.summary.quantities}
-    if not _known(context, quantities[context.summary.rank_by]):
+    if not _with_a_value(context, quantities[context.summary.rank_by]):
         return None
-    shown = [quantity for quantity in quantities.values() if quantity.drawn and _known(context, quantity)]
+    shown = [quantity for quantity in quantities.values() if quantity.drawn and _with_a_value(context, quantity)]
     names = [standing.policy for standing in reversed(context.summary.overall)]
 
     def draw(figure: Any) -> None:
@@ -119,7 +119,7 @@ def ranking(context: Context) -> Chart | None:
     return Chart("ranking", alt, [("", svg(draw, _lanes_height(names)))])
 
 
-def _known(context: Context, quantity: Quantity) -> dict[str, Interval]:
+def _with_a_value(context: Context, quantity: Quantity) -> dict[str, Interval]:
     """Select policies with a value; an unknown interval becomes that point."""
     values = {standing.policy: standing[quantity.key] for standing in context.summary.overall}
     return {
@@ -134,10 +134,10 @@ def _dots(context: Context, axes: Any, names: list[str], quantity: Quantity, sec
 
     Values more than two interquartile ranges beyond the quartiles are written at the edge.
     """
-    known, standings = _known(context, quantity), context.summary.standings
-    first, third = np.percentile([value for value, *_ in known.values()], [25, 75]).tolist()
+    with_value, standings = _with_a_value(context, quantity), context.summary.standings
+    first, third = np.percentile([value for value, *_ in with_value.values()], [25, 75]).tolist()
     floor, ceiling = first - 2 * (third - first) - 1e-3, third + 2 * (third - first) + 1e-3
-    for policy, (value, low, high) in known.items():
+    for policy, (value, low, high) in with_value.items():
         lane, colour = names.index(policy), context.paint(policy)
         if not floor <= value <= ceiling:
             words = f"{quantity.write(value)} ▸" if value > ceiling else f"◂ {quantity.write(value)}"
@@ -153,7 +153,7 @@ def _dots(context: Context, axes: Any, names: list[str], quantity: Quantity, sec
     if quantity.write is percent:
         axes.xaxis.set_major_formatter("{x:.0%}")
     set_lanes(axes, names)
-    compared = known.get(quantity.versus or context.summary.baseline)
+    compared = with_value.get(quantity.versus or context.summary.baseline)
     if compared is not None:
         axes.axvline(compared.value, color=PALETTE["axis"], zorder=0.5)
 

@@ -15,13 +15,13 @@ from bufgym.benchmark.tasks.task import Task
 from bufgym.benchmark.tasks.topics import TopicsTask
 from bufgym.ground.errors import BufgymError
 
-__all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "of"]
+__all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "task_for"]
 
 TASKS: dict[str, Task] = {task.kind: task for task in (QueueTask(), StressTask(), TopicsTask(), FleetTask())}
 """``Suite.kind`` -> task."""
 
 
-def of(scenario: Any, **settings: Any) -> Task:
+def task_for(scenario: Any, **settings: Any) -> Task:
     """Find the task for a scenario; a scenario of unknown kind is for one queue.
 
     ``settings`` are the task's own, such as max_bytes, decide_at and bound of ``QueueTask``.

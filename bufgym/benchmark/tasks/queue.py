@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from bufgym import policies as registry
 from bufgym.benchmark import bootstrap, table
 from bufgym.benchmark.rows import RUNS, Row
 from bufgym.benchmark.score import REFERENCE, scores
@@ -19,7 +20,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.oracle import Plan, clairvoyant
 from bufgym.oracle.clairvoyant import privileged
 from bufgym.oracle.measure import BASELINE, TIE, regret
-from bufgym.policies import Policy, names
+from bufgym.policies import Policy
 from bufgym.scenario import Episode, Scenario
 from bufgym.scenario.numbered import draw
 from bufgym.scenario.suites import Setting
@@ -81,7 +82,10 @@ class QueueTask(Task):
 
     def default_policies(self, suite: str) -> list[str]:
         """List all policies for one queue with their sources' parameters, and the variants tuned on the suite."""
-        return [*names(for_topics=False), *tuned(suite)]
+        able = list(registry.names(for_topics=False))
+        if self.decide_at != "arrival":  # see ``check``
+            able = [name for name in able if registry.get(name).privileged is None]
+        return [*able, *tuned(suite)]
 
     def check(self, policy: Policy) -> None:
         if policy.privileged is not None and self.decide_at != "arrival":
@@ -133,34 +137,54 @@ class QueueTask(Task):
         return Summary(quantities, "score", scored.standings, {}, self.baseline, scored)
 
     def tables(
-        self, rows: Sequence[Row], floor: Sequence[Row], summary: Summary, unranked: Unranked, abouts: Mapping[str, str]
+        self, rows: Sequence[Row], summary: Summary, scenario: Any, unranked: Unranked, hidden: str
     ) -> list[Table]:
         """The table of means; then, where policies are compared with one of them, their shares of AFR's regret."""
         cells = [cell for cell in summary.scores.cells if cell.episodes > 1] if summary.scores else []
         behind = {(cell.capacity, cell.policy): bootstrap.written(cell.score, score)[1] for cell in cells}
-        means = table.of(rows, floor, unranked, behind)
-        if "score" in means.head:
-            means = means._replace(notes=[table.SCORE, *[table.BRACKETS] * any(behind.values()), *means.notes])
+        means = table.means_table(rows, unranked, behind, hidden)
+        scale = [table.SCORE, *[table.BRACKETS] * any(behind.values())] if "score" in means.head else []
+        means = means._replace(notes=[*scale, *means.notes, *self._bound_notes(rows, scenario)])
         paired = [quantity for quantity in summary.quantities if quantity.key in ("share", "against")]
         if len(paired) == 1:
             return [means]
         notes = [f"{quantity.title}: {quantity.about}." for quantity in paired]
         return [means, table_over([("", summary.overall)], paired)._replace(notes=notes)]
 
+    def _bound_notes(self, rows: Sequence[Row], scenario: Any) -> list[str]:
+        """State the clairvoyant's result on a recording, and whether it is exact."""
+        workload = getattr(scenario, "workload", None)
+        if workload is None or not self.bound:
+            return []
+        equal_sizes = workload.size_bytes.min() == workload.size_bytes.max()
+        why = f"decisions are asked at {self.decide_at}" if equal_sizes else "message sizes differ"
+        notes = []
+        for capacity in dict.fromkeys(row["capacity"] for row in rows):
+            episodes = {(row["trace"], row["seed"]): row for row in rows if row["capacity"] == capacity}.values()
+            most = sum(row["clairvoyant"] for row in episodes) / len(episodes)
+            exact = all(row["certified"] for row in episodes)
+            what = f"is {most:.3f}" if exact else f"is at most {most:.3f}, an upper bound, as {why}"
+            notes.append(f"note: L = {capacity}: the clairvoyant's QoI {what}; regret is measured against it")
+        if any(row["policy"] == "clairvoyant" and not row["certified"] for row in rows):
+            notes.append(
+                "note: the row clairvoyant follows a plan for which there is not always room: less than its bound"
+            )
+        return notes
+
     def example(
         self, policies: Sequence[Policy], rows: Sequence[Row], setting_of: Callable[[Row], Setting]
     ) -> dict[str, Any] | None:
-        row = choose(rows)
+        row = row_to_show(rows)
         if row is None:
             return None
         setting = setting_of(row)
-        return {**timeline(policies, setting.scenario, row), "about": setting.about}
+        return {**timeline(policies, setting.scenario, row, self.max_bytes, self.decide_at), "about": setting.about}
 
 
 _STEP_S = 0.25  # between the points of the curve of the link's capacity
 
 
-def choose(rows: Sequence[Row]) -> Row | None:
+def row_to_show(rows: Sequence[Row]) -> Row | None:
     """The row of the episode to show: at the middle capacity, the one on which Drop Oldest has the largest regret."""
     capacities = sorted({row["capacity"] for row in rows})
     middle = capacities[len(capacities) // 2]
@@ -170,16 +194,17 @@ def choose(rows: Sequence[Row]) -> Row | None:
     return max(candidates, key=lambda row: (row["regret"], row["scenario"], row["trace"], row["seed"]), default=None)
 
 
-def timeline(policies: Sequence[Policy], scenario: Scenario, chosen: Row) -> dict[str, Any]:
-    """The episode of the row ``chosen`` under every policy; times in s, rates in bytes/s."""
-    episode = draw(scenario, chosen["seed"])
-    capacity = chosen["capacity"]
-    plan = best(episode, capacity, scenario)
+def timeline(
+    policies: Sequence[Policy], scenario: Scenario, row: Row, max_bytes: int | None = None, decide_at: str = "arrival"
+) -> dict[str, Any]:
+    """The episode of ``row`` under every policy; times in s, rates in bytes/s."""
+    episode, capacity = draw(scenario, row["seed"]), row["capacity"]
+    plan = best(episode, capacity, scenario, max_bytes, decide_at)
     arrivals = np.asarray(episode.arrivals)
     lanes: dict[str, Any] = {}
     last_us = int(arrivals["arrival_us"][-1])
     for policy in policies:
-        senders = meet(policy, [episode], capacity, scenario, [plan])
+        senders = meet(policy, [episode], capacity, scenario, [plan], max_bytes, decide_at)
         log = np.asarray(senders.batch.log[0])[: len(arrivals)]
         h = outcome(senders, 0).qoi
         received = np.flatnonzero(log["transmitted_us"] != NEVER)
@@ -198,7 +223,7 @@ def timeline(policies: Sequence[Policy], scenario: Scenario, chosen: Row) -> dic
     carried = np.diff(episode.link.carried_by(edges_us))
     offered_s = max(1, int(arrivals["arrival_us"][-1])) / 1e6
     return {
-        **{key: chosen[key] for key in ("scenario", "capacity", "trace", "seed")},
+        **{key: row[key] for key in ("scenario", "capacity", "trace", "seed")},
         "arrival_s": (arrivals["arrival_us"] / 1e6).tolist(),
         "x": arrivals["x"].tolist(),
         "rate": {"t_s": (edges_us[:-1] / 1e6).tolist(), "bytes_per_s": (carried / _STEP_S).tolist()},

@@ -1,9 +1,9 @@
-"""Protocol of a task, and the drawing of its episodes."""
+"""Protocol of a task."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -12,6 +12,7 @@ from bufgym.benchmark.summary import Quantity, Summary, table_of
 from bufgym.benchmark.table import NOBODY, Table, Unranked, invalid
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
+from bufgym.scenario import about
 from bufgym.scenario.suites import Setting
 
 Result = list[Row]
@@ -76,13 +77,14 @@ class Task(ABC):
 
     def notes(self, rows: Sequence[Row], summary: Summary) -> list[str]:
         """Lines under a printed summary: the legend, who has no rank, invalid decisions, and the summary's own."""
-        apart = [f"{s.policy} has no rank: {s.apart}." for s in summary.overall if not s.ranked]
-        return [*self.legend, *apart, *invalid(self.senders(rows)), *summary.notes]
+        no_rank = [f"{s.policy} has no rank: {s.unranked_because}." for s in summary.overall if not s.ranked]
+        return [*self.legend, *no_rank, *invalid(self.senders(rows)), *summary.notes]
 
     def tables(
-        self, rows: Sequence[Row], floor: Sequence[Row], summary: Summary, unranked: Unranked, abouts: Mapping[str, str]
+        self, rows: Sequence[Row], summary: Summary, scenario: Any, unranked: Unranked, hidden: str
     ) -> list[Table]:
-        """Tables of one scenario's rows. ``floor`` has the baseline's rows where they are not among ``rows``."""
+        """Tables of one scenario's rows; the policy ``hidden`` gets no line of its own in the first."""
+        abouts = {rows[0]["scenario"]: about(scenario)}
         return [table_of(summary, abouts, ["", *self.notes(rows, summary)])]
 
     def describe(self, scenarios: Sequence[Any], episodes: int) -> str:

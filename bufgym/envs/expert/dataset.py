@@ -3,14 +3,15 @@
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 
 from bufgym.envs import SenderVectorEnv
-from bufgym.envs.expert.record import KINDS, ROWS, record
+from bufgym.envs.expert.record import KINDS, ROWS, Recorded, record
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.libraries import needs
 
@@ -45,13 +46,9 @@ def make(
         seed: seed of the batch, as in ``reset``.
         regret: whether to compute each decision's regret, which takes most of the time; equal sizes only.
     """
-    from unittest.mock import patch  # here, as it is slow to import
-
     with needs(("minari", "pyarrow"), "dataset", "a data set"):
-        import minari
+        import minari  # noqa: F401
         import pyarrow  # noqa: F401  (Minari's storage format here)
-        from minari import namespace as namespaces
-        from minari.data_collector import EpisodeBuffer
     env = env if "/" in env else f"bufgym/{env}"
     known = [id for id in gym.registry if id.startswith("bufgym/")]
     if env not in known:
@@ -59,57 +56,95 @@ def make(
     if kind not in KINDS:
         raise BufgymError(f"kind = {kind!r}: must be one of {', '.join(KINDS)}")
     name = name or f"{env.lower().rsplit('-', 1)[0]}/{kind}-v0"
-    single: Any = gym.make(env, **options)
-    try:
-        single.spec.to_json()
-    except (TypeError, ValueError):
-        raise BufgymError("options: give them as text or numbers, so that the environment can be recovered") from None
-    envs = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "none"})
+    root = _folder_for(name, out)
+    single = _recoverable(env, options)
+    batch = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "none"})
+    recorded = record(batch, kind, episodes, medium=medium, seed=seed, regret=regret)
+    players = {"expert": "clairvoyant", "medium": medium, "random": "random", "mixed": f"clairvoyant, {medium}, random"}
+    about = f"bufgym: {players[kind]} in {env}, {options or 'default settings'}, seed {seed}"
+    with tempfile.TemporaryDirectory(prefix=".bufgym-", dir=root) as folder:
+        with _minari_writes_to(folder):
+            _write(name, recorded, single, players[kind], about)
+        with _minari_writes_to(root):
+            _register_namespace(name)
+        os.replace(Path(folder) / name, root / name)
+    return name
 
-    def buffers() -> Iterator[Any]:
-        recorded = record(envs, kind, episodes, medium=medium, seed=seed, regret=regret)
-        for number, episode in enumerate(recorded):
-            infos: dict[str, Any] = {"action_mask": episode.action_mask, "qoi": episode.qoi.tolist()}
-            if episode.regret is not None:
-                infos["regret"] = episode.regret.tolist()
-            T = len(episode.actions)
-            yield EpisodeBuffer(
-                id=number,
-                options={"player": episode.player},
-                observations=episode.observations,
-                actions=episode.actions,
-                rewards=episode.rewards,
-                terminations=[False] * (T - 1) + [True],
-                truncations=[False] * T,
-                infos=infos,
-            )
 
-    # For a relative folder Minari writes Arrow files beside it.
+def _folder_for(name: str, out: str | Path | None) -> Path:
+    """The folder of data sets, made if missing; an error if it holds this one. Absolute, as for a relative folder
+    Minari writes Arrow files beside it."""
     root = Path(out or os.environ.get(VARIABLE) or Path.home() / ".minari" / "datasets").absolute()
     if (root / name).exists():
         raise BufgymError(f"{root / name}: exists already; remove it or give another --name")
     root.mkdir(parents=True, exist_ok=True)
-    players = {"expert": "clairvoyant", "medium": medium, "random": "random", "mixed": f"clairvoyant, {medium}, random"}
-    with tempfile.TemporaryDirectory(prefix=".bufgym-", dir=root) as folder, warnings.catch_warnings():
+    return root
+
+
+def _recoverable(env: str, options: dict[str, Any]) -> Any:
+    """The single environment, whose options a data set can store."""
+    single = gym.make(env, **options)
+    try:
+        cast(Any, single.spec).to_json()
+    except (TypeError, ValueError):
+        raise BufgymError("options: give them as text or numbers, so that the environment can be recovered") from None
+    return single
+
+
+@contextmanager
+def _minari_writes_to(folder: str | Path) -> Iterator[None]:
+    from unittest.mock import patch  # here, as it is slow to import
+
+    with patch.dict(os.environ, {VARIABLE: str(folder)}):
+        yield
+
+
+def _write(name: str, recorded: Iterable[Recorded], single: Any, players: str, about: str) -> None:
+    """Write the episodes as the data set ``name`` into Minari's folder."""
+    import minari
+
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # Minari asks for an author and the like
-        with patch.dict(os.environ, {VARIABLE: folder}):
-            try:
-                minari.create_dataset_from_buffers(
-                    name,
-                    buffers(),
-                    env=single,
-                    algorithm_name=players[kind],
-                    description=f"bufgym: {players[kind]} in {env}, {options or 'default settings'}, seed {seed}",
-                    data_format="arrow",
-                    requirements=["bufgym"],
-                )
-            except ValueError as error:
-                if "dataset ID" not in str(error):
-                    raise
-                raise BufgymError(f"--name {name}: must be of the form (namespace/)name-v0") from None
-        with patch.dict(os.environ, {VARIABLE: str(root)}):
-            namespace = name.rpartition("/")[0]
-            if namespace and namespace not in namespaces.list_local_namespaces():
-                namespaces.create_namespace(namespace)
-        os.replace(Path(folder) / name, root / name)
-    return name
+        try:
+            minari.create_dataset_from_buffers(
+                name,
+                (_episode_buffer(number, episode) for number, episode in enumerate(recorded)),
+                env=single,
+                algorithm_name=players,
+                description=about,
+                data_format="arrow",
+                requirements=["bufgym"],
+            )
+        except ValueError as error:
+            if "dataset ID" not in str(error):
+                raise
+            raise BufgymError(f"--name {name}: must be of the form (namespace/)name-v0") from None
+
+
+def _episode_buffer(number: int, episode: Recorded) -> Any:
+    """An episode as Minari stores it."""
+    from minari.data_collector import EpisodeBuffer
+
+    infos: dict[str, Any] = {"action_mask": episode.action_mask, "qoi": episode.qoi.tolist()}
+    if episode.regret is not None:
+        infos["regret"] = episode.regret.tolist()
+    T = len(episode.actions)
+    return EpisodeBuffer(
+        id=number,
+        options={"player": episode.player},
+        observations=episode.observations,
+        actions=episode.actions,
+        rewards=episode.rewards,
+        terminations=[False] * (T - 1) + [True],
+        truncations=[False] * T,
+        infos=infos,
+    )
+
+
+def _register_namespace(name: str) -> None:
+    """Make the data set's namespace in Minari's folder, if it has one that is new there."""
+    from minari import namespace as namespaces
+
+    namespace = name.rpartition("/")[0]
+    if namespace and namespace not in namespaces.list_local_namespaces():
+        namespaces.create_namespace(namespace)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import compile_for, entry, located, named
 from bufgym.model.buffer import ACCEPT, HOLD
+from bufgym.model.checks import constants
 from bufgym.policies import Policy
 from bufgym.policies.registry import signatures
 from bufgym.sim import Senders
@@ -37,6 +38,15 @@ class Player:
         self._memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)
+
+    @property
+    def memory(self) -> NDArray[np.float64]:
+        """float64[n, entries], with the policy's scratch."""
+        return self._memory
+
+    def rewrite(self, numbers: NDArray[np.float64]) -> None:
+        """Give the policy other parameters or weights, as many as it has."""
+        self._parameters = constants(numbers)
 
     def action(self, senders: Senders, i: int = 0) -> int:
         """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept.

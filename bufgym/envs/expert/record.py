@@ -91,7 +91,7 @@ def record(
             numbers[i, T] = 0.0, rows.output.qoi[i], 0.0
             yield Recorded(
                 cast[turns[i]],
-                rows.form.of(seen[i, : T + 1].copy()),
+                rows.form.masked(rows.form.of(seen[i, : T + 1].copy()), masks[i, : T + 1].copy()),
                 taken[i, :T].copy(),
                 numbers[i, :T, 0].copy(),
                 masks[i, : T + 1].copy(),

@@ -10,7 +10,7 @@ from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
 from bufgym.ground.kernel.cache import Code
-from bufgym.ground.kernel.pipeline import PartCompiler, WholeCompiler
+from bufgym.ground.kernel.pipeline import KernelCompiler
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -31,7 +31,7 @@ class _Kernel(CPUDispatcher):
     @functools.cached_property
     def _part(self) -> Any:
         options, part = {**_OPTIONS, **_INLINED}, cast(Any, CPUDispatcher)
-        return part(cast(Any, self).py_func, targetoptions=options, pipeline_class=PartCompiler)
+        return part(cast(Any, self).py_func, targetoptions=options, pipeline_class=KernelCompiler)
 
     @property
     def _numba_type_(self) -> Any:
@@ -41,7 +41,7 @@ class _Kernel(CPUDispatcher):
 
 def _dispatcher(kind: Any, function: Callable[..., Any], role: str, **options: bool) -> Any:
     """Numba's compiler of ``function``, which keeps its code on disk by ``role``."""
-    dispatcher = kind(function, targetoptions={**_OPTIONS, **options}, pipeline_class=WholeCompiler)
+    dispatcher = kind(function, targetoptions={**_OPTIONS, **options}, pipeline_class=KernelCompiler)
     dispatcher._cache = Code(function, role)
     return dispatcher
 

@@ -19,8 +19,13 @@ _Model: Any = datamodel.models.TupleModel
 _Pass: Any = FunctionPass
 
 
-class WholeCompiler(_Compiler):  # type: ignore[misc]
-    """Compiler of the kernels that Python calls."""
+class KernelCompiler(_Compiler):  # type: ignore[misc]
+    """Compiler of the kernels that Python calls, and of the parts that go into them, which are marked to be inlined."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, types: Any, result: Any, flags: Any, names: Any) -> None:
+        if flags.forceinline:
+            library = _PartLibrary(target.codegen(), "part")
+        super().__init__(typing, target, library, types, result, flags, names)
 
     def define_pipelines(self) -> list[Any]:
         """Numba's own passes, and ``_NoneFields`` before all that look at types."""
@@ -31,6 +36,8 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
 
     def compile_extra(self, function: Any) -> Any:
         """Compile ``function``; Numba calls it with its compiler's lock held."""
+        if self.state.flags.forceinline:
+            return super().compile_extra(function)
         notice = threading.Timer(announce.PATIENCE_S, announce.say)
         numbas, notice.daemon = cast(Any, config), True
         level = numbas.OPT
@@ -44,16 +51,6 @@ class WholeCompiler(_Compiler):  # type: ignore[misc]
         for environment in result._find_referenced_environments():  # of Python objects that parts use, such as texts
             result.codegen.set_env(environment.env_name, environment)
         return result
-
-
-class PartCompiler(WholeCompiler):
-    """Compiler of the kernels that go into others."""
-
-    def __init__(self, typing: Any, target: Any, library: Any, *others: Any) -> None:
-        super().__init__(typing, target, library, *others)
-        self.state.library = _PartLibrary(target.codegen(), "part")
-
-    compile_extra = _Compiler.compile_extra
 
 
 class _PartLibrary(_Library):  # type: ignore[misc]

@@ -4,18 +4,29 @@
 """
 
 from bufgym.model.observe.declare import Field
-from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, RewardTerm
 from bufgym.model.observe.on_board import (
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
     observe_on_board,
     observe_on_board_slots,
 )
-from bufgym.model.observe.own import OWN_FIELDS, OWN_TERMS, OwnField, OwnTerm, field, own_field, own_term, reward_term
+from bufgym.model.observe.own import (
+    OWN_FIELDS,
+    OWN_TERMS,
+    REWARD_TERMS,
+    OwnTerm,
+    RewardTerm,
+    field,
+    own_field,
+    own_term,
+    reward_term,
+)
 from bufgym.model.observe.queue import CONTEXT_FIELDS, SLOT_FIELDS, observe
 from bufgym.model.observe.terms import TOPIC_REWARD_TERMS, terms_for
 from bufgym.model.observe.topics import (
+    FIELDS,
     TOPIC_CONTEXT_FIELDS,
+    TOPIC_FIELDS,
     TOPIC_SLOT_FIELDS,
     observe_topic_context,
     observe_topic_slots,
@@ -24,7 +35,7 @@ from bufgym.model.observe.topics import (
 __all__ = [
     "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS", "OWN_FIELDS", "OWN_TERMS", "REWARD_TERMS",
     "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS", "TOPIC_FIELDS", "TOPIC_REWARD_TERMS", "TOPIC_SLOT_FIELDS", "Field",
-    "OwnField", "OwnTerm", "RewardTerm", "field", "observe", "observe_on_board", "observe_on_board_slots",
+    "OwnTerm", "RewardTerm", "field", "observe", "observe_on_board", "observe_on_board_slots",
     "observe_topic_context", "observe_topic_slots", "own_field", "own_term", "reward_term",
     "terms_for",
 ]  # fmt: skip

@@ -1,11 +1,11 @@
 """What a field is, and how a table of fields becomes a kernel.
 
-A field's number is an expression of what the kernel that writes it has at hand. ``writer`` makes the kernel that has a
-line for every field of a table.
+Each field names one function. ``writer`` makes the kernel that calls the functions of a table one after the other.
+Their arguments are the *facts* of that table: what several fields share is computed once and handed to all of them.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,48 +34,30 @@ class Field:
     """Its unit, or how it is scaled to [0, 1]."""
     meaning: str
     """Meaning in words."""
+    function: Function
+    """Facts of its table -> number. A field observed where it is named has the facts (buffer, arrival) for the context
+    and (buffer, arrival, k) for a slot."""
     low: float = 0.0
     """Least value."""
     high: float = 1.0
     """Largest value."""
-    _: KW_ONLY
-    number: str = ""
-    """Its number as an expression. With a ``reference`` or a ``mean`` it is the length g, of which g / (g + r) is
-    observed."""
-    reference: str = ""
-    """r, which may differ from slot to slot, as an expression."""
-    mean: str = ""
-    """The same for an r of the whole queue."""
+    compile: bool = True
+    """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
 
 
-def writer(
-    module: dict[str, Any],
-    fields: Sequence[Field],
-    arguments: str,
-    plain: str,
-    scaled: str | None = None,
-    mean: str | None = None,
-    first: int = 0,
-) -> Any:
-    """Make the kernel ``write(arguments)`` that has a line for each of ``fields``.
+def writer(fields: Sequence[Field], facts: str, first: int = 0) -> Any:
+    """Make the kernel of a table: ``write(facts, column, rows)`` of slot fields, or ``write(facts, row)`` of a context.
 
-    ``scaled`` is the line of a field with a reference, ``mean`` of one with a mean, ``plain`` of others and by default
-    of those too. An empty line leaves the field out. In a line {i} is the place, counted from ``first``, {n} the
-    number, and {r} the reference or mean. ``module`` is the ``globals()`` that hold all that lines name.
+    It puts the i-th field's number at index ``first + i``. ``facts`` are the names of the functions' arguments.
     """
-    lines = []
+    into, index = ("column, rows", "rows[{}, column]") if fields[0].per == "slot" else ("row", "row[{}]")
+    names: dict[str, Any] = {"__name__": __name__}
+    lines = [f"def write({facts}, {into}):"]
     for i, field in enumerate(fields, first):
-        line = scaled if field.reference else mean if field.mean else plain
-        lines.append((plain if line is None else line).format(i=i, n=field.number, r=field.reference or field.mean))
-    return kernel(made(module, arguments, *filter(None, lines)))
-
-
-def made(module: dict[str, Any], arguments: str, *lines: str) -> Function:
-    """Make the function of these arguments and lines, whose globals are ``module``."""
-    found: dict[str, Any] = {}
-    exec("\n    ".join([f"def write({arguments}):", *lines]), module, found)
-    function: Function = found["write"]
-    return function
+        names[f"field_{i}"] = kernel(field.function)
+        lines.append(f"    {index.format(i)} = field_{i}({facts})")
+    exec("\n".join(lines), names)
+    return kernel(names["write"])
 
 
 @kernel
@@ -85,24 +67,21 @@ def squash(g: float, reference: float) -> float:
 
 
 @kernel
-def squash_kept(g: float, reference: float, numbers: NDArray[np.floating[Any]]) -> Any:
-    """Apply ``squash`` to ``g`` as the array keeps it, in single precision."""
-    length, r = numbers.dtype.type(g), np.float32(max(reference, TINY))
-    return length / (length + r)
+def ratio(g: Any, reference: Any) -> Any:
+    """``squash`` for a reference > 0, in the precision of its arguments."""
+    return g / (g + reference)
 
 
 @kernel
-def squash_row(row: NDArray[np.floating[Any]], reference: float) -> None:
-    """Apply ``squash_kept`` to every entry, in place."""
-    for k in range(np.uint64(len(row))):  # an unsigned index is not checked, so many entries are divided at once
-        row[k] = squash_kept(row[k], reference, row)
+def length(g: float, rows: NDArray[np.floating[Any]]) -> Any:
+    """The length g in the precision of ``rows``, for ``ratio``."""
+    return rows.dtype.type(g)
 
 
 @kernel
-def divide_row(row: NDArray[np.floating[Any]], reference: float) -> None:
-    """Apply ``squash`` to every entry, in place."""
-    for k in range(len(row)):
-        row[k] = squash(row[k], reference)
+def single(reference: float) -> Any:
+    """The reference in single precision and > 0, for ``ratio``."""
+    return np.float32(max(reference, TINY))
 
 
 @kernel

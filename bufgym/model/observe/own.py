@@ -20,18 +20,19 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.settings import named_settings
 from bufgym.model.checks import changed, check_name, constants, is_number
 from bufgym.model.observe.declare import Field, Function
-from bufgym.model.observe.fields import FIELDS, REWARD_TERMS, TOPIC_FIELDS, RewardTerm
+from bufgym.model.observe.topics import FIELDS, TOPIC_FIELDS
 
 
 @dataclass(frozen=True)
-class OwnField(Field):
-    """A field observed where it is named."""
+class RewardTerm:
+    """A named reward; an environment rewards a weighted sum of them and reports each by name in ``info``."""
 
-    _: KW_ONLY
-    function: Function
-    """(buffer, arrival) -> number for the context, (buffer, arrival, k) -> number for a slot."""
-    compile: bool = False
-    """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
+    name: str
+    """Unique over all terms."""
+    unit: str
+    """Its unit."""
+    meaning: str
+    """Meaning in words."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,11 @@ class OwnTerm(RewardTerm):
     """Whether the function is for one queue only. With several topics the term is missing, or among
     ``TOPIC_REWARD_TERMS``."""
     compile: bool = False
-    """As in ``OwnField``."""
+    """As in ``Field``."""
+    at_end: bool = False
+    """Whether the function runs only in the step that ends the episode; the term is 0 in all others."""
+    prepare: Callable[[], object] | None = None
+    """Called once for each environment that names the term, as it is made: work that no step should wait for."""
     built_in: bool = False
     """Whether it is bufgym's own, whose name stays taken."""
 
@@ -59,12 +64,18 @@ class OwnTerm(RewardTerm):
         return constants(self.parameters.values())
 
 
-OWN_FIELDS: dict[str, OwnField] = {}
+REWARD_TERMS = (
+    RewardTerm("delivered", "QoI", "V gained when a message arrives at the server; sums to H - 1"),
+    RewardTerm("retained", "QoI", "change of the H that delivering all that is kept would give; sums to H - 1 too"),
+)
+"""``retained`` is ``delivered`` shaped by a potential, the QoI held and not yet delivered (Ng, Harada and Russell
+1999). It shows at once what a decision costs or gains, and telescopes to the same total."""
+OWN_FIELDS: dict[str, Field] = {}
 """Your own fields by name, in the order of their registration."""
 OWN_TERMS: dict[str, OwnTerm] = {}
 """Terms likewise; the built-in ones are in ``bufgym.model.observe.terms``."""
 
-Entry = TypeVar("Entry", OwnField, OwnTerm)
+Entry = TypeVar("Entry", Field, OwnTerm)
 
 
 def field(
@@ -96,7 +107,7 @@ def field(
     def add(function: Function) -> Function:
         _check_function("field", name, function, 3 if per == "slot" else 2)
         meaning = modules.first_line(function)
-        OWN_FIELDS[name] = OwnField(name, per, "own", unit, meaning, low, high, function=function, compile=compile)
+        OWN_FIELDS[name] = Field(name, per, "own", unit, meaning, function, low, high, compile)
         return function
 
     return add
@@ -110,6 +121,8 @@ def reward_term(
     memory: Mapping[str, float] | None = None,
     one_queue: bool = False,
     compile: bool = False,
+    at_end: bool = False,
+    prepare: Callable[[], object] | None = None,
     built_in: bool = False,
 ) -> Callable[[Function], Function]:
     """Register the decorated function ``f(step, memory)`` as the reward term ``name``; it comes back unchanged.
@@ -119,21 +132,24 @@ def reward_term(
     ``memory`` is float64[entries] for each sender and episode. The other arguments are as in ``OwnTerm`` and ``field``.
 
     Raises:
-        BufgymError: the name is taken or no name, or the function does not take two arguments.
+        BufgymError: the name is taken or no name, the function does not take two arguments, or ``at_end`` and
+            ``compile`` are both asked for.
     """
     _check_name("reward term", name, (known.name for known in REWARD_TERMS), OWN_TERMS)
+    if at_end and compile:
+        raise BufgymError(f"reward term {name!r}: at_end = True: is for plain Python, so compile must be False")
 
     def add(function: Function) -> Function:
         _check_function("reward term", name, function, 2)
         settings: Any = {"parameters": dict(parameters or {}), "memory": dict(memory or {}), "one_queue": one_queue}
-        settings |= {"compile": compile, "built_in": built_in}
+        settings |= {"compile": compile, "at_end": at_end, "prepare": prepare, "built_in": built_in}
         OWN_TERMS[name] = OwnTerm(name, unit, modules.first_line(function), function=function, **settings)
         return function
 
     return add
 
 
-def own_field(text: str) -> OwnField | None:
+def own_field(text: str) -> Field | None:
     """The field of that name, or the field that ``module:function`` registers; None if there is none."""
     return _found(text, OWN_FIELDS, "field")
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import item, kernel
-from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain  # noqa: F401 (in generated lines)
-from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_kept, squash_row, writer  # noqa: F401 (in generated lines)
+from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
+from bufgym.model.observe.declare import TINY, Field, kept, length, ratio, single, squash, writer
 from bufgym.model.qoi import EXPONENTIAL, merging_loss, value
 
 # Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
@@ -22,46 +22,40 @@ class Slot(NamedTuple):
     """A queued message or the newcomer, beside its neighbours."""
 
     rank: float  # (k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer
-    back_us: float  # time since the message kept before it, us
-    merged_us: float  # time gap left if it is dropped, us
-    back_x: float  # motion since the message before it
-    merged_x: float  # motion gap left if it is dropped
-    lost: float  # V lost if it alone is dropped
+    back_us: Any  # time since the message kept before it, us
+    merged_us: Any  # time gap left if it is dropped, us
+    back_x: Any  # motion since the message before it
+    merged_x: Any  # motion gap left if it is dropped
+    lost: Any  # V lost if it alone is dropped
     loss: float  # the same as a part of H: weighted with several topics
-    size_bytes: int  # its bytes
-    even_us: float  # the even time spacing, us
-    even_x: float  # the even motion spacing
-    even_lost: float  # V lost by merging two even gaps
-    mean_bytes: float  # mean bytes of the queued messages and the newcomer
+    size_bytes: Any  # its bytes
+    even_us: Any  # the even time spacing, us
+    even_x: Any  # the even motion spacing
+    even_lost: Any  # V lost by merging two even gaps
+    mean_bytes: Any  # mean bytes of the queued messages and the newcomer
 
 
 SLOT_FIELDS = (
     Field("occupied", "slot", "queue", "flag", "1 where the slot holds a message (the newcomer's always does)",
-          number="1.0"),
+          lambda slot: 1.0),
     Field("rank", "slot", "queue", "fraction", "(k + 1) / (s + 1) for slot k of s queued; 1 for the newcomer",
-          number="slot.rank"),
+          lambda slot: slot.rank),
     Field("time_before", "slot", "time", "g/(g+r), r = even time spacing", "time since the message kept before it",
-          number="slot.back_us", reference="slot.even_us"),
+          lambda slot: ratio(slot.back_us, slot.even_us)),
     Field("time_merged", "slot", "time", "g/(g+r), r = 2 x even time spacing", "time gap left if it is dropped",
-          number="slot.merged_us", reference="2 * slot.even_us"),
+          lambda slot: ratio(slot.merged_us, slot.even_us + slot.even_us)),
     Field("motion_before", "slot", "motion", "g/(g+r), r = even motion spacing", "motion since the message before it",
-          number="slot.back_x", reference="slot.even_x"),
+          lambda slot: ratio(slot.back_x, slot.even_x)),
     Field("motion_merged", "slot", "motion", "g/(g+r), r = 2 x even motion spacing", "motion gap left if it is dropped",
-          number="slot.merged_x", reference="2 * slot.even_x"),
+          lambda slot: ratio(slot.merged_x, slot.even_x + slot.even_x)),
     Field("loss", "slot", "value", "QoI", "V(a) + V(b) - V(a+b): QoI lost if it alone is dropped now",
-          number="slot.loss"),
+          lambda slot: slot.loss),
     Field("size", "slot", "queue", "g/(g+r), r = mean queued size", "its bytes",
-          number="slot.size_bytes", mean="slot.mean_bytes"),
+          lambda slot: ratio(slot.size_bytes, slot.mean_bytes)),
     Field("relative_loss", "slot", "value", "l/(l+r), r = that of an even gap", "the same loss, free of V's scale",
-          number="slot.lost", reference="slot.even_lost"),
+          lambda slot: ratio(slot.lost, slot.even_lost)),
 )  # fmt: skip
-_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
-_AT_ONCE = "rows[{i}, column] = squash_kept({n}, {r}, rows)"
-_OF_SLOT, _OF_ROWS = "buffer, arrival, slot, column, rows", "buffer, arrival, slot, rows"
-_write = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, _AT_ONCE, _AT_ONCE)
-# With references of its own for each slot.
-write_by_slot = writer(globals(), SLOT_FIELDS, _OF_SLOT, _LENGTH, "rows[{i}, column] = squash({n}, {r})")
-squash_means = writer(globals(), SLOT_FIELDS, _OF_ROWS, "", "", _SQUASHED)
+write_slot = writer(SLOT_FIELDS, "slot")
 
 
 @kernel
@@ -71,8 +65,8 @@ def _write_slots(buffer: Buffer, arrival: Any, even_lost: float, rows: NDArray[n
     per_rank, even = 1 / (s + 1), 1 / (buffer.capacity + 1)
     rows[:, :] = 0.0
     even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
-    even_lost = max(even_lost, ROUNDING)
     mean_bytes = (buffer.backlog_bytes + arrival.size_bytes) * per_rank
+    r_us, r_x, r_lost, r_bytes = single(even_us), single(even_x), single(max(even_lost, ROUNDING)), single(mean_bytes)
     newest = arrival_gain(buffer, arrival)
     gain = item(buffer.slots, 0).gain if s > 0 else newest
     is_exponential = buffer.v[0] == EXPONENTIAL
@@ -95,10 +89,10 @@ def _write_slots(buffer: Buffer, arrival: Any, even_lost: float, rows: NDArray[n
         lost = gain * next_gain if is_exponential else merging_loss(buffer.v, back_x, gain, on_x, next_gain)
         lost = max(lost, 0.0)
         slot = Slot(
-            place, float(back_us), float(merged_us), back_x, merged_x, lost, lost, size_bytes,
-            even_us, even_x, even_lost, mean_bytes,
+            place, length(back_us, rows), length(merged_us, rows), length(back_x, rows), length(merged_x, rows),
+            length(lost, rows), lost, length(size_bytes, rows), r_us, r_x, r_lost, r_bytes,
         )  # fmt: skip
-        _write(buffer, arrival, slot, np.uint64(column), rows)
+        write_slot(slot, np.uint64(column), rows)
         gain, from_us, from_x = next_gain, at_us, x
 
 
@@ -116,27 +110,29 @@ class Newcomer(NamedTuple):
 
 CONTEXT_FIELDS = (
     Field("occupancy", "context", "queue", "fraction of L", "messages queued",
-          number="len(buffer.slots) / buffer.capacity"),
+          lambda buffer, newcomer: len(buffer.slots) / buffer.capacity),
     Field("backlog", "context", "queue", "fraction of B", "bytes queued; 0 where there is no byte limit",
-          number="buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0"),
+          lambda buffer, _: buffer.backlog_bytes / buffer.max_bytes if buffer.max_bytes < UNLIMITED_BYTES else 0.0),
     Field("arrival_time_gap", "context", "time", "g/(g+r), r = even time spacing", "time since the previous arrival",
-          number="squash(newcomer.gap_us, newcomer.even_us)"),
+          lambda buffer, newcomer: squash(newcomer.gap_us, newcomer.even_us)),
     Field("arrival_motion_gap", "context", "motion", "g/(g+r), r = even motion spacing", "motion since then",
-          number="squash(newcomer.gap_x, newcomer.even_x)"),
-    Field("busy", "context", "link", "flag", "1 while a message is in transmission", number="float(buffer.busy)"),
+          lambda buffer, newcomer: squash(newcomer.gap_x, newcomer.even_x)),
+    Field("busy", "context", "link", "flag", "1 while a message is in transmission",
+          lambda buffer, newcomer: float(buffer.busy)),
     Field("left", "context", "link", "fraction", "part of the message in transmission that is still to be transmitted",
-          number="buffer.left_fraction"),
+          lambda buffer, newcomer: buffer.left_fraction),
     Field("stalled", "context", "link", "g/(g+r), r = L + 1 arrival periods", "time since a message was last dequeued",
-          number="squash(buffer.stalled_us, (buffer.capacity + 1) * buffer.period_us)"),
+          lambda buffer, newcomer: squash(buffer.stalled_us, (buffer.capacity + 1) * buffer.period_us)),
     Field("departures", "context", "link", "n/(n+1)", "messages dequeued since the previous arrival",
-          number="squash(buffer.departures, 1.0)"),
+          lambda buffer, newcomer: squash(buffer.departures, 1.0)),
     Field("service_ratio", "context", "link", "g/(g+r), r = 1", "running mean of departures per arrival",
-          number="squash(buffer.service_ratio, 1.0)"),
-    Field("even_value", "context", "value", "QoI", "V of the even motion spacing e", number="newcomer.even_value"),
+          lambda buffer, newcomer: squash(buffer.service_ratio, 1.0)),
+    Field("even_value", "context", "value", "QoI", "V of the even motion spacing e",
+          lambda buffer, newcomer: newcomer.even_value),
     Field("bend", "context", "value", "fraction", "(2 V(e) - V(2e)) / V(e): 0 where V is straight, 1 where it is flat",
-          number="newcomer.even_lost / max(newcomer.even_gain, TINY)"),
+          lambda buffer, newcomer: newcomer.even_lost / max(newcomer.even_gain, TINY)),
 )  # fmt: skip
-write_context = writer(globals(), CONTEXT_FIELDS, "buffer, arrival, newcomer, context", "context[{i}] = {n}")
+write_context = writer(CONTEXT_FIELDS, "buffer, newcomer")
 
 
 @kernel
@@ -154,4 +150,4 @@ def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], conte
         _write_slots(buffer, arrival, lost, rows)
     gap_us, gap_x = float(arrival.arrival_us - buffer.previous_us), arrival.x - buffer.previous_x
     newcomer = Newcomer(gap_us, gap_x, even_us, even_x, kept(gain, context), gain, lost)
-    write_context(buffer, arrival, newcomer, context)
+    write_context(buffer, newcomer, context)

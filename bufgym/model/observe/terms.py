@@ -2,16 +2,23 @@
 
 Each is a cost, hence negative: a weight > 0 rewards less of it. Steps are ``bufgym.envs.own.Step``. ``age`` and
 ``late`` mean the same with one queue and with several topics. There every environment has them, and the transition
-counts them for each topic; one queue has the weight 1 and a deadline of its own.
+counts them for each topic by the same ``age_between``; one queue has the weight 1 and a deadline of its own.
 """
 
 import functools
 from typing import Any
 
-from bufgym.model.observe.fields import REWARD_TERMS, RewardTerm
-from bufgym.model.observe.own import OWN_TERMS, reward_term
+from bufgym.ground.kernel import kernel
+from bufgym.model.observe.own import OWN_TERMS, REWARD_TERMS, RewardTerm, reward_term
+from bufgym.model.topics import age_between
 
 built_in = functools.partial(reward_term, compile=True, built_in=True)
+
+
+@kernel
+def delay_us(step: Any, seq: int) -> int:
+    """Time from a message's arrival to the server, us."""
+    return int(step.log[seq].transmitted_us + step.propagation_us - step.messages[seq].arrival_us)
 
 
 @built_in("delay", unit="s")
@@ -19,7 +26,7 @@ def delay(step: Any, memory: Any) -> float:
     "minus the time from its arrival to the server, of each message that reaches it"
     total_us = 0
     for seq in step.delivered:
-        total_us += step.log[seq].transmitted_us + step.propagation_us - step.messages[seq].arrival_us
+        total_us += delay_us(step, seq)
     return -total_us / 1e6
 
 
@@ -37,8 +44,7 @@ def late(step: Any, memory: Any) -> float:
     "minus the weight of each message that reaches the server after its deadline; one queue: deadline_s, by default 1 s"
     count = 0
     for seq in step.delivered:
-        delay_us = step.log[seq].transmitted_us + step.propagation_us - step.messages[seq].arrival_us
-        if delay_us > step.parameters[0] * 1e6:
+        if delay_us(step, seq) > step.parameters[0] * 1e6:
             count += 1
     return -float(count)
 
@@ -56,9 +62,8 @@ def age(step: Any, memory: Any) -> float:
         until_us = last_us
         if k < len(step.delivered):
             until_us = min(step.log[step.delivered[k]].transmitted_us + step.propagation_us, last_us)
-        from_s, until_s = (memory[1] - memory[0]) / 1e6, (until_us - memory[0]) / 1e6
-        if until_s > from_s:
-            area += (from_s + until_s) / 2 * (until_s - from_s)
+        if until_us > memory[1]:
+            area += age_between(memory[0], memory[1], until_us)
             memory[1] = until_us
         if k < len(step.delivered):
             memory[0] = max(memory[0], step.messages[step.delivered[k]].arrival_us)

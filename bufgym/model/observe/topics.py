@@ -6,20 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first  # noqa: F401 (in generated lines)
-from bufgym.model.observe.declare import TINY, Field, kept, squash, squash_row, writer  # noqa: F401 (in generated lines)
-from bufgym.model.observe.queue import (
-    CONTEXT_FIELDS,
-    ROUNDING,
-    SLOT_FIELDS,
-    Newcomer,
-    Slot,
-    squash_means,
-    write_by_slot,
-    write_context,
-)
+from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first
+from bufgym.model.observe.declare import TINY, Field, kept, length, ratio, single, squash, writer
+from bufgym.model.observe.queue import CONTEXT_FIELDS, ROUNDING, SLOT_FIELDS, Newcomer, Slot, write_context, write_slot
 from bufgym.model.qoi import merging_loss, value
-from bufgym.model.topics import NO_DEADLINE_US  # noqa: F401 (in generated lines)
+from bufgym.model.topics import NO_DEADLINE_US
 
 _SECOND_US = 1_000_000
 
@@ -27,53 +18,53 @@ _SECOND_US = 1_000_000
 class OfTopic(NamedTuple):
     """One message among several topics."""
 
-    k: int  # its slot
     topic: Any  # TOPIC: its topic's settings and past
+    first: bool  # whether it is the oldest queued message of its topic
     own: bool  # whether its topic is the newcomer's
-    known_us: int  # arrival of its topic's message dequeued last; 0 before there is one
     age_us: int  # time since its arrival, us
+    silent_us: int  # time since the arrival of its topic's message dequeued last, or since 0 before there is one, us
+    capacity: int  # L
     priority: float  # the highest priority
     weight: float  # the largest weight
     gain: float  # what its delivery adds to H, in units of that weight
-    per_byte: float  # the same for each byte of it
-    mean_per_byte: float  # the mean of that over the queue
+    per_byte: Any  # the same for each byte of it
+    mean_per_byte: Any  # the mean of that over the queue
 
 
 TOPIC_SLOT_FIELDS = (
     Field("priority", "slot", "topic", "fraction of the highest", "priority of its topic",
-          number="float(slot.topic.priority / slot.priority)"),
+          lambda slot: float(slot.topic.priority / slot.priority)),
     Field("weight", "slot", "topic", "fraction of the largest", "weight of its topic in the sum of H",
-          number="float(slot.topic.weight / slot.weight)"),
-    Field("no_drop", "slot", "topic", "flag", "1 where it may not be dropped", number="float(slot.topic.no_drop)"),
+          lambda slot: float(slot.topic.weight / slot.weight)),
+    Field("no_drop", "slot", "topic", "flag", "1 where it may not be dropped", lambda slot: float(slot.topic.no_drop)),
     Field("oldest", "slot", "topic", "flag", "1 where it is the oldest of its topic, the only one that may be sent",
-          number="1.0 if slot.k < len(buffer.slots) and is_first(buffer, slot.k) else 0.0"),
+          lambda slot: 1.0 if slot.first else 0.0),
     Field("own", "slot", "topic", "flag", "1 where its topic is the newcomer's; 0 when the socket asks",
-          number="1.0 if slot.own else 0.0"),
+          lambda slot: 1.0 if slot.own else 0.0),
     Field("waited", "slot", "topic", "g/(g+r), r = 1 s", "time since its arrival",
-          number="squash(slot.age_us, _SECOND_US)"),
+          lambda slot: squash(slot.age_us, _SECOND_US)),
     Field("silence", "slot", "topic", "g/(g+r), r = 1 s", "time since the arrival of its topic's message dequeued last",
-          number="squash(max(buffer.now_us - slot.known_us, 0), _SECOND_US)"),
+          lambda slot: squash(slot.silent_us, _SECOND_US)),
     Field("lateness", "slot", "topic", "g/(g+r), r = its deadline", "time since its arrival; 0 without a deadline",
-          number="squash(slot.age_us, slot.topic.deadline_us) if slot.topic.deadline_us < NO_DEADLINE_US else 0.0"),
+          lambda slot:
+          squash(slot.age_us, slot.topic.deadline_us) if slot.topic.deadline_us < NO_DEADLINE_US else 0.0),
     Field("queued", "slot", "topic", "fraction of L", "messages of its topic in the buffer",
-          number="float(slot.topic.queued / buffer.capacity)"),
-    Field("gain", "slot", "topic", "QoI, weighted", "what its delivery adds to H", number="slot.gain"),
+          lambda slot: float(slot.topic.queued / slot.capacity)),
+    Field("gain", "slot", "topic", "QoI, weighted", "what its delivery adds to H", lambda slot: slot.gain),
     Field("gain_per_byte", "slot", "topic", "g/(g+r), r = mean of the queue", "the same for each byte of it",
-          number="slot.per_byte", mean="slot.mean_per_byte"),
+          lambda slot: ratio(slot.per_byte, slot.mean_per_byte)),
 )  # fmt: skip
 TOPIC_CONTEXT_FIELDS = (
     Field("socket_asks", "context", "topic", "flag", "1 where the socket asks what to send, 0 at an arrival",
-          number="0.0 if arriving else 1.0"),
+          lambda buffer, arriving: 0.0 if arriving else 1.0),
     Field("in_flight", "context", "topic", "n/(n+r), r = n_T", "messages sent and not yet acknowledged",
-          number="squash(buffer.in_flight, buffer.window)"),
+          lambda buffer, arriving: squash(buffer.in_flight, buffer.window)),
 )  # fmt: skip
-_FIRST = len(SLOT_FIELDS)
-_LENGTH, _SQUASHED = "rows[{i}, column] = {n}", "squash_row(rows[{i}], {r})"
-_write = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, column, rows", _LENGTH, first=_FIRST)
-_squash_means = writer(globals(), TOPIC_SLOT_FIELDS, "buffer, slot, rows", "", mean=_SQUASHED, first=_FIRST)
-_write_context = writer(
-    globals(), TOPIC_CONTEXT_FIELDS, "buffer, arriving, context", "context[{i}] = {n}", first=len(CONTEXT_FIELDS)
-)
+FIELDS = SLOT_FIELDS + CONTEXT_FIELDS
+TOPIC_FIELDS = TOPIC_SLOT_FIELDS + TOPIC_CONTEXT_FIELDS
+"""Fields observed besides ``FIELDS`` with several topics."""
+_write_slot = writer(TOPIC_SLOT_FIELDS, "slot", first=len(SLOT_FIELDS))
+_write_context = writer(TOPIC_CONTEXT_FIELDS, "buffer, arriving", first=len(CONTEXT_FIELDS))
 
 
 @kernel
@@ -106,16 +97,19 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
     priority, weight = largest(buffer)
     rows[:, :] = 0.0
     count = s + 1 if arriving else s
-    size_sum, gain_sum = 0.0, 0.0
+    newest = arrival_gain(buffer, arrival) if arriving else 0.0
+    size_sum, per_byte_sum = 0.0, 0.0
+    for k in range(count):
+        message, gain = (buffer.slots[k], buffer.slots[k].gain) if k < s else (arrival, newest)
+        size_sum += message.size_bytes
+        per_byte_sum += kept(kept(gain / weight, rows) / message.size_bytes, rows)
+    mean_bytes, mean_per_byte = single(size_sum / max(count, 1)), single(per_byte_sum / max(count, 1))
     for k in range(count):
         message, column = (buffer.slots[k], k) if k < s else (arrival, capacity)
         topic = buffer.topics[message.topic]
         back_us, on_us, back_x, on_x, _ = gaps(buffer, arrival, arriving, k)
-        gain = message.gain
-        if k == s:
-            if topic.queued == 0 and topic.dequeued == 0:  # nothing of the topic was kept before it
-                back_us, back_x = 0, 0.0
-            gain = arrival_gain(buffer, arrival)
+        if k == s and topic.queued == 0 and topic.dequeued == 0:  # nothing of the topic was kept before it
+            back_us, back_x = 0, 0.0
         own = arriving and message.topic == arrival.topic
         last_us, last_x = (arrival.arrival_us, arrival.x) if own else (topic.previous_us, topic.previous_x)
         even_us, even_x = even_gaps(topic, last_us, last_x)
@@ -124,22 +118,21 @@ def observe_topic_slots(buffer: Buffer, arrival: Any, arriving: bool, rows: NDAr
         lost = max(merging_loss(v, before_x, value(v, before_x), on_x, value(v, on_x)), 0.0)
         even_gain = value(v, even_x)
         even_lost = max(merging_loss(v, even_x, even_gain, even_x, even_gain), ROUNDING)
-        size_sum += message.size_bytes
         slot = Slot(
             (k + 1) / (s + 1), before_us, before_us + on_us, before_x, before_x + on_x,
-            lost, lost * topic.weight / weight, message.size_bytes, even_us, even_x, even_lost, size_sum / (k + 1),
+            lost, lost * topic.weight / weight, length(message.size_bytes, rows),
+            max(even_us, TINY), max(even_x, TINY), even_lost, mean_bytes,
         )  # fmt: skip
-        write_by_slot(buffer, arrival, slot, column, rows)
-        gain = kept(gain / weight, rows)
-        per_byte = kept(gain / message.size_bytes, rows)
-        gain_sum += per_byte
+        write_slot(slot, column, rows)
+        gain = kept((message.gain if k < s else newest) / weight, rows)
+        per_byte = length(gain / message.size_bytes, rows)
         age_us = buffer.now_us - message.arrival_us
-        known_us = topic.dequeued_arrival_us if topic.dequeued > 0 else 0
-        of = OfTopic(k, topic, own, known_us, age_us, priority, weight, gain, per_byte, gain_sum / (k + 1))
-        _write(buffer, of, column, rows)
-        if k == count - 1:  # the means are complete
-            squash_means(buffer, arrival, slot, rows)
-            _squash_means(buffer, of, rows)
+        silent_us = max(buffer.now_us - (topic.dequeued_arrival_us if topic.dequeued > 0 else 0), 0)
+        first = k < s and is_first(buffer, k)
+        of_topic = OfTopic(
+            topic, first, own, age_us, silent_us, capacity, priority, weight, gain, per_byte, mean_per_byte
+        )  # fmt: skip
+        _write_slot(of_topic, column, rows)
 
 
 @kernel
@@ -155,5 +148,5 @@ def observe_topic_context(buffer: Buffer, arrival: Any, arriving: bool, context:
         lost = min(merging_loss(v, even_x, gain, even_x, gain), max(gain, TINY))
         share = topic.weight * gain / largest(buffer)[1]
         newcomer = Newcomer(gap_us, gap_x, even_us, even_x, gain, share, lost)
-    write_context(buffer, arrival, newcomer, context)
+    write_context(buffer, newcomer, context)
     _write_context(buffer, arriving, context)

@@ -62,7 +62,7 @@ def workload_from_bag(
 ) -> Workload:
     """The messages of these topics, with x from the bag's poses if it was read with some. See `read_workload`."""
     settings = settings or MotionSettings()
-    names, chosen, topic = _chosen(bag.path, list(bag.topics), bag.topic, topics)
+    names, chosen, topic = _on_topics(bag.path, list(bag.topics), bag.topic, topics)
     if not chosen.any():
         raise BufgymError(f"{bag.path}: no message on {', '.join(names) or 'any topic'}")
     time_ns = bag.time_ns[chosen]
@@ -117,7 +117,7 @@ def _with_topics(workload: Workload, patterns: Sequence[str] | None) -> Workload
     if patterns is None:
         return workload
     assert workload.topic is not None
-    names, chosen, topic = _chosen(workload.source, workload.topics, workload.topic, patterns)
+    names, chosen, topic = _on_topics(workload.source, workload.topics, workload.topic, patterns)
     arrival_us = workload.arrival_us[chosen]
     return replace(
         workload,
@@ -129,7 +129,7 @@ def _with_topics(workload: Workload, patterns: Sequence[str] | None) -> Workload
     )
 
 
-def _chosen(
+def _on_topics(
     source: str, topics: Sequence[str], topic: Int64Array, patterns: Sequence[str] | None
 ) -> tuple[tuple[str, ...], npt.NDArray[np.bool_], Int64Array]:
     """The topics that fit, which messages they have (bool[n]), and these messages' topics by their new numbers."""

@@ -21,8 +21,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
+from bufgym.ground.libraries import missing
 from bufgym.traces.formats import bag_files
 from bufgym.traces.formats.bag_files import SOURCES, Message, RefusedError, Unpacked, journals, unzstd, unzstd_pieces
 from bufgym.traces.formats.faults import fault, os_errors, warn
@@ -112,7 +113,7 @@ def damage_errors(path: Path, before: str = "", after: Callable[[], str] = str) 
     except BufgymError:
         raise
     except ModuleNotFoundError as error:
-        raise BufgymError(f"{path}: reading recordings needs {error.name}: {install('ros')}") from None
+        raise missing(f"{path}: reading recordings", error.name, "ros") from None
     except RefusedError as error:
         raise fault(path, str(error)) from error
     except Exception as error:

@@ -17,14 +17,14 @@ _STEP_US: Final = 100_000
 
 # How a small delivery or survey robot drives: limits of its speed in m/s, its turning in degrees/s and the time in s.
 _NOTHING: Final[Limits] = (0.0, 0.0)
-_PHASES: Final[dict[str, tuple[Limits, Limits, Limits]]] = {
+PHASES: Final[dict[str, tuple[Limits, Limits, Limits]]] = {
     "cruise": ((0.5, 1.5), (0.0, 10.0), (4.0, 15.0)),
     "turn": (_NOTHING, (30.0, 60.0), (1.0, 4.0)),
     "stop": (_NOTHING, _NOTHING, (2.0, 8.0)),
 }
 # What follows a stretch of driving; otherwise the robot drives on at another speed.
-_TURN_CHANCE: Final = 0.55
-_STOP_CHANCE: Final = 0.25
+TURN_CHANCE: Final = 0.55
+STOP_CHANCE: Final = 0.25
 
 
 def drive_motion(seed: int, duration_s: float = 300.0) -> Motion:
@@ -47,14 +47,14 @@ def drive_motion(seed: int, duration_s: float = 300.0) -> Motion:
     steps: list[int] = []
     phase = "cruise"
     while len(steps) < count:
-        speed_m_per_s, turn_deg_per_s, lasts_s = (_drawn(random, limits) for limits in _PHASES[phase])
+        speed_m_per_s, turn_deg_per_s, lasts_s = (_drawn(random, limits) for limits in PHASES[phase])
         per_s = speed_m_per_s / scale.scene_scale_m + turn_deg_per_s / scale.fov_deg
         steps += [round(per_s * step_s * 1e6)] * max(1, round(lasts_s / step_s))
         uniform = float(random.random())
-        if phase != "cruise" or uniform >= _TURN_CHANCE + _STOP_CHANCE:
+        if phase != "cruise" or uniform >= TURN_CHANCE + STOP_CHANCE:
             phase = "cruise"
         else:
-            phase = "turn" if uniform < _TURN_CHANCE else "stop"
+            phase = "turn" if uniform < TURN_CHANCE else "stop"
     millionths = np.append(0, np.cumsum(steps[:count]))
     time_us = np.arange(count + 1, dtype=np.int64) * _STEP_US
     return Motion(f"drive-{seed}", time_us, millionths / 1e6, f"drive_motion(seed={seed}, {duration_s:g} s)")

@@ -46,7 +46,7 @@ LTE_MODES: Final[dict[LteMode, LteParameters]] = {
 
 # No second is better than this many times the "fair" rate, because the best modulation sets a ceiling. It comes to
 # 1.6-2.3 times the mean; in the Belgium logs the maximum is 1.5-4.4 times the mean (median 1.9).
-_CEILING: Final = 1.6
+CEILING: Final = 1.6
 
 
 def synthetic_lte(seed: int, duration_s: int = 300, mean_bytes_per_s: float = 10e6, mode: LteMode = "drive") -> Trace:
@@ -91,7 +91,7 @@ def _relative_rates(random: np.random.Generator, count: int, p: LteParameters) -
         if move < 1 / p.stay_s:
             # From an end the middle is next; from the middle either end, with equal odds.
             state = 1 if state != 1 else (0 if direction < 0.5 else 2)
-        rate = min(math.exp(p.levels[state] + deviation), _CEILING)
+        rate = min(math.exp(p.levels[state] + deviation), CEILING)
         if fade_left_s == 0 and begin < p.fade_chance:
             # Given that it begins, begin / chance is again uniform and gives the length.
             fade_left_s = _fade_length(begin / p.fade_chance, p.fade_mean_s)

@@ -28,4 +28,10 @@ __all__ = [
     "Rule", "Server", "Session", "Source", "StoreLimits", "Tls", "Tokens", "compiled", "load", "security",
     "serve_forever", "token",
 ]  # fmt: skip
-__getattr__ = on_demand(__name__)
+__getattr__ = on_demand(__name__, {
+    "BagSource": "bag", "RobotClient": "client", "Config": "config", "Foxglove": "config", "Limits": "config",
+    "Nats": "config", "Rotation": "config", "Rule": "config", "StoreLimits": "config", "Tls": "config",
+    "Tokens": "config", "load": "config", "compiled": "policies", "Robot": "robot", "Source": "robot",
+    "Server": "server", "serve_forever": "server", "Session": "session", "security": "session", "token": "session",
+    "Message": "wire", "RefusedError": "wire"
+})  # fmt: skip

@@ -23,4 +23,8 @@ __all__ = [
     "TRANSPORTS", "Item", "LogFile", "Odometry", "PolicyQueue", "Received", "Receiver", "Recording", "Replay", "Sender",
     "ShapedLink", "read_log", "replay",
 ]  # fmt: skip
-__getattr__ = on_demand(__name__)
+__getattr__ = on_demand(__name__, {
+    "TRANSPORTS": "channels", "LogFile": "log", "read_log": "log", "Odometry": "odometry", "Item": "queue",
+    "PolicyQueue": "queue", "Received": "receiver", "Receiver": "receiver", "Recording": "receiver",
+    "Replay": "replaying", "replay": "replaying", "Sender": "sender", "ShapedLink": "shaped"
+})  # fmt: skip

@@ -23,4 +23,9 @@ __all__ = [
     "map_error", "open_sequence", "orbbuf_by", "points_of", "seen_shares", "track",
 ]  # fmt: skip
 
-__getattr__ = on_demand(__name__)
+__getattr__ = on_demand(__name__, {
+    "Sequence": "frames", "fuse": "mapping", "grid_of": "mapping", "map_error": "mapping", "points_of": "mapping",
+    "OrbSimilarity": "orb", "orbbuf_by": "orb", "open_sequence": "recordings", "made_up_room": "room",
+    "Tracker": "tracking", "difference": "tracking", "jumped": "tracking", "track": "tracking", "Coverage": "views",
+    "seen_shares": "views"
+})  # fmt: skip

@@ -10,6 +10,7 @@ counting it.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -46,7 +47,7 @@ def recording() -> Sequence:
 
 @functools.cache
 def scene() -> Stage:
-    """Render the room once per process, in some seconds."""
+    """Render the room once per process, in some seconds, as an environment that rates frames is made."""
     return Stage(recording())
 
 
@@ -79,6 +80,11 @@ def tracked_part(frames: NDArray[np.int64]) -> float:
     return float(reached[-1] - frames[0]) / (FRAMES - 1)
 
 
+def _rated_at_end(name: str, unit: str, prepare: Callable[[], object]) -> Callable[[Any], Any]:
+    """Register a term of the frames that arrived, which are rated once an episode has ended."""
+    return reward_term(name, unit=unit, one_queue=True, at_end=True, prepare=prepare)
+
+
 def _arrived(step: Any) -> NDArray[np.int64]:
     """Indices of the frames transmitted, int64[frames]."""
     n = len(step.log)
@@ -87,19 +93,19 @@ def _arrived(step: Any) -> NDArray[np.int64]:
     return np.flatnonzero(np.asarray(step.log["transmitted_us"]) >= 0)
 
 
-@reward_term("covered", unit="part of the scene", one_queue=True)
+@_rated_at_end("covered", "part of the scene", lambda: scene().coverage)
 def covered(step: Any, memory: Memory) -> float:
     """at the end, the part of the scene that the frames which arrived have seen (`bufgym/Mapping-v0`)"""
-    return coverage_of(_arrived(step)) if step.ended else 0.0
+    return coverage_of(_arrived(step))
 
 
-@reward_term("followed", unit="part of a frame", one_queue=True)
+@_rated_at_end("followed", "part of a frame", lambda: scene().seen)
 def followed(step: Any, memory: Memory) -> float:
     """at the end, the least part of a frame that the one before it has seen: stands in for `tracked`"""
-    return least_followed(_arrived(step)) if step.ended else 0.0
+    return least_followed(_arrived(step))
 
 
-@reward_term("tracked", unit="part of the recording", one_queue=True)
+@_rated_at_end("tracked", "part of the recording", lambda: scene().track_of([0, 1]))
 def tracked(step: Any, memory: Memory) -> float:
     """at the end, how far tracking gets along the frames that arrived in `bufgym/Mapping-v0`; takes some seconds"""
-    return tracked_part(_arrived(step)) if step.ended else 0.0
+    return tracked_part(_arrived(step))

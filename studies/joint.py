@@ -1,6 +1,6 @@
 """One agent for all links: outputs that guide ``gap-price``, evolved on twelve families at once.
 
-``python -m agents.joint --seed 0`` writes runs/joint/seed-0.safetensors. ``python -m agents.joint FILE ...`` compares
+``python -m studies.joint --seed 0`` writes runs/joint/seed-0.safetensors. ``python -m studies.joint FILE ...`` compares
 agents with the rules on the validation links, or with ``--split test`` on links that chose nothing. ``--data DIR`` adds
 recorded uplinks.
 
@@ -19,11 +19,12 @@ from pathlib import Path
 import cma
 import numpy as np
 
-from agents.families import Family, Run, divided, families
-from agents.page import command, publish, table, written
+from agents.families import Family, Run, divided
 from bufgym import policies
 from bufgym.policies import weights
 from bufgym.policies.guided import GuidedWeights
+from studies.families import families
+from studies.page import command, publish, table, written
 
 FOLDER = Path("runs/joint")
 SIGMA, LEAST, POPULATION, MEMORY, GENERATIONS = 0.03, 0.02, 16, 40, 110
@@ -68,7 +69,7 @@ def train(seed: int, generations: int, out: Path) -> None:
         if generation % 10 == 9:
             spent = f"{POPULATION} x {decisions:,} decisions, {time.process_time() - began:.0f} s"
             print(f"seed {seed}: {generation + 1} of {generations} generations of {spent}", flush=True)
-    training = f"python -m agents.joint --seed {seed}"
+    training = f"python -m studies.joint --seed {seed}"
     training += f" --generations {generations}" if generations != GENERATIONS else ""
     notes = {"name": "learned", "about": ABOUT, "training": training}
     print(f"wrote {weights.save(out, agent(np.mean(means[-MEMORY:], axis=0)), {**notes, 'seeds': [seed]})}")
@@ -105,7 +106,7 @@ seeds. Seeds that lie more than 0.02 above the rule on a family were left out.
 
 ```
 {command}    # and the same with other seeds
-python -m agents.joint {files} --split {split}{data} --out docs/agents.md
+python -m studies.joint {files} --split {split}{data} --out docs/agents.md
 ```
 
 Shares of AFR's regret on the {split} links, which are drawn apart from the training links. Less is better. A family's
@@ -136,7 +137,7 @@ def page(files: Sequence[Path], split: str, data: str | None) -> str:
     notes = weights.read_any(files[0])[1]
     return PAGE.format(
         seed=notes["seeds"][0],
-        command=notes["training"],
+        command=notes["training"].replace("agents.joint", "studies.joint"),  # where this module was when it ran
         files=" ".join(map(str, files)),
         split=split,
         data=" --data DIR" if data else "",

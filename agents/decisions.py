@@ -1,0 +1,122 @@
+"""Learners of stable-baselines3, which learn from single decisions: checkpoints, resuming, validation.
+
+Updates bound them, not the environment. A compiled step of 256 environments costs as much as one gradient step on a few
+hundred decisions. So the network is small, and a process has one torch thread.
+"""
+
+from __future__ import annotations
+
+import shutil
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.callbacks import Budget, Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
+from agents.evaluation import Agent, SlotModel
+from agents.learner import Learner
+from agents.runs import MODEL, Numbers, Run, Validations
+from agents.settings import OnSlots, SingleDecisions
+from bufgym.policies import weights
+
+Decisions = TypeVar("Decisions", bound=SingleDecisions)
+
+
+class DecisionLearner(Learner[Decisions]):
+    """An algorithm of stable-baselines3."""
+
+    @property
+    @abstractmethod
+    def algorithm(self) -> Any:
+        """Its class, by which its file is read."""
+
+    @property
+    @abstractmethod
+    def env_options(self) -> dict[str, Any]:
+        """Options of the environment that it trains in."""
+
+    @abstractmethod
+    def make(self, env: VecEnv) -> Any:
+        """Make an untrained model."""
+
+    def weights_of(self, model: Any) -> Any:
+        """The weights of a model whose agent is a compiled policy; None for others, which decide in torch."""
+        return None
+
+    def callbacks(self, curve: Curve) -> list[BaseCallback]:
+        """Work between updates, besides saving and validating."""
+        return [Budget(self.seconds, curve)]
+
+    def env(self, folder: Path, seed: int = 0) -> VecEnv:
+        """The batch of environments to train on."""
+        return self.objective(folder, seed).env(self.settings.num_envs, self.settings.reward, **self.env_options)
+
+    def agent_of(self, model: Any, name: str) -> Agent:
+        """The agent of a model, by its name."""
+        return weights.policy_of(name, self.weights_of(model))
+
+    def agent(self, run: Run) -> Agent:
+        """A policy if the run kept a file of weights, or its model."""
+        torch.set_num_threads(1)  # on batches this small, more threads only wait for one another
+        model = self.algorithm.load(run.folder / "model.zip", device="cpu")
+        return super().agent(run) if run.file == MODEL else self.agent_of(model, self.settings.algo)
+
+    def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
+        """Train one seed for its steps or so many seconds, from its latest checkpoint if any."""
+        torch.set_num_threads(1)
+        home, settings = folder / f"seed-{seed}", self.settings
+        home.mkdir(exist_ok=True)
+        objective = self.objective(folder, seed)
+        env, saved = self.env(folder, seed), checkpoints(home)
+        torch.manual_seed(seed)  # for the first weights
+        model = self.algorithm.load(saved[-1], env=env, device="cpu") if saved else self.make(env)
+        # Every session has a seed of its own, by its first step: the episodes before a kill do not come again.
+        model.set_random_seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1)[0]))
+        model.set_logger(configure(str(home / "tensorboard"), ["tensorboard"]))
+        curve = Curve(home / "curve.csv", model.num_timesteps)
+
+        def measure(model: Any) -> Numbers:
+            return objective.validate(self.agent_of(model, objective.name))
+
+        validations = Validations(home, objective.columns, objective.best, settings, model.num_timesteps)
+        validation = Validation(home, validations, measure, objective.message, curve)
+        left = settings.steps - model.num_timesteps
+        if left > 0:
+            callbacks: list[BaseCallback] = [Checkpoints(home, settings.checkpoint_every), curve, validation]
+            callbacks += [Progress(validation, settings, seed, line), *self.callbacks(curve)]
+            # The library counts ``total_timesteps`` from here on when the count is not reset.
+            model.learn(left, callbacks, reset_num_timesteps=False)
+            save(model, home)
+        validation.validate(model, last=True)
+        model.logger.close()
+        env.close()
+        shutil.copyfile(checkpoint(home, int(validations.best[0])), home / "model.zip")
+        spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
+        found = self.weights_of(self.algorithm.load(home / "model.zip", device="cpu"))
+        if found is not None:
+            weights.save(home / MODEL, found, self.notes(seed, settings.algo))
+        file = "model.zip" if found is None else MODEL
+        return Run(seed, home, spent, curve.record.rows, validations.rows, file, validations.choose)
+
+
+Slots = TypeVar("Slots", bound=OnSlots)
+
+
+class SlotLearner(DecisionLearner[Slots]):
+    """An algorithm that chooses among slots."""
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """When it is asked."""
+        return {"decide_at": self.settings.decide_at}
+
+    def agent_of(self, model: Any, name: str) -> Agent:
+        """A policy where the model's weights are one, else the model."""
+        compiled = self.weights_of(model) is not None
+        on, decide_at = self.settings.on, self.settings.decide_at
+        return super().agent_of(model, name) if compiled else SlotModel(model, on.slots, decide_at)

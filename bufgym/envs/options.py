@@ -1,0 +1,142 @@
+"""The options that every environment takes, as one checked record with all defaults."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from bufgym import scenario as scenarios
+from bufgym.envs.observation import MaskKeys
+from bufgym.ground.errors import BufgymError, UnknownArgumentError, unknown
+from bufgym.model.checks import whole
+from bufgym.scenario import Scenario
+from bufgym.scenario.registry import parameters
+
+GUIDED = "guided"
+ACTIONS = ("slots", GUIDED)  # What an action is: the slot that goes, or numbers of the rule
+INFOS = ("full", "steady", "mask", "none")
+"""How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
+nothing. At an episode's end the summary is always there."""
+MASKS = ("valid", "plausible")
+"""Actions that the mask shows: all valid ones, or those of them that a good rule chooses among (``plausible``)."""
+RENDER_MODES = ("ansi", "rgb_array")
+MASK_KEYS = {
+    "rllib": ("observations", "action_mask"),
+    "tianshou": ("obs", "mask"),
+    "pettingzoo": ("observation", "action_mask"),
+}
+"""Library -> its keys of the observation and of the action mask in it."""
+
+
+_CHOICES = {"info": INFOS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """An environment's options beside its scenario. ``SenderEnv`` says what each of them means.
+
+    A new option is a field here, with its check below, and a line in the docstring of ``SenderEnv``. Values that belong
+    to one part of an environment are checked where that part is made: the queue's in ``Senders``, the fields' in
+    ``ObservationForm``, the reward's in ``reward_weights``.
+    """
+
+    capacity: int = 8
+    max_bytes: int | None = None
+    decide_at: str = "arrival"
+    reward: str | Mapping[str, float] = "retained"
+    actions: str = "slots"
+    mask: str = "valid"
+    fields: str | Sequence[str] | None = None
+    observation: str = "dict"
+    info: str = "full"
+    bound: bool = False
+    pool: int | None = None
+    num_threads: int = 1
+    render_mode: str | None = None
+    mask_in_observation: bool | str | Sequence[str] = False
+    mask_dtype: str = "int8"
+
+    def __post_init__(self) -> None:
+        for name, known in _CHOICES.items():
+            if (given := getattr(self, name)) not in known:
+                raise BufgymError(f"{name} = {given!r}: must be one of {', '.join(map(repr, known))}")
+        if not isinstance(self.actions, str) or self.actions not in ACTIONS:
+            raise unknown("actions", str(self.actions), ACTIONS)
+        if self.mask not in MASKS:
+            raise BufgymError(f"mask = {self.mask!r}: must be one of {', '.join(map(repr, MASKS))}")
+        if not isinstance(self.bound, bool | np.bool_):
+            raise BufgymError(f"bound = {self.bound!r}: must be True or False")
+        whole("num_threads", self.num_threads, 1)
+        if self.mask_keys and self.acts_guided:
+            raise BufgymError(f"mask_in_observation: actions = {GUIDED!r} have no mask")
+
+    @property
+    def acts_guided(self) -> bool:
+        """Whether an action sets the numbers of a rule."""
+        return self.actions == GUIDED
+
+    @property
+    def sees_guided(self) -> bool:
+        """Whether an observation holds the inputs of that rule, and nothing else."""
+        return isinstance(self.fields, str) and self.fields == GUIDED
+
+    @property
+    def shows_all(self) -> bool:
+        """Whether ``info`` has all entries in every step."""
+        return self.info in ("full", "steady")
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether ``info`` has the same entries in every step, the summary so far among them."""
+        return self.info == "steady"
+
+    @property
+    def shows_mask(self) -> bool:
+        """Whether ``info`` has the action mask in every step."""
+        return self.info != "none" and not self.acts_guided
+
+    @property
+    def mask_keys(self) -> MaskKeys | None:
+        """Keys of an observation that holds the action mask; None if it does not."""
+        asked = self.mask_in_observation
+        if isinstance(asked, bool):
+            beside = None if self.observation != "flat" else "observation"
+            return MaskKeys(beside, "action_mask", self.mask_dtype) if asked else None
+        keys = MASK_KEYS.get(asked) if isinstance(asked, str) else asked
+        if not isinstance(keys, Sequence) or len({*map(str, keys)}) != 2 or len(keys) != 2:
+            rule = f"must be True, False, two names of keys or one of {', '.join(map(repr, MASK_KEYS))}"
+            raise BufgymError(f"mask_in_observation = {asked!r}: {rule}")
+        return MaskKeys(keys[0], keys[1], self.mask_dtype)
+
+    def check_without_own_queue(self, what: str) -> None:
+        """Refuse options for one queue on a link of its own where the sender has ``what`` instead."""
+        if self.bound:
+            raise BufgymError(
+                f"bound = True: the clairvoyant is known for one queue on a link of its own, not for {what}"
+            )
+        if self.mask == "plausible":
+            raise BufgymError(f"mask = 'plausible': the plausible actions are known for one queue, not for {what}")
+        if self.acts_guided or self.sees_guided:
+            name = "actions" if self.acts_guided else "fields"
+            raise BufgymError(f"{name} = {GUIDED!r}: the rule serves one queue on a link of its own, not {what}")
+
+
+_NAMES = tuple(field.name for field in fields(Options))
+_OF_BATCHES = ("max_episode_steps", "autoreset_mode")
+
+
+def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
+    """The scenario, with the arguments that are its parameters, and the options, which are the others."""
+    options = {name: arguments.pop(name) for name in _NAMES if name in arguments}
+    spec = scenarios.get(scenario)
+    known = parameters(spec)
+    for name in arguments:
+        if name not in known:
+            ours = str(unknown("argument", name, [*known, *_NAMES, *_OF_BATCHES]))
+            if name in _OF_BATCHES:
+                ours = f"a batch takes it; Gymnasium's SyncVectorEnv by vector_kwargs={{{name!r}: ...}}"
+            raise UnknownArgumentError(
+                f"{type(spec).__name__}.__init__() got an unexpected keyword argument {name!r}: {ours}"
+            )
+    return scenarios.get(spec, **arguments), Options(**options)

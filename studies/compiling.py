@@ -1,0 +1,121 @@
+"""What compilation costs: lines of the kernel's base, the first step of a batch without and with kept code, staleness.
+
+``python -m studies.compiling [--repeats N]``
+
+A new process makes each figure. Its time is the processor's, from the start of Python to the first step of 64 rows of
+``Uplink-v0``. Python's bytecode is kept in a folder of this command, as installed packages keep theirs. With
+``PYTHONDONTWRITEBYTECODE=1`` and no bytecode beside the packages, every process translates 800 modules anew. That takes
+another second.
+
+At last a copy of the package is edited, several calls below the kernel that Python calls. The copy finds the machine
+code of the original and must not run it. Its rewards must equal those of the same text as plain Python.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from studies.page import command
+from bufgym.cli.options import Count
+from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import PACKAGE
+from bufgym.ground.tables import Table
+
+ROWS = 64
+PROGRAM = f"""
+import time
+import gymnasium, numpy
+import bufgym
+batch = gymnasium.make_vec("bufgym/Uplink-v0", {ROWS}, vectorization_mode="vector_entry_point", capacity=8)
+_, info = batch.reset(seed=1)
+_, rewards, _, _, info = batch.step(info["action_mask"].argmax(axis=1))
+first_s = time.process_time()
+total = rewards.sum()
+for _ in range(40):
+    _, rewards, _, _, info = batch.step(info["action_mask"].argmax(axis=1))
+    total += rewards.sum()
+best_s, reject = float("inf"), numpy.full({ROWS}, 8)
+for _ in range({{repeats}}):
+    began_s = time.process_time()
+    for _ in range(100):
+        batch.step(reject)
+    best_s = min(best_s, time.process_time() - began_s)
+print(first_s, best_s / 100 / {ROWS} * 1e9, total)
+"""
+"""Prints the time of the first step in s, ns a step of one row, and the rewards of 41 steps of all rows."""
+
+EDITED, TEXT, EDIT = Path("model", "qoi.py"), "float(min(1.0, d / v[1]))", "float(0.5 * min(1.0, d / v[1]))"
+"""A file, the text in it that V is computed by, and another that halves V. A step reaches it by four calls."""
+
+
+def run(
+    package: Path, folder: Path, repeats: int, code: str = "code", **environment: str
+) -> tuple[float, float, float]:
+    """The three numbers of ``PROGRAM`` in a new process with this package; ``folder`` keeps code and bytecode."""
+    settings: Mapping[str, str] = {
+        **{name: text for name, text in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},
+        "PYTHONPATH": str(package.parent),
+        "PYTHONPYCACHEPREFIX": str(folder / "bytecode"),
+        "NUMBA_CACHE_DIR": str(folder / code),
+        **environment,
+    }
+    program = [sys.executable, "-c", PROGRAM.format(repeats=repeats)]
+    done = subprocess.run(program, env=settings, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise BufgymError(f"a new process failed: {done.stderr.strip().splitlines()[-1]}")
+    first_s, step_ns, rewards = map(float, done.stdout.split())
+    return first_s, step_ns, rewards
+
+
+def edited(folder: Path) -> Path:
+    """A copy of the package in ``folder`` whose V is half as large."""
+    copy = folder / PACKAGE.name
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    text = (copy / EDITED).read_text(encoding="utf-8")
+    if text.count(TEXT) != 1:
+        raise BufgymError(f"{EDITED}: must hold {TEXT!r} once")
+    (copy / EDITED).write_text(text.replace(TEXT, EDIT), encoding="utf-8")
+    return copy
+
+
+def lines() -> int:
+    """Lines of the kernel's base."""
+    files = (PACKAGE / "ground" / "kernel").glob("*.py")
+    return sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files)
+
+
+def main(*, repeats: Count = 3) -> None:
+    """Measure what compilation costs on this machine, and whether an edit ever runs stale code.
+
+    Args:
+        repeats: Best of so many.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        run(PACKAGE, folder, 1, NUMBA_DISABLE_JIT="1")  # writes bytecode of bufgym
+        run(PACKAGE, folder, 1)  # and Numba's
+        cold = min(run(PACKAGE, folder, 1, f"cold{k}")[0] for k in range(repeats))
+        warm = [run(PACKAGE, folder, 20) for _ in range(repeats)]
+        copy = edited(folder)
+        compiled, plain = run(copy, folder, 1)[2], run(copy, folder, 1, NUMBA_DISABLE_JIT="1")[2]
+    rows = [
+        ["lines of bufgym/ground/kernel", str(lines())],
+        [f"first step of {ROWS} rows, nothing kept", f"{cold:.2f} s"],
+        [f"first step of {ROWS} rows, code kept", f"{min(first_s for first_s, _, _ in warm):.2f} s"],
+        ["a step of one of these rows", f"{min(step_ns for _, step_ns, _ in warm):.0f} ns"],
+        ["rewards before the edit", f"{warm[0][2]:.6f}"],
+        ["rewards after it, compiled", f"{compiled:.6f}"],
+        ["rewards after it, as plain Python", f"{plain:.6f}"],
+        ["stale code was run", "no" if compiled == plain != warm[0][2] else "YES"],
+    ]
+    print(Table(["", "measured"], [("", rows)]).plain())
+
+
+if __name__ == "__main__":
+    command(main)
