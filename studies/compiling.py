@@ -21,11 +21,11 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from studies.page import command
 from bufgym.cli.options import Count
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import PACKAGE
 from bufgym.ground.tables import Table
+from studies.page import command
 
 ROWS = 64
 PROGRAM = f"""

@@ -1,11 +1,9 @@
 """roscpp's publishers under a policy, by LD_PRELOAD: real nodes in C++ on this machine, their decisions simulated."""
 
-import contextlib
+import itertools
 import os
-import shutil
 import signal
 import socket
-import struct
 import subprocess
 import time
 import xmlrpc.client
@@ -15,33 +13,18 @@ from typing import Any
 
 import pytest
 from refusal_cases import refuse
+from roscpp_cases import build, missing, publishers, seqs, subscriber
 
 from bufgym_live.robot import read_log, replay, roscpp
 from bufgym_live.robot.sockets import free_port
 
-ROS_LIBRARIES = subprocess.run(["pkg-config", "--libs", "roscpp"], capture_output=True, text=True, check=False).stdout
-
-
-def run(*words: Any) -> None:
-    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, timeout=200)
-    assert done.returncode == 0, done.stderr + done.stdout
-
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The library with three policies, and a node that knows nothing of it."""
-    for program in ("cmake", "g++", "rosmaster"):
-        if shutil.which(program) is None:
-            pytest.skip(f"no {program} here")
-    if not ROS_LIBRARIES:
-        pytest.skip("roscpp's headers (libroscpp-dev) are not here")
-    folder = tmp_path_factory.mktemp("roscpp")
-    roscpp.write(folder / "source", roscpp.find("afr,drop-oldest,learned"))
-    run("cmake", "-S", folder / "source", "-B", folder, "-DCMAKE_BUILD_TYPE=Debug")
-    run("cmake", "--build", folder)
-    source = Path(__file__).with_name("roscpp_talker.cpp")
-    run("g++", "-std=c++14", source, "-o", folder / "talker", *ROS_LIBRARIES.split(), "-lpthread")
-    return folder
+    """The folder of the library with three policies, and of a node that knows nothing of it."""
+    if reason := missing():
+        pytest.skip(reason)
+    return build(tmp_path_factory.mktemp("roscpp"), "afr,drop-oldest,learned").parent
 
 
 class Nodes:
@@ -65,60 +48,19 @@ class Nodes:
     def talker(self, topic: str, *words: Any, **settings: str) -> "subprocess.Popen[str]":
         """A node that publishes on the topic, once it is known to the master."""
         process = self._start(str(self._built / "talker"), topic, *map(str, words), **settings)
-        while not self._nodes_of(topic):
+        while not publishers(self._master, topic):
             assert process.poll() is None
             time.sleep(0.05)
         return process
 
     def subscriber(self, topic: str) -> socket.socket:
-        """A connection on which the topic's messages come, only as fast as they are read."""
-        [name] = self._nodes_of(topic)
-        with xmlrpc.client.ServerProxy(self._master.lookupNode("/test", name)[2]) as talker:
-            _, host, port = talker.requestTopic("/test", f"/{topic}", [["TCPROS"]])[2]
-        connection = socket.create_connection((host, port), timeout=5)
-        fields = (f"callerid=/{port}", f"topic=/{topic}", "type=*", "md5sum=*", "tcp_nodelay=1")
-        head = b"".join(struct.pack("<I", len(field)) + field.encode() for field in fields)
-        connection.sendall(struct.pack("<I", len(head)) + head)
-        block(connection)  # the talker's own fields
-        return connection
-
-    def _nodes_of(self, topic: str) -> list[str]:
-        try:
-            published = self._master.getSystemState("/test")[2][0]
-        except OSError:
-            return []
-        return [node for name, nodes in published if name == f"/{topic}" for node in nodes]
+        return subscriber(self._master, topic)
 
     def close(self) -> None:
         self._master("close")()
         for process in reversed(self._started):
             process.kill()
             process.communicate()
-
-
-def block(connection: socket.socket) -> bytes:
-    """The next bytes that have their length before them."""
-    return exactly(connection, struct.unpack("<I", exactly(connection, 4))[0])
-
-
-def exactly(connection: socket.socket, count: int) -> bytes:
-    data = bytearray()
-    while len(data) < count:
-        more = connection.recv(min(count - len(data), 2**16))
-        assert more, "the talker closed the connection"
-        data += more
-    return bytes(data)
-
-
-def seqs(connection: socket.socket, most: int, pause_s: float = 0.0) -> list[int]:
-    """The numbers of the images that come, with a pause before each, until there are so many or no more come."""
-    came: list[int] = []
-    with connection, contextlib.suppress(TimeoutError):
-        while len(came) < most:
-            time.sleep(pause_s)
-            image = block(connection)
-            came.append(int(image[16 : 16 + struct.unpack_from("<I", image, 12)[0]]))
-    return came
 
 
 @pytest.fixture
@@ -193,7 +135,7 @@ def test_x_is_the_robots_motion(built: Path, nodes: Nodes, tmp_path: Path) -> No
     ended(talker)
     records = read_log(logs(log)[0])
     x = [record["x"] for record in records if record["event"] == "put"]
-    steps = [(b - a) / 0.05 for a, b in zip(x, x[1:], strict=False)]
+    steps = [(b - a) / 0.05 for a, b in itertools.pairwise(x)]
     assert x[-1] > 1.5 and all(step >= 0 and step == pytest.approx(round(step)) for step in steps)
     assert records[0]["v"]["numbers"] == [0, -1.0]
 
