@@ -7,8 +7,8 @@ from pathlib import Path
 
 REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
-    "bufgym": 27_250,
-    "tests": 18_200,
+    "bufgym": 27_800,
+    "tests": 19_050,
     "packages/live/bufgym_live": 10_350,
     "packages/live/tests": 6_350,
     "packages/papers/bufgym_papers": 5_250,

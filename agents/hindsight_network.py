@@ -23,6 +23,9 @@ SCALE = 10.0
 class Scorer(nn.Module):
     """One network of a slot scorer, with two hidden layers; its output begins as weights ``prior`` of some fields."""
 
+    skip: Tensor
+    """[inputs]: the prior's weights, which do not change."""
+
     def __init__(self, width: int, prior: dict[str, float]) -> None:
         super().__init__()
         inputs = len(CONTEXT) + len(SLOT)
@@ -43,7 +46,8 @@ class Scorer(nn.Module):
         h = torch.relu(nn.functional.linear(slots, weight[:, c:]) + common[:, None])
         h = torch.relu(self.second(h))
         prior = slots @ self.skip[c:] + (context @ self.skip[:c])[:, None]
-        return SCALE * self.out(h)[..., 0] + prior
+        scores: Tensor = SCALE * self.out(h)[..., 0] + prior
+        return scores
 
     def network(self) -> Network:
         """The same as numbers."""

@@ -323,7 +323,7 @@ class Hindsight(Settings):
     algo = "hindsight"
     learner = "agents.hindsight:HindsightLearner"
     kinds = ("environment", "queue")
-    steps: Natural = 250_000
+    steps: Natural = 200_000
     """Decisions to learn from, for each seed."""
     width: Count = 32
     """Hidden units a layer."""

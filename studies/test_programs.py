@@ -25,8 +25,11 @@ NEEDS = {
     "studies.relay_others": "mosquitto",
 }
 ELSEWHERE = {
+    "studies.causal_planner": "studies/test_causal_planner.py",
+    "studies.compiling": "it compiles for minutes",
     "studies.fit": "studies/test_fit_page.py",
     "studies.fit_sizes": "studies/test_fit_sizes.py",
+    "studies.joint": "it trains for an hour",
     "studies.on_task": "studies/test_on_task.py",
     "studies.peers": "needs the other packages",
     "studies.perf": "studies/test_perf.py",

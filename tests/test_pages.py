@@ -16,14 +16,12 @@ from typing import Any, NamedTuple
 import cyclopts
 import pytest
 
-import bufgym
 import train
 from bufgym import cli, policies
 from bufgym.cli import main
-from bufgym.model.observe import FIELDS, TOPIC_FIELDS
 from bufgym.policies import registry
 from bufgym.scenario.suites import SUITES
-from website import cards, commands, environments, markdown, pages, papers, suites
+from website import cards, commands, markdown, pages, papers, suites
 from website import policies as policy_page
 
 REPO = Path(__file__).resolve().parent.parent
@@ -274,16 +272,6 @@ def test_the_example_runs(path: Path) -> None:
     done = subprocess.run(command, cwd=path.parent, env=where, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()
-
-
-def test_every_environment_has_a_page_that_names_all_that_it_observes() -> None:
-    assert set(environments.HISTORY) == {*environments.SCENARIOS, environments.FLEET}
-    assert all(id.endswith(history[0].name) for id, history in environments.HISTORY.items())
-    for id in bufgym.ENVIRONMENTS:
-        page, fields = environments.page(id), FIELDS + (TOPIC_FIELDS if "Topics" in id else ())
-        assert all(f"| `{field.name}` | {field.per} " in page for field in fields)
-        assert f"gallery/{environments.slug(id)}.webp" in page
-    assert "| `t_max` | `400` | " in environments.page("bufgym/Interruption-v0")
 
 
 def test_pages_have_all_of_their_registry(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,34 +36,22 @@ def newest_two(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return 0 if len(buffer.slots) >= 2 else ACCEPT
 '''
 STEADY = '''
-from dataclasses import dataclass, field
-from typing import ClassVar
-
 import numpy as np
 
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.model.qoi import Value
-from bufgym.model.topics import Topic
 from bufgym.scenario.arrivals import messages
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
 
 
-@dataclass(frozen=True)
 class Halves:
     """A message every second over a link that carries one in two."""
 
-    count: int = 20
-    value: Value = field(default_factory=qoi.exponential)
-    topics: ClassVar[tuple[Topic, ...]] = ()
-
-    @property
-    def max_messages(self) -> int:
-        return self.count
+    value, topics, max_messages = qoi.exponential(), (), 20
 
     def draw(self, streams: Streams) -> Episode:
-        return Episode(messages(np.arange(self.count) * 1_000_000, 1000), Link(Trace.steps([(60.0, 500.0)])))
+        return Episode(messages(np.arange(20) * 1_000_000, 1000), Link(Trace.steps([(60.0, 500.0)])))
 '''
 SUITE = """
 def _halves(split: str, data: str | None = None) -> dict[str, Setting]:
@@ -214,6 +202,17 @@ ROWS = {
         "from bufgym.scenario import suites\n"
         "assert [len(suites.get('halves-v1').settings(split)) for split in suites.SPLITS] == [2, 2, 2]",
     ),
+    "an option of environments": Addition(
+        {},
+        {
+            "bufgym/envs/options.py": ("    bound: bool", "    sloth: int = 0\n    bound: bool"),
+            "bufgym/envs/rows.py": (
+                "        self._own_fields =",
+                "        self.sloth = options.sloth\n        self._own_fields =",
+            ),
+        },
+        "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.rows.sloth == 3",
+    ),
     "a trace format": Addition(
         {},
         {
@@ -259,10 +258,14 @@ ROWS = {
 }
 
 
+ELSEWHERE = {"a learner": "test_a_new_learner_is_a_class_and_its_settings"}
+"""Row -> the test that tries it."""
+
+
 def test_each_row_of_the_table_is_tried() -> None:
     text = (REPO / "docs" / "ARCHITECTURE.md").read_text(encoding="utf-8")
     table = text.partition("| new | goes to |\n|---|---|\n")[2].partition("\n\n")[0]
-    assert set(re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)) == set(ROWS)
+    assert set(re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)) == {*ROWS, *ELSEWHERE}
 
 
 @pytest.fixture(scope="module")

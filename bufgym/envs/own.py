@@ -119,8 +119,7 @@ class OwnFields:
 
     def __init__(self, form: ObservationForm) -> None:
         self._places = form.own_places
-        fields = [place.field for place in self._places]
-        self._compiled = [_compiled("field", field.per, field) if field.compile else None for field in fields]
+        self._compiled = [_compiled("field", p.field.per, p.field) if p.field.compile else None for p in self._places]
 
     def __bool__(self) -> bool:
         return bool(self._places)

@@ -206,7 +206,7 @@ def suffices(buffer: Buffer, arrival: Any, freed_bytes: int) -> bool:
 
 
 @kernel
-def stays(buffer: Buffer, arrival: Any, ahead: bool, freed_bytes: int) -> bool:
+def newcomer_stays(buffer: Buffer, arrival: Any, ahead: bool, freed_bytes: int) -> bool:
     """Whether the newcomer stays where there is no room: it is ``ahead``, and the bytes behind it make room.
 
     Once a message has gone for it, it stays in any case.

@@ -20,7 +20,6 @@ there the plain rule keeps an early message of each burst, which most outputs me
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -148,7 +147,7 @@ INPUT_FIELDS = (
              lambda buffer, known: 1.0 if known.is_plain else 0.0),
 )  # fmt: skip
 INPUTS = {field.name: field for field in INPUT_FIELDS}
-"""The inputs by name, in their order."""
+MEANINGS = [(field.name, field.meaning) for field in INPUT_FIELDS]
 N_INPUTS = len(INPUTS)
 WORK = (chains.SCRATCH[0] + N_INPUTS + N_OUTPUTS + NUMBERS, chains.SCRATCH[1])
 """``Policy.work``: the rule's own, then inputs, outputs and numbers, at the memory's end."""
@@ -274,11 +273,6 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return follow(buffer, arrival, memory, base, outputs)
 
 
-def described(inputs: Iterable[Field]) -> list[tuple[str, str]]:
-    """(name, meaning) of each input."""
-    return [(field.name, field.meaning) for field in inputs]
-
-
 @dataclass(frozen=True)
 class GuidedWeights:
     """Weights of an agent whose outputs are linear in the inputs, as in a file."""
@@ -292,7 +286,7 @@ class GuidedWeights:
     LAYERS: ClassVar[int] = 0
     SHAPE: ClassVar[tuple[int, int]] = (2 * N_OUTPUTS, N_INPUTS)
     LIGHT: ClassVar[tuple[int, int]] = (N_OUTPUTS, N_INPUTS)
-    TABLE: ClassVar[list[Any]] = [described(INPUT_FIELDS), [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
+    TABLE: ClassVar[list[Any]] = [MEANINGS, [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
     """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
 
     @property

@@ -22,7 +22,7 @@ from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, fill, is_first, lo
 from bufgym.model.observe.declare import writer
 from bufgym.model.observe.topics import largest
 from bufgym.model.topics import NO_DEADLINE_US
-from bufgym.policies.guided import GuidedWeights, declared, described, lg, numbers_of
+from bufgym.policies.guided import GuidedWeights, declared, lg, numbers_of
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.robofleet import next_no_drop
 from bufgym.policies.schedulers import fits, make_room, makes_room, topic_of
@@ -53,6 +53,7 @@ INPUT_FIELDS = (
     declared("window", "1 - 2 / n_T", lambda buffer: 1 - 2 / buffer.window),
 )  # fmt: skip
 INPUTS = {field.name: field for field in INPUT_FIELDS}
+MEANINGS = [(field.name, field.meaning) for field in INPUT_FIELDS]
 write_inputs = writer(INPUT_FIELDS, "buffer")
 N_FEATURES, N_INPUTS = len(FEATURES), len(INPUTS)
 DROPS, ROOM = N_FEATURES, 2 * N_FEATURES
@@ -136,7 +137,7 @@ class SchedulerWeights(GuidedWeights):
     CONTEXT_NAMES = tuple(INPUTS)
     NETWORKS = ("scheduler",)
     SHAPE = LIGHT = (N_OUTPUTS, N_INPUTS)
-    TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), described(INPUT_FIELDS), OUTPUTS, PLAIN]
+    TABLE: ClassVar[list[Any]] = [list(FEATURES.items()), MEANINGS, OUTPUTS, PLAIN]
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights, for any topics and every L."""

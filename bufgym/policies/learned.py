@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, stays
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, newcomer_stays
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
     ON_BOARD_FIELDS,
@@ -61,7 +61,7 @@ def reads(fields: NDArray[np.float64], begin: int, end: int) -> bool:
 
 
 @kernel
-def decide(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -> int:
+def choose(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -> int:
     """The decision with the highest score, by what is observed."""
     s, L = len(buffer.slots), buffer.capacity
     for i in range(scorer.context):
@@ -74,7 +74,7 @@ def decide(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -
             freed_bytes += buffer.slots[k].size_bytes
         if dropped > best:
             best, decision = dropped, k
-    if not stays(buffer, arrival, own <= best, freed_bytes):
+    if not newcomer_stays(buffer, arrival, own <= best, freed_bytes):
         best, decision = own, REJECT
     if has_space(buffer, arrival):
         common = begin(scorer, KEEP, scratch)
@@ -83,22 +83,34 @@ def decide(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -
     return decision
 
 
-def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A trained slot scorer."""
+@kernel
+def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """The decision with the highest score."""
     scorer = unpack(buffer.parameters)
     scratch = divide(memory, scorer, CONTEXT, SLOTS, buffer.capacity)
     look(buffer, arrival, scorer, scratch)
-    return decide(buffer, arrival, scorer, scratch)
+    return choose(buffer, arrival, scorer, scratch)
 
 
-def on_arrival_by_rule(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A trained slot scorer that knows what the rule gap-price knows."""
+@kernel
+def decide_by_rule(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """The same with the rule's fields, whose memory comes first."""
     scorer = unpack(buffer.parameters)
     own = memory[RULE_SCRATCH + chains.COLUMNS * (buffer.capacity + 1) :]
     scratch = divide(own, scorer, ALL_CONTEXT, ALL_SLOTS, buffer.capacity)
     observe_rule(buffer, arrival, memory, scratch.rows[SLOTS:], scratch.context[CONTEXT:])
     look(buffer, arrival, scorer, scratch)
-    return decide(buffer, arrival, scorer, scratch)
+    return choose(buffer, arrival, scorer, scratch)
+
+
+def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A trained slot scorer."""
+    return decide(buffer, arrival, memory)
+
+
+def on_arrival_by_rule(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A trained slot scorer that knows what the rule gap-price knows."""
+    return decide_by_rule(buffer, arrival, memory)
 
 
 @dataclass(frozen=True)

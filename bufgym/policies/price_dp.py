@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.ground.kernel import kernel
-from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, stays
+from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, newcomer_stays
 from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import merging_loss, value
@@ -156,7 +156,7 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
         if max(own, best) < a * numbers[PRICE_THRESHOLD]:
             return ACCEPT
         return victim if best >= own - tie else REJECT
-    return victim if stays(buffer, arrival, best >= own - tie, freed_bytes) else REJECT
+    return victim if newcomer_stays(buffer, arrival, best >= own - tie, freed_bytes) else REJECT
 
 
 BOTH: Any = {"parameters": PARAMETERS, "memory": REMEMBERED, "work": chains.SCRATCH, "reads_rate": True}

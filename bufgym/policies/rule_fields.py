@@ -60,7 +60,8 @@ RULE_SLOT_FIELDS = (
           lambda slot: lg(max(slot.lost, 0.0), slot.unit), -MOST, MOST),
     Field("rule_head", "slot", "link", "g",
           "how much nearer to g the gap after dropping it is; 0 but for a head whose turn is near",
-          lambda slot: nearer(slot) if slot.has_turn else 0.0, -MOST, MOST),
+          lambda slot: bounded((abs(slot.before - slot.g) - abs(slot.before + slot.after - slot.g)) / slot.g)
+          if slot.has_turn else 0.0, -MOST, MOST),
     Field("rule_drops", "slot", "link", "0 or 1", "1 if the rule drops it", lambda slot: 1.0 if slot.drops else 0.0),
 )  # fmt: skip
 """In the order in which ``observe_rule`` writes them."""
@@ -82,12 +83,6 @@ RULE_FIELDS = (*(replace(field, name=f"guided_{field.name}") for field in INPUT_
 """The context's, in that order too."""
 _write_slot = writer(RULE_SLOT_FIELDS, "slot")
 _write_state = writer(_STATE_FIELDS, "buffer, arrival, soon, accepts", first=N_INPUTS)
-
-
-@kernel
-def nearer(slot: Candidate) -> float:
-    """How much nearer to g the gap after dropping the head is than the gap before it, in g."""
-    return bounded((abs(slot.before - slot.g) - abs(slot.before + slot.after - slot.g)) / slot.g)
 
 
 @kernel

@@ -128,7 +128,11 @@ def can_reject(batch: Batch, i: int) -> bool:
         return True
     sender = batch.senders[i]
     topic, limited = at(batch.arrivals, i, sender.next).topic, at(batch.log, i, sender.next).limited == 1
-    return limited or not rules.no_drop(batch, i, topic) or (not has_room(batch, i) and rules.refuge(batch, i) < 0)
+    return (
+        limited
+        or not rules.no_drop(batch, i, topic)
+        or (not has_room(batch, i) and rules.last_resort_victim(batch, i) < 0)
+    )
 
 
 @kernel
@@ -149,7 +153,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         enqueue = has_room(batch, i)
         valid = decision == ACCEPT and enqueue
         if batch.several is not None and not enqueue and rules.no_drop(batch, i, arrival.topic):
-            victim = rules.refuge(batch, i)
+            victim = rules.last_resort_victim(batch, i)
             enqueue = victim >= 0
     if not valid:
         sender.invalid += 1

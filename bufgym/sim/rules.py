@@ -128,7 +128,7 @@ def can_fit(batch: Batch, i: int) -> bool:
 
 
 @kernel
-def refuge(batch: Batch, i: int) -> int:
+def last_resort_victim(batch: Batch, i: int) -> int:
     """The slot to evict for a no_drop message as a last resort: lowest priority, oldest; -1 if none may go."""
     sender = batch.senders[i]
     best = -1

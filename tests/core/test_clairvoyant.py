@@ -32,25 +32,6 @@ def line(times, *, sizes=10, x=None, knots=((0, 0), (1_000, 1_000)), after="loop
     return Episode(messages(np.array(times), np.asarray(sizes), x), Link(trace(list(knots), after)), **decisions)
 
 
-@kernels
-def test_one_message_and_nothing_that_can_be_delivered():
-    plan = clairvoyant(line([0]), 1, V)
-    assert (plan.qoi, plan.kept.tolist(), plan.certified) == (1.0, [True], True)
-    stopped = clairvoyant(line([0, 5, 9], knots=((0, 0), (100, 9)), after="stop"), 3, V)
-    assert (stopped.qoi, stopped.kept.any()) == (0.0, False)
-    # Nor ever, where every message is larger than B.
-    crowded = clairvoyant(line([0, 5, 9]), 3, V, max_bytes=9)
-    assert (crowded.qoi, crowded.kept.any()) == (0.0, False)
-    assert clairvoyant(line([0, 5, 9], sizes=[10, 20, 30]), 3, V, max_bytes=9).qoi == 0.0
-
-
-@kernels
-def test_a_message_larger_than_the_buffer_takes_nobodys_place():
-    # B = 50 has no room for message 1. So nothing comes between 0 and 2: 1 + V(2).
-    plan = clairvoyant(line([0, 20, 1_000], sizes=[10, 100, 10]), 2, V, max_bytes=50)
-    assert (plan.qoi, plan.kept.tolist(), plan.certified) == (1.75, [True, False, True], True)
-
-
 @pytest.mark.parametrize(
     ("capacity", "max_bytes", "message"),
     [(0, None, "capacity = 0: L must be"), (-1, None, "capacity = -1: L must be"), (2, 0, "max_bytes = 0: B must be")],
@@ -135,26 +116,6 @@ def test_labels_are_those_that_no_other_beats(offered):
         assert list(zip(held.end[:stop], held.gain[:stop], held.parent[:stop], strict=True)) == [
             (e, g, k) for (e, g), k in sorted(front.items())
         ]
-
-
-@kernels
-def test_unequal_sizes_by_hand():
-    """L = 1, messages of 10, 30 and 10 us at 0, 5 and 6: of the two that wait only one has room, and the small one
-    lets the fourth, at 25, find an idle link."""
-    plan = clairvoyant(line([0, 5, 6, 25], sizes=np.array([10, 30, 10, 10])), 1, V)
-    assert plan.kept.tolist() == [True, False, True, True] and plan.certified
-    assert plan.qoi == pytest.approx(V.information(np.array([0.0, 2.0, 3.0])), abs=EXACT)
-
-
-@kernels
-@pytest.mark.parametrize(("L", "limits", "reached"), [(3, {}, 0.999), (9, {"max_bytes": 40}, 0.98)])
-def test_the_plan_for_sixteen_unequal_messages_comes_close_to_the_bound(L, limits, reached):
-    sizes = np.maximum(1, 12 * np.random.default_rng(2).lognormal(0, 0.9, 16)).astype(int)
-    episode = line(np.arange(16) * 5, sizes=sizes)
-    plan = clairvoyant(episode, L, V, **limits)
-    result = outcome(run(policies.get("clairvoyant"), [episode], L, V, **limits), 0)
-    assert not plan.certified and result.invalid == 0
-    assert result.qoi == V.information(np.flatnonzero(plan.kept).astype(float)) >= reached * plan.qoi
 
 
 @pytest.mark.nightly

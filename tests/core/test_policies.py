@@ -1,36 +1,14 @@
 """Drop policies by hand, their settings and their sources. (Each decision of theirs: ``test_policy_registry``.)"""
 
-import re
-from pathlib import Path
-
-import numpy as np
 import pytest
-from cases import VALUES, cases, log, newcomer, order, queue_of, same
+from cases import VALUES, cases, same
 from hypothesis import given
-from policy_cases import kept, stream, worst_ratio
+from policy_cases import kept, worst_ratio
 
 from bufgym import policies
-from bufgym.policies import ACCEPT, REJECT, afr
 
 MS = 1_000
 kernels = pytest.mark.kernels
-
-
-def ask(on_arrival, L, s, r, c, p):
-    """The decision with s of L messages queued, and the memory after it."""
-    memory = np.array([r, c, p], np.float64)
-    return on_arrival(queue_of(s, L), newcomer(), memory), *memory
-
-
-@kernels
-def test_the_bound_for_halving():
-    # s/L = 2/3 exactly: the code halves r, so the newcomer is accepted; the text does not, so it is counted out.
-    assert ask(afr.afr, 3, 2, r=2, c=0, p=1) == (ACCEPT, 1, 0, 1)
-    assert ask(afr.afr_paper, 3, 2, r=2, c=0, p=1) == (REJECT, 2, 1, 1)
-    # Below it both do, once an arrival, with c reduced: r = 8 -> 4, c = 7 -> 3, which is counted up to 4.
-    for on_arrival in (afr.afr, afr.afr_paper):
-        assert ask(on_arrival, 3, 1, r=8, c=7, p=0) == (ACCEPT, 4, 0, 0)
-        assert ask(on_arrival, 3, 3, r=1, c=0, p=2) == (2, 2, 0, 0)  # the end of a pass
 
 
 def test_worst_gaps():
@@ -90,52 +68,6 @@ def test_what_is_kept(spec, L, T, expected):
     assert kept(spec, L, T) == expected
 
 
-@kernels
-def test_least_distances():
-    # 10 Hz at most: of 100 frames/s every tenth; of camera frames every fourth, for three periods are 99.999 ms.
-    assert order(stream("time-filter", 50, 10_000, 4)) == list(range(0, 50, 10))
-    assert order(stream("time-filter", 20, 33_333, 4)) == list(range(0, 20, 4))
-    # The camera moves 0.02 a frame: every third frame is 0.06 >= 0.05 on. Standing still, none is.
-    assert order(stream("keyframe", 20, 10_000, 4, x=np.arange(20) * 0.02)) == list(range(0, 20, 3))
-    assert order(stream("keyframe", 20, 10_000, 4, x=np.zeros(20))) == [0]
-
-
-@kernels
-def test_foxglove_backlog():
-    # 0.3 MB a message, nothing leaves: one in transmission (all of it unsent) and 32 queued make 9.9 MB; one more would
-    # reach 10.2 MB. With 0.4 MB: 1 + 23 make 9.6, the 25th would reach 10.0 exactly: dropped.
-    for size_bytes, accepted in ((300_000, 33), (400_000, 24)):
-        senders = stream("foxglove-backlog", 60, 1, 100, size_bytes=size_bytes, bytes_per_s=1.0)
-        assert len(log(senders)["dropped_us"]) == 60 - accepted
-    assert len(log(stream("foxglove-backlog", 60, 1, 8, bytes_per_s=1.0))["dropped_us"]) == 60 - 9  # L
-
-
-@kernels
-def test_codel_drops_ever_faster():
-    # Two messages arrive for each that leaves: the one taken at k ms is k/2 ms old. At 10 ms that is the target of 5;
-    # an interval later, at 110 ms, the first is dropped; from there on the gaps are 100 ms / sqrt(count).
-    times_ms = sorted(us / MS for us in log(stream("codel", 600, 500, 1_000))["dropped_us"].values())[:3]
-    exact = 110 + np.cumsum([0, *(100 / np.sqrt(np.arange(1, 3)))])
-    assert exact == pytest.approx([110, 210, 280.7], abs=0.05)
-    assert times_ms == np.ceil(exact).tolist()  # the socket takes a message each ms
-
-
 @pytest.mark.parametrize(("name", "default"), [("lifespan", {"lifespan_s": 0.5}), ("keyframe", {"step": 0.05})])
 def test_settings_by_default(name, default):
     assert dict(policies.get(name).parameters) == default
-
-
-ROOT = Path(__file__).parents[2]
-KEYS = set(re.findall(r"^@\w+\{(\w+),", (ROOT / "docs/references.bib").read_text(encoding="utf-8"), re.M))
-
-
-def test_keys_in_brackets_are_references():
-    for path in sorted((ROOT / "bufgym").rglob("*.py")):
-        assert set(re.findall(r"\[([a-z]+(?:19|20)\d\d[a-z0-9]*)\]", path.read_text(encoding="utf-8"))) <= KEYS, path
-
-
-@pytest.mark.parametrize("name", [*policies.names()])
-def test_a_source_that_is_a_paper_has_its_key(name):
-    source = policies.get(name).source
-    if re.search(r"paper|et al\.|RFC|\b(19|20)\d\d\b|AFR \[|ORBBuf|Robofleet", source):
-        assert set(re.findall(r"\[(\w+)\]", source)) & KEYS, source

@@ -6,17 +6,18 @@ from functools import partial
 import numpy as np
 import pytest
 from cases import VALUES, cases, newcomer, queue_of, same
-from gap_cases import Seen, approached, fits, least_gap, level, spared
-from hypothesis import given
+from gap_cases import Seen, approached, faded, fits, least_gap, level, running_mean, spared
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bufgym import policies
 from bufgym.benchmark.run import by_trace, draw
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.model.link import Link
+from bufgym.model.link import FOREVER, Link
 from bufgym.policies import Policy, target_gap
 from bufgym.policies.target_gap import PACE, PARAMETERS, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, last_chance, needless
-from bufgym.policies.thinning import send_us, spare, steady
+from bufgym.policies.thinning import spare, steady
 from bufgym.scenario import Episode, messages, suites
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
@@ -24,6 +25,7 @@ from bufgym.traces import Trace
 
 POLICY = policies.get("target-gap")
 NUMBERS = np.array(list(PARAMETERS.values()))
+V = qoi.exponential(0.618)
 kernels = pytest.mark.kernels
 
 
@@ -33,6 +35,7 @@ def frames_at_30_hz(*frames, sent=0, now=8, per_frame=1.0, **known):
     buffer = queue_of(len(frames), 8)
     for name, scale in (("arrival_us", 33_333), ("x", per_frame), ("seq", 1)):
         buffer.slots[name] = scale * np.array(frames)
+    buffer.slots["size_bytes"] = 1000
     arrival = newcomer()
     arrival["arrival_us"], arrival["x"] = 33_333 * now, per_frame * now
     arrival["seq"], arrival["size_bytes"] = now, 1000
@@ -73,55 +76,6 @@ def test_the_target_is_what_comes_divided_by_what_the_link_and_the_room_carry():
 
 
 @kernels
-def test_near_the_end_of_the_stream_the_target_is_what_comes_until_then():
-    # In 2 s come 60 frames, and the link sends 15: with three waiting one in 60 / 20. In 0.2 s 6 come, 1.5 are sent.
-    def left(us):
-        return target(*fast(2, 4, 6, remaining_us=us), remembered())
-
-    assert left(2_000_000) == pytest.approx(2 * 60 / 20, rel=1e-3)
-    assert left(200_000) == pytest.approx(2 * 6 / 6.5, rel=1e-3)
-    assert left(5_000_000) == left(60_000_000) == target(*fast(2, 4, 6), remembered())  # farther than the horizon
-    assert left(0) == left(5_000_000)  # past an end that was told wrong
-    # Just before it: what has room goes in, and a full queue keeps to the link's gap.
-    assert 0 < left(1) < 1e-4
-    assert target(*fast(0, 1, 2, 3, 4, 5, 6, 7, remaining_us=1), remembered()) == pytest.approx(2 * 4.0, rel=1e-3)
-
-
-@kernels
-@pytest.mark.parametrize(
-    "change",
-    [{"capacity": 3}, {"max_bytes": 3999}, {"dequeued_arrival_us": 8 * 33_333}],
-    ids=["short queue", "room for three", "no time"],
-)
-def test_where_the_future_is_not_to_be_told_there_is_no_target(change):
-    assert target(*fast(2, 4, **change), remembered()) == 0
-
-
-@kernels
-def test_a_large_newcomer_takes_no_place_from_those_that_wait():
-    # Under B of 9000 bytes eight of 1000 wait; with a newcomer of 28000 the mean is 4000, and two would fit.
-    buffer, arrival = fast(0, 1, 2, 3, 4, 5, 6, 7, capacity=20, max_bytes=9000)
-    arrival["size_bytes"] = 28_000
-    g = target(buffer, arrival, remembered())
-    assert g == pytest.approx(2 * 4.0 * 4, rel=1e-3)  # as the link sends messages four times as large
-
-
-@kernels
-def test_a_stream_must_have_run_for_as_long_as_the_queue_takes_to_be_sent():
-    # L = 8 at 7.5 a second: 1.07 s.
-    assert target(*fast(2, 4), remembered(seen_us=1.06e6)) == 0
-    # A quarter of that, 0.267 s, where the robot knows when it ends.
-    assert target(*fast(2, 4, remaining_us=10**7), remembered(seen_us=0.26e6)) == 0
-    assert target(*fast(2, 4, remaining_us=10**7), remembered(seen_us=0.27e6)) > 0
-    assert target(*fast(2, 4), remembered(seen_us=1.07e6)) > 0
-    assert target(*fast(2, 4), remembered(rate=0.0)) == 0
-    # Bursts are not followed.
-    assert target(*fast(2, 4), remembered(square=1.4 * 33_333.0**2)) > 0
-    assert target(*fast(2, 4), remembered(square=1.6 * 33_333.0**2)) == 0
-    assert target(*fast(2, 4), remembered(pace=0.0)) == 0
-
-
-@kernels
 def test_the_head_goes_when_its_turn_comes_and_the_next_lies_nearer_to_the_target():
     near = {"left_bytes": 374}  # 1.5 arrivals of 250 bytes: before it is decided for good
     assert approach(*fast(3, 5, 8, now=12, **near), 9.0) == 0  # gaps of 6 or 10: 10 is nearer to 9
@@ -140,63 +94,50 @@ def test_with_room_goes_what_leaves_a_gap_no_longer_than_the_target():
     assert approach(*fast(4, 5, 6, now=12, sent=3), 4.0) == 0
 
 
-@kernels
-def test_a_full_queue_drops_the_smallest_gap_older_ones_rather():
-    # Each leaves 4 frames, the head's count 3.34; the newcomer leaves 4 where it is frame 19, 2 where it is 17.
-    frames = (2, 4, 6, 8, 10, 12, 14, 16)
-    assert approach(*fast(*frames, now=19), 1.0) == 0
-    assert approach(*fast(*frames, now=17), 1.0) == REJECT
+RATES = (0.0, 80.0, 900.0, 7_500.0, 30_000.0)
+"""Bytes/s, where 30 messages of 1000 bytes come a second: some seconds for each message, or links that keep up."""
+
+
+@st.composite
+def moments(draw):
+    """(buffer, newcomer, memory, what the twin has seen): queues short and long, links idle, steady and fading."""
+    rng, pick = np.random.default_rng(draw(st.integers(0, 2**32))), lambda *choices: draw(st.sampled_from(choices))
+    seen, memory, even = Seen(), np.zeros(6), draw(st.booleans())
+    for _ in range(draw(st.integers(1, 5))):  # what has come: windows of 20 s and 15 s are passed
+        us, bytes_ = int(rng.choice([0, 33_333, 9_000_000])), int(rng.integers(0, 30_000))
+        past, arrival = frames_at_30_hz(2, drained_bytes=bytes_, drained_us=us, evictions=int(rng.integers(0, 6)) // 5)
+        past = past._replace(previous_us=int(arrival["arrival_us"]) - (33_333 if even else int(rng.integers(0, 10**7))))
+        seen.remember(past, arrival)
+        remember(past, arrival, memory)
+    s, L, mean = draw(st.integers(0, 9)), pick(2, 3, 4, 5, 9, 30), pick(*RATES)
+    frames = np.cumsum(rng.integers(1, 4, s + 1))
+    known = {"capacity": max(L, s), "max_bytes": pick(10**12, 9_000, 3_999), "busy": pick(0, 1, 1, 1)}
+    known |= {"short_rate_bytes_per_s": mean * pick(1.0, 1.015, 1.03, 2.0, 0.3), "long_rate_bytes_per_s": mean}
+    known |= {"medium_rate_bytes_per_s": mean * pick(1.0, 0.995, 0.98), "left_bytes": int(rng.integers(1, 1000))}
+    known |= {"remaining_us": pick(FOREVER, FOREVER, 2_000_000, 200_000, 1, 0), "drained_us": pick(0, 1000)}
+    known |= {"evictions": 0, "v": pick(V, qoi.saturating(9), qoi.tabulated([0, 9, 20], [0, 0.7, 1])).array}
+    buffer, arrival = frames_at_30_hz(*frames[:-1], now=int(frames[-1]), per_frame=pick(0.5, 2.0), **known)
+    arrival["size_bytes"] = pick(1000, 28_000)
+    return buffer, arrival, memory, seen
 
 
 @kernels
-def test_an_idle_or_empty_socket_takes_what_comes():
-    assert approach(*fast(2, 4, 6, busy=0), 99.0) == ACCEPT
-    assert approach(*fast(), 99.0) == ACCEPT
-
-
-@kernels
-def test_long_means_are_kept():
-    memory = np.zeros(6)
-    buffer, arrival = fast(2, drained_bytes=500, drained_us=20_000)
-    remember(buffer, arrival, memory)
-    assert memory.tolist() == [500 / 20_000, 20_000, 2 / 33_333, 33_333, 33_333, 33_333**2]
-    remember(buffer._replace(evictions=1), arrival, memory)  # the same arrival once more
-    assert memory[SEEN_US] == 33_333
-    remember(buffer._replace(drained_bytes=0, drained_us=10_000), arrival, memory)
-    assert memory[RATE] == pytest.approx(500 / 30_000) and memory[PACE] == pytest.approx(4 / 66_666)
-    assert memory[PERIOD] == pytest.approx(33_333) and memory[SQUARE] == pytest.approx(33_333**2)
-    long = np.array([1.0, 60e6, 1.0, 60e6, 1.0, 1.0])  # windows of 20 s and 15 s, however long it has run
-    remember(buffer._replace(drained_bytes=0, drained_us=20_000_000), arrival, long)
-    assert long[RATE] == pytest.approx(0.5)
-    assert long[PERIOD] == pytest.approx(1 + 33_332 / 32)  # the newest weighs 1/32
-    assert long[PACE] == pytest.approx((15e6 + 2) / (15e6 + 33_333))
-
-
-@kernels
-def test_where_v_is_straight_the_message_between_adds_nothing():
-    # In x, 0 was sent, 4, 10 and 16 wait, 20 comes: without 4 a gap of 10 is left, without 10 of 12, without 16 of 10.
-    buffer, arrival = fast(2, 5, 8, now=10)
-    for v, k in ((qoi.saturating(10), 0), (qoi.saturating(9.9), -1), (qoi.exponential(0.9), -1)):
-        assert needless(buffer._replace(v=v.array), arrival) == k
-    bend = qoi.tabulated([0, 10, 20], [0, 0.7, 1]).array
-    assert needless(buffer._replace(v=bend), arrival) == 0
-    assert needless(buffer._replace(v=bend, busy=0), arrival) == -1  # an idle link takes what there is
-
-
-@kernels
-def test_the_head_of_a_short_queue_gets_a_last_chance():
-    # L = 4, one waits: f = 1/4. The link sends one in four now, as in the mean: S = M = 4 arrivals. The head may leave
-    # 1 + 1.09 / 4 + (.76 - .92 / 4) 4 + .076 / 4 x 4 = 3.47 arrivals, 6.94 in x.
-    short = {"capacity": 4, "left_bytes": 254, "short_rate_bytes_per_s": 7500.0}
-
-    def goes(*frames, **known):
-        return last_chance(*fast(*frames, **short | known), remembered(), NUMBERS)
-
-    assert goes(1, now=3) and not goes(1, now=4)  # 3 and 4 arrivals
-    assert not goes(1, now=3, left_bytes=256)  # 1.02 arrivals of 250 bytes have not left yet
-    assert not goes(1, now=3, capacity=6) and not goes(1, now=3, medium_rate_bytes_per_s=7500.0, drained_us=1)
-    # At twice the rate S = 2: 1 + .27 + 1.06 + .08 = 2.41.
-    assert goes(1, now=2, short_rate_bytes_per_s=15000.0) and not goes(1, now=3, short_rate_bytes_per_s=15000.0)
+@settings(max_examples=4 * settings().max_examples)
+@given(moments())
+def test_each_rule_is_its_twins_at_any_moment(moment):
+    """Windows, horizons and limits beyond those of the short random episodes below."""
+    buffer, arrival, memory, seen = moment
+    means = [running_mean(seen.sent, 20e6), sum(us for _, us in seen.sent), running_mean(seen.moved, 15e6)]
+    assert memory.tolist() == pytest.approx([*means, seen.seen_us, *faded(seen.periods)])
+    assert steady(buffer) == level(buffer)
+    assert last_chance(buffer, arrival, memory, NUMBERS) == seen.last_chance(buffer, arrival)
+    needless_, g = seen.needless(buffer, arrival), seen.target(buffer, arrival)
+    assert needless(buffer, arrival) == (-1 if needless_ is None else needless_)
+    assert target(buffer, arrival, memory) == pytest.approx(g or 0.0)
+    for near in (0.5, g or 4.0, 9.0):
+        assert approach(buffer, arrival, near) == approached(buffer, arrival, near)
+    for victim in range(REJECT, len(buffer.slots)):
+        assert spare(buffer, arrival, victim) == spared(buffer, arrival, victim)
 
 
 def twin():
@@ -237,73 +178,6 @@ def test_over_fading_links_less_is_lost_than_by_the_smallest_gap_alone():
         return float(run(policies.get(name), episodes, 15, scenario.value).batch.senders["delivered_gain"].sum())
 
     assert total("afr") < total("min-motion-gap") < total("target-gap")
-
-
-V = qoi.exponential(0.618)
-
-
-def waiting(*frames, rate_bytes_per_s=7500.0, **known):
-    rates = {"medium_rate_bytes_per_s": rate_bytes_per_s, "long_rate_bytes_per_s": rate_bytes_per_s / 2}
-    return frames_at_30_hz(*frames, **rates | known)
-
-
-@kernels
-def test_the_fastest_rate_of_late_says_how_long_a_message_takes():
-    assert send_us(*waiting(2, 5)) == pytest.approx(1e6 * 1000 / 7500)
-    assert send_us(*waiting(2, 5, rate_bytes_per_s=0.0)) == 0
-
-
-@kernels
-def test_what_goes_leaves_no_gap_longer_than_the_link_sends():
-    # Sent: 0; queued: 2, 5, 7; frame 8 comes. Without 2 a gap of 5 frames is left, without 5 one of 5, without 7 of 3.
-    # The link sends one frame every four.
-    spares = [spare(*waiting(2, 5, 7), victim) for victim in (0, 1, 2, REJECT)]
-    assert spares == [False, False, True, True]  # without 8: from 7 to 9, which is expected
-    slower = [spare(*waiting(2, 5, 7, rate_bytes_per_s=5900.0), victim) for victim in (0, 1)]
-    assert slower == [True, True]  # one in 5.08
-
-
-@kernels
-def test_the_room_that_is_left_is_to_be_filled_in_a_minute():
-    # One frame in four is sent, 450 in a minute; with 26 places more 4 x 450 / 476 = 3.78.
-    assert not spare(*waiting(1, 4, 8, now=12, capacity=29), 0)  # leaves a gap of 4
-    assert spare(*waiting(1, 4, 8, now=12, capacity=3), 0)
-
-
-@kernels
-def test_or_by_the_end_of_the_stream():
-    # 15 frames are sent in 2 s; with 3 places more 4 x 15 / 18 = 3.33, with 1 more 3.75.
-    assert spare(*waiting(2, 5, 7, capacity=6, remaining_us=2_000_000), REJECT)  # leaves a gap of 2
-    assert not spare(*waiting(1, 4, 8, now=12, capacity=4, remaining_us=2_000_000), 0)  # leaves a gap of 4
-    assert spare(*waiting(1, 4, 8, now=12, capacity=3, remaining_us=2_000_000), 0)  # no room: one frame in four
-    assert not spare(*waiting(2, 5, 7, remaining_us=1), REJECT)
-
-
-@kernels
-def test_the_link_never_waits_for_what_was_spared():
-    assert not spare(*waiting(5, 7), REJECT)  # two wait: three are wanted
-    assert not spare(*waiting(2, 5, 7, busy=0), 2)
-    assert not spare(*waiting(2, 5, 7, rate_bytes_per_s=0.0), 2)
-    assert not spare(*waiting(2, 5, 7, dequeued_arrival_us=8 * 33_333), 2)  # all at one time: no pace
-
-
-@kernels
-def test_a_long_queue_on_a_slow_link_is_kept_for_the_end_of_the_stream():
-    assert spare(*waiting(2, 5, 7, capacity=29), 2)  # 29 x 1000 / 7500 = 3.87 s
-    assert not spare(*waiting(2, 5, 7, capacity=31), 2)  # 4.13 s: over SOON_US
-
-
-@kernels
-def test_a_link_is_steady_while_its_rates_agree():
-    buffer = queue_of(0, 8)._replace(drained_us=1000)
-
-    def is_steady(short, medium, long, **known):
-        rates = {"short_rate_bytes_per_s": short, "medium_rate_bytes_per_s": medium, "long_rate_bytes_per_s": long}
-        return steady(buffer._replace(**rates, **known))
-
-    assert is_steady(1e6, 1e6, 1e6) and is_steady(1.02e6, 0.99e6, 1e6)
-    assert not is_steady(1.03e6, 1e6, 1e6) and not is_steady(1e6, 0.98e6, 1e6)
-    assert not is_steady(0.0, 0.0, 0.0) and not is_steady(1e6, 1e6, 1e6, drained_us=0)
 
 
 def episode(share, frames=600):

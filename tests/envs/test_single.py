@@ -62,20 +62,6 @@ def test_gymnasium_finds_nothing_to_complain_about(env_id: str, observation: str
     check_env(gym.make(env_id, observation=observation, **SMALL[env_id]).unwrapped)
 
 
-def played(env_id: str, seed: int) -> list[Any]:
-    """What three episodes of random play hand out."""
-    env = gym.make(env_id, **SMALL[env_id])
-    rng = np.random.default_rng(seed)
-    record = []
-    for k in range(3):
-        obs, info = env.reset(seed=seed if k == 0 else None)
-        ended = False
-        while not ended:
-            obs, reward, ended, _, info = env.step(int(rng.integers(10)))
-            record.append((reward, info["action_mask"].tolist(), {key: obs[key].tolist() for key in obs}))
-    return record
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_a_copy_plays_on_and_begins_anew_as_the_original(copied: Any) -> None:
     def rest(env: SenderEnv) -> list[Any]:

@@ -11,7 +11,8 @@ _is_silent = False
 def say() -> None:
     """Write ``NOTICE``, once in a process."""
     if not _is_silent and sys.stderr is not None:
-        print(NOTICE, file=sys.stderr, flush=True)
+        sys.stderr.write(f"{NOTICE}\n")  # in one piece, as the process may end meanwhile
+        sys.stderr.flush()
     compile_silently()
 
 

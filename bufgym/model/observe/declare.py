@@ -4,6 +4,7 @@ Each field names one function. ``writer`` makes the kernel that calls the functi
 Their arguments are the *facts* of that table: what several fields share is computed once and handed to all of them.
 """
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,6 +45,20 @@ class Field:
     compile: bool = True
     """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickle a field of a table by its place, as its function may have no name."""
+        place = self.function.__module__, self.name
+        return (_of_table, place) if _IN_TABLES.get(place) is self else super().__reduce_ex__(protocol)
+
+
+_IN_TABLES: dict[tuple[str, str], Field] = {}
+"""Module of the function, name of the field -> the field."""
+
+
+def _of_table(module: str, name: str) -> Field:
+    importlib.import_module(module)
+    return _IN_TABLES[module, name]
+
 
 def writer(fields: Sequence[Field], facts: str, first: int = 0) -> Any:
     """Make the kernel of a table: ``write(facts, column, rows)`` of slot fields, or ``write(facts, row)`` of a context.
@@ -54,6 +69,7 @@ def writer(fields: Sequence[Field], facts: str, first: int = 0) -> Any:
     names: dict[str, Any] = {"__name__": __name__}
     lines = [f"def write({facts}, {into}):"]
     for i, field in enumerate(fields, first):
+        _IN_TABLES[field.function.__module__, field.name] = field
         names[f"field_{i}"] = kernel(field.function)
         lines.append(f"    {index.format(i)} = field_{i}({facts})")
     exec("\n".join(lines), names)

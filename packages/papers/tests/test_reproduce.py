@@ -19,7 +19,6 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.ground.libraries import library
 from bufgym.traces import Trace
-from bufgym_papers import figures
 from bufgym_papers.figures import FIGURES, afr_fig5, afr_fig7, afr_fig8, frame_tasks, page, run
 from bufgym_papers.figures.figure import UNDECIDED, about, of_all, statements, within
 from bufgym_papers.figures.frame_runs import spearman
@@ -132,13 +131,6 @@ def test_the_rows_of_one_figure_are_renewed(tmp_path: Path, monkeypatch: Patch, 
     fails(command, "--live: not with --claims, whose numbers are simulated", capsys)
     says = "afr-fig4: is not played on sockets; robofleet-fig3 to robofleet-fig7 are"
     fails(["reproduce", "afr-fig4", "--live", "--out", str(tmp_path)], says, capsys)
-
-
-def test_what_is_cited_is_in_the_references() -> None:
-    keys = set(re.findall(r"^@\w+\{(\w+),", (CLAIMS.parent / "references.bib").read_text(encoding="utf-8"), re.M))
-    texts = [CLAIMS, *Path(figures.__file__).parent.glob("*.py")]
-    cited = {key for path in texts for key in re.findall(r"\[([a-z]+20\d\d\w+)\]", path.read_text(encoding="utf-8"))}
-    assert {"wang2022afr", "sikand2021robofleet", "vanderhooft2016http2"} <= cited <= keys
 
 
 def test_unknown_names_and_unusable_options_are_refused() -> None:

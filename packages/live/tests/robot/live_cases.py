@@ -1,5 +1,6 @@
 """A queue on a link of a test's own, where every time is an argument; and which transports there are here."""
 
+import asyncio
 import contextlib
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -11,6 +12,7 @@ from loop_cases import beside
 
 from bufgym_live.robot import PolicyQueue
 from bufgym_live.robot.channels import TRANSPORTS
+from bufgym_live.robot.frames import DATA, GREETING, Frame
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.receiver import Received, Receiver
 from bufgym_live.robot.sender import Sender
@@ -83,6 +85,36 @@ def put(queue: PolicyQueue, messages: int, size_bytes: int = 50_000) -> None:
     for _ in range(messages):
         queue.put(bytes(size_bytes), size_bytes)
         assert len(queue) <= 4
+
+
+class Channel:
+    """A channel whose system wants more when told so, and whose receiver acks when told so."""
+
+    def __init__(self, hidden: bool = False) -> None:
+        self.answers: asyncio.Queue[Frame] = asyncio.Queue()
+        self.wanted = asyncio.Semaphore(0)
+        self.sent: list[int] = []
+        self.hidden = hidden
+
+    async def send(self, frame: Frame) -> None:
+        if frame.kind == GREETING:
+            self.answers.put_nowait(Frame(GREETING, 0, 1000))
+        elif frame.kind == DATA:
+            self.sent.append(frame.number)
+
+    async def receive(self) -> Frame:
+        return await self.answers.get()
+
+    async def until_wanted(self) -> bool:
+        if not self.hidden:
+            await self.wanted.acquire()
+        return not self.hidden
+
+    def left_bytes(self) -> int | None:
+        return None
+
+    def close(self) -> None:
+        pass
 
 
 class Bench:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any, get_args
 
 import pytest
-from live_cases import in_order, meeting_port, put, receiving, sending
+from live_cases import Channel, in_order, meeting_port, put, receiving, sending
 from loop_cases import beside, until
 from refusal_cases import refuse
 
@@ -222,37 +222,27 @@ async def test_nobody_there_is_tried_again(
 async def test_a_receiver_that_hangs_up_before_the_goodbye_is_known_as_sent_is_no_fault() -> None:
     """As over a bus, whose ``publish`` returns late: everything is acked, so nothing is begun again."""
 
-    class Hasty:
+    class Hasty(Channel):
         """Acks at once; hangs up on a goodbye whose sending has not returned."""
 
-        def __init__(self) -> None:
-            self.answers: asyncio.Queue[Frame | None] = asyncio.Queue()
-
         async def send(self, frame: Frame) -> None:
-            if frame.kind == GOODBYE:
-                self.answers.put_nowait(None)
+            await super().send(frame)
+            if frame.kind == DATA:
+                self.answers.put_nowait(Frame(ACK, frame.number))
+            elif frame.kind == GOODBYE:
+                self.answers.put_nowait(frame)
                 await asyncio.Event().wait()
-            self.answers.put_nowait(Frame(GREETING, 0, 1000) if frame.kind == GREETING else Frame(ACK, frame.number))
 
         async def receive(self) -> Frame:
-            answer = await self.answers.get()
-            if answer is None:
+            answer = await super().receive()
+            if answer.kind == GOODBYE:
                 raise ConnectionResetError("the peer has gone")
             return answer
 
-        async def until_wanted(self) -> bool:
-            return False
-
-        def left_bytes(self) -> int | None:
-            return None
-
-        def close(self) -> None:
-            pass
-
     connections: list[Hasty] = []
 
-    async def connect() -> Hasty:
-        connections.append(Hasty())
+    async def connect() -> Any:
+        connections.append(Hasty(hidden=True))
         return connections[-1]
 
     queue = PolicyQueue("drop-oldest", 4)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live_cases import meeting_port
+from live_cases import Channel, meeting_port
 from loop_cases import beside, until
 from ros1_cases import played
 
@@ -27,7 +27,7 @@ from bufgym.scenario import Episode, messages
 from bufgym.sim import outcome, run
 from bufgym.traces import Trace
 from bufgym_live.robot import PolicyQueue, far, sockets, tunnel
-from bufgym_live.robot.frames import ACK, DATA, GREETING, Frame
+from bufgym_live.robot.frames import ACK, Frame
 from bufgym_live.robot.path_window import PathWindow
 from bufgym_live.robot.sender import Sender
 
@@ -65,38 +65,8 @@ def test_a_short_path_holds_one_message(round_trip_s: float, messages_: int) -> 
 # --- when the next message goes --------------------------------------------------------------------------------------
 
 
-class Path:
-    """A channel whose system wants more when told so, and whose receiver acks when told so."""
-
-    def __init__(self, hidden: bool = False) -> None:
-        self.answers: asyncio.Queue[Frame] = asyncio.Queue()
-        self.wanted = asyncio.Semaphore(0)
-        self.sent: list[int] = []
-        self.hidden = hidden
-
-    async def send(self, frame: Frame) -> None:
-        if frame.kind == GREETING:
-            self.answers.put_nowait(Frame(GREETING, 0, 1000))
-        elif frame.kind == DATA:
-            self.sent.append(frame.number)
-
-    async def receive(self) -> Frame:
-        return await self.answers.get()
-
-    async def until_wanted(self) -> bool:
-        if not self.hidden:
-            await self.wanted.acquire()
-        return not self.hidden
-
-    def left_bytes(self) -> int | None:
-        return None
-
-    def close(self) -> None:
-        pass
-
-
 @contextlib.asynccontextmanager
-async def over(path: Path, leaves: Any = "sent", window: int = 1) -> AsyncIterator[PolicyQueue]:
+async def over(path: Channel, leaves: Any = "sent", window: int = 1) -> AsyncIterator[PolicyQueue]:
     """Five messages put at once into a queue of eight."""
 
     async def connect() -> Any:
@@ -113,7 +83,7 @@ async def over(path: Path, leaves: Any = "sent", window: int = 1) -> AsyncIterat
 
 async def test_the_next_message_goes_when_the_system_wants_more() -> None:
     """No ack ever comes. Each time that the system wants more, one message goes, and no second one is chosen sooner."""
-    path = Path()
+    path = Channel()
     async with over(path) as queue:
         for sent in range(1, 5):
             await until(lambda sent=sent: len(path.sent) == sent)  # type: ignore[misc]
@@ -123,7 +93,7 @@ async def test_the_next_message_goes_when_the_system_wants_more() -> None:
 
 async def test_a_hidden_socket_gets_as_many_as_the_path_holds() -> None:
     """Where a library hides its socket, the first ack lets the second message go, and a long round trip more."""
-    path = Path(hidden=True)
+    path = Channel(hidden=True)
     async with over(path) as queue:
         await until(lambda: path.sent == [0])
         assert (len(queue), queue.in_flight) == (4, 1)
@@ -133,7 +103,7 @@ async def test_a_hidden_socket_gets_as_many_as_the_path_holds() -> None:
 
 async def test_a_fixed_window_waits_for_acks() -> None:
     """Robofleet's n_T = 2: two go, and a third when the first is acked, whatever the system wants."""
-    path = Path()
+    path = Channel()
     async with over(path, "acked", 2) as queue:
         await until(lambda: path.sent == [0, 1])
         assert (len(queue), queue.in_flight) == (3, 2)

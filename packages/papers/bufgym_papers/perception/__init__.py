@@ -22,7 +22,6 @@ __all__ = [
     "Coverage", "OrbSimilarity", "Sequence", "Tracker", "difference", "fuse", "grid_of", "jumped", "made_up_room",
     "map_error", "open_sequence", "orbbuf_by", "points_of", "seen_shares", "track",
 ]  # fmt: skip
-
 __getattr__ = on_demand(__name__, {
     "Sequence": "frames", "fuse": "mapping", "grid_of": "mapping", "map_error": "mapping", "points_of": "mapping",
     "OrbSimilarity": "orb", "orbbuf_by": "orb", "open_sequence": "recordings", "made_up_room": "room",
