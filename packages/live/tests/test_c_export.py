@@ -196,6 +196,44 @@ def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+TWO = """
+#define OLD_OWN_VALUE
+#define OLD_STRAIGHT 0.0
+static double old_value(double d) { return d < 1.0 ? d : 1.0; }
+static double old_merging_loss(double a, double u, double b, double v) { return u + v - old_value(a + b); }
+#include "old.h"
+#include "policy.h"
+#include <stdio.h>
+
+/* Five messages into room for two of eight: what is dropped by each policy, and V of a program's own. */
+int main(void)
+{
+    struct old_queue old;
+    struct bufgym_queue new;
+    int k;
+    old_init(&old, 0);
+    bufgym_init(&new, 0);
+    old.capacity = new.capacity = 2;
+    for (k = 0; k < 5; k++) {
+        const struct old_message a = {1000 * k, 10, k, 0.0, 0, 0};
+        const struct bufgym_message b = {1000 * k, 10, k, 0.0, 0, 0};
+        printf("%d %d;", old_arrival(&old, a, 0), bufgym_arrival(&new, b, 0));
+    }
+    printf("%g", old_value(0.5));
+    return 0;
+}
+"""
+
+
+def test_two_policies_in_one_program_with_a_capacity_of_its_run(tmp_path):
+    (tmp_path / "old.h").write_text(header(policies.get("drop-oldest"), 8, EXPONENTIAL, prefix="old"), encoding="utf-8")
+    (tmp_path / "two.c").write_text(TWO, encoding="utf-8")
+    text = header(policies.get("drop-newest"), 8, EXPONENTIAL)
+    program = compiled(tmp_path, "gcc", "c99", tmp_path / "two.c", text)
+    assert output(program) == "-2 -2;-2 -2;0 -1;0 -1;0 -1;0.5"
+    refuse("prefix 'A-b': must be small letters", header, policies.get("afr"), 8, EXPONENTIAL, prefix="A-b")
+
+
 def test_what_has_c_is_a_drop_rule_of_the_registry():
     for policy in map(policies.get, SUPPORTED):
         assert policy.compile and policy.ranked

@@ -53,7 +53,7 @@ class LogFile(McapFile):
 
 
 def read_log(path: str | Path) -> list[Record]:
-    """Read the records of a log file, which may be cut short.
+    """Read the records of a log file, which may be cut short: MCAP, or a record of JSON in each line (``.jsonl``).
 
     Raises:
         BufgymError: there is no such file, it is not MCAP, or a record is not one of ``EVENTS``.
@@ -63,6 +63,9 @@ def read_log(path: str | Path) -> list[Record]:
 
     records: list[Record] = []
     try:
+        if Path(path).suffix == ".jsonl":
+            lines = Path(path).read_bytes().split(b"\n")
+            return _begun(path, [_record(path, k, line) for k, line in enumerate(lines[:-1])])
         with Path(path).open("rb") as file:
             for entry in StreamReader(file, record_size_limit=MAX_RECORD_BYTES).records:
                 if isinstance(entry, Message):
@@ -74,6 +77,10 @@ def read_log(path: str | Path) -> list[Record]:
     except Exception as error:  # mcap raises many kinds of errors at the end of a cut file
         if not records:
             raise BufgymError(f"{path}: no log of a live queue: {type(error).__name__}") from None
+    return _begun(path, records)
+
+
+def _begun(path: str | Path, records: list[Record]) -> list[Record]:
     if not records or records[0]["event"] != "settings":
         raise BufgymError(f"{path}: must begin with the settings of a live queue")
     return records

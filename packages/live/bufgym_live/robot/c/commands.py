@@ -19,6 +19,8 @@ class COptions:
     """Bytes queued at most (default: no limit)."""
     value: str | None = None
     """V as in saturating:4 (default: exponential:0.618)."""
+    prefix: str | None = None
+    """How all its names begin, for several policies in one program (default: bufgym)."""
 
 
 def export(
@@ -26,22 +28,23 @@ def export(
     /,
     out: str,
     *,
-    to: Literal["safetensors", "c"] = "safetensors",
+    to: Literal["safetensors", "c", "roscpp"] = "safetensors",
     weights: WeightOptions = WeightOptions(),
     c: COptions = COptions(),
 ) -> None:
-    """Write a trained agent as a file of weights, read without torch; or a policy in C.
+    """Write a trained agent as a file of weights; a policy in C; or a library for C++ nodes of ROS 1.
 
     A model.zip holds pickles, so reading it can run any code: export models of your own alone.
 
     Args:
         model: Of a run of train.py: model.safetensors, or model.zip (ppo --network slots). For C: a policy's name, such
-            as afr, or a .safetensors of weights.
-        out: File to write.
+            as afr, or a .safetensors of weights. For roscpp: all, or several of these with commas between.
+        out: File to write; for roscpp a folder of sources, which cmake or catkin compiles on the robot.
         to: Kind of file.
     """
-    if to == "safetensors":
+    if to != "c":
         refuse(given(c), "belongs to --to c")
+    if to == "safetensors":
         of_weights.export(model, out, weights=weights)
         return
     from bufgym import policies
@@ -49,6 +52,11 @@ def export(
     from bufgym_live.robot import c as header
 
     refuse(given(weights), "belongs to --to safetensors")
+    if to == "roscpp":
+        from bufgym_live.robot import roscpp
+
+        print(f"wrote {roscpp.write(out, roscpp.find(model))}")
+        return
     policy = policies.load(model) if model.endswith(".safetensors") else policies.get(model)
     value = qoi.load(c.value or "exponential:0.618")
-    print(f"wrote {header.write(policy, out, c.capacity or 16, value, c.max_bytes)}")
+    print(f"wrote {header.write(policy, out, c.capacity or 16, value, c.max_bytes, c.prefix or 'bufgym')}")

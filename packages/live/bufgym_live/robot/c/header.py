@@ -48,23 +48,29 @@ _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tab
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40  # Seed, episodes and messages of the calls in the header
 
 
-def write(policy: Policy, out: str | Path, capacity: int, value: Value, max_bytes: int | None = None) -> Path:
+def write(
+    policy: Policy, out: str | Path, capacity: int, value: Value, max_bytes: int | None = None, prefix: str = "bufgym"
+) -> Path:
     """Write ``header`` to the file ``out``, whole or not at all.
 
     Raises:
         BufgymError: as ``header``, or the file cannot be written.
     """
-    write_text(out, [header(policy, capacity, value, max_bytes)])
+    write_text(out, [header(policy, capacity, value, max_bytes, prefix)])
     return Path(out)
 
 
-def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None) -> str:
-    """Make the policy's C99 header for L = ``capacity`` and B = ``max_bytes`` with V = ``value``.
+def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None, prefix: str = "bufgym") -> str:
+    """Make the policy's C99 header for L up to ``capacity`` and B = ``max_bytes`` with V = ``value``.
+
+    All its names begin with ``prefix``, its macros with the same in capitals.
 
     Raises:
-        BufgymError: the policy has no C, or a limit is invalid.
+        BufgymError: the policy has no C, a limit is invalid, or C has no names that begin so.
     """
     check_limits(capacity, max_bytes)
+    if re.fullmatch("[a-z][a-z0-9_]*", prefix) is None:
+        raise BufgymError(f"prefix {prefix!r}: must be small letters, digits and _, as names in C begin")
     learns, guides = policy.on_arrival is learned.on_arrival, policy.on_arrival is guided.on_arrival
     body = "".join(map(_part, _LEARNED)) if learns else _rule(policy, guides)
     parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False)) if guides else policy.parameters
@@ -104,7 +110,9 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     }
     if learns:
         numbers |= _scorer(policy)
-    return _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
+    text = _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
+    named = re.sub(r"\bbufgym_", f"{prefix}_", text)
+    return re.sub(r"\bBUFGYM_", f"{prefix.upper()}_", named)
 
 
 def _rule(policy: Policy, guides: bool) -> str:

@@ -20,7 +20,7 @@ static inline void bufgym_squash_row(double *row, double reference)
 /* V of the even motion spacing, and the QoI lost where two such gaps become one. */
 static inline double bufgym_even_gap(const struct bufgym_queue *q, const struct bufgym_message *arrival, double *loss)
 {
-    const double even = (arrival->x - q->dequeued_x) / (BUFGYM_CAPACITY + 1);
+    const double even = (arrival->x - q->dequeued_x) / (q->capacity + 1);
     const double gain = bufgym_value(even);
     *loss = bufgym_merging_loss(even, gain, even, gain);
     return gain;
@@ -45,7 +45,7 @@ static inline double bufgym_deviation(const struct bufgym_queue *q, const struct
 static inline void bufgym_observe_context(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     double *context = q->context;
-    const int L = BUFGYM_CAPACITY, spread = L + 1;
+    const int L = q->capacity, spread = L + 1;
     const double time_gap = (double)(arrival->arrival_us - q->previous_us), motion_gap = arrival->x - q->previous_x;
     const double time = (double)(arrival->arrival_us - q->dequeued_arrival_us), motion = arrival->x - q->dequeued_x;
     const double mean_bytes = (double)(q->backlog_bytes + arrival->size_bytes) / (q->occupancy + 1);
@@ -84,13 +84,13 @@ static inline void bufgym_observe_context(struct bufgym_queue *q, const struct b
 static inline void bufgym_observe_slots(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     double (*rows)[BUFGYM_CAPACITY + 1] = q->rows;
-    const int s = q->occupancy, last = BUFGYM_CAPACITY;
-    const double per_rank = 1.0 / (s + 1), even = 1.0 / (BUFGYM_CAPACITY + 1);
+    const int s = q->occupancy, last = q->capacity;
+    const double per_rank = 1.0 / (s + 1), even = 1.0 / (q->capacity + 1);
     const double even_us = even * (double)(arrival->arrival_us - q->dequeued_arrival_us);
     const double even_x = even * (arrival->x - q->dequeued_x);
     const double step_us = (double)(arrival->arrival_us - q->previous_us), step_x = arrival->x - q->previous_x;
     int64_t before_us = q->dequeued_arrival_us;
-    const double even_seq = (double)(arrival->seq - q->dequeued_seq) / (BUFGYM_CAPACITY + 1);
+    const double even_seq = (double)(arrival->seq - q->dequeued_seq) / (q->capacity + 1);
     const double carried = 1e6 * q->long_rate * (q->period_us > 1.0 ? q->period_us : 1.0);
     int64_t before_seq = q->dequeued_seq;
     double before_x = q->dequeued_x, newcomer_gain = 0.0, per_byte = 0.0, loss, even_loss;

@@ -66,7 +66,7 @@ static inline void bufgym_look(const struct bufgym_queue *q, const struct bufgym
     seen[BUFGYM_IN_STALL] = waited < @MOST@ ? waited : @MOST@;
     seen[BUFGYM_IN_SIZE_SPREAD] = 2 * (sizes < 1.0 ? sizes : 1.0);
     seen[BUFGYM_IN_BYTES] = bufgym_lg((double)arrival->size_bytes, size);
-    seen[BUFGYM_IN_FILL] = 2.0 * s / BUFGYM_CAPACITY - 1.0;
+    seen[BUFGYM_IN_FILL] = 2.0 * s / q->capacity - 1.0;
     seen[BUFGYM_IN_UNKNOWN] = known > 0.0 ? 0.0 : 1.0;
     seen[BUFGYM_IN_ONE] = 1.0;
     seen[BUFGYM_IN_HEAD_GAP] = s > 0 ? bufgym_lg(bufgym_gap_left(q, arrival, 0), g) : 0.0;

@@ -31,6 +31,7 @@ struct bufgym_message {
 struct bufgym_queue {
     struct bufgym_message slots[BUFGYM_CAPACITY]; /* the queued messages, 0 = oldest */
     int occupancy;                                /* how many they are */
+    int capacity; /* L, at most BUFGYM_CAPACITY; yours to lower after bufgym_init */
     int64_t backlog_bytes;
     struct bufgym_message dropped; /* the last one to be evicted or rejected */
     int evictions;                 /* for the arrival at hand, which has no room yet; 0: it is settled */
@@ -65,7 +66,9 @@ static const double bufgym_memory[@MEMORY_SIZE@] = {@MEMORY@};
 @PARAMETERS@
 /* --- Quantity of Information: V = @VALUE@ --- */
 
-@VALUE_PART@
+#ifndef BUFGYM_OWN_VALUE /* defined where your program has its own V: all that stands until the #endif */
+#define BUFGYM_STRAIGHT @STRAIGHT@ /* the distance up to which V is straight */
+@VALUE_PART@#endif
 /* --- the policy: @NAME@ --- */
 
 /* A running mean over about so much time, us, goes on by us microseconds in which so much came. */
@@ -77,7 +80,7 @@ static inline void bufgym_average(double *mean, double amount, double us, double
 /* Whether the newcomer fits as the queue is, by messages and by bytes. */
 static inline int bufgym_has_space(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
-    return q->occupancy < BUFGYM_CAPACITY && q->backlog_bytes + arrival->size_bytes <= BUFGYM_MAX_BYTES;
+    return q->occupancy < q->capacity && q->backlog_bytes + arrival->size_bytes <= BUFGYM_MAX_BYTES;
 }
 
 /* Time until the stream ends, us, at least 0; BUFGYM_FOREVER where the queue was not told. */
@@ -166,6 +169,7 @@ static inline void bufgym_init(struct bufgym_queue *q, int64_t now_us)
     memset(q, 0, sizeof *q);
     q->now_us = q->last_dequeue_us = now_us;
     q->ends_us = BUFGYM_FOREVER;
+    q->capacity = BUFGYM_CAPACITY;
     memcpy(q->memory, bufgym_memory, sizeof q->memory);
 }
 

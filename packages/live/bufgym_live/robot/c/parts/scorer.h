@@ -70,7 +70,7 @@ static inline double bufgym_score(
 static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const struct bufgym_scorer *scorer = &bufgym_scorer;
-    const int s = q->occupancy, L = BUFGYM_CAPACITY;
+    const int s = q->occupancy, L = q->capacity;
     double common, own, best = -HUGE_VAL;
     int64_t freed_bytes = 0;
     int i, k, decision = BUFGYM_REJECT;

@@ -47,7 +47,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     const double horizon_us = bufgym_within(q, 1e6 * @HORIZON_S@);
     double r, m;
     /* The first test is for compilers, which leave out then what a short queue never does. */
-    if (BUFGYM_CAPACITY < @LEAST@ || L < @LEAST@ || elapsed_us <= 0.0)
+    if (q->capacity < @LEAST@ || L < @LEAST@ || elapsed_us <= 0.0)
         return 0.0;
     if (memory[BUFGYM_RATE] <= 0.0 || memory[BUFGYM_PACE] <= 0.0)
         return 0.0;
@@ -70,10 +70,10 @@ static inline int bufgym_free_soon(const struct bufgym_queue *q, double arrivals
 static inline int bufgym_needless(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     int k;
-    if (@STRAIGHT@ <= 0.0 || q->occupancy == 0 || q->busy == 0)
+    if (BUFGYM_STRAIGHT <= 0.0 || q->occupancy == 0 || q->busy == 0)
         return -1;
     k = bufgym_smallest_gap(q, arrival, 0, q->occupancy, 0.0);
-    return bufgym_gap_left(q, arrival, k) <= @STRAIGHT@ ? k : -1;
+    return bufgym_gap_left(q, arrival, k) <= BUFGYM_STRAIGHT ? k : -1;
 }
 
 /* Whether the head of a short queue goes before its turn comes. */

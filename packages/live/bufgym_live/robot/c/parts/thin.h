@@ -4,7 +4,7 @@ enum { BUFGYM_R, BUFGYM_C, BUFGYM_P };
 /* How full the queue is, by messages or by bytes, whichever is more. */
 static inline double bufgym_fill(const struct bufgym_queue *q)
 {
-    double messages = (double)q->occupancy / BUFGYM_CAPACITY;
+    double messages = (double)q->occupancy / q->capacity;
     double bytes = (double)q->backlog_bytes / (double)BUFGYM_MAX_BYTES;
     return bytes > messages ? bytes : messages;
 }

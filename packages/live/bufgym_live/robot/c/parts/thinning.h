@@ -16,7 +16,7 @@ static inline double bufgym_mean_bytes(const struct bufgym_queue *q, const struc
 static inline int bufgym_places(const struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
     const double fit = (double)BUFGYM_MAX_BYTES / bufgym_mean_bytes(q, arrival);
-    const int places = fit < BUFGYM_CAPACITY ? (int)fit : BUFGYM_CAPACITY;
+    const int places = fit < q->capacity ? (int)fit : q->capacity;
     return places > q->occupancy ? places : q->occupancy;
 }
 
@@ -51,7 +51,7 @@ static inline double bufgym_spare_us(const struct bufgym_queue *q, const struct 
     const int s = q->occupancy, L = bufgym_places(q, arrival);
     const double horizon_us = bufgym_within(q, @STEADY_US@), each_us = bufgym_send_us(q, arrival);
     /* The first test is for compilers, which see then that no such queue has room here. */
-    if (BUFGYM_CAPACITY <= @WAITING@ || s < @WAITING@ || q->busy == 0 || each_us <= 0.0)
+    if (q->capacity <= @WAITING@ || s < @WAITING@ || q->busy == 0 || each_us <= 0.0)
         return 0.0;
     if (arrival->arrival_us <= q->dequeued_arrival_us || L * each_us > @SOON_US@)
         return 0.0;

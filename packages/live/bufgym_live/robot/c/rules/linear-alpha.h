@@ -3,7 +3,7 @@ static inline double bufgym_full_length(const struct bufgym_queue *q, const stru
 {
     const double bytes = (double)(q->backlog_bytes + arrival->size_bytes);
     const double like_these = (double)BUFGYM_MAX_BYTES * (q->occupancy + 1) / bytes;
-    return floor(like_these < BUFGYM_CAPACITY ? like_these : BUFGYM_CAPACITY);
+    return floor(like_these < q->capacity ? like_these : q->capacity);
 }
 
 /* LINEAR: evicts pass after pass as AFR does, but keeps arrivals at times i^alpha. */

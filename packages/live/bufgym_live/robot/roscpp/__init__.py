@@ -1,0 +1,65 @@
+"""ROS 1 in C++: the source of a library that puts roscpp's queues under policies, by LD_PRELOAD, nodes unchanged.
+
+The AFR paper's own program is a changed roscpp, and leaves an interface to choose the algorithm for future work
+[wang2022afr, Sec. IV-C]. Here the choice is an environment variable or a private parameter of the node.
+"""
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from bufgym import policies
+from bufgym.ground import __version__
+from bufgym.ground.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.policies import Policy
+from bufgym.traces.formats.text import write_text
+from bufgym_live.robot.c.header import SUPPORTED, header
+
+_SOURCE: Final = Path(__file__).with_name("source")
+_CAPACITY: Final = 64  # ``MOST`` of policy.h
+
+_QUEUE: Final = """
+#define {macro}_OWN_VALUE
+#define {macro}_STRAIGHT bufgym::straight()
+#define {prefix}_value bufgym::value
+#define {prefix}_merging_loss bufgym::merging_loss
+#include "{prefix}.h"
+BUFGYM_QUEUE({prefix})
+"""
+"""A policy's header, with V of the library."""
+
+
+def find(text: str) -> list[Policy]:
+    """The policies of ``all``, or of names and files of weights with commas between."""
+    names = [*SUPPORTED, "learned"] if text == "all" else text.split(",")
+    return [policies.load(name) if name.endswith(".safetensors") else policies.get(name) for name in names]
+
+
+def write(folder: str | Path, chosen: Sequence[Policy]) -> Path:
+    """Write the library's source with these policies to a folder: C++, CMakeLists.txt, package.xml.
+
+    Raises:
+        BufgymError: a policy has no C, or the folder cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BufgymError(f"{folder}: {error.strerror or error}") from None
+    texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(_SOURCE.iterdir())}
+    texts["package.xml"] = texts["package.xml"].replace("@VERSION@", __version__)
+    queues, table = "", ""
+    for policy in chosen:
+        prefix = "p_" + re.sub("[^a-z0-9]", "_", policy.name.lower())
+        texts[f"{prefix}.h"] = header(policy, _CAPACITY, qoi.exponential(), prefix=prefix)
+        queues += _QUEUE.format(prefix=prefix, macro=prefix.upper())
+        facts = json.dumps(policy.name), json.dumps(json.dumps(dict(policy.parameters))), f"{prefix}_class::make"
+        table += f"    {{{', '.join(facts)}}},\n"
+    table = f"const bufgym::Policy bufgym::policies[] = {{\n{table}    {{nullptr, nullptr, nullptr}}}};\n"
+    texts["policies.cpp"] = f'// The policies of this library.\n#include "policy.h"\n{queues}\n{table}'
+    for name, text in texts.items():
+        write_text(folder / name, [text])
+    return folder

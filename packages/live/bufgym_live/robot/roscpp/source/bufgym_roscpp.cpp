@@ -1,0 +1,254 @@
+// libbufgym_roscpp.so: queues of roscpp's publishers under policies of bufgym, the node unchanged.
+//
+//   LD_PRELOAD=libbufgym_roscpp.so BUFGYM_POLICY=learned rosrun ...      (settings.h has all settings)
+//
+// It takes the place of three functions of ros::TransportSubscriberLink that libroscpp exports: enqueueMessage,
+// startMessageWrite and onMessageWritten. Calls to them go through vtable, PLT and GOT, so the library that is loaded
+// first has them. roscpp's class is the same from indigo to noetic (transport_subscriber_link.h of ros_comm at
+// indigo-devel, kinetic-devel, melodic-devel and noetic-devel); its Boost headers must be the robot's own.
+#include <algorithm>
+#include <chrono>
+#include <cstring>
+#include <deque>
+#include <memory>
+#include <unordered_map>
+
+#include <linux/sockios.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <sys/ioctl.h>
+#include <sys/socket.h>
+
+#include <boost/bind/bind.hpp>
+#include <ros/connection.h>
+#include <ros/publication.h>
+#include <ros/transport/transport_tcp.h>
+#define private public  // the functions below are members of the class and use its members
+#include <ros/transport_subscriber_link.h>
+#undef private
+
+#include "log.h"
+#include "motion.h"
+#include "policy.h"
+#include "settings.h"
+
+namespace
+{
+// A private member of another class may be named in an explicit instantiation.
+template <class Key, typename Key::type POINTER> struct Named { friend typename Key::type pointer(Key) { return POINTER; } };
+#define NAMED(KEY, CLASS, TYPE, MEMBER)                                                  \
+  struct KEY { typedef TYPE CLASS::*type; friend type pointer(KEY); };                   \
+  template struct Named<KEY, &CLASS::MEMBER>;
+NAMED(Socket, ros::TransportTCP, int, sock_)
+NAMED(Written, ros::Connection, uint32_t, write_sent_)
+NAMED(ToWrite, ros::Connection, uint32_t, write_size_)
+
+const int UNSENT_BYTES = 16384;  // the system wants more when less than this is unsent, whatever is in flight
+
+const bufgym::Settings &settings()
+{
+  static const bufgym::Settings *all = new bufgym::Settings;  // outlives every thread, as all that is static here
+  return *all;
+}
+
+bufgym::Motion *motion()
+{
+  static bufgym::Motion *all = settings().odometry.empty() ? nullptr : new bufgym::Motion(settings().odometry);
+  return all;
+}
+
+int64_t now_us()
+{
+  timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return t.tv_sec * INT64_C(1000000) + t.tv_nsec / 1000;
+}
+
+// What a subscriber's link has besides roscpp's own members; roscpp's poll thread alone uses it.
+struct State
+{
+  boost::weak_ptr<ros::SubscriberLink> link;
+  std::unique_ptr<bufgym::Queue> queue;  // null where roscpp's own rule stays
+  bufgym::Log log;
+  int socket = -1;
+  int64_t first_us = 0, last_us = 0;  // when it began, and its last event
+  int64_t arrived = 0, dequeued_bytes = 0, carried = 0, seq = -1, in_socket = 0;
+
+  int64_t stamp() { return last_us = std::max(last_us + 1, now_us() - first_us); }
+};
+
+std::unordered_map<void *, std::unique_ptr<State>> &states()
+{
+  static auto *all = new std::unordered_map<void *, std::unique_ptr<State>>;
+  return *all;
+}
+
+boost::mutex &states_mutex()
+{
+  static auto *mutex = new boost::mutex;
+  return *mutex;
+}
+
+struct Box : std::queue<ros::SerializedMessage>
+{
+  using queue::c;
+};
+
+bool is_local(int socket)
+{
+  sockaddr_storage here, there;
+  socklen_t size = sizeof here, other = sizeof there;
+  if (getsockname(socket, (sockaddr *)&here, &size) || getpeername(socket, (sockaddr *)&there, &other))
+    return false;
+  if (here.ss_family == AF_INET)
+    return ((sockaddr_in *)&here)->sin_addr.s_addr == ((sockaddr_in *)&there)->sin_addr.s_addr;
+  return !memcmp(&((sockaddr_in6 *)&here)->sin6_addr, &((sockaddr_in6 *)&there)->sin6_addr, sizeof(in6_addr));
+}
+
+int capacity_of(const ros::PublicationWPtr &publication)
+{
+  const ros::PublicationPtr parent = publication.lock();
+  return parent ? (int)parent->getMaxQueue() : 0;
+}
+
+void begin(State &state, ros::TransportSubscriberLink *link, int capacity)
+{
+  const std::string topic = link->getTopic();
+  const bufgym::Policy *policy = settings().of(topic);
+  auto *tcp = dynamic_cast<ros::TransportTCP *>(link->getConnection()->getTransport().get());
+  if (settings().capacity > 0 && capacity > 0)
+    capacity = settings().capacity;
+  if (!policy || !tcp || capacity < 1)
+    return;
+  if (capacity > bufgym::MOST)
+  {
+    ROS_WARN("bufgym: %s: queue_size %d is over %d: roscpp's own queue stays", topic.c_str(), capacity, bufgym::MOST);
+    return;
+  }
+  state.socket = tcp->*pointer(Socket());
+  if (!settings().local && is_local(state.socket))
+    return;
+  state.first_us = now_us();
+  state.queue = policy->make(0, capacity);
+  if (!settings().log.empty())
+    state.log.open(settings().log, topic, *policy, capacity);
+  tcp->setNoDelay(true);
+  setsockopt(state.socket, IPPROTO_TCP, TCP_NOTSENT_LOWAT, &UNSENT_BYTES, sizeof UNSENT_BYTES);
+}
+
+State &state_of(ros::TransportSubscriberLink *link, const ros::PublicationWPtr &publication)
+{
+  boost::mutex::scoped_lock lock(states_mutex());
+  std::unique_ptr<State> &state = states()[link];
+  if (state && state->link.lock().get() == link)
+    return *state;
+  state.reset(new State);  // a new link, perhaps at an old one's address
+  state->link = link->shared_from_this();
+  begin(*state, link, capacity_of(publication));
+  State &made = *state;
+  for (auto i = states().begin(); i != states().end();)
+    i = i->second->link.expired() ? states().erase(i) : std::next(i);
+  return made;
+}
+
+// Bytes that the link has carried so far, by what the system says is unsent.
+int64_t carried(State &state, const ros::Connection &connection)
+{
+  if (state.in_socket == 0)
+    return state.carried;
+  int unsent = 0;
+  ioctl(state.socket, SIOCOUTQNSD, &unsent);
+  const int64_t left = unsent + int64_t(connection.*pointer(ToWrite()) - connection.*pointer(Written()));
+  state.carried = std::max(state.carried, std::min(state.dequeued_bytes - 1, state.dequeued_bytes - left));
+  return state.carried;
+}
+
+// Ask the policy, and carry its decision out on roscpp's queue; whether the message stays.
+bool keeps(State &state, std::deque<ros::SerializedMessage> &box, int64_t size_bytes, const ros::Connection &connection)
+{
+  const int64_t us = state.stamp(), seq = state.arrived++, position = carried(state, connection);
+  const double x = motion() ? motion()->x() : double(seq);
+  const auto begun = std::chrono::steady_clock::now();
+  const int decision = state.queue->arrival(us, size_bytes, x, state.dequeued_bytes - position);
+  const std::chrono::duration<double, std::micro> took = std::chrono::steady_clock::now() - begun;
+  state.log.put(us, seq, size_bytes, x, position, took.count());
+  if (decision >= 0)
+    box.erase(box.begin() + decision);
+  if (decision != bufgym::ACCEPT)
+    state.log.event("dropped", us, state.queue->dropped());
+  return decision != bufgym::REJECT;
+}
+}
+
+namespace ros
+{
+void TransportSubscriberLink::enqueueMessage(const SerializedMessage &m, bool ser, bool)
+{
+  if (!ser)
+    return;
+  {
+    boost::mutex::scoped_lock lock(outbox_mutex_);
+    State &state = state_of(this, parent_);
+    std::deque<SerializedMessage> &box = static_cast<Box &>(outbox_).c;
+    if (state.queue)
+    {
+      if (!keeps(state, box, m.num_bytes, *connection_))
+        return;
+    }
+    else if (const int capacity = capacity_of(parent_))
+    {
+      if ((int)box.size() >= capacity)
+        box.pop_front();
+    }
+    box.push_back(m);
+  }
+  startMessageWrite(false);
+  stats_.messages_sent_++;
+  stats_.bytes_sent_ += m.num_bytes;
+  stats_.message_data_sent_ += m.num_bytes;
+}
+
+void TransportSubscriberLink::startMessageWrite(bool immediate_write)
+{
+  SerializedMessage m(boost::shared_array<uint8_t>(), 0);
+  {
+    boost::mutex::scoped_lock lock(outbox_mutex_);
+    if (writing_message_ || !header_written_ || outbox_.empty())
+      return;
+    State &state = state_of(this, parent_);
+    writing_message_ = true;
+    m = outbox_.front();
+    outbox_.pop();
+    if (state.queue)
+    {
+      state.seq = state.queue->dequeue(state.last_us);
+      state.in_socket = m.num_bytes;
+      state.dequeued_bytes += m.num_bytes;
+      state.log.event("dequeued", state.last_us, state.seq);
+    }
+  }
+  connection_->write(
+      m.buf, m.num_bytes, boost::bind(&TransportSubscriberLink::onMessageWritten, this, boost::placeholders::_1),
+      immediate_write);
+}
+
+void TransportSubscriberLink::onMessageWritten(const ConnectionPtr &)
+{
+  bool ruled = false;
+  {
+    boost::mutex::scoped_lock lock(outbox_mutex_);
+    State &state = state_of(this, parent_);
+    if (state.queue && state.in_socket > 0)
+    {
+      ruled = true;
+      const int64_t us = state.stamp();
+      state.queue->sent(us, state.in_socket);
+      state.carried = state.dequeued_bytes;
+      state.log.gone(us, state.seq, state.carried);
+      state.in_socket = 0;
+    }
+    writing_message_ = false;
+  }
+  startMessageWrite(!ruled);  // under a policy the next one waits for POLLOUT, which TCP_NOTSENT_LOWAT holds back
+}
+}

@@ -1,0 +1,56 @@
+#include "policy.h"
+
+#include <cmath>
+#include <cstdlib>
+
+namespace bufgym
+{
+const Policy *find(const std::string &name)
+{
+  for (const Policy *policy = policies; policy->name; policy++)
+    if (name == policy->name)
+      return policy;
+  return nullptr;
+}
+
+std::string known()
+{
+  std::string names;
+  for (const Policy *policy = policies; policy->name; policy++)
+    names += (names.empty() ? "" : ", ") + std::string(policy->name);
+  return names;
+}
+
+Value v;
+
+bool set_value(const std::string &text)
+{
+  const size_t colon = text.find(':');
+  if (colon == std::string::npos)
+    return false;
+  char *end = nullptr;
+  const double number = std::strtod(text.c_str() + colon + 1, &end);
+  const bool saturating = text.compare(0, colon, "saturating") == 0;
+  if (*end || (saturating ? !(number > 0) : text.compare(0, colon, "exponential") != 0 || !(number > 0 && number < 1)))
+    return false;
+  v.name = text;
+  v.saturating = saturating;
+  v.number = saturating ? number : std::log(number);
+  return true;
+}
+
+double value(double d)
+{
+  if (!v.saturating)
+    return 1.0 - std::exp(d * v.number);
+  const double part = d / v.number;
+  return part < 1.0 ? part : 1.0;
+}
+
+double merging_loss(double a, double value_a, double b, double value_b)
+{
+  return v.saturating ? value_a + value_b - value(a + b) : value_a * value_b;
+}
+
+double straight() { return v.saturating ? v.number : 0.0; }
+}

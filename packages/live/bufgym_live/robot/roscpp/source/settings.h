@@ -1,0 +1,83 @@
+// What the user set: environment variables, or private parameters of the node (~bufgym_policy for BUFGYM_POLICY).
+//
+//   BUFGYM_POLICY      policy of all topics (learned); none: roscpp's own queue
+//   BUFGYM_TOPICS      policies of single topics, as /scan=drop-oldest,/map=none
+//   BUFGYM_VALUE       V (exponential:0.618 over messages, exponential:0.36787944 over motion)
+//   BUFGYM_QUEUE_SIZE  L (the publisher's queue_size)
+//   BUFGYM_ODOMETRY    topic of nav_msgs/Odometry from which x is summed (x counts messages)
+//   BUFGYM_LOCAL       1: also for subscribers on this machine
+//   BUFGYM_LOG         folder for a log of each queue, which `bufgym live replay` reads
+#ifndef BUFGYM_ROSCPP_SETTINGS_H
+#define BUFGYM_ROSCPP_SETTINGS_H
+#include <cstdlib>
+#include <map>
+#include <sstream>
+#include <string>
+
+#include <ros/console.h>
+#include <ros/param.h>
+
+#include "policy.h"
+
+namespace bufgym
+{
+struct Settings
+{
+  const Policy *policy = nullptr;
+  std::map<std::string, const Policy *> topics;
+  int capacity = 0;
+  bool local = false;
+  std::string odometry, log;
+
+  // The policy of a topic; null where roscpp's own queue stays.
+  const Policy *of(const std::string &topic) const
+  {
+    const auto own = topics.find(topic);
+    return own == topics.end() ? policy : own->second;
+  }
+
+  Settings()
+  {
+    for (const char *small : {"/rosout", "/rosout_agg", "/tf", "/tf_static", "/clock"})  // every node reads them
+      topics[small] = nullptr;
+    policy = named(text("POLICY", "learned"));
+    std::istringstream pairs(text("TOPICS", ""));
+    for (std::string pair; std::getline(pairs, pair, ',');)
+    {
+      const size_t equals = pair.find('=');
+      if (equals == std::string::npos || pair[0] != '/')
+        ROS_ERROR("bufgym: BUFGYM_TOPICS: %s: must be /TOPIC=POLICY", pair.c_str());
+      else
+        topics[pair.substr(0, equals)] = named(pair.substr(equals + 1));
+    }
+    capacity = std::atoi(text("QUEUE_SIZE", "0").c_str());
+    local = text("LOCAL", "0") == "1";
+    odometry = text("ODOMETRY", "");
+    log = text("LOG", "");
+    const std::string wanted = text("VALUE", odometry.empty() ? v.name : "exponential:0.36787944117144233");
+    if (!set_value(wanted))
+      ROS_ERROR("bufgym: V = %s: must be exponential:BASE or saturating:DISTANCE; it is %s", wanted.c_str(), v.name.c_str());
+  }
+
+private:
+  static std::string text(const std::string &name, const std::string &otherwise)
+  {
+    const char *word = std::getenv(("BUFGYM_" + name).c_str());
+    if (word)
+      return word;
+    std::string key = "~bufgym_", told;
+    for (char c : name)
+      key += c == '_' ? c : char(c + 32);
+    return ros::param::get(key, told) ? told : otherwise;
+  }
+
+  static const Policy *named(const std::string &name)
+  {
+    const Policy *found = name == "none" ? nullptr : find(name);
+    if (!found && name != "none")
+      ROS_ERROR("bufgym: unknown policy %s: roscpp's own queue stays; known: none, %s", name.c_str(), known().c_str());
+    return found;
+  }
+};
+}
+#endif
