@@ -9,8 +9,8 @@ REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
     "bufgym": 27_800,
     "tests": 19_050,
-    "packages/live/bufgym_live": 10_350,
-    "packages/live/tests": 6_350,
+    "packages/live/bufgym_live": 10_440,
+    "packages/live/tests": 6_580,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_200,
 }
