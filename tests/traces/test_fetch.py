@@ -19,7 +19,9 @@ from requests import PreparedRequest, Response
 
 from bufgym.cli import main
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.datasets import Fetched, Remote, cache_folder, datasets, fetch, fetch_dataset, table
+from bufgym.traces.datasets import fetch, table
+from bufgym.traces.datasets.fetch import Fetched, cache_folder, fetch_dataset
+from bufgym.traces.datasets.table import Remote, datasets
 
 
 def test_two_at_once_fetch_once(site: Site, tmp_path: Path) -> None:
