@@ -46,7 +46,7 @@ from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.sim.state import ARRIVAL_WAITS, new_batch
 from bufgym.traces.generate.lte import LTE_MODES
-from bufgym.traces.generate.shipped import SHIPPED_LTE
+from bufgym.traces.shipped import SHIPPED_LTE
 from studies.futures import DriveSeen, Hidden, Links, LinkSeen, prior, rates
 from studies.page import command, publish, table, written
 

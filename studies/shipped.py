@@ -9,7 +9,7 @@ from pathlib import Path
 from bufgym.traces import write_csv, write_motion_csv
 from bufgym.traces.generate.driving import drive_motion
 from bufgym.traces.generate.lte import synthetic_lte
-from bufgym.traces.generate.shipped import SHIPPED_DURATION_S, SHIPPED_LTE, SHIPPED_SEEDS_OF_MOTION
+from bufgym.traces.shipped import SHIPPED_DURATION_S, SHIPPED_LTE, SHIPPED_SEEDS_OF_MOTION
 
 
 def main(folder: Path) -> None:

@@ -7,8 +7,7 @@ import fit_cases
 import numpy as np
 import pytest
 
-from bufgym.traces import write_csv
-from bufgym.traces.generate import markov_link
+from bufgym.traces import markov_link, write_csv
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import write_links
 from studies.compare_links import compare, held_out, ks_distance

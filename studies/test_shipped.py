@@ -6,7 +6,7 @@ from typing import Any
 from bufgym import traces
 from bufgym.traces import describe, load, load_motion, synthetic_lte
 from bufgym.traces.generate.driving import drive_motion
-from bufgym.traces.generate.shipped import shipped_calls
+from bufgym.traces.shipped import shipped_calls
 from studies.shipped import main
 
 ROOT = Path(__file__).resolve().parents[1]

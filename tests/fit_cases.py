@@ -1,6 +1,6 @@
 """Parameters of a made-up link, as a fit to its recordings should find them."""
 
-from bufgym.traces.generate import LinkParameters, OutageParameters
+from bufgym.traces.generate.parameters import LinkParameters, OutageParameters
 
 KNOWN = LinkParameters(
     recordings=20,

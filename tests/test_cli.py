@@ -18,7 +18,7 @@ from bufgym.cli import main
 from bufgym.cli.listing import LISTS
 from bufgym.ground.kernel import JIT
 from bufgym.policies import registry
-from bufgym.traces.generate.shipped import shipped_calls
+from bufgym.traces.shipped import shipped_calls
 
 
 @pytest.fixture

@@ -99,15 +99,17 @@ def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, cap
     folder = Path("runs/tiny")
     # So does one that the clairvoyant teaches.
     (_, taught), *_ = columns(folder / "hindsight" / "seed-0" / "validation.csv", "steps", "qoi")
-    found = policies.load(folder / "ppo" / "seed-0" / runs.MODEL)
     (_, first), *_ = columns(folder / "evolve" / "seed-0" / "validation.csv", "steps", "qoi")
     judges, test = FixedEpisodes(on, "validation", 2), FixedEpisodes(on, "test", 3)
     assert first == taught == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
-    agent = policies.load(folder / "model.safetensors")
-    rows = json.loads((folder / "results.json").read_text(encoding="utf-8"))["scores"]
-    told = {row["policy"]: row["qoi"] for row in rows}
-    assert told["agent (seed 0)"] == np.mean([o.qoi for o in test.play(agent)])
-    assert told["agent by ppo (seed 0)"] == np.mean([o.qoi for o in test.play(found)])
+    results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    told = {row["policy"]: row["qoi"] for row in results["scores"]}
+    best = results["settings"]["algo"]
+    for algo in ("evolve", "hindsight", "ppo"):
+        name = "agent (seed 0)" if algo == best else f"agent by {algo} (seed 0)"
+        agent = policies.load(folder / algo / "seed-0" / runs.MODEL)
+        assert told[name] == np.mean([outcome.qoi for outcome in test.play(agent)])
+    assert (folder / runs.MODEL).read_bytes() == (folder / best / "seed-0" / runs.MODEL).read_bytes()
     assert "the best rule written by hand, " in capsys.readouterr().out
 
 

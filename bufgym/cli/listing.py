@@ -114,7 +114,7 @@ def _in_parts(parts: Mapping[str, Sequence[Sequence[str]]]) -> str:
 
 def _list_traces() -> str:
     from bufgym.traces import shipped
-    from bufgym.traces.generate.shipped import shipped_calls
+    from bufgym.traces.shipped import shipped_calls
 
     kinds = {"lte": "bandwidth, synthetic LTE", "drive": "motion of a driving robot, synthetic"}
     calls = shipped_calls()

@@ -1,7 +1,6 @@
 """Errors that bufgym raises on purpose.
 
-``except BufgymError`` catches every error that the caller can put right, such as a bad parameter or a broken file. Any
-other exception that escapes is a bug in bufgym.
+``except BufgymError`` catches every error that the caller can put right. Any other exception is a bug in bufgym.
 """
 
 import difflib

@@ -4,8 +4,6 @@ Importing the module runs its code, and modules in the current folder count too.
 leaderboards, results and configurations of clients, therefore never get here.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import os

@@ -16,8 +16,7 @@ _CALL = "import sys; sys.path[:] = {path!r}; from {module} import {name}; {name}
 def end_with(parent: int) -> None:
     """End this process soon after ``parent``, the process number of its parent, has ended.
 
-    A killed parent leaves its workers running, and they would hold its pipes and files for ever. The parent may be gone
-    already when a worker calls this.
+    A killed parent's workers would hold its pipes and files for ever. It may be gone when a worker calls this.
     """
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 

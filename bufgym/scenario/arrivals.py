@@ -81,8 +81,7 @@ def sealed(arrivals: Any) -> NDArray[Any]:
 def check_messages(arrivals: NDArray[Any]) -> tuple[int, bool]:
     """Check ``_RULES``; return (bytes of all messages, whether x never falls from one to the next).
 
-    Kernels rely on the rules: they find a message's entries by its ``seq``, and count bytes and microseconds in 64
-    bits.
+    Kernels rely on them: they find a message's entries by its ``seq``, and count bytes and microseconds in 64 bits.
     """
     if len(arrivals) == 0:
         raise BufgymError("an episode needs at least one message")

@@ -61,8 +61,7 @@ def check_value(scenario: object) -> None:
 def recordings(scenario: object) -> None:
     """Make tuples of Trace and Motion of the parameters ``traces`` and ``motion``, even of a single one.
 
-    Text names a shipped recording, a file, or for traces a generator (``links``); the motion "none" stands for no
-    motion.
+    Text names a shipped recording, a file, or for traces a generator (``links``); the motion "none" stands for none.
     """
     if getattr(scenario, "motion") in ("none", ["none"]):  # noqa: B009
         object.__setattr__(scenario, "motion", ())

@@ -1,6 +1,5 @@
 """Draws that uplinks and clients share: shipped recordings, places on them, and message sizes."""
 
-import math
 from typing import Any, cast
 
 import numpy as np
@@ -8,10 +7,10 @@ from numpy.typing import NDArray
 
 from bufgym import traces
 from bufgym.traces import Motion, Trace
+from bufgym.traces.generate.sizes import lognormal
 
-SIZES = (
-    1  # Number of the generator ``derived_generator`` makes of a stream that draws sizes; of robot or stream r: r more
-)
+# Number of the generator that ``derived_generator`` makes of a stream that draws sizes; of robot or stream r: r more.
+SIZES = 1
 
 
 def derived_generator(rng: np.random.Generator, number: int) -> np.random.Generator:
@@ -52,8 +51,7 @@ def sizes(n: int, mean_bytes: int, cv: float, rng: np.random.Generator) -> NDArr
     """Draw int64[n] log-normal sizes, bytes, of that mean and coefficient of variation, at least 1."""
     if not cv:
         return np.full(n, int(mean_bytes), np.int64)
-    spread = math.sqrt(math.log1p(cv**2))
-    drawn = mean_bytes * np.exp(spread * rng.standard_normal(n) - spread**2 / 2)
+    drawn = mean_bytes * lognormal(rng.standard_normal(n), cv)
     size: NDArray[np.int64] = np.maximum(1, np.rint(drawn)).astype(np.int64)
     return size
 

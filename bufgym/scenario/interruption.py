@@ -30,8 +30,7 @@ class Interruption:
 
     Message 0 is in transmission when the link stops. The policy decides on messages 1..T, which arrive one a period.
     Then the link resumes, and all kept messages are delivered, with message T + 1 last. T is hidden and drawn from
-    ``law``: ``fixed`` (t_max), ``uniform`` or ``log-uniform`` on t_min..t_max, ``geometric`` from t_min on with mean
-    ``t_mean``, cut off at t_max.
+    ``law``: ``fixed`` (t_max), ``uniform``, ``log-uniform`` or, with mean ``t_mean``, ``geometric`` on t_min..t_max.
     """
 
     law: str = "log-uniform"

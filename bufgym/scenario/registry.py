@@ -44,8 +44,7 @@ _BUILT_IN = frozenset(SCENARIOS)
 def register(name: str, about: str = "") -> Callable[[Maker], Maker]:
     """Register the decorated class or function as the scenario ``name``; it comes back unchanged.
 
-    A function takes no arguments and returns a ``Scenario``. ``about`` is a line about it, by default the first of the
-    docstring.
+    A function takes no arguments and returns a ``Scenario``. ``about`` is a line, by default the docstring's first.
 
     Raises:
         BufgymError: the name is a built-in scenario's, empty, or holds a blank, ":" or "=".

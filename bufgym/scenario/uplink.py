@@ -37,12 +37,10 @@ class Uplink:
 
     Frames arrive at ``rate_hz``. The link is one of ``traces``, chosen at random, times one of ``scale``, from a random
     offset on. x is one of the recordings in ``motion`` from a random offset on, or without one the frame index. Jitter,
-    sizes and motion have draws of their own, so one seed gives the same link and motion for other rates, jitters or
-    sizes.
+    sizes and motion have draws of their own: one seed gives the same link and motion for other rates or sizes.
 
     A ``workload``, a robot's recording, is played as it is. It replaces the stream that ``rate_hz``, ``jitter``,
-    ``size_bytes``, ``sizes``, ``size_cv`` and ``duration_s`` describe. All its topics share the queue; it gives x if it
-    has one.
+    ``size_bytes``, ``sizes``, ``size_cv`` and ``duration_s`` describe. Its topics share the queue; it may give x.
 
     Text in place of an object is read as on the command line: ``traces="lte-synthetic-0"`` (a shipped name or a file,
     or a list of them), ``motion="drive-0"`` (or "none"), ``value="saturating:0.5"``, ``workload="drive.mcap"``.

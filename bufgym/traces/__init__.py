@@ -18,16 +18,11 @@ from bufgym.traces.formats.recordings import read_workload, workload_from_bag
 from bufgym.traces.formats.trajectories import read_poses
 from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
 from bufgym.traces.formats.writers import WRITERS, difference, write_csv, write_mahimahi
-from bufgym.traces.generate import (
-    drive_motion,
-    fitted_links,
-    markov_link,
-    ramp,
-    read_links,
-    steady,
-    synthetic_lte,
-    tunnel,
-)
+from bufgym.traces.generate.driving import drive_motion
+from bufgym.traces.generate.lte import synthetic_lte
+from bufgym.traces.generate.markov import markov_link
+from bufgym.traces.generate.parameters import fitted_links, read_links
+from bufgym.traces.generate.rules import ramp, steady, tunnel
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses
 from bufgym.traces.shipped import load, load_motion, shipped

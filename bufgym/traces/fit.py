@@ -64,14 +64,10 @@ def mode_of(path: StrPath) -> str:
 
 
 def fit_links(recordings: Mapping[str, Rates]) -> dict[str, LinkParameters]:
-    """Mode -> parameters.
-
-    Args:
-        recordings: mode -> rates of its recordings, bytes/s.
+    """Mode -> parameters, from mode -> rates of its recordings, bytes/s.
 
     Raises:
-        BufgymError: no recordings, a mode with under 60 seconds at or above the threshold, a rate that is negative or
-            not finite.
+        BufgymError: no recordings, a mode with under 60 seconds at or above the threshold, a rate not finite or < 0.
     """
     if not recordings:
         raise BufgymError("no recordings: must be at least one")

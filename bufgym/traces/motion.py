@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel
-from bufgym.traces.poses import Poses, angles, longest_s, unit
+from bufgym.traces.poses import Poses, angles, gaps_between, longest_s, unit
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array, first_true, freeze
 
 
@@ -29,8 +29,7 @@ class MotionSettings:
     """Greatest rate at which poses are compared, 1/s: that of a camera. Motion capture at 100-300 Hz jitters by a
     fraction of a mm, and summing over every sample would count that as motion."""
     max_gap_s: float = 1.0
-    """Longer times between poses are gaps, s. Motion across a gap counts as the straight way from its first pose to its
-    last, the least that can have happened."""
+    """Longer times between poses are gaps, s. Motion across one counts as the straight way, the least possible."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -129,16 +128,12 @@ def motion_from_poses(
     """Sum rotation / field of view + translation / scene scale over successive poses.
 
     Poses that come faster than the settings' rate (by their median distance) are first resampled to it: positions along
-    a line, orientations along the shortest arc (slerp). Slower ones are used as they are.
-
-    Args:
-        poses: where the camera was; quaternions need not be exactly of norm 1.
-        settings: by default `MotionSettings()`.
-        name, source: those of the motion.
+    a line, orientations along the shortest arc (slerp). Slower ones are used as they are. Quaternions need not be
+    exactly of norm 1.
     """
     settings = settings or MotionSettings()
     poses = replace(poses, quaternion=unit(poses.quaternion))
-    gaps = poses.gaps(settings.max_gap_s)
+    gaps = gaps_between(poses.time_us, settings.max_gap_s)
     # A recording at just this rate jitters by some percent, and must not be resampled for that.
     if np.median(np.diff(poses.time_us)) < 0.9 * US_PER_S / settings.rate_hz:
         poses = poses.resampled(settings.rate_hz)

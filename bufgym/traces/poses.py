@@ -26,10 +26,6 @@ class Poses:
     format: str = ""
     """What they were read from."""
 
-    def gaps(self, max_gap_s: float) -> tuple[tuple[int, int], ...]:
-        """(start, end) in microseconds of each stretch longer than `max_gap_s` without a pose."""
-        return gaps_between(self.time_us, max_gap_s)
-
     def at(self, time_us: Int64Array) -> Poses:
         """The poses at these times, int64[m] within the recording: position linear, orientation by slerp."""
         k = np.clip(np.searchsorted(self.time_us, time_us, side="right") - 1, 0, self.time_us.size - 2)

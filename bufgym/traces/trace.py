@@ -51,11 +51,9 @@ class Trace:
     """int64[K], K >= 2, microseconds, strictly increasing from 0. Knots are added inside a segment in which
     (bytes x microseconds) >= 2**62, which integer interpolation could not hold."""
     cumulative_bytes: Int64Array
-    """int64[K], bytes that the link could have carried by then, non-decreasing from 0; the rate between knots is
-    constant."""
+    """int64[K], bytes that the link could have carried by then, non-decreasing from 0; linear between knots."""
     after: After = "loop"
-    """What follows the last knot: "loop" begins again at the first, "hold" continues at the rate of the last segment,
-    "stop" carries nothing more."""
+    """After the last knot: "loop" begins again, "hold" continues at the last segment's rate, "stop" carries nothing."""
     source: str = ""
     """Where it comes from, in words, with the file's format."""
 
@@ -202,9 +200,7 @@ class Trace:
         Args:
             interval_us: int64[K-1], length of each interval in microseconds, > 0.
             bytes_in_interval: int64[K-1], bytes transmitted in each, >= 0.
-            name: that of the trace.
-            after: what follows its end.
-            source: where it comes from, in words.
+            name, after, source: as in ``Trace``.
         """
         lengths = _whole_numbers(interval_us, "interval_us")
         counts = _whole_numbers(bytes_in_interval, "bytes_in_interval")
@@ -229,8 +225,7 @@ class Trace:
         rounded to whole microseconds, and each knot's count to a whole byte.
 
         Raises:
-            BufgymError: a rate below 0, a duration under 1 us, over 10**7 s in all, or a number that is not
-                finite.
+            BufgymError: a rate below 0, a duration under 1 us, over 10**7 s in all, or a number not finite.
         """
         knot_us, knot_bytes = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
         start_us = start_bytes = 0

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bufgym.traces.datasets import Dataset, Fetched, Remote, fetch_dataset
+from bufgym.traces.datasets.fetch import Fetched, fetch_dataset
+from bufgym.traces.datasets.table import Dataset, Remote
 
 DATA = random.Random(1).randbytes(300_000)
 SHA256 = hashlib.sha256(DATA).hexdigest()

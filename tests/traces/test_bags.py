@@ -27,7 +27,8 @@ from bufgym.ground.errors import TraceWarning
 from bufgym.traces import MotionSettings, read_workload, workload_from_bag
 from bufgym.traces.datasets.unpack import unpack
 from bufgym.traces.formats import bag_files, bags
-from bufgym.traces.formats.bags import is_bag, read_bag
+from bufgym.traces.formats.bags import read_bag
+from bufgym.traces.formats.splits import is_recording
 
 ODOMETRY, STRING = "nav_msgs/msg/Odometry", "std_msgs/msg/String"
 
@@ -154,7 +155,7 @@ def test_what_is_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "folder" / "a.mcap")
     nothing, drive = cases.write_mcap(tmp_path / "nothing.mcap", []), mcap()(tmp_path / "drive.mcap")
-    assert not is_bag(tmp_path / "text.mcap") and not is_bag(tmp_path / "empty")
+    assert not is_recording(tmp_path / "text.mcap") and not is_recording(tmp_path / "empty")
     for name in ("text.mcap", "empty"):
         refused(tmp_path / name, f"{name}: must be an MCAP file, a ROS 1 bag, or a rosbag2 folder")
     refused(tmp_path / "absent", "absent: no such file")

@@ -24,8 +24,10 @@ from requests import PreparedRequest, Response
 
 from bufgym.cli import main
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.datasets import Fetched, Remote, cache_folder, datasets, fetch, fetch_dataset, table
+from bufgym.traces.datasets import fetch, table
 from bufgym.traces.datasets import unpack as unpacking
+from bufgym.traces.datasets.fetch import Fetched, cache_folder, fetch_dataset
+from bufgym.traces.datasets.table import Remote, datasets
 from bufgym.traces.datasets.unpack import unpack
 
 

@@ -11,11 +11,10 @@ from refusal_cases import refuse
 
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
-from bufgym.traces import write_csv
+from bufgym.traces import markov_link, read_links, write_csv
 from bufgym.traces.fit import autocorrelation, fit_links, mode_of, rates_of, spells
-from bufgym.traces.generate import LinkParameters, markov_link, read_links
 from bufgym.traces.generate.markov import link_rates
-from bufgym.traces.generate.parameters import LINKS, UPLINKS
+from bufgym.traces.generate.parameters import LINKS, UPLINKS, LinkParameters
 from bufgym.traces.trace import Float64Array
 
 

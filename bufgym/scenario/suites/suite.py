@@ -54,11 +54,7 @@ class Suite:
     """Task of its scenarios: a name in ``bufgym.benchmark.tasks``."""
 
     def settings(self, split: str, data: str | Path | None = None) -> dict[str, Setting]:
-        """The scenarios of one split by label.
-
-        Args:
-            split: one of ``SPLITS``.
-            data: the folder of recordings, for suites that need one.
+        """The scenarios of one split by label; ``data`` is the folder of recordings, for suites that need one.
 
         Raises:
             BufgymError: for another split, or recordings that are missing.

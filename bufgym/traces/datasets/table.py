@@ -1,8 +1,7 @@
 """The public data sets that `bufgym trace fetch` knows, read from `datasets.toml` and `SHA256SUMS` beside this file.
 
 `SHA256SUMS` has the format of the program `sha256sum` (path = data set / file). Each checksum was computed from a copy
-of the published file, because none of these publishers states one. A file that is listed in `datasets.toml` alone has
-no known checksum.
+of the published file, as none of these publishers states one. A file in `datasets.toml` alone has no known checksum.
 """
 
 import functools

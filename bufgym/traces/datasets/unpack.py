@@ -31,12 +31,9 @@ def ending(name: str) -> str | None:
 
 
 def unpack(archive: Path, folder: Path, most_bytes: int = MAX_UNPACKED_BYTES) -> None:
-    """Unpack `archive` into `folder`, which must not exist yet; after an error it does not exist either.
+    """Unpack `archive` (.zip, .tgz, .tar.gz) into a new `folder`; after an error the folder does not exist.
 
-    Args:
-        archive: named .zip, .tgz or .tar.gz.
-        folder: created by this call, complete.
-        most_bytes: limit of the bytes after decompression; never more than `unpacked_limit` of the archive's size.
+    It must hold at most `most_bytes` after decompression, and never more than `unpacked_limit` of its size.
 
     Raises:
         BufgymError: a damaged archive, one that is too big, or a member that must not be in the folder.

@@ -5,8 +5,6 @@ unpacks to no more than MAX_CHUNK_BYTES, and the whole to no more than `files.un
 can make a small file endless. So rosbag2's SQLite files are read by two plain queries.
 """
 
-from __future__ import annotations
-
 import bz2
 import io
 import os

@@ -1,7 +1,5 @@
 """Poses from the messages of one topic of a recording: odometry, poses, or one transform of tf."""
 
-from __future__ import annotations
-
 import functools
 import math
 import re
@@ -80,11 +78,7 @@ class PoseCollector:
     """Decodes the messages of one topic and keeps their poses."""
 
     def __init__(self, path: StrPath, spec: str) -> None:
-        """
-        Args:
-            path: the recording, for error messages.
-            spec: as ``named_source`` takes it.
-        """
+        """Take the recording, for error messages, and what ``named_source`` splits."""
         self.path, self._spec = path, spec
         self.topic, self._frames = named_source(spec)
         self._poses: dict[Frames, list[tuple[int, tuple[float, ...]]]] = {}

@@ -3,8 +3,6 @@
 See docs/methods.md, "Recordings of robots".
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +17,8 @@ from bufgym.traces.formats.bag_files import MAX_TOPICS, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.clocks import LogTimes
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.jumps import warn_of_jumps
-from bufgym.traces.formats.splits import damage_errors, is_recording, split_messages, splits
+from bufgym.traces.formats.splits import damage_errors, split_messages, splits
+from bufgym.traces.formats.trajectories import warn_of_jumps
 from bufgym.traces.poses import Poses
 from bufgym.traces.trace import Int64Array
 
@@ -50,17 +48,6 @@ def matching(source: str, names: Sequence[str], patterns: Sequence[str] | None) 
         if not any(fnmatchcase(name, pattern) for name in names):
             raise BufgymError(f"{source}: no topic {pattern!r}; it has: {', '.join(names) or 'none'}")
     return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
-
-
-def is_bag(path: StrPath) -> bool:
-    """Whether this is a recording, by its first bytes (a folder: by its content), whatever its name."""
-    return is_recording(Path(path))
-
-
-def refuse_bag(path: StrPath, rule: str) -> None:
-    """Raise an error if this is a recording, which must be something else by this rule."""
-    if is_bag(path):
-        raise fault(path, f"is a recording of messages, whose topics `bufgym trace from-bag` lists: {rule}")
 
 
 def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], object] = int) -> Bag:

@@ -4,8 +4,6 @@ Arrival times are log times, so a clock that was set back would shuffle the mess
 and units", says what is refused and what is warned of.
 """
 
-from __future__ import annotations
-
 import struct
 from array import array
 from functools import cache

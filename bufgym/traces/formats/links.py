@@ -16,12 +16,12 @@ from typing import Final
 
 from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces.formats import tables
-from bufgym.traces.formats.bags import refuse_bag
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_iperf3, read_nuttcp, read_runs
+from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace
 
@@ -68,7 +68,7 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
     Args:
         path: the file, plain or gzip'd.
         format: one of `FORMATS`; by default it is detected from the content.
-        after: what follows the end of the trace (see `Trace`).
+        after: as in `Trace`.
         column: the one to read, where a format has several (`ucc`: DL_bitrate, the default, or UL_bitrate; `runs`:
             run 1, the default, run 2, ...).
 
@@ -81,7 +81,7 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         BufgymError: an unknown `format`, `after` or `column`.
     """
     origin = "requested"
-    refuse_bag(path, "must be a bandwidth trace")
+    refuse_recording(path, "must be a bandwidth trace")
     if format is None:
         format, origin = detect_format(path), "detected"
     elif format not in FORMATS:

@@ -46,12 +46,8 @@ def read_ucc(path: StrPath, column: str = "DL_bitrate") -> Knots:
     """
     intervals = Intervals()
     with open_text(path) as file:
-        lines = file.lines()
-        header = next(lines, None)
-        columns = ", ".join((_UCC_TIME, *UCC_COLUMNS))
-        if header is None or not fits_ucc(header.text):
-            raise fault(path, f"must begin with a header that names {columns}", line=header and header.number)
-        names = split_cells(header.text)
+        header, lines = file.below_header(f"a header that names {_UCC_TIME}, {', '.join(UCC_COLUMNS)}", fits_ucc)
+        names = split_cells(header)
         time_at, rate_at = names.index(_UCC_TIME), names.index(column)
         first = previous = latest = None
         for line in lines:

@@ -1,16 +1,13 @@
 """Motion from files: camera trajectories (see `trajectories`), or CSV of finished coordinates, header `t_s,motion`."""
 
-from __future__ import annotations
-
 from typing import Final
 
-from bufgym.traces.formats.bags import refuse_bag
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.links import trace_name
-from bufgym.traces.formats.text import Line, is_header, open_text, write_text
+from bufgym.traces.formats.splits import refuse_recording
+from bufgym.traces.formats.text import Line, decimals, is_header, open_text, write_text
 from bufgym.traces.formats.trajectories import read_poses, read_rows, seconds
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
-from bufgym.traces.trace import US_PER_S
 
 MOTION_HEADER: Final = "t_s,motion"
 
@@ -25,13 +22,9 @@ def read_motion(
     The first time becomes 0. A CSV holds finished coordinates, which are used as they are, minus the first. Stretches
     without a pose are bridged and listed in `Motion.gaps`.
 
-    Args:
-        path: the file.
-        settings: how the motion of a trajectory is measured, by default `MotionSettings()`.
-        format: of a trajectory, see `trajectories.read_poses`.
-        times: of a trajectory, likewise.
+    A trajectory is read as by `trajectories.read_poses`, and its motion measured by `motion_from_poses`.
     """
-    refuse_bag(path, "must be a trajectory (motion in it is taken with --odom)")
+    refuse_recording(path, "must be a trajectory (motion in it is taken with --odom)")
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
     if first is not None and format is None and times is None and is_header(first.text, MOTION_HEADER):
@@ -45,16 +38,20 @@ def read_motion(
 def write_motion_csv(motion: Motion, path: StrPath) -> None:
     """Write `t_s,motion`; `read_motion` gives back the same times and coordinates, bit for bit."""
     rows = (
-        f"{t // US_PER_S}.{t % US_PER_S:06d}".rstrip("0").rstrip(".") + f",{x!r}\n"
-        for t, x in zip(motion.time_us.tolist(), motion.coordinate.tolist(), strict=True)
+        f"{decimals(t, 6)},{x!r}\n" for t, x in zip(motion.time_us.tolist(), motion.coordinate.tolist(), strict=True)
     )
     write_text(path, [MOTION_HEADER + "\n"], rows)
 
 
 def _motion_row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
-    """Time, then the coordinate, which must not decrease."""
+    """Time, then the coordinate."""
     time, text = line.columns(2, ",")
-    value = line.decimal("motion", text, 0, MAX_COORDINATE)
-    if previous is not None and value < previous[0]:
-        raise line.error(text, f"must not be below the line above ({previous[0]!r})", "motion")
-    return time, seconds(line, time), [value]
+    return time, seconds(line, time), [coordinate(line, "motion", text, previous[0] if previous else 0.0)]
+
+
+def coordinate(line: Line, field: str, text: str, previous: float) -> float:
+    """A coordinate that is not below that of the line above, which is 0 for the first line."""
+    value = line.decimal(field, text, 0, MAX_COORDINATE)
+    if value < previous:
+        raise line.error(text, f"must not be below the line above ({previous!r})", field)
+    return value

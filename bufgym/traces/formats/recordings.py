@@ -1,7 +1,5 @@
 """A robot's recording as a workload: the messages of some topics in one queue, with x from its odometry."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,6 +12,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats import bags
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.links import trace_name
+from bufgym.traces.formats.splits import is_recording
 from bufgym.traces.formats.workloads import read_workload_csv
 from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import gaps_between, longest_s
@@ -45,7 +44,7 @@ def read_workload(
         TraceError: a file that cannot be read, or breaks a rule of its format.
         BufgymError: an unknown topic, no message, or gaps without `bridge_gaps`.
     """
-    if not bags.is_bag(path):
+    if not is_recording(path):
         if odom is not None and Path(path).exists():
             raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
         return _with_topics(read_workload_csv(path), topics)

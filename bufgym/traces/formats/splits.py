@@ -9,8 +9,6 @@ copy. A SQLite file with a journal beside it (``-wal``, ``-journal``) is read fr
 changes both when it reads them, and without the journal messages would be missing.
 """
 
-from __future__ import annotations
-
 import filecmp
 import re
 import shutil
@@ -26,7 +24,7 @@ from bufgym.ground.files import read_utf8
 from bufgym.ground.libraries import missing
 from bufgym.traces.formats import bag_files
 from bufgym.traces.formats.bag_files import SOURCES, Message, RefusedError, Unpacked, journals, unzstd, unzstd_pieces
-from bufgym.traces.formats.faults import fault, os_errors, warn
+from bufgym.traces.formats.faults import StrPath, fault, os_errors, warn
 
 MAX_METADATA_BYTES: Final = 2**23
 
@@ -55,12 +53,19 @@ class Split:
     by_message: bool = False  # each of its messages is packed in zstd, as the folder's metadata says
 
 
-def is_recording(path: Path) -> bool:
+def is_recording(source: StrPath) -> bool:
     """Whether this is a recording, by its first bytes (a folder: by its content), whatever its name."""
+    path = Path(source)
     with os_errors(path, "opened"):
         if path.is_dir():
             return (path / _METADATA).is_file() or any(file.name.endswith(_ENDINGS) for file in path.iterdir())
         return path.is_file() and _split(path).kind != ""
+
+
+def refuse_recording(path: StrPath, rule: str) -> None:
+    """Raise an error if this is a recording, which must be something else by this rule."""
+    if is_recording(path):
+        raise fault(path, f"is a recording of messages, whose topics `bufgym trace from-bag` lists: {rule}")
 
 
 def splits(path: Path) -> list[Split]:

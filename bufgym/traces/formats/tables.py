@@ -1,12 +1,11 @@
 """Readers of simple tables: bufgym's CSV, the Belgium log, Mbit/s over time, rates over time."""
 
-from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from typing import Final, Literal
 
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.text import Line, TextFile, is_header, open_text, split_cells
+from bufgym.traces.formats.text import Line, is_header, open_text, split_cells
 from bufgym.traces.trace import US_PER_S
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
@@ -25,7 +24,7 @@ def read_csv(path: StrPath) -> Knots:
     """Header `t_ms,bytes,interval_ms`; times in ms with up to 3 decimals, so that microseconds survive."""
     intervals = Intervals()
     with open_text(path) as file:
-        for line in below_header(file, CSV_HEADER, lambda text: is_header(text, CSV_HEADER))[1]:
+        for line in file.below_header(f"the header {CSV_HEADER}", lambda text: is_header(text, CSV_HEADER))[1]:
             end_ms, count, length_ms = line.columns(3, ",")
             intervals.add_ending_at(line, end_ms, length_ms, count)
     return intervals.knots(path)
@@ -59,20 +58,9 @@ def fits_rates(text: str) -> bool:
 def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
-        header, lines = below_header(file, f"{RATES_HEADER} or time,mbps", fits_rates)
+        header, lines = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
         column = split_cells(header.lower())[1]
         return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column]) for line in lines))
-
-
-def below_header(file: TextFile, header: str, fits: Callable[[str], bool]) -> tuple[str, Iterator[Line]]:
-    """The first line, which must be that header, and the lines below it."""
-    lines = file.lines()
-    first = next(lines, None)
-    if first is None:
-        raise fault(file.path, f"is empty: must begin with the header {header}")
-    if not fits(first.text):
-        raise first.error(first.text, f"must be the header {header}")
-    return first.text, lines
 
 
 def _rate(line: Line, separator: Literal[","] | None, field: str, unit: float) -> Rate:

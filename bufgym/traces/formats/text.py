@@ -5,15 +5,13 @@ ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of
 4096 characters a line, and for what is held as a whole 16 MiB of JSON and 128 MiB of Mahimahi's numbers.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import itertools
 import os
 import re
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Final, Literal, NamedTuple
@@ -41,6 +39,12 @@ _MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
 def split_cells(text: str) -> list[str]:
     """The cells between commas, without white space around them; a comma at the end of the line begins no cell."""
     return [cell.strip() for cell in text.strip().removesuffix(",").split(",")]
+
+
+def decimals(number: int, places: int) -> str:
+    """A whole number over 10**places, without needless decimals: 840500 with 3 is "840.5"."""
+    whole, rest = divmod(number, 10**places)
+    return f"{whole}.{rest:0{places}d}".rstrip("0") if rest else f"{whole}"
 
 
 def is_header(text: str, header: str) -> bool:
@@ -104,7 +108,7 @@ class Line(NamedTuple):
 
 
 @contextmanager
-def open_text(path: StrPath) -> Iterator[TextFile]:
+def open_text(path: StrPath) -> Iterator["TextFile"]:
     """Open a text file for one pass: plain or gzip, recognised by its first bytes whatever its name."""
     with os_errors(path, "opened"):
         raw = _open(path)
@@ -128,8 +132,7 @@ class TextFile:
         """The lines that are not blank, numbered from 1, without surrounding white space.
 
         Raises:
-            TraceError: also for a line over MAX_LINE_CHARACTERS, a line that is not UTF-8, and more than MAX_LINES
-                lines, blank ones included.
+            TraceError: also for a line over MAX_LINE_CHARACTERS or not UTF-8, and more than MAX_LINES with blank ones.
         """
         for number, raw in self._raw_lines():
             line = _parsed_line(self.path, number, raw)
@@ -137,6 +140,16 @@ class TextFile:
                 raise _too_long(line)
             if line.text:
                 yield line
+
+    def below_header(self, header: str, fits: Callable[[str], object]) -> tuple[str, Iterator[Line]]:
+        """The first line, which must be that ``header`` (in words), and the lines below it."""
+        lines = self.lines()
+        first = next(lines, None)
+        if first is None:
+            raise fault(self.path, f"is empty: must begin with {header}")
+        if not fits(first.text):
+            raise first.error(first.text, f"must be {header}")
+        return first.text, lines
 
     def first(self) -> Line | None:
         """The first line that is not blank, None in an empty file.

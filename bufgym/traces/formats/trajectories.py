@@ -12,12 +12,10 @@ unit of the times. Then 8 columns in seconds, or between blanks, are TUM's, and 
 on the order of a quaternion's four.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Final
@@ -25,8 +23,7 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.jumps import warn_of_jumps
+from bufgym.traces.formats.faults import StrPath, fault, warn
 from bufgym.traces.formats.text import NUMBER, Line, open_text, split_cells
 from bufgym.traces.poses import Poses, quaternions
 from bufgym.traces.poses import unit as normalized
@@ -50,6 +47,9 @@ _USUAL_STEPS_S: Final = (0.9e-3, 10.0)  # From one pose to the next, where only 
 _LONGEST_STEP_S: Final = 3600  # The same where the times count from 1970
 _LEAST_STEP_S: Final = 1e-4  # No camera or robot tells its pose more often
 _TIMES_READ: Final = 1000  # Lines by which the unit is found
+MAX_SPEED_M_PER_S: Final = 50
+_STANDS_M: Final = 1.0  # Shorter ways are no jump at any speed: two poses may be logged within microseconds
+_MOST_USUAL_S: Final = 0.1  # So may a car's of a usual step each, which came in a burst; but a slow topic jumps, too
 
 RowReader = Callable[[Line, list[float] | None], tuple[str, int, list[float]]]
 """Parses a line, given the values of the previous one, into the time as it is written, the time in us, and values."""
@@ -87,6 +87,24 @@ def read_poses(path: StrPath, *, format: str | None = None, times: StrPath | Non
     return poses
 
 
+def warn_of_jumps(path: StrPath, poses: Poses) -> None:
+    """Warn of poses that no robot can reach from the pose before: localisation was lost, or numbers are wrong."""
+    moved_m = np.linalg.norm(np.diff(poses.position_m, axis=0), axis=1)
+    step_s = np.diff(poses.time_us) / US_PER_S
+    usual_s = min(float(step_s.mean()), _MOST_USUAL_S)
+    jumps = np.flatnonzero((moved_m > _STANDS_M) & (moved_m > MAX_SPEED_M_PER_S * np.maximum(step_s, usual_s)))
+    if not len(jumps):
+        return
+    k = int(jumps[0])
+    more = f", the first of {len(jumps)} jumps" if len(jumps) > 1 else ""
+    warn(
+        path,
+        f"pose {k + 2} of {len(poses.time_us)} ({poses.format}), {poses.time_us[k + 1] / US_PER_S:.3f} s after the "
+        f"first, is {moved_m[k]:.6g} m from the one {step_s[k]:.6g} s before{more}: no robot is faster than "
+        f"{MAX_SPEED_M_PER_S} m/s, and x counts it as motion",
+    )
+
+
 def _detected(path: StrPath) -> tuple[str, str]:
     """The format and the unit of the times that the file's first lines fit."""
     times: list[float] = []
@@ -115,10 +133,7 @@ def _detected(path: StrPath) -> tuple[str, str]:
 def _unit(path: StrPath, times: Float64Array, own: str) -> str:
     """The unit of a trajectory's times: that in which they are dates, else that in which poses follow each other.
 
-    Args:
-        path: the file, for the error.
-        times: of its first lines.
-        own: the unit of the format that the columns suggest. It goes before another that is as likely.
+    ``own``, the unit of the format that the columns suggest, goes before another that is as likely.
     """
     with np.errstate(invalid="ignore"):
         steps = np.diff(times)
@@ -154,11 +169,7 @@ def read_rows(path: StrPath, read_row: RowReader, skip: int = 0) -> tuple[Int64A
             if line.number <= skip or line.text.startswith("#"):
                 continue
             text, time_us, row = read_row(line, rows[-1] if rows else None)
-            if times and time_us < times[-1]:
-                rule = f"must not be before the line above ({times[-1] / US_PER_S:.6f})"
-                raise line.error(text, rule, "time in s")
-            if times and time_us - times[0] > MAX_DURATION_S * US_PER_S:
-                raise line.error(text, f"must be at most {MAX_DURATION_S} s after the first", "time in s")
+            check_order(line, "time in s", text, time_us, times)
             if times and time_us == times[-1]:
                 rows[-1] = row
                 continue
@@ -172,6 +183,14 @@ def read_rows(path: StrPath, read_row: RowReader, skip: int = 0) -> tuple[Int64A
         rule = f"must be at least {_LEAST_STEP_S:g} s (are the times in another unit?)"
         raise fault(path, rule, value=f"{step_s:g} s", field="median step of the times")
     return time_array - time_array[0], np.array(rows, np.float64)
+
+
+def check_order(line: Line, field: str, text: str, time_us: int, times: Sequence[int]) -> None:
+    """Check that a time, written as ``text``, is not before the latest of ``times``, nor too far from the first, us."""
+    if times and time_us < times[-1]:
+        raise line.error(text, f"must not be before the line above ({times[-1] / US_PER_S:.6f})", field)
+    if times and time_us - times[0] > MAX_DURATION_S * US_PER_S:
+        raise line.error(text, f"must be at most {MAX_DURATION_S} s after the first", field)
 
 
 def seconds(line: Line, text: str) -> int:

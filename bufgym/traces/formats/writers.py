@@ -1,7 +1,6 @@
 """Bandwidth traces into files, and how much a copy differs from its original.
 
-`write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms, so any other trace loses something.
-`difference` says how much.
+`write_csv` is exact. A Mahimahi file holds packets of 1500 bytes at whole ms; `difference` says what others lose.
 """
 
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES
 from bufgym.traces.formats.mahimahi import PACKET_BYTES
 from bufgym.traces.formats.tables import CSV_HEADER
-from bufgym.traces.formats.text import write_text
+from bufgym.traces.formats.text import decimals, write_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array, Trace
 
 # Lines of at most 11 digits, as many as fit into the reader's 128 MiB.
@@ -24,8 +23,7 @@ def write_csv(trace: Trace, path: StrPath) -> None:
     """Write the `csv` format, one line a segment; `read_trace` gives back the same knots, exactly.
 
     Raises:
-        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**12 bytes
-            in a segment, 10**7 s).
+        TraceError: cannot be written, or beyond what the reader accepts (10**12 bytes in a segment, 10**7 s).
     """
     segment_bytes = np.diff(trace.cumulative_bytes)
     if segment_bytes.max() > MAX_INTERVAL_BYTES or trace.duration_us > MAX_DURATION_S * US_PER_S:
@@ -33,7 +31,7 @@ def write_csv(trace: Trace, path: StrPath) -> None:
         raise fault(path, f"cannot be written: {rule}")
     ends_us, lengths_us = trace.time_us[1:].tolist(), np.diff(trace.time_us).tolist()
     lines = (
-        f"{_milliseconds(end_us)},{count},{_milliseconds(length_us)}\n"
+        f"{decimals(end_us, 3)},{count},{decimals(length_us, 3)}\n"
         for end_us, count, length_us in zip(ends_us, segment_bytes.tolist(), lengths_us, strict=True)
     )
     write_text(path, [CSV_HEADER + "\n"], lines)
@@ -47,8 +45,7 @@ def write_mahimahi(trace: Trace, path: StrPath) -> None:
     then. A trace that came from Mahimahi is preserved exactly (its packets of ms 0 as packets of ms 1).
 
     Raises:
-        TraceError: the file cannot be written, or the trace is beyond what the reader accepts (10**7 s, 10**7
-            packets).
+        TraceError: cannot be written, or beyond what the reader accepts (10**7 s, 10**7 packets).
     """
     packets = trace.total_bytes // PACKET_BYTES
     if packets > MAX_PACKETS or trace.duration_us > MAX_DURATION_S * US_PER_S:
@@ -92,9 +89,3 @@ def _transmitted_us(trace: Trace, due: Int64Array) -> Int64Array:
     within, length_us = due - cumulative[k - 1], time_us[k] - time_us[k - 1]
     # The product is at most (bytes x microseconds) of a segment, which a Trace keeps below 2**62.
     return np.asarray(time_us[k - 1] - (-within * length_us) // (cumulative[k] - cumulative[k - 1]), np.int64)
-
-
-def _milliseconds(time_us: int) -> str:
-    """Microseconds as ms without needless decimals: 840000 is "840", 840500 is "840.5"."""
-    whole, rest = divmod(time_us, 1000)
-    return f"{whole}.{rest:03d}".rstrip("0") if rest else f"{whole}"

@@ -56,6 +56,12 @@ def checked(name: str, value: float, least: float, most: float) -> float:
     return value
 
 
+def whole_seconds(duration_s: float, most: int) -> None:
+    """Check that a duration is a whole number of seconds from 1 to `most`."""
+    if checked("duration_s", duration_s, 1, most) % 1:
+        raise BufgymError(f"duration_s = {duration_s}: must be a whole number")
+
+
 def is_finite(value: object) -> bool:
     """Whether `value` is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

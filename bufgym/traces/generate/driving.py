@@ -4,8 +4,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.draws import stream
+from bufgym.traces.generate.draws import checked, stream
 from bufgym.traces.motion import Motion, MotionSettings
 from bufgym.traces.trace import US_PER_S
 
@@ -32,14 +31,9 @@ def drive_motion(seed: int, duration_s: float = 300.0) -> Motion:
 
     The coordinate is that of `MotionSettings()`, with a field of view of 60 degrees and a scene scale of 2 m: cruising
     at 1 m/s adds 0.5 a second, turning in place at 45 degrees/s 0.75, stopping nothing. Each sample's step is a whole
-    number of millionths. Changes of speed are instant.
-
-    Args:
-        seed: >= 0.
-        duration_s: rounded to whole tenths; 0.1 to 10**6.
+    number of millionths. Changes of speed are instant. The duration, 0.1 to 10**6 s, is rounded to whole tenths.
     """
-    if not 0.1 <= duration_s <= 1e6:
-        raise BufgymError(f"duration_s = {duration_s}: must be from 0.1 to 1e6")
+    checked("duration_s", duration_s, 0.1, 1e6)
     random = stream(seed)
     scale = MotionSettings()
     count = round(duration_s * US_PER_S / _STEP_US)

@@ -11,7 +11,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.draws import NORMAL_UNIFORMS, stream
+from bufgym.traces.generate.draws import NORMAL_UNIFORMS, checked, stream, whole_seconds
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Trace
 
 LteMode = Literal["walk", "drive", "train"]
@@ -23,8 +23,7 @@ MAX_FADE_S: Final = 20
 class LteParameters:
     """A Markov-modulated link, in steps of 1 s.
 
-    The log of the rate is the level of a hidden state (how good the coverage is) plus an AR(1) process. Now and then
-    the rate breaks down altogether.
+    The log of the rate is the level of a hidden state (the coverage) plus an AR(1) process. At times it breaks down.
     """
 
     levels: tuple[float, float, float]
@@ -53,17 +52,15 @@ def synthetic_lte(seed: int, duration_s: int = 300, mean_bytes_per_s: float = 10
     """An LTE-like trace with one sample a second, which loops.
 
     Args:
-        seed: >= 0.
+        seed: from 0 up.
         duration_s: whole seconds, 1 to 10**7.
         mean_bytes_per_s: mean of this very trace, breakdowns included (to half a byte), 1 to 10**10.
         mode: one of `LTE_MODES`; the faster, the more variable.
     """
     if mode not in get_args(LteMode):
         raise BufgymError(f"mode = {mode!r}: must be one of {', '.join(get_args(LteMode))}")
-    if not 1 <= duration_s <= MAX_DURATION_S or int(duration_s) != duration_s:
-        raise BufgymError(f"duration_s = {duration_s}: must be a whole number from 1 to {MAX_DURATION_S}")
-    if not 1 <= mean_bytes_per_s <= 1e10:
-        raise BufgymError(f"mean_bytes_per_s = {mean_bytes_per_s}: must be from 1 to 1e10")
+    whole_seconds(duration_s, MAX_DURATION_S)
+    checked("mean_bytes_per_s", mean_bytes_per_s, 1, 1e10)
     relative = _relative_rates(stream(seed), int(duration_s), LTE_MODES[mode])
     # math.fsum is exact, so the sum does not depend on how numpy splits it between vector lanes.
     unit = mean_bytes_per_s * len(relative) / math.fsum(relative)

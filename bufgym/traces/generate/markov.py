@@ -10,7 +10,15 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.draws import NORMAL_UNIFORMS, ar1, checked, nearly_normal, second_stream, stream
+from bufgym.traces.generate.draws import (
+    NORMAL_UNIFORMS,
+    ar1,
+    checked,
+    nearly_normal,
+    second_stream,
+    stream,
+    whole_seconds,
+)
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
 from bufgym.traces.trace import US_PER_S, Float64Array, Trace
 
@@ -41,9 +49,7 @@ def markov_link(
     links = fitted_links() if links is None else links
     if mode not in links:
         raise BufgymError(f"mode = {mode!r}: must be one of {', '.join(links)}")
-    checked("duration_s", duration_s, 1, MAX_LINK_S)
-    if int(duration_s) != duration_s:
-        raise BufgymError(f"duration_s = {duration_s}: must be a whole number")
+    whole_seconds(duration_s, MAX_LINK_S)
     rates = link_rates(links[mode], seed, int(duration_s))
     if mean_bytes_per_s is not None:
         checked("mean_bytes_per_s", mean_bytes_per_s, 1, 1e10)

@@ -1,7 +1,6 @@
 """Parameters of fitted links, and the file that holds them: one entry for each mode, that is, way of moving.
 
-`links.json` and `uplinks.json` beside this module are what `bufgym trace fit` wrote for public recordings, of downlinks
-and of uplinks; each states its command.
+`links.json` and `uplinks.json` are what `bufgym trace fit` wrote for public recordings; each states its command.
 """
 
 import functools
@@ -21,8 +20,7 @@ from bufgym.traces.generate.draws import checked, is_finite
 LINKS: Final = Path(__file__).with_name("links.json")
 UPLINKS: Final = Path(__file__).with_name("uplinks.json")
 
-# Where the distribution of the rates is tabulated, and the same in standard deviations; -3 and 3 stand for the least
-# and the greatest rate.
+# Where the rates' distribution is tabulated, also in standard deviations; -3 and 3 are the least and greatest rate.
 PROBABILITIES: Final = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 1.0)
 DEVIATIONS: Final = (-3.0, -2.326348, -1.644854, -1.281552, -0.67449, 0.0, 0.67449, 1.281552, 1.644854, 2.326348, 3.0)
 
@@ -127,11 +125,7 @@ def read_links(path: StrPath) -> dict[str, LinkParameters]:
 def write_links(links: Mapping[str, LinkParameters], path: StrPath, threshold_bytes_per_s: float, made_by: str) -> None:
     """Write the parameters of each mode; the same links give the same bytes.
 
-    Args:
-        links: mode -> parameters.
-        path: the file to write.
-        threshold_bytes_per_s: a second with a lower rate counts as one of an outage.
-        made_by: the command that made them, stated in the file.
+    A second below the threshold counts as one of an outage. The file states ``made_by``, their command.
     """
     content = {
         "about": "Links fitted to recordings, in steps of 1 s: see bufgym/traces/generate/markov.py. Rates in bytes/s.",

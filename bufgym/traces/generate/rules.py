@@ -32,8 +32,7 @@ def ramp(start_bytes_per_s: float, end_bytes_per_s: float, duration_s: float = 1
     """A rate that changes linearly from start to end; by default the rate of the last step then continues.
 
     Raises:
-        BufgymError: a rate that is not from 0 to 10**10, a duration that is not from 0.001 to 10**5 s, an unknown
-            `after`.
+        BufgymError: a rate not from 0 to 10**10, a duration not from 0.001 to 10**5 s, an unknown `after`.
     """
     checked("start_bytes_per_s", start_bytes_per_s, 0, 1e10)
     checked("end_bytes_per_s", end_bytes_per_s, 0, 1e10)

@@ -137,14 +137,15 @@ def _mean_of_motion(motion: Motion, exponent: float) -> float:
 
 def _slow(n: int, rng: np.random.Generator, p: Numbers) -> Float64Array:
     """A log-normal AR(1) process of mean 1."""
-    return _lognormal(np.array(ar1(rng.standard_normal(n).tolist(), p["rho"])), p["cv"])
+    return lognormal(np.array(ar1(rng.standard_normal(n).tolist(), p["rho"])), p["cv"])
 
 
 def _noise(n: int, rng: np.random.Generator, p: Numbers) -> Float64Array:
-    return _lognormal(rng.standard_normal(n), p["noise"])
+    return lognormal(rng.standard_normal(n), p["noise"])
 
 
-def _lognormal(normal: Float64Array, cv: float) -> Float64Array:
+def lognormal(normal: Float64Array, cv: float) -> Float64Array:
+    """Log-normal numbers of mean 1 and coefficient of variation `cv`, of standard normal ones."""
     spread = math.sqrt(math.log1p(cv**2))
     return np.asarray(np.exp(spread * normal - spread**2 / 2), np.float64)
 
@@ -173,9 +174,8 @@ def recorded_sizes(name: str) -> Int64Array:
 def read_sizes(path: Path) -> dict[str, Int64Array]:
     """Column -> int64[m] of a table of whole numbers with a header; `motion` is x in millionths of a view."""
     with open_text(path) as file:
-        lines = file.lines()
-        header = next(lines, None)
-        titles = split_cells(header.text) if header else []
+        header, lines = file.below_header("a header that names its columns", bool)
+        titles = split_cells(header)
         rows = [
             [line.whole(title, cell, MAX_MESSAGE_BYTES) for title, cell in zip(titles, cells, strict=True)]
             for line in lines

@@ -13,7 +13,7 @@ from itertools import product
 from typing import Any
 
 from bufgym.benchmark.rows import Row
-from bufgym.traces.generate import steady
+from bufgym.traces import steady
 from bufgym_papers.figures.figure import COLOURS, finish, legend_below
 from bufgym_papers.figures.robofleet_evaluation import MBIT, SHORT, CloudFigure, cloud_bytes, curves, p95, stream
 from bufgym_papers.figures.rows import FigureRows, listed

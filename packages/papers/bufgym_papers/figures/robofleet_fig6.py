@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.traces.generate import steady
+from bufgym.traces import steady
 from bufgym_papers.figures.figure import COLOURS, either, finish, legend_below, several, whole
 from bufgym_papers.figures.robofleet_evaluation import MBIT, PROGRAMS, ClientFigure, cloud_bytes, p95, stream
 from bufgym_papers.figures.rows import FigureRows, average, listed
