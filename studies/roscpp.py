@@ -74,7 +74,7 @@ def cells(built: Path, policy: str, round_trip_ms: float) -> tuple[str, ...]:
     """A row of the table."""
     with tempfile.TemporaryDirectory() as folder:
         frames = frames_of(built, policy, round_trip_ms, Path(folder))
-        told = ("", "", "")
+        told: tuple[str, ...] = ("", "", "")
         for file in Path(folder).glob("*.jsonl"):
             took_us = [record["took_us"] for record in read_log(file) if record["event"] == "put"]
             again = replay(file)

@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from tests.conftest import COMPILED, REPO
+from conftest import COMPILED, REPO
 
 from bufgym.ground import kernel
 from bufgym.ground.kernel.closure import closure

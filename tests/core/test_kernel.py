@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.conftest import COMPILED
+from conftest import COMPILED
 
 from bufgym.ground.kernel import JIT, announce, cache, direct, interruptible, kernel
 

@@ -26,7 +26,7 @@ from bufgym.ground.files import read_utf8, read_whole
 from bufgym.ground.libraries import library
 from bufgym.traces.formats.text import open_text
 from bufgym.traces.formats.trajectories import read_poses, seconds
-from bufgym.traces.poses import Poses, rotations
+from bufgym.traces.poses import Poses, gaps_between, rotations
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym_papers.perception.frames import Camera, Depth, Image, Sequence
 
@@ -154,7 +154,7 @@ def _tum(folder: Path) -> Sequence:
     nearest -= depth_us - image_us[nearest - 1] < image_us[nearest] - depth_us
     kept = np.abs(image_us[nearest] - depth_us) <= SAME_MOMENT_S * US_PER_S
     kept &= (depth_us >= start_us) & (depth_us <= start_us + poses.time_us[-1])
-    for gap_start, gap_end in poses.gaps(POSE_GAP_S):
+    for gap_start, gap_end in gaps_between(poses.time_us, POSE_GAP_S):
         kept &= (depth_us <= start_us + gap_start) | (depth_us >= start_us + gap_end)
     if kept.sum() < 2:
         raise BufgymError(f"{folder}: {kept.sum()} depth images have a picture and a pose: must be at least 2")
