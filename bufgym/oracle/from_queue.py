@@ -110,13 +110,11 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
                 count += 1
             work.arrived[t] = count
         u = e + (t - 1) * b  # t - 1 of the queue are sent, then a later arrival
-        known, chosen, furthest = n, n + 1, sender.arrivals - 1
-        begin, last = max(0, t - 2), own - 1 if t > 1 else 0
-        # The best successor of a later message is no earlier, as V is concave. So the last one's bounds all others'.
-        for step in range(last - begin + 1):
-            k = begin + step - 1 if step > 0 else last
+        known, chosen = n, n + 1
+        for k in range(max(0, t - 2), own if t > 1 else 1):
+            # The best successor of a later message is no earlier: V is concave.
             most, target, m = 0.0, -1, chosen
-            while m <= furthest:
+            while m < sender.arrivals:
                 if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= u:
                     break  # another message could be sent in the meantime
                 if m > known:
@@ -132,10 +130,7 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
                         most, target = added + after, m
                 m += 1
             work.jump[t - 1, k], work.target[t - 1, k] = most, target
-            if step > 0 and target >= 0:
-                chosen = target
-            elif target >= 0:
-                furthest = target
+            chosen = target if target >= 0 else chosen
 
 
 @kernel
