@@ -76,9 +76,9 @@ def test_it_shows_the_robots(browser: Any, port: int, scheme: str, width: int) -
         for id, text in (("camera", "camera"), ("scan", "laser")):
             until(page, f"document.querySelector('#{id}-says').textContent.startsWith('{text}')")
         until(page, "document.querySelectorAll('#topics tr').length === 5")
-        names = page.eval_on_selector_all(".card b", "cards => cards.map(card => card.textContent)")
-        assert names == ["robot-1", "robot-2"]
-        page.click(".card:nth-of-type(2)")
+        names = page.eval_on_selector_all(".called", "cards => cards.map(card => card.textContent)")
+        assert sorted(names) == ["robot-1", "robot-2"]
+        page.click(".card:has-text('robot-2')")
         until(page, "document.querySelector('#name').textContent === 'robot-2'")
         until(page, "document.querySelector('#facts').textContent.includes('battery')")
         for canvas, colours in (("#camera", 20), ("#scan", 3), ("#map", 5), ("#slots", 1)):
@@ -120,7 +120,7 @@ def test_no_number_freezes_the_page(browser: Any, port: int, number: Any) -> Non
             assert await robot.rest() == []
 
     with shows(browser, f"http://127.0.0.1:{port}/") as page:
-        until(page, "[...document.querySelectorAll('.card b')].map(card => card.textContent).includes('robot-1')")
+        until(page, "[...document.querySelectorAll('.called')].map(card => card.textContent).includes('robot-1')")
         threading_run(rave(page))
         mad = "[...document.querySelectorAll('.card')].find(card => card.textContent.includes('mad'))"
         until(page, f"{mad} !== undefined")

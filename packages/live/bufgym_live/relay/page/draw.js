@@ -1,7 +1,7 @@
 // Canvases: their size, their colours, and what the panels of one robot show.
 
 const SENSES_RANGE_M = 8;
-const HISTORY_MS = 60_000;
+const HISTORY_MS = 60_000, FRESH_MS = 1000, GREY_MS = 10_000, OLD_MS = 2000;
 
 // A canvas's context, its pixels as many as the screen has; [context, width, height] in CSS pixels.
 export function context(canvas) {
@@ -24,17 +24,30 @@ export function whenColoursChange(redraw) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { colours = {}; redraw(); });
 }
 
-// Hues far apart, one after the other, as many as there are robots or topics.
-export const hue = (k, dark = matchMedia("(prefers-color-scheme: dark)").matches) =>
-  `hsl(${(210 + k * 137.5) % 360} ${dark ? "70% 64%" : "68% 42%"})`;
+// Hues far apart, one after the other, as many as there are topics.
+export const hue = k => tint((210 + k * 137.5) % 360);
 
-export function drawPicture(canvas, bitmap) {
-  const [drawing, width, height] = context(canvas);
-  if (!bitmap) return;
-  const scale = Math.min(width / bitmap.width, height / bitmap.height);
-  const [w, h] = [bitmap.width * scale, bitmap.height * scale];
-  drawing.drawImage(bitmap, (width - w) / 2, (height - h) / 2, w, h);
+// A robot's colour is a part of a turn round the colours, from its name: the same in every browser, and far from its neighbours' by number.
+export function colourOf(name) {
+  const [, stem, number] = /^(.*?)(\d*)$/s.exec(name);
+  let hash = 2166136261;
+  for (const letter of stem) hash = Math.imul(hash ^ letter.codePointAt(0), 16777619) >>> 0;
+  return (hash % 360 + (Number(number.slice(-9)) || 0) * 137.5) % 360;
 }
+
+// What is old loses its colour: from ``part`` 0, fresh, to 1.
+export const tint = (colour, part = 0, dark = matchMedia("(prefers-color-scheme: dark)").matches) =>
+  `hsl(${colour} ${(dark ? 70 : 68) * (1 - part)}% ${dark ? 64 - 14 * part : 42 + 14 * part}%)`;
+export const faded = ageMs => Math.min(1, Math.max(0, (ageMs - FRESH_MS) / (GREY_MS - FRESH_MS)));
+
+// Let a figure lose colour with the age of what it shows, and say that age in large letters.
+export function aged(figure, ageMs) {
+  const part = faded(ageMs).toFixed(1), old = ageMs > OLD_MS ? `${seconds(ageMs / 1000)} old` : "";
+  if (figure.style.getPropertyValue("--age") !== part) figure.style.setProperty("--age", part);
+  if (figure.dataset.old !== old) figure.dataset.old = old;
+}
+
+export const say = (element, text) => { if (element.textContent !== String(text)) element.textContent = text; };
 
 // The robot in the middle looks up.
 export function drawScan(canvas, scan, tint) {

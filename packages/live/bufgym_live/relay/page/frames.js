@@ -51,8 +51,9 @@ class Tree {
     return bases.sort((one, other) => worth(other) - worth(one))[0] ?? null;
   }
 
-  place() {
-    let frame = this.base, at = [0, 0, 0], turn = [0, 0, 0, 1];
+  // Where a frame's origin lies in the uppermost frame above it, and how it is turned there.
+  from(frame) {
+    let at = [0, 0, 0], turn = [0, 0, 0, 1];
     for (const child of this.above(frame).slice(0, -1)) {
       const link = this.links.get(child);
       at = moved(link.turn, at).map((value, k) => value + link.at[k]);
@@ -62,6 +63,23 @@ class Tree {
     const [qx, qy, qz, qw] = turn;
     return place({x: at[0], y: at[1], yaw: Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)), frame});
   }
+
+  place() { return this.from(this.base); }
+
+  // Where a frame's origin lies in another frame, seen from above; undefined where tf does not lead from one to the other.
+  between(frame, other) {
+    if (frame === other) return {x: 0, y: 0, yaw: 0};
+    const [a, b] = [this.from(frame), this.from(other)];
+    if (!a || !b || a.frame !== b.frame) return;
+    const [dx, dy] = [a.x - b.x, a.y - b.y], [cos, sin] = [Math.cos(b.yaw), Math.sin(b.yaw)];
+    return {x: cos * dx + sin * dy, y: cos * dy - sin * dx, yaw: a.yaw - b.yaw};
+  }
+}
+
+// A place that is said in a frame, in the frame in which that frame lies at ``to``.
+export function within(to, {x, y, yaw = 0}) {
+  const [cos, sin] = [Math.cos(to.yaw), Math.sin(to.yaw)];
+  return {x: to.x + cos * x - sin * y, y: to.y + sin * x + cos * y, yaw: to.yaw + yaw};
 }
 
 export class Place {

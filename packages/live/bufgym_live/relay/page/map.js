@@ -1,23 +1,26 @@
 // The map: robots, where they were, and the walls that lasers have seen. It can be moved and zoomed.
 
-import {arrow, colour, context} from "./draw.js";
+import {arrow, colour, context, faded, seconds, tint} from "./draw.js";
+import {listen} from "./gestures.js";
+import {BELOW_TOP, placed} from "./labels.js";
+import {flagAt} from "./layers.js";
 
 const CELL_M = 0.05, CELLS = 1024;
 const TRAIL_MS = 60_000;
-const REDRAW_MS = 500, FRAME_MS = 30;               // what lies below is drawn twice a second, robots 30 times at most
+const REDRAW_MS = 500, LAYERS_MS = 150, FRAME_MS = 30;  // what lies below is drawn twice a second, or soon after a layer came; robots 30 times at most
+const OLD_MS = 3000;
 
 export class Map2D {
-  constructor(canvas, onPick) {
-    this.canvas = canvas;
-    this.onPick = onPick;
+  constructor(canvas, layers, onPick) {
+    Object.assign(this, {canvas, layers, onPick});
+    this.tool = this.preview = null;                // a tool in hand: {tint, done(at)}; and where it points now
     this.walls = Object.assign(document.createElement("canvas"), {width: CELLS, height: CELLS});
     this.below = document.createElement("canvas");   // trails and walls: drawn some times a second, not with each message
     this.forget();
     this.follow = true;                             // until somebody moves the map
     this.view = {x: 0, y: 0, scale: 40};            // pixels for a metre
     this.middle = [0, 0];                           // of the canvas, pixels: to ask the page for each point takes long
-    this.pointers = new Map();
-    this.listen();
+    listen(this);
   }
 
   forget() {
@@ -26,35 +29,6 @@ export class Map2D {
     this.seen = [];                                 // two corners of what lasers have seen
     this.belowMs = this.drawnMs = -Infinity;
     this.changed = true;
-  }
-
-  listen() {
-    const place = event => [event.offsetX, event.offsetY];
-    this.canvas.addEventListener("pointerdown", event => {
-      this.canvas.setPointerCapture(event.pointerId);
-      this.pointers.set(event.pointerId, place(event));
-      this.moved = 0;
-    });
-    this.canvas.addEventListener("pointermove", event => {
-      const before = this.pointers.get(event.pointerId);
-      if (!before) return;
-      const now = place(event), [dx, dy] = [now[0] - before[0], now[1] - before[1]];
-      this.moved += Math.hypot(dx, dy);
-      const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
-      if (other) {
-        const distance = at => Math.max(1, Math.hypot(at[0] - other[0], at[1] - other[1]));
-        this.zoom(distance(now) / distance(before), other);
-      } else if (this.moved > 4) this.shift(dx, dy);
-      this.pointers.set(event.pointerId, now);
-    });
-    for (const name of ["pointerup", "pointercancel"])
-      this.canvas.addEventListener(name, event => {
-        if (this.pointers.delete(event.pointerId) && this.moved <= 4 && name === "pointerup") this.pick(...place(event));
-      });
-    this.canvas.addEventListener("wheel", event => {
-      event.preventDefault();
-      this.zoom(Math.exp(-event.deltaY / 500), place(event));
-    }, {passive: false});
   }
 
   shift(dx, dy) {
@@ -88,6 +62,15 @@ export class Map2D {
 
   at(x, y) {
     return [(x - this.view.x) * this.view.scale + this.middle[0], (this.view.y - y) * this.view.scale + this.middle[1]];
+  }
+
+  // A place where the pointer went down, with the heading to where it is; a tool takes it once the pointer is up.
+  aim(from, to, isOver) {
+    const [px, py] = from, {view} = this, yaw = Math.hypot(to[0] - px, to[1] - py) < 8 ? 0 : Math.atan2(py - to[1], to[0] - px);
+    const at = {x: (px - this.middle[0]) / view.scale + view.x, y: view.y - (py - this.middle[1]) / view.scale, yaw};
+    this.preview = isOver ? null : {...at, tint: this.tool.tint};
+    this.changed = true;
+    if (isOver) this.tool.done(at);
   }
 
   // Where a laser's rays ended.
@@ -126,40 +109,58 @@ export class Map2D {
     this.fitted = true;
   }
 
-  draw(robots, chosen, nowMs) {
+  // ``chosen`` is the robot whose layers are drawn, in ``frame``; it may be undefined.
+  draw(robots, chosen, frame, nowMs) {
     this.robots = robots;
     this.middle = [this.canvas.clientWidth / 2, this.canvas.clientHeight / 2];
     const clock = performance.now();
-    if (clock - this.belowMs > REDRAW_MS) {
-      if (this.follow) this.fit(robots);
-      this.drawBelow(robots, chosen, nowMs);
+    if (clock - this.belowMs > (this.layersChanged ? LAYERS_MS : REDRAW_MS)) {
+      if (this.follow && !this.tool) this.fit(robots);
+      this.drawBelow(robots, chosen, frame, nowMs);
+      this.layersChanged = false;
       this.belowMs = clock;
     } else if (!this.changed || clock - this.drawnMs < FRAME_MS) return;
     this.changed = false;
     this.drawnMs = clock;
     const [drawing, width, height] = context(this.canvas);
     drawing.drawImage(this.below, 0, 0, width, height);
-    drawing.font = "600 12px system-ui, sans-serif";
-    for (const robot of robots) {
-      if (!robot.pose) continue;
-      const [x, y] = this.at(robot.pose.x, robot.pose.y), large = robot.name === chosen;
-      drawing.globalAlpha = robot.away ? 0.4 : 1;
-      arrow(drawing, x, y, -(robot.pose.yaw ?? 0), large ? 13 : 9, robot.tint);
-      drawing.lineWidth = 3;
-      drawing.strokeStyle = colour("lane");
-      drawing.strokeText(robot.name, x + 13, y - 9);
-      drawing.fillStyle = large ? colour("ink") : colour("soft");
-      drawing.fillText(robot.name, x + 13, y - 9);
+    const seen = robots.filter(robot => robot.pose);
+    for (const robot of seen) {
+      const [x, y] = this.at(robot.pose.x, robot.pose.y), old = faded(nowMs - robot.poseMs);
+      drawing.globalAlpha = 1 - 0.4 * old;
+      arrow(drawing, x, y, -(robot.pose.yaw ?? 0), robot === chosen ? 13 : 9, tint(robot.colour, old));
     }
     drawing.globalAlpha = 1;
+    this.drawNames(drawing, seen, chosen, nowMs, width, height);
+    if (this.preview) flagAt(drawing, this, this.preview, this.preview.tint);
   }
 
-  drawBelow(robots, chosen, nowMs) {
+  drawNames(drawing, robots, chosen, nowMs, width, height) {
+    const worth = robot => (robot === chosen ? -1 : robot.troubles?.[0]?.rank ?? 9);
+    const items = [...robots].sort((one, other) => worth(one) - worth(other)).map(robot => {
+      const [x, y] = this.at(robot.pose.x, robot.pose.y), ageMs = nowMs - robot.poseMs;
+      return {robot, x, y, text: ageMs > OLD_MS ? `${robot.name} · ${seconds(ageMs / 1000)} old` : robot.name};
+    });
+    drawing.font = "600 12px system-ui, sans-serif";
+    const boxes = placed(items, text => drawing.measureText(text).width, width, height);
+    drawing.lineWidth = 3;
+    drawing.strokeStyle = colour("lane");
+    boxes.forEach((box, k) => {
+      if (!box) return;
+      const {robot, text} = items[k];
+      drawing.strokeText(text, box[0], box[1] + BELOW_TOP, box[2] - box[0]);
+      drawing.fillStyle = robot.troubles?.[0]?.level === "error" ? colour("lost") : robot === chosen ? colour("ink") : colour("soft");
+      drawing.fillText(text, box[0], box[1] + BELOW_TOP, box[2] - box[0]);
+    });
+  }
+
+  drawBelow(robots, chosen, frame, nowMs) {
     const ratio = devicePixelRatio || 1, width = this.canvas.clientWidth, height = this.canvas.clientHeight, {scale} = this.view;
     this.below.width = Math.round(width * ratio);
     this.below.height = Math.round(height * ratio);
     const drawing = this.below.getContext("2d");
     drawing.setTransform(ratio, 0, 0, ratio, 0, 0);
+    if (chosen) this.layers.draw(drawing, this, chosen, frame, nowMs, ["grid"]);
     const step = 10 ** Math.ceil(Math.log10(40 / scale)), metres = 40 / scale <= step / 5 ? step / 5 : 40 / scale <= step / 2 ? step / 2 : step;
     drawing.strokeStyle = colour("rule");
     drawing.beginPath();
@@ -172,7 +173,7 @@ export class Map2D {
       drawing.lineTo(width, Math.round(this.at(0, y)[1]) + 0.5);
     }
     drawing.stroke();
-    if (this.seen.length) {                         // only the part of the walls' canvas in which there are any
+    if (this.seen.length && this.layers.isOn("laser walls")) {                         // only the part of the walls' canvas in which there are any
       const half = CELLS * CELL_M / 2, [low, high] = this.seen;
       const column = Math.floor((low.x - this.origin.x + half) / CELL_M), row = Math.floor((this.origin.y - high.y + half) / CELL_M);
       const columns = Math.ceil((high.x - low.x) / CELL_M) + 1, rows = Math.ceil((high.y - low.y) / CELL_M) + 1;
@@ -183,9 +184,10 @@ export class Map2D {
     drawing.lineJoin = "bevel";
     for (const robot of robots) {
       while (robot.trail.length && robot.trail[0].ms < nowMs - TRAIL_MS) robot.trail.shift();
-      drawing.strokeStyle = robot.tint;
-      drawing.lineWidth = robot.name === chosen ? 2.5 : 1.5;
-      drawing.globalAlpha = robot.name === chosen ? 0.75 : 0.4;
+      if (!this.layers.isOn("trails")) continue;
+      drawing.strokeStyle = tint(robot.colour);
+      drawing.lineWidth = robot === chosen ? 2.5 : 1.5;
+      drawing.globalAlpha = robot === chosen ? 0.75 : 0.4;
       drawing.beginPath();
       for (const point of robot.trail) {
         const [x, y] = this.at(point.x, point.y);
@@ -194,6 +196,7 @@ export class Map2D {
       drawing.stroke();
     }
     drawing.globalAlpha = 1;
+    if (chosen) this.layers.draw(drawing, this, chosen, frame, nowMs, ["path", "poses", "markers", "goal"]);
     drawing.fillStyle = colour("soft");
     drawing.font = "11px system-ui, sans-serif";
     drawing.fillRect(12, height - 14, metres * scale, 2);

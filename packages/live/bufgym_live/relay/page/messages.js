@@ -1,14 +1,9 @@
-// What goes over the wire, and what is in it: the relay's binary frames, and ROS 2 messages in CDR.
+// What goes over the wire, and what is in it: the relay's binary frames, and what each kind of message says.
+
+import {Cdr, FAR_M, number, numbers, object} from "./cdr.js";
 
 const text = new TextDecoder();
-const FAR_M = 1e6, MOST = 1e12, MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64, MOST_TRANSFORMS = 1000;
-
-// A number from outside as it may be drawn: finite, from -most to most. Nothing else is a number.
-function number(value, most = MOST) {
-  return Number.isFinite(value) ? Math.min(most, Math.max(-most, value)) : undefined;
-}
-const numbers = (said, ...names) => Object.fromEntries(names.map(name => [name, number(said?.[name])]));
-const object = value => value !== null && typeof value === "object" ? value : {};
+const MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64, MOST_TRANSFORMS = 1000, MOST_PARTS = 500;
 
 // A message of a binary frame: {topic, type, encoding, sender, seq, stampMs, noDrop, payload}.
 export function decode(buffer) {
@@ -40,55 +35,29 @@ export function json(message) {
   return message.value;
 }
 
-class Cdr {
-  constructor(payload) {
-    this.view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
-    this.little = (this.view.getUint8(1) & 1) === 1;
-    this.at = 4;                                    // alignment counts from behind the four bytes that say how it is encoded
-  }
-  skipTo(bytes) { this.at += (bytes - (this.at - 4) % bytes) % bytes; }
-  number(kind, bytes) {
-    this.skipTo(bytes);
-    const value = this.view["get" + kind](this.at, this.little);
-    this.at += bytes;
-    return value;
-  }
-  uint() { return this.number("Uint32", 4); }
-  float() { return this.number("Float32", 4); }
-  double() { return this.number("Float64", 8); }
-  bytes(length) { return new Uint8Array(this.view.buffer, this.view.byteOffset + (this.at += length) - length, length); }
-  string() { const length = this.uint(); return text.decode(this.bytes(length).subarray(0, Math.max(0, length - 1))); }
-  frame() { return this.string().replace(/^\/+/, ""); }
-  header() { this.uint(); this.uint(); return this.frame(); }
-  doubles(count) { return Array.from({length: count}, () => this.double()); }
-  pose() {
-    const [x, y, , qx, qy, qz, qw] = this.doubles(7);
-    return {x, y, yaw: Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))};
-  }
-  transform() { return {frame: this.header(), child: this.frame(), at: this.doubles(3), turn: this.doubles(4)}; }
-  scan() {
-    const [angle_min, , angle_increment] = [this.float(), this.float(), this.float()];
-    this.float(); this.float(); this.float(); this.float();
-    const ranges = new Float32Array(Math.min(this.uint(), this.view.byteLength / 4));
-    for (let k = 0; k < ranges.length; k++) ranges[k] = this.float();
-    return {angle_min, angle_increment, ranges};
-  }
-}
-
 const KINDS = {
   "nav_msgs/msg/Odometry": "pose", "geometry_msgs/msg/PoseStamped": "pose", "geometry_msgs/msg/PoseWithCovarianceStamped": "pose",
   "tf2_msgs/msg/TFMessage": "tf", "tf/msg/tfMessage": "tf",
   "sensor_msgs/msg/LaserScan": "scan", "sensor_msgs/msg/CompressedImage": "picture", "sensor_msgs/msg/Image": "picture",
+  "theora_image_transport/msg/Packet": "picture", "foxglove_msgs/msg/CompressedVideo": "picture", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "picture",
+  "diagnostic_msgs/msg/DiagnosticArray": "diagnostics", "sensor_msgs/msg/BatteryState": "battery",
+  "nav_msgs/msg/OccupancyGrid": "grid", "nav_msgs/msg/Path": "path", "geometry_msgs/msg/PoseArray": "poses",
+  "visualization_msgs/msg/MarkerArray": "markers", "visualization_msgs/msg/Marker": "markers",
 };
+export const DRAWN = ["grid", "path", "poses", "goal", "markers"], HEALTH = ["diagnostics", "estop", "battery"];   // kinds: of the map's layers, of what is wrong
 
 // Poses where a robot shall go, or that a person says; bag_poses.py has them too.
 const GOAL = new RegExp("(^|[/_])(goals?|targets?|(way|set)_?points?|clicked|desired|cmd|command|(goal|target|set|initial)_?pose)" +
   "([^a-z/][^/]*)?(/(pose|local|global))?$");
 
-// What a topic shows: "pose", "tf", "scan", "picture", or nothing that the page can draw.
+const STOP = /(^|[/_])(e_?stop|emergency_?stop)/;
+
+// What a topic shows, as in KINDS, or nothing that the page can draw.
 export function kindOf(name, {type, encoding}) {
-  if (KINDS[type] === "pose" && type !== "nav_msgs/msg/Odometry" && GOAL.test(name.toLowerCase())) return;
-  if (KINDS[type] && encoding === "cdr") return KINDS[type];
+  const kind = KINDS[type];
+  if (encoding === "cdr" && kind === "pose" && type !== "nav_msgs/msg/Odometry" && GOAL.test(name.toLowerCase())) return "goal";
+  if (encoding === "cdr" && type === "std_msgs/msg/Bool" && STOP.test(name.toLowerCase())) return "estop";
+  if (kind && encoding === "cdr") return kind;
   if (encoding === "jpeg" || encoding === "png") return "picture";
   if (encoding === "json") return {odom: "pose", scan: "scan"}[name];
 }
@@ -115,15 +84,15 @@ export function transforms(message) {
 
 // Distances in metres; NaN where a ray met nothing.
 export function scan(message) {
-  let said;
+  let said, frame = "";
   if (message.encoding === "json") said = object(json(message));
   else {
     const cdr = new Cdr(message.payload);
-    cdr.header();
+    frame = cdr.header();
     said = cdr.scan();
   }
   const ranges = Array.from(said.ranges.slice(0, MOST_RAYS), range => number(range, FAR_M) ?? NaN);
-  return {angle_min: number(said.angle_min) ?? 0, angle_increment: number(said.angle_increment) ?? 0, ranges};
+  return {angle_min: number(said.angle_min) ?? 0, angle_increment: number(said.angle_increment) ?? 0, ranges, frame};
 }
 
 export function queue(said) {
@@ -138,41 +107,34 @@ export function queue(said) {
   };
 }
 
+const texts = said => (Array.isArray(said) ? said : []).slice(0, MOST_TOPICS).map(String);
+
 export function status(said) {
-  const {location, network, policies, publishes, recording, queue: its} = object(said);
+  const {answer, commands, estop, location, network, ok, policies, publishes, receives, recording, text, queue: its} = object(said);
   return {
     ...numbers(said, "battery"), network: numbers(network, "rtt_ms"), location: place(location), recording: String(recording ?? ""),
-    policies: (Array.isArray(policies) ? policies : []).slice(0, MOST_TOPICS).map(String), queue: its && queue(its),
+    ok: typeof ok === "boolean" ? ok : undefined, estop: estop === true, text: String(text ?? "").slice(0, 300),
+    commands: texts(commands), receives: texts(receives), policies: texts(policies), queue: its && queue(its),
+    answer: {id: String(object(answer).id ?? ""), why: String(object(answer).why ?? "").slice(0, 300)},
     publishes: Object.fromEntries(Object.entries(object(publishes)).slice(0, MOST_TOPICS).map(([topic, of]) => [topic, object(of)])),
   };
 }
 
-// A promise of something that a canvas can draw.
-export function picture(message) {
-  let {payload, encoding} = message;
-  if (encoding === "cdr") {
-    const cdr = new Cdr(payload);
-    cdr.header();
-    if (message.type === "sensor_msgs/msg/Image") return createImageBitmap(plain(cdr));
-    encoding = cdr.string().includes("png") ? "png" : "jpeg";
-    payload = cdr.bytes(cdr.uint());
-  }
-  return createImageBitmap(new Blob([payload], {type: "image/" + encoding}));
+// What diagnostics say, a part each: its level (0 is fine, 1 a warning, 2 an error, 3 stale), name, message and values.
+export function diagnostics(message) {
+  const cdr = new Cdr(message.payload);
+  cdr.header();
+  return cdr.list(() => ({level: cdr.byte(), name: cdr.string().slice(0, 200), says: cdr.string().slice(0, 300), hardware: cdr.string(),
+    values: cdr.list(() => [cdr.string(), cdr.string()])}), MOST_PARTS);
 }
 
-function plain(cdr) {
-  const [height, width] = [cdr.uint(), cdr.uint()], order = cdr.string();
-  cdr.at++;                                         // whether it is big endian
-  const step = cdr.uint(), data = cdr.bytes(cdr.uint());
-  const [red, green, blue, bytes] = {rgb8: [0, 1, 2, 3], bgr8: [2, 1, 0, 3], rgba8: [0, 1, 2, 4], bgra8: [2, 1, 0, 4]}[order] ?? [0, 0, 0, 1];
-  if (Math.max(width * bytes, step) * height > data.length) throw new Error("a picture without its pixels");
-  const image = new ImageData(width, height);
-  for (let y = 0, to = 0; y < height; y++)
-    for (let x = 0, from = y * step; x < width; x++, from += bytes, to += 4) {
-      image.data[to] = data[from + red];
-      image.data[to + 1] = data[from + green];
-      image.data[to + 2] = data[from + blue];
-      image.data[to + 3] = 255;
-    }
-  return image;
+// Whether an emergency stop holds.
+export const flag = message => new Cdr(message.payload).byte() === 1;
+
+// The battery's charge, from 0 to 1, of a BatteryState.
+export function charge(message) {
+  const cdr = new Cdr(message.payload);
+  cdr.header();
+  for (let k = 0; k < 6; k++) cdr.float();          // voltage, temperature, current, charge, capacity, design capacity
+  return number(cdr.float());
 }

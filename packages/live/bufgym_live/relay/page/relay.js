@@ -4,6 +4,15 @@ import {decode, fromJson} from "./messages.js";
 
 const FIRST_MS = 250, MOST_MS = 8000, HELD_MS = 5000;  // as in backoff.py
 
+// Whether a whole topic matches; true for a pattern that only the relay's engine knows: the relay will say.
+function matches(pattern, topic) {
+  try {
+    return new RegExp(`^(?:${pattern})$`).test(topic);
+  } catch {
+    return true;
+  }
+}
+
 export class Relay {
   // on: {state(text, isOn), welcome(), message(message), said(object), unauthorized(why)}
   constructor(on) {
@@ -14,7 +23,12 @@ export class Relay {
     this.subscriptions = new Map();
     this.commands = [];                             // not answered yet; the first is on its way
     this.name = "page-" + [...crypto.getRandomValues(new Uint8Array(8))].map(byte => byte.toString(16).padStart(2, "0")).join("");
-    this.token = new URLSearchParams(location.hash.slice(1)).get("token") ?? sessionStorage.getItem("token");
+    this.token = sessionStorage.getItem("token");
+    const brought = new URLSearchParams(location.hash.slice(1)).get("token");
+    if (brought !== null) {                         // kept, but not in an address that somebody may send on
+      this.keep(brought);
+      history.replaceState(null, "", "#/");
+    }
     this.mostMs = FIRST_MS;                         // the longest delay until the next try
     this.connect();
   }
@@ -41,10 +55,14 @@ export class Relay {
   }
 
   authorize(token) {
-    this.token = token;
-    sessionStorage.setItem("token", token);
+    this.keep(token);
     this.refused = false;
     this.connect();
+  }
+
+  keep(token) {
+    this.token = token;
+    sessionStorage.setItem("token", token);
   }
 
   say(op, fields) {
@@ -61,28 +79,25 @@ export class Relay {
     if (this.subscriptions.delete(id) && this.welcome) this.say("unsubscribe", {id});
   }
 
-  // Done when the relay holds it; an error says why it does not.
-  command(topic, data) {
+  // Done when the relay holds it, true; an error says why it does not. What it does not hold goes at once, false.
+  command(topic, data, fields = {encoding: "json"}) {
+    const holds = (this.welcome?.no_drop ?? []).some(pattern => matches(pattern, topic));
+    if (this.welcome && !holds) {
+      this.say("publish", {topic, data, ...fields});
+      return Promise.resolve(false);
+    }
     return new Promise((done, failed) => {
-      this.commands.push({topic, data, done, failed});
+      this.commands.push({topic, data, fields, done, failed});
       if (this.commands.length === 1 && this.welcome) this.sendCommand();
     });
   }
 
   sendCommand() {
     const [command] = this.commands;
-    if (command) this.say("publish", {topic: command.topic, data: command.data, encoding: "json", no_drop: true, seq: this.acked + 1});
+    if (command) this.say("publish", {topic: command.topic, data: command.data, ...command.fields, no_drop: true, seq: this.acked + 1});
   }
 
-  mayCommand(topic) {
-    return (this.welcome?.rules ?? []).some(rule => {
-      try {
-        return rule.send && new RegExp(`^(?:${rule.topic})$`).test(topic);
-      } catch {
-        return rule.send;                           // a pattern that only the relay's engine knows: the relay will say
-      }
-    });
-  }
+  mayCommand(topic) { return (this.welcome?.rules ?? []).some(rule => rule.send && matches(rule.topic, topic)); }
 
   hear(data) {
     if (typeof data !== "string") return this.take(decode(data));
@@ -104,7 +119,7 @@ export class Relay {
   answered(seq) {
     if (seq <= this.acked) return;
     this.acked = seq;
-    this.commands.shift()?.done();
+    this.commands.shift()?.done(true);
     this.sendCommand();
   }
 

@@ -1,0 +1,160 @@
+// What the robots have said: a state for each, which messages change and others draw.
+
+import {colourOf} from "./draw.js";
+import {layer} from "./drawings.js";
+import {Place, within} from "./frames.js";
+import {charge, diagnostics, DRAWN, flag, json, kindOf, queue, scan, status} from "./messages.js";
+
+export const AWAY_MS = 5000, LOW = 0.25;
+const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, POSES = 100, NEAR_MS = 20, GAP_MS = 400, PARTS = 500, LAYERS = 64;
+const LATELY_MS = 10_000, MANY = 0.3;               // a robot that drops so many of its messages lately is in trouble
+const ROBOT = /^\/robots\/([^/]+)\/(.+)$/;
+
+export class Fleet {
+  // on: {nowMs(), drawn(robot), added(robot), status(robot), reframed(robot), scanned(robot, pose, scan), moved()}
+  constructor(on) {
+    this.on = on;
+    this.robots = new Map();
+  }
+
+  get(name) { return this.robots.get(name); }
+  all() { return [...this.robots.values()]; }
+
+  // Those of these kinds among all robots' topics, without the robots' names.
+  topics(kinds, robots = this.all()) {
+    return robots.flatMap(robot => Object.keys(robot.kinds).filter(topic => kinds.includes(robot.kinds[topic])));
+  }
+
+  of(name) {
+    if (!this.robots.has(name)) {
+      const robot = {name, colour: colourOf(name), place: new Place(name), kinds: Object.create(null), heardMs: 0};
+      this.robots.set(name, robot);
+      this.blank(robot);
+      this.on.added(robot);
+    }
+    return this.robots.get(name);
+  }
+
+  // As it was before its first message; what its topics are is known still.
+  blank(robot) {
+    Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0, estop: new Map(),
+      cameras: new Map(), layers: new Map(), parts: new Map()});
+    robot.place.forget();
+  }
+
+  take(message) {
+    const [, name, topic] = ROBOT.exec(message.topic) ?? [];
+    if (!name) return;
+    const robot = this.of(name), nowMs = this.on.nowMs();
+    robot.heardMs = nowMs;
+    // A robot's clock may be wrong; how late a message is shows beside the promptest of them.
+    robot.skewMs = Math.min(robot.skewMs, nowMs - message.stampMs);
+    const ms = message.stampMs + robot.skewMs;
+    if (topic === "status") return this.takeStatus(robot, status(json(message)), ms);
+    if (topic === "queue") return this.takeQueue(robot, queue(json(message)), ms);
+    const kind = robot.kinds[topic] ??= kindOf(topic, message);
+    if (kind === "pose" || kind === "tf") this.takePose(robot, robot.place.take(topic, kind, message, ms), ms);
+    else if (kind === "scan") this.takeScan(robot, scan(message), ms);
+    else if (kind === "picture") this.takePicture(robot, topic, message, ms);
+    else if (kind === "battery") robot.charge = charge(message);
+    else if (kind === "estop") robot.estop.set(topic, flag(message));
+    else if (kind === "diagnostics") this.takeParts(robot, diagnostics(message), ms);
+    if (DRAWN.includes(kind)) this.takeLayer(robot, topic, kind, message, ms);
+  }
+
+  takeStatus(robot, status, ms) {
+    robot.status = status;
+    for (const [topic, what] of Object.entries(status.publishes ?? {})) robot.kinds[topic] ??= kindOf(topic, what);
+    this.takePose(robot, robot.place.takeStatus(status.location, ms), ms);
+    if (status.queue && !(robot.queueMs > ms - 3000)) this.takeQueue(robot, status.queue, ms, false);
+    this.on.status(robot);
+  }
+
+  takeQueue(robot, queue, ms, own = true) {
+    robot.queue = queue;
+    robot.saidMs = ms;
+    if (own) robot.queueMs = ms;
+    robot.history.push({ms, queued: queue.queued, capacity: queue.capacity, rate: queue.rate_bps ?? 0, put: queue.put ?? 0, dropped: queue.dropped, drops: 0});
+    robot.history.sort((one, other) => one.ms - other.ms);
+    while (robot.history[0].ms < ms - HISTORY_MS - 1000) robot.history.shift();
+    for (let k = 1; k < robot.history.length; k++) {
+      const [before, entry] = [robot.history[k - 1], robot.history[k]];
+      entry.drops = Math.max(0, entry.dropped - before.dropped) / Math.max(0.1, (entry.ms - before.ms) / 1000);
+    }
+    robot.queueChanged = true;
+  }
+
+  takePose(robot, at, ms) {
+    if (!at || robot.poseMs > ms) return;
+    if (robot.pose && robot.pose.frame !== at.frame) {  // what was drawn lies in another frame
+      robot.trail = [];
+      robot.poses = [];
+      this.on.reframed(robot);
+    }
+    robot.pose = at;
+    robot.poseMs = ms;
+    robot.poses.push({...at, ms});
+    if (robot.poses.length > POSES) robot.poses.shift();
+    if (!robot.trail.length || ms - robot.trail.at(-1).ms >= TRAIL_GAP_MS) robot.trail.push({x: at.x, y: at.y, ms});
+    this.on.moved();
+  }
+
+  takeScan(robot, scan, ms) {
+    if (!this.on.drawn(robot)) return;
+    Object.assign(robot, {scan, scanMs: ms, scanChanged: true});
+    const then = poseAt(robot, ms), {tree} = robot.place, mounted = tree.base && scan.frame && tree.between(scan.frame, tree.base);
+    if (then) this.on.scanned(robot, mounted ? within(then, mounted) : then, scan);
+  }
+
+  // Only the latest picture is decoded.
+  takePicture(robot, topic, message, ms) {
+    if (!this.on.drawn(robot) || (!robot.cameras.has(topic) && robot.cameras.size >= LAYERS)) return;
+    if (!robot.cameras.has(topic)) robot.cameras.set(topic, {topic, frames: []});
+    const camera = robot.cameras.get(topic);
+    Object.assign(camera, {coming: message, comingMs: ms});
+    camera.frames.push(this.on.nowMs());
+  }
+
+  takeLayer(robot, topic, kind, message, ms) {
+    if (!this.on.drawn(robot) || (!robot.layers.has(topic) && robot.layers.size >= LAYERS)) return;
+    robot.layers.set(topic, layer(kind, message, ms, robot.layers.get(topic)));
+    this.on.moved(true);
+  }
+
+  takeParts(robot, parts, ms) {
+    for (const part of parts) if (robot.parts.size < PARTS || robot.parts.has(part.name)) robot.parts.set(part.name, {...part, ms});
+  }
+}
+
+// Where a robot was: between two poses, or right at one.
+function poseAt(robot, ms) {
+  const k = robot.poses.findIndex(at => at.ms >= ms), after = robot.poses[k], before = robot.poses[k - 1];
+  const near = [before, after, robot.poses.at(-1)].find(at => at && Math.abs(at.ms - ms) < NEAR_MS);
+  if (!before || !after || after.ms - before.ms > GAP_MS) return near;
+  const part = (ms - before.ms) / Math.max(1, after.ms - before.ms), turn = Math.atan2(Math.sin(after.yaw - before.yaw), Math.cos(after.yaw - before.yaw));
+  return {x: before.x + part * (after.x - before.x), y: before.y + part * (after.y - before.y), yaw: before.yaw + part * turn};
+}
+
+export const battery = robot => robot.status?.battery ?? robot.charge;
+
+// The part of a robot's messages that it dropped in the last ten seconds.
+function dropping(robot) {
+  const last = robot.history.at(-1), first = robot.history.find(entry => entry.ms >= (last?.ms ?? 0) - LATELY_MS);
+  return last && last.put > first.put ? (last.dropped - first.dropped) / (last.put - first.put) : 0;
+}
+
+// What is wrong with a robot, the worst first: {kind, rank, level, text}; kinds are fault, silent, battery, dropping and warning.
+export function troubles(robot, nowMs) {
+  const {status = {}} = robot, silentMs = nowMs - robot.heardMs, charged = battery(robot), part = dropping(robot), found = [];
+  const say = (kind, rank, level, text) => found.push({kind, rank, level, text});
+  const parts = [...robot.parts.values()].filter(part => part.level > 0).sort((one, other) => other.level % 3 - one.level % 3);
+  if (status.estop || [...robot.estop.values()].includes(true)) say("emergency stop", 0, "error", "emergency stop");
+  if (status.ok === false) say("fault", 0, "error", status.text || "not OK");
+  const broken = parts.find(part => part.level === 2), doubtful = parts.find(part => part.level !== 2);
+  if (broken) say("diagnostics", 0, "error", `${broken.name}: ${broken.says}`);
+  if (silentMs > AWAY_MS) say("silent", 1, "error", "silent");
+  if (charged < LOW) say("battery", 2, "error", "low battery");
+  if (part > MANY) say("dropping", 3, "warn", `drops ${Math.round(100 * part)} %`);
+  if (doubtful) say("warning", 3, "warn", `${doubtful.name}: ${doubtful.says}`);
+  return found;
+}

@@ -1,0 +1,70 @@
+// How the map is moved, zoomed and tapped, and how a place with a heading is drawn on it: by mouse, by wheel, by fingers, by keys.
+
+const STILL_PX = 6, STEP_PX = 60;
+
+// map: {canvas, shift(dx, dy), zoom(factor, at), pick(x, y), aim(from, to, isOver)}; aim is for a tool, where one is in hand.
+export function listen(map) {
+  const {canvas} = map, place = event => [event.offsetX, event.offsetY];
+  let from = null, before = null, moved = 0;
+  canvas.addEventListener("pointerdown", event => {
+    if (!event.isPrimary) return;
+    canvas.setPointerCapture(event.pointerId);
+    from = before = place(event);
+    moved = 0;
+    if (map.tool) map.aim(from, from, false);
+  });
+  canvas.addEventListener("pointermove", event => {
+    if (!before || !event.isPrimary) return;
+    const now = place(event);
+    moved += Math.hypot(now[0] - before[0], now[1] - before[1]);
+    if (map.tool) map.aim(from, now, false);
+    else if (event.pointerType !== "touch" && moved > STILL_PX) map.shift(now[0] - before[0], now[1] - before[1]);
+    before = now;
+  });
+  canvas.addEventListener("pointerup", event => {
+    if (!before || !event.isPrimary) return;
+    if (map.tool) map.aim(from, place(event), true);
+    else if (moved <= STILL_PX) map.pick(...place(event));
+    before = null;
+  });
+  canvas.addEventListener("pointercancel", () => {  // the page scrolls: one finger is for that
+    before = null;
+    map.preview = null;
+  });
+  canvas.addEventListener("wheel", event => {
+    event.preventDefault();
+    map.zoom(Math.exp(-event.deltaY / 500), place(event));
+  }, {passive: false});
+  canvas.addEventListener("keydown", event => {
+    const step = {ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1]}[event.key], factor = {"+": 1.25, "=": 1.25, "-": 0.8}[event.key];
+    if (step) map.shift(STEP_PX * step[0], STEP_PX * step[1]);
+    else if (factor) map.zoom(factor, [canvas.clientWidth / 2, canvas.clientHeight / 2]);
+    else return;
+    event.preventDefault();
+  });
+  fingers(map);
+}
+
+// Two fingers move the map and zoom it.
+function fingers(map) {
+  const {canvas} = map;
+  let last = null;
+  const two = event => {
+    const {left, top} = canvas.getBoundingClientRect(), [one, other] = [...event.targetTouches].map(touch => [touch.clientX - left, touch.clientY - top]);
+    return {middle: [(one[0] + other[0]) / 2, (one[1] + other[1]) / 2], apart: Math.max(1, Math.hypot(one[0] - other[0], one[1] - other[1]))};
+  };
+  const take = event => {
+    if (map.tool || event.targetTouches.length !== 2) {
+      last = null;
+      return;
+    }
+    if (event.cancelable) event.preventDefault();
+    const now = two(event);
+    if (last) {
+      map.shift(now.middle[0] - last.middle[0], now.middle[1] - last.middle[1]);
+      map.zoom(now.apart / last.apart, now.middle);
+    }
+    last = now;
+  };
+  for (const name of ["touchstart", "touchmove", "touchend", "touchcancel"]) canvas.addEventListener(name, take, {passive: false});
+}

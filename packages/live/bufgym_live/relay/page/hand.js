@@ -1,0 +1,119 @@
+// Commands by hand: stop, a goal or a pose by drag with its heading, cancel, a policy. Each is offered where a rule allows it and the
+// robot takes it, and is done once the robot answers.
+
+import {say, tint} from "./draw.js";
+import {FAR_M, number} from "./cdr.js";
+import {stamped, still} from "./cdr_write.js";
+
+// Topics of ROS that do the same, below /robots/NAME/to/, for a robot that takes them: each with its type and what it says.
+const POSE = "geometry_msgs/msg/PoseStamped", ESTIMATE = "geometry_msgs/msg/PoseWithCovarianceStamped";
+const TOPICS = {
+  goal: {"goal_pose": POSE, "move_base_simple/goal": POSE}, pose: {"initialpose": ESTIMATE}, stop: {"cmd_vel": "geometry_msgs/msg/Twist"},
+};
+const KINDS = ["stop", "goal", "pose", "cancel"];
+
+export class Hand {
+  // asks: {robot(), isReplay(), frame(), nowMs()}
+  constructor($, relay, map, notices, asks) {
+    Object.assign(this, {$, relay, map, notices, asks, sent: null, number: 0});
+    $("stop").onclick = () => this.send("stop");
+    $("cancel").onclick = () => this.send("cancel");
+    for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
+    addEventListener("keydown", event => { if (event.key === "Escape") this.take(null); });
+    $("policy").onchange = () => {
+      this.send("policy", {policy: $("policy").value});
+      $("policy").blur();
+    };
+  }
+
+  // How the robot takes a command of a kind: its topic, and a type if that is ROS's own; undefined if it does not, or the viewer may not.
+  way(robot, kind) {
+    const {commands = [], receives = []} = robot.status ?? {}, own = `/robots/${robot.name}/command`, asked = kind === "policy" ? robot.status?.policies.length : commands.includes(kind);
+    if (asked && this.relay.mayCommand(own)) return {topic: own};
+    for (const [name, type] of Object.entries(TOPICS[kind] ?? {})) {
+      const topic = `/robots/${robot.name}/to/${name}`;
+      if (receives.some(one => one.replace(/^\//, "") === name) && this.relay.mayCommand(topic)) return {topic, type};
+    }
+  }
+
+  take(kind) {
+    const robot = this.asks.robot();
+    this.map.tool = kind && robot ? {kind, tint: tint(robot.colour), done: at => this.aimed(kind, robot, at)} : null;
+    this.map.preview = null;
+    this.map.canvas.classList.toggle("aims", this.map.tool !== null);
+    for (const each of ["goal", "pose"]) this.$(each).setAttribute("aria-pressed", this.map.tool?.kind === each);
+    if (this.map.tool) this.tell(`${robot.name}: press where, drag to where it shall look; Escape ends it`, "aim");
+    else if (this.told === "aim") this.tell("");
+  }
+
+  aimed(kind, robot, at) {
+    this.take(null);
+    const {x, y, yaw} = Object.fromEntries(Object.entries(at).map(([name, value]) => [name, Number((number(value, FAR_M) ?? 0).toFixed(3))]));
+    if (robot === this.asks.robot()) this.send(kind, {x, y, yaw, frame: this.asks.frame() ?? ""});
+  }
+
+  tell(text, what = "") {
+    this.told = what;
+    say(this.$("told"), text);
+  }
+
+  async send(kind, fields = {}) {
+    const robot = this.asks.robot(), way = robot && this.way(robot, kind);
+    if (!way) return;
+    const id = `${this.relay.name}-${++this.number}`, sent = this.sent = {id, kind, robot, ms: Date.now(), state: "not sent yet"};
+    this.draw();
+    try {
+      if (way.type) {
+        await this.relay.command(way.topic, kind === "stop" ? still() : stamped(way.type === ESTIMATE, fields), {type: way.type, encoding: "cdr"});
+        sent.state = "sent to its ROS, which does not answer";
+      } else {
+        await this.relay.command(way.topic, {command: kind, id, ...fields});
+        if (sent.state === "not sent yet") sent.state = "held by the relay, until the robot answers";
+      }
+    } catch (error) {
+      this.notices.refused(robot.name, `${kind}: ${error.message}`, this.asks.nowMs());
+      if (this.sent === sent) this.sent = null;
+    }
+    this.draw();
+  }
+
+  // A robot's status: it may answer.
+  answered(robot) {
+    const {id, why} = robot.status.answer, {sent} = this;
+    const isPolicy = sent?.kind === "policy" && robot.queue?.policy === this.$("policy").value;
+    if (!sent || sent.robot !== robot || (id !== sent.id && !isPolicy)) return;
+    if (why) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
+    sent.state = why ? "refused" : "done";
+    sent.doneMs = Date.now();
+    this.draw();
+  }
+
+  // What is offered, and how far the last command is.
+  draw() {
+    const robot = this.asks.robot(), isOff = !robot || this.asks.isReplay(), ways = Object.fromEntries(KINDS.map(kind => [kind, !isOff && this.way(robot, kind) !== undefined]));
+    const may = !isOff && this.relay.mayCommand(`/robots/${robot.name}/command`);
+    this.$("stop").hidden = !may && !ways.stop;
+    this.$("stop").disabled = !ways.stop;
+    say(this.$("stop"), ways.stop ? `Stop ${robot.name}` : `${robot?.name ?? ""} takes no stop`);
+    for (const kind of ["goal", "pose", "cancel"]) this.$(kind).hidden = !ways[kind];
+    if (this.map.tool && !ways[this.map.tool.kind]) this.take(null);
+    if (this.told === "aim") return;
+    const {sent} = this;
+    if (sent?.doneMs && Date.now() - sent.doneMs > 5000) this.sent = null;
+    this.tell(this.sent && this.sent.robot === robot ? `${sent.kind}: ${sent.doneMs ? `${robot.name} answers: ${sent.state}` : sent.state}` : "", "sent");
+  }
+
+  offerPolicies() {
+    const robot = this.asks.robot(), policies = robot?.status?.policies ?? [], now = robot?.queue?.policy ?? "", select = this.$("policy");
+    const may = robot && !this.asks.isReplay() && this.way(robot, "policy") !== undefined;
+    select.parentNode.hidden = !policies.length && !now;
+    select.disabled = !may;
+    select.title = may ? "" : "You may only watch";
+    const offered = [...new Set([...policies, now])].filter(Boolean).join();
+    if (select.dataset.offered !== offered) {
+      select.dataset.offered = offered;
+      select.replaceChildren(...offered.split(",").map(policy => new Option(policy, policy)));
+    }
+    if (!(this.sent?.kind === "policy" && !this.sent.doneMs) && document.activeElement !== select) select.value = now;
+  }
+}

@@ -1,0 +1,72 @@
+// The list of robots: those that need somebody first, and those that a search finds.
+
+import {bits, percent, say, seconds, tint} from "./draw.js";
+import {battery, LOW} from "./fleet.js";
+import {address} from "./route.js";
+
+const byName = (one, other) => one.name.localeCompare(other.name, undefined, {numeric: true});
+
+export class List {
+  constructor(element, search, count) {
+    Object.assign(this, {element, search, count, cards: new Map()});
+    search.oninput = () => this.find();
+  }
+
+  add(robot) {
+    const card = Object.assign(document.createElement("a"), {className: "card"});
+    card.innerHTML = `<b><i class="dot"></i><span class="called"></span><i class="mark" hidden></i></b><span class="says"></span>
+      <span class="soft"><span class="seen"></span><span class="charge"></span></span><span class="bar" hidden><i></i></span>`;
+    card.querySelector(".called").textContent = robot.name;
+    const odd = /[^\x20-\x7e]/.test(robot.name);    // letters of other scripts look like ours
+    Object.assign(card.querySelector(".mark"), {hidden: !odd, textContent: "unusual letters", title: [...robot.name].map(letter => "U+" + letter.codePointAt(0).toString(16)).join(" ")});
+    this.cards.set(robot.name, card);
+    this.element.append(card);
+    this.colour(robot);
+    document.getElementById("nobody")?.remove();
+  }
+
+  colour(robot) { this.cards.get(robot.name)?.style.setProperty("--robot", tint(robot.colour)); }
+
+  clear() {
+    this.element.replaceChildren();
+    this.cards.clear();
+  }
+
+  // Their troubles are in ``robot.troubles``.
+  update(robots, chosen, tab, nowMs) {
+    for (const robot of robots) this.say(robot, chosen, tab, nowMs);
+    const rank = robot => robot.troubles[0]?.rank ?? 9;
+    const sorted = [...robots].sort((one, other) => rank(one) - rank(other) || byName(one, other)), focused = document.activeElement;
+    sorted.forEach((robot, k) => {
+      const card = this.cards.get(robot.name), there = this.element.children[k];
+      if (there !== card) this.element.insertBefore(card, there ?? null);
+    });
+    if (focused !== document.activeElement && this.element.contains(focused)) focused.focus({preventScroll: true});
+    const bad = robots.filter(robot => rank(robot) < 3).length;
+    say(this.count, `${robots.length}${bad ? `, ${bad} need${bad === 1 ? "s" : ""} help` : ""}`);
+    this.find();
+  }
+
+  say(robot, chosen, tab, nowMs) {
+    const card = this.cards.get(robot.name), charged = battery(robot), [worst] = robot.troubles, silentMs = nowMs - robot.heardMs;
+    const level = worst?.level ?? (robot.status?.ok ? "ok" : ""), [says, seen, charge, bar] = [".says", ".seen", ".charge", ".bar"].map(name => card.querySelector(name));
+    const text = worst && worst.kind !== "silent" ? worst.text : robot.status?.text || (robot.status?.ok ? "OK" : "");
+    card.classList.toggle("away", robot.away);
+    card.dataset.level = level;
+    if (card.hash !== address(robot.name, tab)) card.href = address(robot.name, tab);
+    if (robot.name === chosen) card.setAttribute("aria-current", "true");
+    else card.removeAttribute("aria-current");
+    say(says, text);
+    if (says.title !== text) says.title = text;
+    say(seen, robot.away ? `silent for ${seconds(silentMs / 1000)}` : bits(robot.queue?.rate_bps ?? 0));
+    say(charge, charged == null ? "" : percent(charged));
+    bar.hidden = charged == null;
+    bar.classList.toggle("low", charged < LOW);
+    bar.firstChild.style.width = percent(Math.min(1, Math.max(0, charged ?? 0))).replace(" ", "");
+  }
+
+  find() {
+    const wanted = this.search.value.trim().toLowerCase();
+    for (const [name, card] of this.cards) card.hidden = !(name + " " + card.querySelector(".says").textContent).toLowerCase().includes(wanted);
+  }
+}
