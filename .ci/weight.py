@@ -10,7 +10,7 @@ LIMITS = {
     "bufgym": 27_800,
     "tests": 19_050,
     "packages/live/bufgym_live": 10_440,
-    "packages/live/tests": 6_580,
+    "packages/live/tests": 6_870,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_200,
 }

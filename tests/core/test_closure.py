@@ -9,10 +9,12 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from conftest import COMPILED, REPO
 
 from bufgym.ground import kernel
+from bufgym.ground.kernel import JIT
 from bufgym.ground.kernel.closure import closure
+
+REPO = Path(__file__).resolve().parents[2]
 
 TALE = """
 from typing import NamedTuple
@@ -81,7 +83,7 @@ def test_what_code_does_not_rest_on(before: str, after: str) -> None:
     assert hash_of(TALE.replace(before, after)) == hash_of(TALE)
 
 
-needs_compilation = pytest.mark.skipif(not COMPILED, reason="nothing is kept without compilation")
+needs_compilation = pytest.mark.skipif(not JIT, reason="nothing is kept without compilation")
 
 
 @needs_compilation
@@ -252,5 +254,5 @@ def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
             closure(getattr(one, "py_func", one))
     finally:
         module._told = original
-    assert kernel.FOLDER or not COMPILED
+    assert kernel.FOLDER or not JIT
     assert [text for text in seen if " at 0x" in text] == []

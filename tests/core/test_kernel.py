@@ -12,7 +12,6 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from conftest import COMPILED
 
 from bufgym.ground.kernel import JIT, announce, cache, direct, interruptible, kernel
 
@@ -50,7 +49,7 @@ class Numbers(NamedTuple):
     several: bool | None = None
 
 
-needs_compilation = pytest.mark.skipif(not COMPILED, reason="nothing is kept without compilation")
+needs_compilation = pytest.mark.skipif(not JIT, reason="nothing is kept without compilation")
 
 
 @needs_compilation

@@ -86,7 +86,9 @@ def drawn() -> Iterator[tuple[str, str, bytes]]:
 def health(level: int, says: str) -> tuple[str, str, bytes]:
     value = made("diagnostic_msgs/msg/KeyValue", key="current", value="12 A")
     parts = [("laser", 0, "fine"), ("motor left", level, says)]
-    array = [made("diagnostic_msgs/msg/DiagnosticStatus", name=n, level=k, message=m, values=[value]) for n, k, m in parts]
+    array = [
+        made("diagnostic_msgs/msg/DiagnosticStatus", name=n, level=k, message=m, values=[value]) for n, k, m in parts
+    ]
     return "diagnostics", DIAGNOSTICS, cdr(DIAGNOSTICS, status=array)
 
 

@@ -14,7 +14,7 @@ from loop_cases import compiled
 for library in ("websockets", "re2", "rosbags", "PIL"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
-from page_cases import ODOMETRY, MadeUp, drawn, health, jpeg, message  # noqa: E402
+from page_cases import MadeUp, drawn, health, jpeg  # noqa: E402
 from relay_cases import ALL, Rule, client, relay, settings  # noqa: E402
 from test_page import SEES, until  # noqa: E402
 
