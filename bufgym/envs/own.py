@@ -122,9 +122,6 @@ class OwnFields:
         fields = [place.field for place in self._places]
         self._compiled = [_compiled("field", field.per, field) if field.compile else None for field in fields]
 
-    def __bool__(self) -> bool:
-        return bool(self._places)
-
     def write(self, batch: Batch, output: StepOutput) -> None:
         """Write each field of every row that waits for a decision; other rows are 0 already."""
         records = named(batch)
@@ -199,9 +196,6 @@ class OwnTerms:
         for term in terms:
             if term.prepare is not None:
                 term.prepare()
-
-    def __bool__(self) -> bool:
-        return bool(self._terms)
 
     def begin(self, batch: Batch, rows: NDArray[np.int64]) -> None:
         """Begin an episode in these rows."""

@@ -139,11 +139,10 @@ def untrained(tmp_path, network="slots"):
     import torch
     from sb3_contrib import MaskablePPO
 
-    from bufgym.sb3 import make_vec_env
-    from bufgym.sb3.networks import policy_of
+    from bufgym.sb3 import SlotPolicy, make_vec_env
 
     env = make_vec_env("bufgym/Uplink-v0", 2, scenario=WORLD, capacity=CAPACITY, decide_at="arrival")
-    policy, its_settings = policy_of(network, WIDTH)
+    policy, its_settings = (SlotPolicy, {"width": WIDTH}) if network == "slots" else ("MultiInputPolicy", {})
     model = MaskablePPO(policy, env, n_steps=8, batch_size=16, policy_kwargs=its_settings, device="cpu")
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():

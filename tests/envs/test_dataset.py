@@ -10,7 +10,7 @@ from refusal_cases import refuse
 from bufgym import oracle
 from bufgym.cli import main
 from bufgym.envs import SenderEnv, SenderVectorEnv, expert
-from bufgym.envs.expert.record import KINDS, record
+from bufgym.envs.expert.dataset import KINDS, record
 from bufgym.ground.errors import BufgymError
 
 SHORT = {"duration_s": 2.0, "size_bytes": 500_000}
