@@ -22,12 +22,12 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor, get_monitor_files
 
 import bufgym
-from bufgym.benchmark.run import draw
 from bufgym.envs import SenderVectorEnv
 from bufgym.ground.errors import BufgymError
 from bufgym.sb3 import GymVecEnv, SlotPolicy, as_policy, make_vec_env
 from bufgym.scenario import Interruption
 from bufgym.scenario import get as scenario_of
+from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 

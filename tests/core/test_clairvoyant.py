@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from refusal_cases import refuse
 
 from bufgym import policies, scenario
-from bufgym.benchmark.run import draw
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
 from bufgym.oracle import beam, clairvoyant, integer, labels, programme
 from bufgym.scenario import Episode, Interruption, messages
+from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 

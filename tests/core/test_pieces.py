@@ -8,12 +8,12 @@ import pytest
 from cases import trace
 
 from bufgym import policies, scenario
-from bufgym.benchmark.run import draw
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import clairvoyant, kept, pieces
 from bufgym.oracle.clairvoyant import Plan
 from bufgym.scenario import Episode, messages
+from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 

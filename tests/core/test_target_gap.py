@@ -10,7 +10,6 @@ from gap_cases import Seen, approached, fits, least_gap, level, spared
 from hypothesis import given
 
 from bufgym import policies
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
@@ -18,6 +17,7 @@ from bufgym.policies import Policy, target_gap
 from bufgym.policies.target_gap import PACE, PARAMETERS, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, last_chance, needless
 from bufgym.policies.thinning import send_us, spare, steady
 from bufgym.scenario import Episode, messages, suites
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
 from bufgym.traces import Trace
