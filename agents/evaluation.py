@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from agents.mixed_env import Cell, MixedEnv, cells
 from agents.settings import Settings
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.run import run as run_policies
 from bufgym.benchmark.score import DISCRIMINATIVE, regret
 from bufgym.benchmark.sweep import Sweep, run_sweep
@@ -28,6 +27,7 @@ from bufgym.oracle import BASELINE, measure, normalised_score
 from bufgym.policies import Policy
 from bufgym.sb3 import takes_masks
 from bufgym.scenario import Episode
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import Senders, run
 from bufgym.sim.metrics import Outcome, outcome
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from agents.evaluation import Numbers, qoi_of
 from bufgym import policies
 from bufgym.benchmark.bootstrap import RESAMPLES, Interval, percentile_interval, times_drawn
-from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.tasks.queue import best
+from bufgym.benchmark.tasks import QueueTask
 from bufgym.policies import Policy
 from bufgym.scenario import suites
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import Senders
 
 LEAST, MOST = 0.01, 4.0
@@ -31,7 +31,7 @@ Run = dict[str, Any]
 def run_of(link: str, scenario: Any, seed: int, capacity: int, max_bytes: int | None = None) -> Run:
     """One run, with its bound."""
     episode = draw(scenario, seed)
-    most = best(episode, capacity, scenario, max_bytes).qoi
+    most = QueueTask(max_bytes=max_bytes).best(episode, capacity, scenario).qoi
     known = {"link": link, "episode": episode, "capacity": capacity, "max_bytes": max_bytes}
     return {**known, "value": scenario.value, "best": most}
 

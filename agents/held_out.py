@@ -17,12 +17,12 @@ from agents.settings import Environment, Settings
 from bufgym import scenario as scenarios
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, percentile_interval, times_drawn
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.run import draw
 from bufgym.benchmark.score import scores
-from bufgym.benchmark.tasks.queue import best
+from bufgym.benchmark.tasks import QueueTask
 from bufgym.oracle import BASELINE, normalised_score, regret
 from bufgym.policies import registry
 from bufgym.scenario import Scenario, Uplink
+from bufgym.scenario.numbered import draw
 from bufgym.sim.metrics import Outcome
 
 HELD_OUT_TRACES = 2
@@ -50,7 +50,7 @@ class FixedEpisodes:
         self.scenario, self.capacity = split_scenario(on)[split == "test"], on.capacity
         # With uniform draws for policies that randomise.
         self.episodes = [draw(self.scenario, FIRST_SEED[split] + i) for i in range(count)]
-        self._plans = [best(episode, self.capacity, self.scenario) for episode in self.episodes]
+        self._plans = [QueueTask().best(episode, self.capacity, self.scenario) for episode in self.episodes]
         self._base = math.fsum(result.qoi for result in self.play(registry.get(BASELINE)))
         self._best = math.fsum(plan.qoi for plan in self._plans)
 

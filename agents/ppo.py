@@ -6,15 +6,17 @@ from typing import Any
 
 import stable_baselines3 as sb3
 from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from agents.decisions import SlotLearner
 from agents.settings import PPO, ActorCritic
 from bufgym.ground.errors import BufgymError
 from bufgym.policies.weights import MAX_WIDTH
-from bufgym.sb3 import weights_of
-from bufgym.sb3.networks import policy_of
+from bufgym.sb3 import SlotPolicy, weights_of
 
 
 class SlotPPO(SlotLearner[PPO]):
@@ -28,7 +30,7 @@ class SlotPPO(SlotLearner[PPO]):
     def make(self, env: VecEnv) -> Any:
         """Make an untrained actor and critic."""
         settings = self.settings
-        policy, arguments = policy_of(settings.network, settings.width, not settings.unmasked)
+        policy, arguments = network_of(settings)
         return self.algorithm(policy, env, policy_kwargs=arguments, **ppo_arguments(settings, env, settings.n_steps))
 
     def weights_of(self, model: Any) -> Any:
@@ -36,6 +38,14 @@ class SlotPPO(SlotLearner[PPO]):
         settings = self.settings
         scores_slots = settings.network == "slots" and not settings.unmasked and settings.width <= MAX_WIDTH
         return weights_of(model) if scores_slots and settings.decide_at == "arrival" else None
+
+
+def network_of(settings: PPO) -> tuple[Any, dict[str, Any]]:
+    """The actor-critic class and its arguments: the slot network, or a plain one over all numbers at once."""
+    if settings.network == "slots":
+        return SlotPolicy, {"width": settings.width, "masked": not settings.unmasked}
+    plain = MultiInputActorCriticPolicy if settings.unmasked else MaskableMultiInputActorCriticPolicy
+    return plain, {"net_arch": [2 * settings.width, 2 * settings.width], "activation_fn": nn.ReLU}
 
 
 def ppo_arguments(settings: ActorCritic, env: VecEnv, n_steps: int) -> dict[str, Any]:

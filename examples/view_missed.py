@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, scenario, sim
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.oracle import BASELINE, clairvoyant, normalised_score
 from bufgym.sim import NEVER, outcome
 
@@ -39,7 +38,7 @@ def main() -> None:
     parser.add_argument("--score", type=float, default=0.7, help="what would this miss? (%(default)s)")
     options = parser.parse_args()
     uplink = scenario.get("lte", duration_s=options.seconds)
-    episodes = [draw(part, seed) for _, part in by_trace(uplink) for seed in range(options.seeds)]
+    episodes = [scenario.draw(part, seed) for _, part in scenario.by_trace(uplink) for seed in range(options.seeds)]
     best = sum(clairvoyant(episode, options.capacity, uplink.value).qoi for episode in episodes)
     h, missed_s = {}, {}
     for name in dict.fromkeys([BASELINE, *options.policies.split(",")]):

@@ -30,9 +30,8 @@ from agents.held_out import FIRST_SEED, split_scenario
 from agents.settings import Environment
 from bufgym import policies
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.score import scores
-from bufgym.benchmark.tasks.queue import best, columns
+from bufgym.benchmark.tasks.queue import QueueTask, columns
 from bufgym.cli.options import Capacities, Count, Natural, Positive
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.link import FOREVER
@@ -41,7 +40,7 @@ from bufgym.oracle.from_queue import find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.policies import Policy
 from bufgym.scenario import Uplink, suites
-from bufgym.scenario.numbered import SEEDS_PER_TRACE
+from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace, draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.sim.state import ARRIVAL_WAITS, new_batch
@@ -200,7 +199,7 @@ TASKS = {"uplink": (uplink_cases, SHIPPED_LTE), "lte-v2": (lte_cases, LTE_V2)}
 def played(case: Case, planning: Planning, links: Hidden) -> list[Row]:
     """Rows of the planner and its rivals; ``planner_s`` is the time that the planner took."""
     episode = draw(case.scenario, case.seed)
-    plan = best(episode, case.capacity, case.scenario)
+    plan = QueueTask().best(episode, case.capacity, case.scenario)
     planner = CausalPlanner(planning, links, case.scenario, case.capacity, case.seed)
     key = {"scenario": case.label, "trace": case.trace, "seed": case.seed, "capacity": case.capacity}
     rows = []

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from agents.families import Run, merged, of_suite, run_of
-from bufgym.benchmark.run import by_trace
 from bufgym.ground.files import replaced
 from bufgym.model import qoi
 from bufgym.scenario import Uplink
+from bufgym.scenario.numbered import by_trace
 from bufgym.scenario.uplink import uplink_over_lte
 from bufgym.traces import Trace, drive_motion, markov_link, synthetic_lte
 

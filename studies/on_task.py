@@ -22,8 +22,8 @@ from agents.cma_es import Search, evaluation_here
 from agents.objectives.objective import Objective
 from bufgym import policies
 from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.policies import Policy
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import Senders
 from bufgym_papers.perception import worth
 from studies.page import command, publish, table

@@ -29,12 +29,12 @@ import numpy as np
 
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark.run import draw
 from bufgym.cli.options import Count
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.ground.kernel import JIT
 from bufgym.ground.tables import Table
+from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 from studies import yardstick
 from studies.page import command

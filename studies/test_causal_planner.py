@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
 
-from bufgym.benchmark.run import draw
 from bufgym.ground.kernel import JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Uplink
+from bufgym.scenario.numbered import draw
 from bufgym.sim import outcome, run
 from bufgym.traces import Trace, drive_motion, synthetic_lte
 from studies import causal_planner, futures

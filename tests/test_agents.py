@@ -17,7 +17,6 @@ from agents.dqn import INVALID, SlotDQN, valid_actions
 from agents.evaluation import EvaluationSet, SlotModel, sweep_for
 from agents.settings import DQN, Evolve, Suites
 from bufgym import policies
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.run import run as rows_of
 from bufgym.ground import files
 from bufgym.model import qoi
@@ -27,6 +26,7 @@ from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv
 from bufgym.sb3.networks import SlotExtractor, SlotScorer
 from bufgym.scenario import Interruption, suites
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
 
 SHORT = Interruption(law="uniform", t_min=6, t_max=30)

@@ -14,10 +14,11 @@ from agents.objectives import fleet
 from agents.settings import PPO, Evolve, Suites
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
-from bufgym.benchmark.run import by_trace, draw, run
+from bufgym.benchmark.run import run
 from bufgym.benchmark.tasks import TASKS, FleetTask
 from bufgym.policies import weights
 from bufgym.scenario import suites
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.scenario.suites import Setting
 
 FLEET_V1 = suites.get("fleet-v1")

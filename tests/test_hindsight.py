@@ -13,13 +13,13 @@ from agents.hindsight_network import CONTEXT, SLOT, Student, mean_regret
 from agents.mixed_env import Cell
 from agents.settings import Environment, Hindsight, Suites
 from bufgym import policies
-from bufgym.benchmark.run import draw
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.expert import clairvoyant
 from bufgym.envs.expert.player import Player
 from bufgym.model.buffer import ACCEPT
 from bufgym.policies import learned, weights
 from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
+from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 

@@ -23,7 +23,6 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 
 import bufgym
 from bufgym import cli, policies
-from bufgym.benchmark.run import draw
 from bufgym.envs import SenderVectorEnv
 from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import FIELDS as FIELDS_OF_ALL
@@ -31,6 +30,7 @@ from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv, SlotPolicy, as_policy, make_vec_env
 from bufgym.scenario import Interruption
 from bufgym.scenario import get as scenario_of
+from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bufgym import policies
-from bufgym.benchmark.run import draw
 from bufgym.envs import SenderEnv
 from bufgym.envs.expert import Player
 from bufgym.envs.render.image import COLOURS, canvas_of, pixels
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Episode, Interruption, Scenario, get, suites
-from bufgym.scenario.numbered import numbered
+from bufgym.scenario.numbered import draw, numbered
 from website import interactive, picture
 from website.picture import fading, play
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from bufgym import policies, sim
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Scenario, get
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import metrics
 from website.picture import fading, play
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bufgym import oracle, policies, sim  # noqa: F401  (the oracle registers the clairvoyant)
-from bufgym.benchmark.run import draw
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption
+from bufgym.scenario.numbered import draw
 from bufgym.sim import metrics
 from website.markdown import cited, code
 

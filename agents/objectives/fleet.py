@@ -18,12 +18,12 @@ from agents.objectives.objective import Objective
 from agents.settings import Settings, Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.benchmark.sweep import Sweep
 from bufgym.envs import FleetVecEnv
 from bufgym.policies import Policy
 from bufgym.sb3 import GymVecEnv
 from bufgym.scenario import FleetEpisode, FleetScenario, suites
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 

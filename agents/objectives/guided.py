@@ -18,11 +18,11 @@ from agents.held_out import FixedEpisodes, fixed_episodes, split_scenario
 from agents.objectives.objective import Objective
 from agents.report import Report, Trained, by_hand, report_environment
 from bufgym import policies
-from bufgym.benchmark.run import draw
 from bufgym.oracle import BASELINE
 from bufgym.policies import Policy
 from bufgym.sb3 import make_vec_env
 from bufgym.scenario import Episode
+from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 
 PARTS, EPISODES = 18, 100

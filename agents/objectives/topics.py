@@ -19,13 +19,13 @@ from agents.objectives.objective import Objective
 from agents.settings import Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
-from bufgym.benchmark.run import draw
 from bufgym.ground import files
 from bufgym.ground.errors import BufgymError
 from bufgym.model.link import FOREVER
 from bufgym.policies import Policy
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.scenario import Client, suites
+from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 from bufgym.sim.rules import age_until
 

@@ -8,17 +8,17 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bufgym.benchmark.run import by_trace, draw
-from bufgym.benchmark.tasks.queue import meet
+from bufgym.benchmark.tasks import QueueTask
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.ground.tables import Table
 from bufgym.policies import Policy
 from bufgym.scenario import Uplink
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim.state import NEVER
 
 # Most topics for a readable table; the CSV file has all.
@@ -44,16 +44,10 @@ class Drop(NamedTuple):
 
 
 def drops(
-    policies: Sequence[Policy],
-    scenario: Uplink,
-    capacities: Sequence[int],
-    seeds: int,
-    *,
-    max_bytes: int | None = None,
-    decide_at: str = "arrival",
+    policies: Sequence[Policy], scenario: Uplink, capacities: Sequence[int], seeds: int, **settings: Any
 ) -> Iterator[Drop]:
     """Yield in time order every message that each policy drops in the runs of ``run.run`` with these arguments."""
-    workload = scenario.workload
+    workload, task = scenario.workload, QueueTask(**settings)
     if workload is None:
         raise BufgymError("drops: the scenario must play a recording (workload=...)")
     for trace, part in by_trace(scenario):
@@ -62,7 +56,7 @@ def drops(
             arrivals = np.asarray(episode.arrivals)
             for capacity in capacities:
                 for policy in policies:
-                    senders = meet(policy, [episode], capacity, part, [None], max_bytes, decide_at)
+                    senders = task.meet(policy, [episode], capacity, part)
                     dropped_us = np.asarray(senders.batch.log[0])["dropped_us"][: len(arrivals)]
                     for k in np.flatnonzero(dropped_us != NEVER).tolist():
                         arrival = arrivals[k]

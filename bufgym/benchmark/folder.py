@@ -8,11 +8,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from bufgym.benchmark.checked_json import check, read_object
-from bufgym.benchmark.rows import Row, has_pyarrow, read_rows
+from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import replaced
@@ -119,7 +120,7 @@ def claim(out: Path, manifest: dict[str, Any]) -> None:
     if not file.exists():
         if (out / "parts").exists() or any(out.glob("rows.*")):
             raise BufgymError(f"{out}: holds rows without a manifest.json; choose another --out")
-        write_json(file, manifest)
+        write_text(file, json.dumps(manifest, indent=1))
         return
     held = read_manifest(file)
     for key in _SAME:
@@ -143,7 +144,7 @@ def make_empty(out: Path) -> None:
 def form_of_rows(out: Path) -> str:
     """Format of the rows already in the folder, or else the best format available."""
     held = {file.suffix for pattern in ("rows.*", "parts/*") for file in out.glob(pattern)}
-    return "csv" if not has_pyarrow() or (".csv" in held and ".parquet" not in held) else "parquet"
+    return "csv" if not find_spec("pyarrow") or (".csv" in held and ".parquet" not in held) else "parquet"
 
 
 def read_manifest(path: Path) -> Mapping[str, Any]:
@@ -165,9 +166,11 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
     return manifest
 
 
-def write_json(file: Path, content: dict[str, Any]) -> None:
+def write_text(file: Path, text: str) -> Path:
+    """Write a file, whole or not at all; return its path."""
     with replaced(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
+    return file
 
 
 def _short(entry: object) -> str:

@@ -22,7 +22,7 @@ from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import read_utf8, replaced
+from bufgym.ground.files import read_utf8
 from bufgym.ground.kernel.closure import closure
 from bufgym.oracle import kept
 from bufgym.scenario import suites
@@ -107,9 +107,9 @@ def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> lis
     ]
 
 
-def make(path: Path, names: Sequence[str], specs: Mapping[str, Sequence[str]], **options: Any) -> list[Entry]:
-    """Run the suites with their policies (``specs``, by suite) and write the file, whole or not at all."""
-    board = [entry for name in names for entry in _run(name, specs[name], **options)]
+def make(path: Path, specs: Mapping[str, Sequence[str]], **options: Any) -> list[Entry]:
+    """Run suites with their policies (``specs``, by suite) and write the file, whole or not at all."""
+    board = [entry for suite, policies in specs.items() for entry in _run(suite, policies, **options)]
     write(board, path)
     return board
 
@@ -163,21 +163,10 @@ def write(board: Sequence[Entry], path: Path) -> None:
     lines = []
     for entry in board:
         for key, interval in entry.values.items():
-            cells = (
-                entry.suite,
-                entry.policy,
-                entry.rank,
-                entry.cells,
-                key,
-                *interval,
-                entry.bufgym,
-                entry.made_of,
-                entry.command,
-            )
-            lines.append(dict(zip(COLUMNS, cells, strict=True)))
+            cells = {"quantity": key, **interval._asdict()}
+            lines.append({name: cells[name] if name in cells else getattr(entry, name) for name in COLUMNS})
     write_rows(lines, path, COLUMNS)
-    with replaced(path.with_suffix(".md")) as temporary:
-        temporary.write_text(markdown(board), encoding="utf-8")
+    folder.write_text(path.with_suffix(".md"), markdown(board))
 
 
 def read(path: Path) -> dict[str, Entry]:

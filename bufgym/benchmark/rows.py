@@ -122,15 +122,6 @@ def _parsed(path: Path, line: int, name: str, text: str, layout: Layout) -> Any:
         raise BufgymError(f"{path}, line {line}: {name} = {text!r}: must be {rule}") from None
 
 
-def has_pyarrow() -> bool:
-    """Whether Parquet files can be written here."""
-    try:
-        _pyarrow()
-    except BufgymError:
-        return False
-    return True
-
-
 def _pyarrow() -> tuple[Any, Any]:
     pyarrow, parquet = (
         library(name, "bench", "a Parquet file, unlike .csv,") for name in ("pyarrow", "pyarrow.parquet")

@@ -17,8 +17,6 @@ from bufgym.ground.progress import bar
 from bufgym.policies import Policy, names
 from bufgym.scenario.numbered import by_trace, draw
 
-__all__ = ["by_trace", "check_distinct", "draw", "run"]
-
 _BATCH_MESSAGES = 1_000_000  # messages held at a time, 88 bytes each; many seeds run in several batches
 
 

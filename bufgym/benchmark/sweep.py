@@ -12,6 +12,7 @@ import datetime
 import hashlib
 import importlib.util
 import itertools
+import json
 import os
 import shutil
 import sys
@@ -24,7 +25,7 @@ from bufgym import policies
 from bufgym.benchmark import cluster, folder, sources, tasks
 from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, read_rows, write_rows
-from bufgym.benchmark.run import by_trace, check_distinct, run
+from bufgym.benchmark.run import check_distinct, run
 from bufgym.benchmark.table import unranked_among
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__, modules
@@ -32,7 +33,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
 from bufgym.ground.progress import bar
 from bufgym.scenario import suites
-from bufgym.scenario.numbered import SEEDS_PER_TRACE
+from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace
 from bufgym.scenario.registry import with_parameters
 from bufgym.scenario.suites import Setting
 
@@ -207,7 +208,7 @@ def run_sweep(
                 sweep.policies, rows, lambda row: sweep.setting(row["scenario"], row["seed"] // SEEDS_PER_TRACE)
             )
             if example is not None:
-                folder.write_json(out / "timeline.json", example)
+                folder.write_text(out / "timeline.json", json.dumps(example, indent=1))
         shutil.rmtree(parts, ignore_errors=True)
         return rows
 

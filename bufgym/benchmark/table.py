@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from bufgym.ground.tables import Table as Table
-from bufgym.oracle.measure import BASELINE, normalised_score
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 
 RunRows = Sequence[Mapping[str, Any]]
@@ -66,7 +66,6 @@ class Column(NamedTuple):
 COLUMNS = (
     Column("policy", "policy", str),
     Column("L", "capacity", str),
-    Column("score", "score", score),
     Column("QoI", "qoi", score),
     Column("regret", "regret", lambda share: decimal(100 * share, 2, "%")),
     Column("delivered", "delivered", partial(decimal, digits=1)),
@@ -95,38 +94,20 @@ def means(rows: RunRows, unranked: Collection[str] = ()) -> list[dict[str, Any]]
     """Average the rows of each policy and capacity, sorted by capacity ascending, then QoI descending.
 
     Policies in ``unranked``, which do not compete, come last within a capacity. None and NaN count as missing, and a
-    mean of missing numbers is NaN. The score is that of the cell, see ``measure.normalised_score``; it needs the rows
-    of Drop Oldest.
+    mean of missing numbers is NaN.
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["capacity"], row["policy"]), []).append(row)
-    base = {_episode(row): row["qoi"] for row in rows if row["policy"] == BASELINE}
     entries: list[dict[str, Any]] = [
         {
             "policy": policy,
             "capacity": capacity,
             **{c.key: mean([row.get(c.key) for row in group]) for c in COLUMNS[2:]},
-            "score": _score(group, base),
         }
         for (capacity, policy), group in groups.items()
     ]
     return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in unranked, -e["qoi"], e["policy"]))
-
-
-def _episode(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row.get(name) for name in ("scenario", "trace", "seed", "capacity"))
-
-
-def _score(group: RunRows, base: Mapping[tuple[Any, ...], float]) -> float:
-    """Score of one policy at one capacity; NaN if one of the three sums is unknown or L does not bind the policy."""
-    if any(row.get("regret") is None or _episode(row) not in base for row in group):
-        return math.nan
-    sums = [
-        math.fsum(h)
-        for h in zip(*((row["qoi"], base[_episode(row)], row["clairvoyant"]) for row in group), strict=True)
-    ]
-    return float(normalised_score(*sums))
 
 
 def with_equal_rows(rows: RunRows, unranked: Collection[str] = ()) -> dict[str, list[str]]:
@@ -156,29 +137,30 @@ def unranked_among(policies: Iterable[Policy]) -> dict[str, str]:
 def means_table(
     rows: RunRows,
     unranked: Unranked = NOBODY,
-    intervals: Mapping[tuple[int, str], str] = MappingProxyType({}),
+    scores: Mapping[tuple[int, str], str] = MappingProxyType({}),
     hidden: str = "",
 ) -> Table:
     """Make the table of ``means``, with one line for policies that have equal rows.
 
-    Score and regret are left out if no row has them. ``intervals`` has the text behind the score at (L, policy). The
-    policy ``hidden`` gets no line; its rows serve the others' scores.
+    ``scores`` has the text of each known score at (L, policy). Score and regret are left out if no line has them. The
+    policy ``hidden`` gets no line.
     """
     shown = [row for row in rows if row["policy"] != hidden]
     alike = with_equal_rows(shown, unranked)
     without_line = {hidden, *(name for names in alike.values() for name in names)}
     entries = [entry for entry in means(rows, unranked) if entry["policy"] not in without_line]
-    bounded = {key for key in ("score", "regret") if any(not math.isnan(entry[key]) for entry in entries)}
-    columns = [c for c in COLUMNS if c.key in bounded or c.key not in ("score", "regret")]
+    columns = [c for c in COLUMNS if c.key != "regret" or any(not math.isnan(entry["regret"]) for entry in entries)]
+    scored = any((entry["capacity"], entry["policy"]) in scores for entry in entries)
     inexact = any(row.get("certified") is False and row.get("regret") is not None for row in shown)
     titles = [REGRET_AT_MOST if c.key == "regret" and inexact else c.title for c in columns]
     by_capacity = [list(block) for _, block in itertools.groupby(entries, lambda entry: entry["capacity"])]
 
-    def written(entry: Mapping[str, Any], c: Column) -> str:
-        behind = intervals.get((entry["capacity"], entry["policy"]), "") if c.key == "score" else ""
-        return f"{c.write(entry[c.key])} {behind}".rstrip()
+    def written(entry: Mapping[str, Any]) -> list[str]:
+        texts = [c.write(entry[c.key]) for c in columns]
+        return [*texts[:2], *[scores.get((entry["capacity"], entry["policy"]), NONE)] * scored, *texts[2:]]
 
-    blocks = [("", [[written(entry, c) for c in columns] for entry in block]) for block in by_capacity]
+    titles[2:2] = ["score"] * scored
+    blocks = [("", [written(entry) for entry in block]) for block in by_capacity]
     notes = [f"note: {policy} does not compete: {reason}" for policy, reason in unranked.items()]
     notes += [*equal_rows_notes(alike), *([f"note: {UPPER_BOUND}"] if inexact else []), *invalid(shown)]
     return Table(titles, blocks, notes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import gymnasium
@@ -32,25 +32,23 @@ def _environments() -> None:
     env.step(_L)
 
 
-def _policies(for_topics: bool, on: Any) -> None:
-    run([policies.get(name) for name in policies.names(for_topics=for_topics)], on, [_L], 1)
-
-
-def _bound() -> None:
-    for size_cv in (0.0, 0.5):
-        run([policies.get("drop-oldest")], scenario.get("lte", duration_s=1.0, size_cv=size_cv), [_L], 1)
+def _run(names: Iterable[str], *scenarios: Any) -> None:
+    for on in scenarios:
+        run([policies.get(name) for name in names], on, [_L], 1)
 
 
 def _fleets() -> None:
     _played(FleetVecEnv(1, 2, "lte", _L, duration_s=1.0), 2)
-    run([policies.get("drop-oldest")], FleetScenario.of(2, "lte", duration_s=1.0), [_L], 1)
+    _run(["drop-oldest"], FleetScenario.of(2, "lte", duration_s=1.0))
 
 
 PARTS: dict[str, Callable[[], object]] = {
-    "policies of one queue": lambda: _policies(False, Interruption(t_max=5)),
+    "policies of one queue": lambda: _run(policies.names(for_topics=False), Interruption(t_max=5)),
     "environments": _environments,
-    "policies of several topics": lambda: _policies(True, scenario.get("topics", duration_s=1.0)),
-    "the clairvoyant": _bound,
+    "policies of several topics": lambda: _run(policies.names(for_topics=True), scenario.get("topics", duration_s=1.0)),
+    "the clairvoyant": lambda: _run(
+        ["drop-oldest"], *(scenario.get("lte", duration_s=1.0, size_cv=cv) for cv in (0.0, 0.5))
+    ),
     "fleets": _fleets,
 }
 """Description of a part -> function that compiles it."""

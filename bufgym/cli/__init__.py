@@ -30,8 +30,8 @@ _formatwarning = warnings.formatwarning
 COMMANDS: dict[str, Any] = {
     "list": "bufgym.cli.listing:listing",
     "bench": "bufgym.cli.bench:bench",
-    "topics": "bufgym.cli.topics:topics",
-    "fleet": "bufgym.cli.topics:fleet",
+    "topics": "bufgym.cli.bench:topics",
+    "fleet": "bufgym.cli.bench:fleet",
     "report": "bufgym.cli.results:report",
     "leaderboard": "bufgym.cli.results:leaderboard",
     "validate": "bufgym.cli.results:validate",

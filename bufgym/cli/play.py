@@ -41,8 +41,8 @@ def play(
 
     import gymnasium
 
-    from bufgym.benchmark.run import draw
     from bufgym.envs.expert import Player
+    from bufgym.scenario.numbered import draw
 
     policy = one_policy(policies, policy_file)
     known = environments()

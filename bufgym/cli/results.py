@@ -43,8 +43,9 @@ def leaderboard(
     from bufgym.scenario.suites import SUITES
 
     names = suites or [name for name, suite in SUITES.items() if not suite.needs or data]
-    specs = {name: boards.task_of(name).default_policies(name) for name in names}
-    board = boards.make(file, names, specs, data=data, jobs=jobs)
+    board = boards.make(
+        file, {name: boards.task_of(name).default_policies(name) for name in names}, data=data, jobs=jobs
+    )
     print(f"{len(board)} rows in {file}, as Markdown in {file.with_suffix('.md')}")
 
 

@@ -142,9 +142,6 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         draw = cell.cell_ansi if self.render_mode == "ansi" else cell.cell_rgb_array
         return draw(self.rows, self.possible_agents)
 
-    def close(self) -> None:
-        """Do nothing: no resource is open."""
-
     def _observations(self) -> dict[str, Observation]:
         return {agent: self.rows.observation(i) for i, agent in enumerate(self.possible_agents)}
 

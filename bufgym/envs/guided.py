@@ -64,9 +64,8 @@ class Guiding:
     """The guided part of n rows."""
 
     def __init__(self, n: int, options: Options) -> None:
-        self.acts, self.sees = options.acts_guided, options.sees_guided
         memory = linear(GUIDED, np.zeros((N_OUTPUTS, N_INPUTS))).new_memory(n, options.capacity)
-        self.guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(self.acts), int(self.sees))
+        self.guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(options.acts_guided), int(options.sees_guided))
         self._nothing = np.zeros(n, np.int64)
         self.action_space = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)
 

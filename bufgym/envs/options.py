@@ -29,7 +29,7 @@ MASK_KEYS = {
 """Library -> its keys of the observation and of the action mask in it."""
 
 
-_CHOICES = {"info": INFOS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
+_CHOICES = {"info": INFOS, "mask": MASKS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +63,6 @@ class Options:
                 raise BufgymError(f"{name} = {given!r}: must be one of {', '.join(map(repr, known))}")
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
-        if self.mask not in MASKS:
-            raise BufgymError(f"mask = {self.mask!r}: must be one of {', '.join(map(repr, MASKS))}")
         if not isinstance(self.bound, bool | np.bool_):
             raise BufgymError(f"bound = {self.bound!r}: must be True or False")
         whole("num_threads", self.num_threads, 1)
@@ -85,11 +83,6 @@ class Options:
     def shows_all(self) -> bool:
         """Whether ``info`` has all entries in every step."""
         return self.info in ("full", "steady")
-
-    @property
-    def is_steady(self) -> bool:
-        """Whether ``info`` has the same entries in every step, the summary so far among them."""
-        return self.info == "steady"
 
     @property
     def shows_mask(self) -> bool:

@@ -121,9 +121,6 @@ class OwnFields:
         self._places = form.own_places
         self._compiled = [_compiled("field", p.field.per, p.field) if p.field.compile else None for p in self._places]
 
-    def __bool__(self) -> bool:
-        return bool(self._places)
-
     def write(self, batch: Batch, output: StepOutput) -> None:
         """Write each field of every row that waits for a decision; other rows are 0 already."""
         records = named(batch)
@@ -198,9 +195,6 @@ class OwnTerms:
         for term in terms:
             if term.prepare is not None:
                 term.prepare()
-
-    def __bool__(self) -> bool:
-        return bool(self._terms)
 
     def begin(self, batch: Batch, rows: NDArray[np.int64]) -> None:
         """Begin an episode in these rows."""

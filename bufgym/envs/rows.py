@@ -97,7 +97,8 @@ class Rows:
         if several_topics:
             options.check_without_own_queue("several topics")
         self.scenario, self.options = scenario, options
-        self._shows_all, self._shows_mask, self._is_steady = options.shows_all, options.shows_mask, options.is_steady
+        self._shows_all, self._shows_mask = options.shows_all, options.shows_mask
+        self._is_steady = options.info == "steady"
         self.senders = Senders(
             n,
             options.capacity,
@@ -127,10 +128,9 @@ class Rows:
 
         self.form = self._observed()
         self.observation_space, self._handed = self.form.space, Handed(self.form)
-        self._puts_mask = self.form.mask is not None
         self._own_fields = OwnFields(self.form)
         self._sums_here = bool(own_terms)
-        self._has_own = bool(self._own_fields) or self._sums_here
+        self._has_own = bool(own_terms or self.form.own_places)
         self.output = self.new_output()
 
     def _observed(self) -> ObservationForm:
@@ -256,7 +256,7 @@ class Rows:
         if i is None:
             return self.form.masked(self.form.of(self.output.flat), self.output.action_mask)
         observation = self._handed.of(self.output.flat[i])
-        return self.form.masked(observation, self.output.action_mask[i].copy()) if self._puts_mask else observation
+        return self.form.masked(observation, self.output.action_mask[i].copy()) if self.form.mask else observation
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""

@@ -54,7 +54,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity=capacity, **arguments)
         if max_episode_steps is not None and max_episode_steps < 1:
             raise BufgymError(f"max_episode_steps = {max_episode_steps}: must be >= 1, or None for no limit")
-        if rows.options.is_steady:
+        if rows.options.info == "steady":
             raise BufgymError("info = 'steady': is for recorders of a single environment; a batch has 'full'")
         modes = {text: mode for mode in AutoresetMode for text in (mode, mode.value, mode.name)}
         if autoreset_mode not in list(modes):
@@ -63,8 +63,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.autoreset_mode = modes[autoreset_mode]
         self.render_mode = rows.options.render_mode
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.rows, self._puts_mask = rows, rows.form.mask is not None
-        self.num_envs = len(rows)
+        self.rows, self.num_envs = rows, len(rows)
         self.max_episode_steps = max_episode_steps
         self.single_observation_space = rows.observation_space
         self.single_action_space = rows.action_space
@@ -194,8 +193,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """The present observation; a dict of its own each time."""
         if not self._views:
             return self.rows.observation()
-        views = self._views.copy()
-        return self.rows.form.masked(views, self.rows.output.action_mask) if self._puts_mask else views
+        return self.rows.form.masked(self._views.copy(), self.rows.output.action_mask)
 
     def _new_buffers(self) -> Any:
         """(New arrays for a step, the views that are its observation, its info), and all these arrays."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import kernel
+from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.qoi import Value, value
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Scenario
@@ -72,21 +72,13 @@ def law(scenario: Interruption) -> NDArray[np.float64]:
     return p
 
 
-def by_length(dropped: NDArray[np.int64], v: Value) -> NDArray[np.float64]:
-    """H of each interruption of T = 0..t_max messages, float64[t_max + 1], from one run through the longest.
-
-    ``dropped``, int64[t_max + 2], tells for each message 0..t_max + 1 of that run at which arrival it was dropped (1 =
-    the first of the interruption). A number after t_max means never.
-    """
-    h, kept = np.ones(len(dropped) - 1), np.zeros(len(dropped), np.int64)
-    _by_length(np.ascontiguousarray(dropped, np.int64), v.array, kept, h)
-    return h
-
-
 @kernel
-def _by_length(
-    dropped: NDArray[np.int64], v: NDArray[np.float64], kept: NDArray[np.int64], h: NDArray[np.float64]
-) -> None:
+def by_length(dropped: Ints, v: Floats, kept: Ints, h: Floats) -> None:
+    """Add to ``h``, float64[t_max + 1], the gain of each interruption of T = 0..t_max messages, all from one run.
+
+    ``dropped``, int64[t_max + 2], tells for each message 0..t_max + 1 of the longest at which arrival it was dropped (1
+    = the first of the interruption). A number after t_max means never. ``kept``, int64[t_max + 2], is work space.
+    """
     held = 0
     for T in range(len(h)):
         if T > 0:
@@ -142,7 +134,10 @@ class EveryLength:
         dropped_us = batch.log["dropped_us"]
         arrival_number = np.rint(dropped_us / self.scenario.period_us).astype(np.int64)
         dropped = np.where(dropped_us < 0, self.scenario.max_messages, arrival_number)
-        return np.array([by_length(row, self.scenario.value) for row in dropped])
+        h, kept = np.ones((len(dropped), self.scenario.t_max + 1)), np.zeros(dropped.shape[1], np.int64)
+        for row, gains in zip(dropped, h, strict=True):
+            by_length(row, self.scenario.value.array, kept, gains)
+        return h
 
     def regrets(self, policy: Policy) -> list[float]:
         """1 - mean H / mean H of the best that knows T, for each capacity."""

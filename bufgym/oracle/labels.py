@@ -8,8 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from bufgym.ground.kernel import Floats, Ints, kernel
+from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
-from bufgym.oracle.programme import Messages, Problem, find_future, new_problem
+from bufgym.oracle.pieces import Piece, most_from, walk
+from bufgym.oracle.programme import Messages, Problem, new_problem
+from bufgym.oracle.unequal import priced, without_idle
 
 GRID = 16  # Grid steps to a message
 
@@ -34,10 +37,13 @@ class Labels(NamedTuple):
 def best(messages: Messages) -> tuple[Ints, float]:
     """Find the best plan; return its messages in order and its gain, H - 1."""
     n = len(messages.c)
-    problem, guide = new_problem(messages, messages.limit, GRID), np.empty(n, np.int64)
-    find_future(problem)
-    _, low = guided(problem, guide)
-    high = most(problem)
+    messages = without_idle(messages, messages.grid(GRID))
+    problem = new_problem(messages, messages.limit, GRID)
+    priced(problem, np.zeros((2, n)), 1, 1)
+    # Equal sizes always fit where ``limit`` allows them, so the plan of a walk needs no other check.
+    sent, begin = np.empty((2, n), np.int64)
+    *_, low = walk(problem, Piece(0, n, n, n), 0, messages, n, UNLIMITED_BYTES, sent, begin, 0, 0)
+    high = most_from(problem, n)
     labels = no_labels(n)
     for share in SHARES:
         enough = high - share * (high - low)
@@ -85,40 +91,6 @@ def plan_of(labels: Labels) -> tuple[Ints, float]:
 def after(p: Problem, i: int, e: int) -> float:
     """Look up ``future`` of message i that ends at byte e."""
     return float(p.future[i, e // p.grid - p.c[i] // p.grid])
-
-
-@kernel
-def most(p: Problem) -> float:
-    """Upper bound of the gain of every plan."""
-    gain = 0.0
-    for i in range(len(p.c)):
-        if p.limit[i] >= 0 and p.c[i] + p.size[i] <= p.ends:
-            gain = max(gain, after(p, i, p.c[i] + p.size[i]))
-    return gain
-
-
-@kernel
-def guided(p: Problem, plan: Ints) -> tuple[int, float]:
-    """Write one good plan, taking as next message always the best by ``future``; return (length, gain)."""
-    i, e, gain, length = -1, 0, 0.0, 0
-    while True:
-        best_look, chosen, chosen_e, chosen_gain = -1.0, -1, 0, 0.0
-        for j in range(i + 1, len(p.c)):
-            if i >= 0 and p.between[j] > i and p.idle[j] >= e:
-                break
-            s = max(e, p.c[j])
-            if s - p.c[j] > p.limit[j] or s + p.size[j] > p.ends:
-                continue
-            added = value(p.v, p.x[j] - p.x[i]) if i >= 0 else 0.0
-            look = added + after(p, j, s + p.size[j])
-            if look > best_look:
-                best_look, chosen, chosen_e, chosen_gain = look, j, s + p.size[j], added
-        if chosen < 0:
-            return length, gain
-        plan[length] = chosen
-        length += 1
-        i, e = chosen, chosen_e
-        gain += chosen_gain
 
 
 @kernel

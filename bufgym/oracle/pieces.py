@@ -53,7 +53,7 @@ def best(messages: Messages, certain: Ints, capacity: int, max_bytes: int) -> tu
                 beyond[k] = _more(before, p, piece.begin - pieces[k - 1].begin, pieces[k - 1].reached - piece.begin)
             first[k] = most_from(p, piece.stop - piece.begin)
             base = int(messages.c[piece.begin]) // grid * grid
-            length, e = walk(p, piece, base, messages, capacity, max_bytes, sent, begin, length, e)
+            length, e, _ = walk(p, piece, base, messages, capacity, max_bytes, sent, begin, length, e)
             before = p
             advance(1)
     beyond_all = np.cumsum(beyond[::-1])[::-1] - beyond
@@ -67,7 +67,7 @@ def cut(messages: Messages, between: Ints, idle: Ints, grid: int, length: int, m
     for begin in range(0, n, length):
         stop = min(begin + length, n)
         latest = max(latest, int(ends[begin:stop].max()))
-        # From here on, a message between could be sent before every further one (see ``find_priced_future``).
+        # From here on, a message between could be sent before every further one (see ``find_future``).
         beyond = (between[stop:] >= stop) & (idle[stop:] >= (latest // grid + 1) * grid)
         reached = stop + int(beyond.argmax()) if beyond.any() else n
         pieces.append(Piece(begin, stop, reached, min(n, stop + max(margin, 2 * (reached - stop)))))
@@ -131,15 +131,16 @@ def walk(
     begin: Ints,
     length: int,
     e: int,
-) -> tuple[int, int]:
+) -> tuple[int, int, float]:
     """Continue a plan through one piece, taking always the best next message by ``future`` that finds room.
 
     ``sent`` and ``begin`` have its messages and the bytes at which they begin, ``length`` of each; the last ends at
-    byte ``e``. Return both anew. Bytes of ``p`` are counted from ``base``.
+    byte ``e``. Return both anew, and the gain of this part. Bytes of ``p`` are counted from ``base``.
     """
+    gain = 0.0
     while length == 0 or sent[length - 1] < piece.stop:
         i = sent[length - 1] if length > 0 else -1
-        best_look, chosen, chosen_s = -1.0, -1, 0
+        best_look, chosen, chosen_s, chosen_gain = -1.0, -1, 0, 0.0
         for j in range(max(i + 1, piece.begin), piece.end):
             k = j - piece.begin
             if i >= 0 and p.between[k] + piece.begin > i and p.idle[k] + base >= e:
@@ -158,9 +159,10 @@ def walk(
                 backlog += messages.size[sent[m]]
                 m -= 1
             if queued <= capacity and backlog <= max_bytes:
-                best_look, chosen, chosen_s = look, j, s
+                best_look, chosen, chosen_s, chosen_gain = look, j, s, added
         if chosen < 0:
             break
         sent[length], begin[length], e = chosen, chosen_s, chosen_s + messages.size[chosen]
         length += 1
-    return length, e
+        gain += chosen_gain
+    return length, e, gain

@@ -100,35 +100,7 @@ def waiting_cost(p: Problem, room: Room, j: int, step: int) -> float:
 
 
 @kernel
-def find_future(p: Problem) -> None:
-    """Fill ``future`` (zeros so far) from the last message back, where waiting costs nothing."""
-    n, steps = p.future.shape
-    for i in range(n - 1, -1, -1):
-        step_i, reach = p.c[i] // p.grid, p.c[i] + p.limit[i] + p.size[i]
-        top = min(steps, reach // p.grid - step_i + 1)
-        for j in range(i + 1, n):
-            low = 0
-            if p.between[j] > i:
-                if p.idle[j] >= reach:
-                    break  # ``between`` could be sent before every further message, too
-                low = max(0, p.idle[j] // p.grid - step_i)
-            if p.limit[j] < 0 or p.c[j] + p.size[j] > p.ends:
-                continue
-            added = value(p.v, p.x[j] - p.x[i])
-            # Ends before c_j: the link is idle, and j begins when it arrives.
-            split = -(-p.c[j] // p.grid) - step_i
-            w = added + p.future[j, (p.c[j] + p.size[j]) // p.grid - p.c[j] // p.grid]
-            for k in range(low, min(split, top)):
-                p.future[i, k] = max(p.future[i, k], w)
-            # Later ends: j waits and begins there.
-            last = min(p.c[j] + p.limit[j], p.ends - p.size[j]) // p.grid - step_i
-            shift = step_i + p.size[j] // p.grid - p.c[j] // p.grid
-            for k in range(max(low, split), min(top, last + 1)):
-                p.future[i, k] = max(p.future[i, k], added + p.future[j, k + shift])
-
-
-@kernel
-def find_priced_future(p: Problem, room: Room, last: Ints, best: Floats) -> None:
+def find_future(p: Problem, room: Room, last: Ints, best: Floats) -> None:
     """Fill ``future`` and ``room.begun`` from the last message back; ``last`` and ``best`` are work space, [positions].
 
     What j gains if i ends at a grid position is V(x_j - x_i) plus a number that does not depend on i. V is concave: the

@@ -11,7 +11,7 @@ from bufgym.ground.kernel import Floats, Ints, kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
 from bufgym.oracle import beam
-from bufgym.oracle.programme import Messages, Problem, Room, find_priced_future, new_problem
+from bufgym.oracle.programme import Messages, Problem, Room, find_future, new_problem
 
 ROUNDS = 40  # Most price updates
 ENOUGH = 1e-4  # Gap between bound and plan, as a fraction of the bound, at which updates end
@@ -88,7 +88,7 @@ def priced(p: Problem, prices: Floats, capacity: int, max_bytes: int) -> Room:
     positions = np.arange(int(p.c[-1]) // p.grid + p.future.shape[1] + 1) * p.grid
     until = np.ascontiguousarray(before[:, np.searchsorted(p.c, positions, side="left")])
     room = Room(capacity, max_bytes, until, before, np.empty_like(p.future))
-    find_priced_future(p, room, np.empty(len(positions), np.int64), np.empty(len(positions)))
+    find_future(p, room, np.empty(len(positions), np.int64), np.empty(len(positions)))
     return room
 
 

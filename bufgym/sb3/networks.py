@@ -1,4 +1,4 @@
-"""The slot network, which scores each slot with the same small network, and a plain one over all numbers at once.
+"""The slot network, which scores each slot with the same small network.
 
 Scoring slots one by one builds knowledge of the problem in. A message's worth depends on its neighbours (the slot's own
 features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
-from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
@@ -132,11 +131,3 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {"width": self.width, "masked": self.masked}
-
-
-def policy_of(network: str, width: int, masked: bool = True) -> tuple[Any, dict[str, Any]]:
-    """Actor-critic class and its arguments for "slots" or "plain"."""
-    if network == "slots":
-        return SlotPolicy, {"width": width, "masked": masked}
-    plain = MaskableMultiInputActorCriticPolicy if masked else MultiInputActorCriticPolicy
-    return plain, {"net_arch": [2 * width, 2 * width], "activation_fn": nn.ReLU}

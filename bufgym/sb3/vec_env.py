@@ -143,9 +143,6 @@ class GymVecEnv(VecEnv):
             )
         self._vector_options = options or None
 
-    def has_attr(self, attr_name: str) -> bool:
-        return hasattr(self.envs.unwrapped, _SINGLE.get(attr_name, attr_name))
-
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """The batch's attribute, once for each index: environments of a native batch share it."""
         value = getattr(self.envs.unwrapped, _SINGLE.get(attr_name, attr_name))

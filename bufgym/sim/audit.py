@@ -13,64 +13,65 @@ from bufgym.model.qoi import value
 from bufgym.scenario import Episode
 from bufgym.sim.state import NEVER, Batch
 
-ARRIVAL = "a message that arrived is not as the episode has it"
-QUEUED = "a queued message is not as it arrived"
-BYTES = "the queue's bytes are not those of its messages"
-LOG = "not every message was sent, dropped or queued exactly once"
-TOPIC = "a topic's rules are not as they were"
-QOI = "H is not that of the messages that were received"
-
-_FAULTS = ("", ARRIVAL, QUEUED, BYTES, LOG, TOPIC, QOI)
-_ARRIVAL, _QUEUED, _BYTES, _LOG, _TOPIC, _QOI = range(1, len(_FAULTS))
+ARRIVAL, QUEUED, BYTES, LOG, TOPIC, QOI = range(1, 7)
+FAULTS = {
+    0: "",
+    ARRIVAL: "a message that arrived is not as the episode has it",
+    QUEUED: "a queued message is not as it arrived",
+    BYTES: "the queue's bytes are not those of its messages",
+    LOG: "not every message was sent, dropped or queued exactly once",
+    TOPIC: "a topic's rules are not as they were",
+    QOI: "H is not that of the messages that were received",
+}
 _ROUNDING = 1e-9  # Tolerance: H is added up in another order here
 
 
 def touched(batch: Batch, i: int, episode: Episode, topic_table: NDArray[Any]) -> str:
     """What does not agree with the episode or the topics' rules in sender ``i``'s finished run; empty if all does."""
-    return _FAULTS[_fault(batch, i, episode.arrivals, topic_table)]
+    return FAULTS[_fault(batch, i, episode.arrivals, topic_table)]
 
 
 @kernel
 def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) -> int:
-    """The fault that is found first, as a place in ``_FAULTS``; 0 for none. ``arrivals`` and ``rules`` are as given."""
+    """The fault that is found first, a key of ``FAULTS``; 0 for none. ``arrivals`` and ``rules`` are as given."""
     sender, n = batch.senders[i], len(arrivals)
     sent, dropped = 0, 0
     for k in range(n):
         if not _agree(at(batch.arrivals, i, k), item(arrivals, k)):
-            return _ARRIVAL
+            return ARRIVAL
         entry = at(batch.log, i, k)
         if entry.dequeued_us != NEVER:
             sent += 1
             if entry.dropped_us != NEVER or entry.dequeued_us < item(arrivals, k).arrival_us:
-                return _LOG
+                return LOG
         if entry.dropped_us != NEVER:
             dropped += 1
     before, queued_bytes = -1, 0
     for k in range(sender.first, sender.first + sender.occupancy):
         message = batch.slots[i, k]
         if not before < message.seq < n or not _agree(message, item(arrivals, message.seq)):
-            return _QUEUED
+            return QUEUED
         before = message.seq
         entry = at(batch.log, i, before)
         if entry.dequeued_us != NEVER or entry.dropped_us != NEVER:
-            return _QUEUED
+            return QUEUED
         queued_bytes += message.size_bytes
     if queued_bytes != sender.backlog_bytes:
-        return _BYTES
+        return BYTES
     # Each event writes one entry: as many entries as events means that no two were about one message.
     if sent != sender.dequeued or dropped != sender.evicted + sender.rejected:
-        return _LOG
+        return LOG
     if sent + dropped + sender.occupancy != sender.next:
-        return _LOG
+        return LOG
     gained = 0.0
     for t in range(batch.topics.shape[1]):
         now, given = at(batch.topics, i, t), item(rules, t)
         if now.priority != given.priority or now.weight != given.weight or now.no_drop != given.no_drop:
-            return _TOPIC
+            return TOPIC
         if now.period_us != given.period_us or now.limit != given.limit or now.deadline_us != given.deadline_us:
-            return _TOPIC
+            return TOPIC
         if now.v_start != given.v_start:
-            return _TOPIC
+            return TOPIC
         several, received, x = batch.topics.shape[1] > 1, 0, 0.0
         own_v = batch.v[given.v_start if several else sender.v_start :]
         for k in range(sender.credited):
@@ -80,7 +81,7 @@ def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) ->
             if received > 0:
                 gained += (given.weight if several else 1.0) * value(own_v, message.x - x)
             received, x = received + 1, message.x
-    return _QOI if abs(gained - sender.delivered_gain) > _ROUNDING * max(1.0, gained) else 0
+    return QOI if abs(gained - sender.delivered_gain) > _ROUNDING * max(1.0, gained) else 0
 
 
 @kernel

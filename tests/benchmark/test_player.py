@@ -10,7 +10,7 @@ from refusal_cases import refuse
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
-from bufgym.benchmark.run import draw, run
+from bufgym.benchmark.run import run
 from bufgym.benchmark.warmup import PARTS
 from bufgym.cli import main
 from bufgym.envs.expert import Player
@@ -18,6 +18,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import FOLDER, JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
+from bufgym.scenario.numbered import draw
 from bufgym.sim import run as run_senders
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace

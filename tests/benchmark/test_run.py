@@ -15,12 +15,12 @@ import bufgym
 from bufgym import oracle, policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
-from bufgym.benchmark.tasks.queue import row_to_show, timeline
+from bufgym.benchmark.tasks.queue import QueueTask, row_to_show
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import replaced
 from bufgym.model import qoi
 from bufgym.policies import Policy
-from bufgym.scenario import Interruption, Uplink
+from bufgym.scenario import Interruption, Uplink, numbered
 from bufgym.traces import Trace
 
 SLOW = Trace.steps([(1.0, 300_000), (1.0, 0)], name="slow")
@@ -60,7 +60,7 @@ def test_a_seed_means_the_same_episode_in_any_company(monkeypatch: pytest.Monkey
 
 
 def test_every_trace_is_met_on_its_own_even_under_one_name() -> None:
-    parts = run.by_trace(replace(UPLINK, traces=(SLOW, FAST, SLOW, SLOW)))
+    parts = numbered.by_trace(replace(UPLINK, traces=(SLOW, FAST, SLOW, SLOW)))
     assert [label for label, _ in parts] == ["slow", "fast", "slow#2", "slow#3"]
     assert all(len(part.traces) == 1 for _, part in parts if isinstance(part, Uplink))
 
@@ -138,7 +138,7 @@ STOPS = replace(GAPPY, traces=(Trace.steps([(2.0, 300_000), (2.0, 20_000)], name
 @pytest.mark.parametrize("scenario", [GAPPY, STOPS, Interruption(t_max=30, value=qoi.saturating(4))])
 def test_every_message_is_accounted_for_as_in_the_rows(scenario: Any) -> None:
     rows = run.run(CHOSEN, scenario, [3], [1003], label="here")
-    made = timeline(CHOSEN, scenario, rows[0])
+    made = QueueTask().timeline(CHOSEN, scenario, rows[0])
     assert json.loads(json.dumps(made, allow_nan=False)) == made
     assert (made["scenario"], made["capacity"], made["seed"]) == ("here", 3, 1003)
     assert list(made["policies"]) == [policy.name for policy in CHOSEN]

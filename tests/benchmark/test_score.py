@@ -12,6 +12,7 @@ from refusal_cases import refuse
 
 from bufgym.benchmark import score, table
 from bufgym.benchmark.score import CellScore, Interval, Scores, Standing
+from bufgym.benchmark.tasks import QueueTask
 
 
 def rows_of(
@@ -283,20 +284,25 @@ def scored(policy: str, seed: int, qoi: float, best: float = 9.0, **more: Any) -
     return row(policy, 8, qoi, **more)
 
 
-BASE = [scored("drop-oldest", 0, 4.0, delivered=3), scored("drop-oldest", 1, 5.0)]
+BASE = [scored("drop-oldest", 0, 4.0, delivered=3), scored("drop-oldest", 1, 5.0, best=11.0)]
 MINE = [scored("mine", 0, 6.0), scored("mine", 1, 7.0, best=11.0)]
+
+
+def table_of(rows: list[Any], unranked: Any = table.NOBODY, hidden: str = "") -> str:
+    task = QueueTask()
+    return task.tables(rows, task.summary(rows, unranked), None, unranked, hidden)[0].plain()
 
 
 def test_the_score_leads_and_is_computed_on_sums() -> None:
     """Drop Oldest has 4 + 5, the clairvoyant 9 + 11, mine 6 + 7: (13 - 9) / (20 - 9); an unbounded queue has none."""
-    free = [scored("rosbridge", seed, 12.0, regret=None) for seed in (0, 1)]
-    entries = {entry["policy"]: entry["score"] for entry in table.means([*BASE, *MINE, *free])}
-    assert entries["mine"] == 4 / 11 and entries["drop-oldest"] == 0 and math.isnan(entries["rosbridge"])
-    made = table.means_table([*BASE, *MINE, *free], unranked={"rosbridge": "its queue is unbounded"})
-    assert made.plain().split("\n")[1].split()[:4] == ["mine", "8", "0.364", "6.500"]
+    free = [scored("rosbridge", seed, 12.0, best=best, regret=None) for seed, best in ((0, 9.0), (1, 11.0))]
+    cells = {cell.policy: cell.score.value for cell in score.scores([*BASE, *MINE, *free]).cells}
+    assert cells["mine"] == 4 / 11 and cells["drop-oldest"] == 0 and math.isnan(cells["rosbridge"])
+    made = table_of([*BASE, *MINE, *free], unranked={"rosbridge": "its queue is unbounded"})
+    assert made.split("\n")[1].split()[:3] == ["mine", "8", "0.364"]
     assert "score" not in table.means_table(MINE).plain()
-    assert table.means_table([*BASE, *MINE], hidden="drop-oldest").plain().split("\n")[1].split()[2] == "0.364"
-    assert "drop-oldest" not in table.means_table([*BASE, *MINE], hidden="drop-oldest").plain()
+    hidden = table_of([*BASE, *MINE], hidden="drop-oldest")
+    assert hidden.split("\n")[1].split()[2] == "0.364" and "\ndrop-oldest" not in hidden
 
 
 def test_policies_that_no_row_tells_apart_are_one_line() -> None:

@@ -146,7 +146,7 @@ REPO = Path(__file__).resolve().parents[2]
 
 
 def made(path: Path) -> list[Entry]:
-    return leaderboard.make(path, ["small-v1"], {"small-v1": ["afr", "min-gap", "clairvoyant", "rosbridge"]}, jobs=1)
+    return leaderboard.make(path, {"small-v1": ["afr", "min-gap", "clairvoyant", "rosbridge"]}, jobs=1)
 
 
 def test_a_file_says_who_is_first_and_how_to_see_it_again(small: Sweep, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from bufgym.benchmark.rows import read_rows, write_rows
 from bufgym.benchmark.sweep import Sweep
 from bufgym.cli.options import load_policies
 from bufgym.ground.errors import BufgymError
-from bufgym.scenario import Uplink, suites
+from bufgym.scenario import Uplink, numbered, suites
 from bufgym.traces import Trace
 
 pytest.importorskip("joblib", reason="a sweep needs joblib")
@@ -68,7 +68,7 @@ def test_each_trace_has_seeds_of_its_own(tmp_path: Path, small: Sweep) -> None:
     chosen = [policies.get(name) for name in THREE]
     wanted = []
     for label, setting in suites.get("small-v1").settings("test").items():
-        for k, (_, part) in enumerate(run.by_trace(setting.scenario)):
+        for k, (_, part) in enumerate(numbered.by_trace(setting.scenario)):
             wanted += run.run(chosen, part, [2, 3], [1000 * k, 1000 * k + 1], label=label)
     assert repr(rows) == repr(wanted) and len(rows) == 2 * 2 * 2 * 3 * 2
 

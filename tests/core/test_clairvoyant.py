@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from refusal_cases import refused
 
 from bufgym import policies, scenario
-from bufgym.benchmark.run import draw
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
@@ -21,6 +20,7 @@ from bufgym.model.link import Link
 from bufgym.oracle import beam, clairvoyant, integer, kept, labels, pieces, programme
 from bufgym.oracle.clairvoyant import Plan
 from bufgym.scenario import Episode, Interruption, messages
+from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 

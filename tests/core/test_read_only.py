@@ -26,15 +26,15 @@ V = qoi.exponential()
 EPISODE = Episode(messages(np.arange(40) * 1_000, 4_000), Link(Trace.constant(1e6, 10)))
 
 WRITES = {
-    "buffer.slots[0].seq = buffer.slots[len(buffer.slots) - 1].seq": audit.LOG,
-    "buffer.slots[0].seq = 10**9": audit.LOG,
-    "arrival.seq = -(10**9)": audit.ARRIVAL,
-    "buffer.slots[len(buffer.slots) - 1].x -= 0.5": audit.QOI,
-    "buffer.slots[len(buffer.slots) - 1].gain = 1.0": audit.QOI,
-    "arrival.x *= 1000": audit.ARRIVAL,
-    "arrival.size_bytes = 1": audit.ARRIVAL,
-    "buffer.slots[0].size_bytes = 1": audit.BYTES,
-    "buffer.topics[0].limit = 10**6": audit.TOPIC,
+    "buffer.slots[0].seq = buffer.slots[len(buffer.slots) - 1].seq": audit.FAULTS[audit.LOG],
+    "buffer.slots[0].seq = 10**9": audit.FAULTS[audit.LOG],
+    "arrival.seq = -(10**9)": audit.FAULTS[audit.ARRIVAL],
+    "buffer.slots[len(buffer.slots) - 1].x -= 0.5": audit.FAULTS[audit.QOI],
+    "buffer.slots[len(buffer.slots) - 1].gain = 1.0": audit.FAULTS[audit.QOI],
+    "arrival.x *= 1000": audit.FAULTS[audit.ARRIVAL],
+    "arrival.size_bytes = 1": audit.FAULTS[audit.ARRIVAL],
+    "buffer.slots[0].size_bytes = 1": audit.FAULTS[audit.BYTES],
+    "buffer.topics[0].limit = 10**6": audit.FAULTS[audit.TOPIC],
 }
 """What a policy writes, and what is said of it."""
 

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bufgym import policies
-from bufgym.benchmark.run import by_trace, draw
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import FOREVER, Link
@@ -19,6 +18,7 @@ from bufgym.policies import Policy, target_gap
 from bufgym.policies.target_gap import PACE, PARAMETERS, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, last_chance, needless
 from bufgym.policies.thinning import spare, steady
 from bufgym.scenario import Episode, messages, suites
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
 from bufgym.traces import Trace

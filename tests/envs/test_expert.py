@@ -15,7 +15,7 @@ from refusal_cases import refuse, refused
 from bufgym import oracle, policies
 from bufgym.cli import main
 from bufgym.envs import SenderEnv, SenderVectorEnv, expert
-from bufgym.envs.expert.record import KINDS, record
+from bufgym.envs.expert.dataset import KINDS, record
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import policies
-from bufgym.benchmark.folder import SuiteRun, read
+from bufgym.benchmark.folder import SuiteRun, read, write_text
 from bufgym.benchmark.report import page, tables
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.summary import Summary
@@ -21,30 +21,22 @@ from bufgym.benchmark.table import Unranked
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import replaced
 from bufgym.policies import Policy
 from bufgym.scenario import about
 from bufgym.scenario.suites import Setting
 
-__all__ = ["markdown", "page_of_rows", "page_of_run", "run_of", "save", "write"]
+__all__ = ["markdown", "page_of_rows", "page_of_run", "run_of", "write"]
 
 
-def write(folder: str | Path, target: Path | None = None) -> Path:
-    """Write the page of a run to ``target``, or as ``report.html`` into its folder; return its path.
+def write(folder: str | Path) -> Path:
+    """Write the page of a run as ``report.html`` into its folder; return its path.
 
     Raises:
         BufgymError: for a folder without a run, a broken file in it, rows that can't be scored, or where matplotlib or
             Jinja is not installed.
     """
     run, summary = run_of(folder)
-    return save(page.html(run, summary), target or run.folder / "report.html")
-
-
-def save(text: str, target: Path) -> Path:
-    """Write a page, whole or not at all; return its path."""
-    with replaced(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return target
+    return write_text(run.folder / "report.html", page.html(run, summary))
 
 
 def page_of_rows(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -29,30 +31,6 @@ from bufgym.sim.metrics import outcome
 from bufgym.sim.senders import padded
 
 SHARE = f"regret / {REFERENCE}'s"  # Title of the share of AFR's regret, see ``score``
-
-
-def best(
-    episode: Episode, capacity: int, scenario: Scenario, max_bytes: int | None = None, decide_at: str = "arrival"
-) -> Plan:
-    """Compute the clairvoyant's plan, which is only an upper bound if decisions wait for a full buffer."""
-    plan = clairvoyant(episode, capacity, scenario.value, max_bytes=max_bytes)
-    return plan if decide_at == "arrival" or plan.kept.all() else replace(plan, certified=False)
-
-
-def meet(
-    policy: Policy,
-    episodes: Sequence[Episode],
-    capacity: int,
-    scenario: Scenario,
-    plans: Sequence[Plan | None],
-    max_bytes: int | None = None,
-    decide_at: str = "arrival",
-) -> Senders:
-    """Run ``policy`` on the episodes and return the senders; the clairvoyant reuses known plans."""
-    memory = None
-    if policy.privileged is privileged and all(plan is not None for plan in plans):
-        memory = padded([plan.kept for plan in plans if plan is not None])
-    return run(policy, episodes, capacity, scenario.value, max_bytes=max_bytes, decide_at=decide_at, memory=memory)
 
 
 def columns(policy: Policy, h: float, plan: Plan | None) -> Row:
@@ -100,20 +78,39 @@ class QueueTask(Task):
             place = f"policy {row['policy']}, L = {row['capacity']}, trace {row['trace']}, seed {row['seed']}"
             raise BufgymError(f"{place}: H = {row['qoi']:.12g} is above {best:.12g}, which no policy can reach")
 
+    def best(self, episode: Episode, capacity: int, scenario: Scenario) -> Plan:
+        """Compute the clairvoyant's plan, which is only an upper bound if decisions wait for a full buffer."""
+        plan = clairvoyant(episode, capacity, scenario.value, max_bytes=self.max_bytes)
+        return plan if self.decide_at == "arrival" or plan.kept.all() else replace(plan, certified=False)
+
+    def meet(
+        self, policy: Policy, episodes: Sequence[Episode], capacity: int, scenario: Scenario, plans: Sequence[Plan] = ()
+    ) -> Senders:
+        """Run ``policy`` on the episodes and return the senders; the clairvoyant reuses known plans."""
+        memory = padded([plan.kept for plan in plans]) if plans and policy.privileged is privileged else None
+        return run(
+            policy,
+            episodes,
+            capacity,
+            scenario.value,
+            max_bytes=self.max_bytes,
+            decide_at=self.decide_at,
+            memory=memory,
+        )
+
     def play(
         self, policies: Sequence[Policy], scenario: Any, episodes: Sequence[Episode], capacity: int
     ) -> Iterator[list[Result]]:
-        settings = self.max_bytes, self.decide_at
         least = min((e.arrivals["size_bytes"].min() for e in episodes if len(e.arrivals)), default=0)
         if self.max_bytes is not None and least > self.max_bytes:
             raise BufgymError(f"max_bytes = {self.max_bytes}: no message fits, the smallest has {least} bytes")
-        plans = [best(e, capacity, scenario, *settings) if self.bound else None for e in episodes]
+        plans = [self.best(episode, capacity, scenario) for episode in episodes] if self.bound else []
         for policy in policies:
-            senders = meet(policy, episodes, capacity, scenario, plans, *settings)
+            senders = self.meet(policy, episodes, capacity, scenario, plans)
             outcomes = [outcome(senders, i) for i in range(len(episodes))]
             yield [
                 [{**asdict(result), **columns(policy, result.qoi, plan)}]
-                for result, plan in zip(outcomes, plans, strict=True)
+                for result, plan in zip_longest(outcomes, plans)
             ]
 
     def quantities(self) -> tuple[Quantity, ...]:
@@ -140,10 +137,10 @@ class QueueTask(Task):
         self, rows: Sequence[Row], summary: Summary, scenario: Any, unranked: Unranked, hidden: str
     ) -> list[Table]:
         """The table of means; then, where policies are compared with one of them, their shares of AFR's regret."""
-        cells = [cell for cell in summary.scores.cells if cell.episodes > 1] if summary.scores else []
-        behind = {(cell.capacity, cell.policy): bootstrap.written(cell.score, score)[1] for cell in cells}
-        means = table.means_table(rows, unranked, behind, hidden)
-        scale = [table.SCORE, *[table.BRACKETS] * any(behind.values())] if "score" in means.head else []
+        cells = [cell for cell in summary.scores.cells if not math.isnan(cell.score.value)] if summary.scores else []
+        texts = {(c.capacity, c.policy): bootstrap.written(c.score, score)[: min(c.episodes, 2)] for c in cells}
+        means = table.means_table(rows, unranked, {place: " ".join(text) for place, text in texts.items()}, hidden)
+        scale = [table.SCORE, *[table.BRACKETS] * any(c.episodes > 1 for c in cells)] if "score" in means.head else []
         means = means._replace(notes=[*scale, *means.notes, *self._bound_notes(rows, scenario)])
         paired = [quantity for quantity in summary.quantities if quantity.key in ("share", "against")]
         if len(paired) == 1:
@@ -178,7 +175,42 @@ class QueueTask(Task):
         if row is None:
             return None
         setting = setting_of(row)
-        return {**timeline(policies, setting.scenario, row, self.max_bytes, self.decide_at), "about": setting.about}
+        return {**self.timeline(policies, setting.scenario, row), "about": setting.about}
+
+    def timeline(self, policies: Sequence[Policy], scenario: Scenario, row: Row) -> dict[str, Any]:
+        """The episode of ``row`` under every policy; times in s, rates in bytes/s."""
+        episode, capacity = draw(scenario, row["seed"]), row["capacity"]
+        plan = self.best(episode, capacity, scenario)
+        arrivals = np.asarray(episode.arrivals)
+        lanes: dict[str, Any] = {}
+        last_us = int(arrivals["arrival_us"][-1])
+        for policy in policies:
+            senders = self.meet(policy, [episode], capacity, scenario, [plan])
+            log = np.asarray(senders.batch.log[0])[: len(arrivals)]
+            h = outcome(senders, 0).qoi
+            received = np.flatnonzero(log["transmitted_us"] != NEVER)
+            dropped = np.flatnonzero(log["dropped_us"] != NEVER)
+            lanes[policy.name] = {
+                "qoi": h,
+                "regret": columns(policy, h, plan)["regret"],
+                "received": [
+                    [int(k), int(log["dequeued_us"][k]) / 1e6, int(log["transmitted_us"][k]) / 1e6] for k in received
+                ],
+                "dropped": [[int(k), int(log["dropped_us"][k]) / 1e6] for k in dropped],
+            }
+            if policy.ranked and len(received):
+                last_us = max(last_us, int(log["transmitted_us"][received].max()))
+        edges_us = np.arange(0, last_us + round(2e6 * _STEP_S), round(1e6 * _STEP_S))
+        carried = np.diff(episode.link.carried_by(edges_us))
+        offered_s = max(1, int(arrivals["arrival_us"][-1])) / 1e6
+        return {
+            **{key: row[key] for key in ("scenario", "capacity", "trace", "seed")},
+            "arrival_s": (arrivals["arrival_us"] / 1e6).tolist(),
+            "x": arrivals["x"].tolist(),
+            "rate": {"t_s": (edges_us[:-1] / 1e6).tolist(), "bytes_per_s": (carried / _STEP_S).tolist()},
+            "demand_bytes_per_s": float(arrivals["size_bytes"][:-1].sum() / offered_s),
+            "policies": lanes,
+        }
 
 
 _STEP_S = 0.25  # between the points of the curve of the link's capacity
@@ -192,41 +224,3 @@ def row_to_show(rows: Sequence[Row]) -> Row | None:
         row for row in rows if row["policy"] == BASELINE and row["capacity"] == middle and row["regret"] is not None
     ]
     return max(candidates, key=lambda row: (row["regret"], row["scenario"], row["trace"], row["seed"]), default=None)
-
-
-def timeline(
-    policies: Sequence[Policy], scenario: Scenario, row: Row, max_bytes: int | None = None, decide_at: str = "arrival"
-) -> dict[str, Any]:
-    """The episode of ``row`` under every policy; times in s, rates in bytes/s."""
-    episode, capacity = draw(scenario, row["seed"]), row["capacity"]
-    plan = best(episode, capacity, scenario, max_bytes, decide_at)
-    arrivals = np.asarray(episode.arrivals)
-    lanes: dict[str, Any] = {}
-    last_us = int(arrivals["arrival_us"][-1])
-    for policy in policies:
-        senders = meet(policy, [episode], capacity, scenario, [plan], max_bytes, decide_at)
-        log = np.asarray(senders.batch.log[0])[: len(arrivals)]
-        h = outcome(senders, 0).qoi
-        received = np.flatnonzero(log["transmitted_us"] != NEVER)
-        dropped = np.flatnonzero(log["dropped_us"] != NEVER)
-        lanes[policy.name] = {
-            "qoi": h,
-            "regret": columns(policy, h, plan)["regret"],
-            "received": [
-                [int(k), int(log["dequeued_us"][k]) / 1e6, int(log["transmitted_us"][k]) / 1e6] for k in received
-            ],
-            "dropped": [[int(k), int(log["dropped_us"][k]) / 1e6] for k in dropped],
-        }
-        if policy.ranked and len(received):
-            last_us = max(last_us, int(log["transmitted_us"][received].max()))
-    edges_us = np.arange(0, last_us + round(2e6 * _STEP_S), round(1e6 * _STEP_S))
-    carried = np.diff(episode.link.carried_by(edges_us))
-    offered_s = max(1, int(arrivals["arrival_us"][-1])) / 1e6
-    return {
-        **{key: row[key] for key in ("scenario", "capacity", "trace", "seed")},
-        "arrival_s": (arrivals["arrival_us"] / 1e6).tolist(),
-        "x": arrivals["x"].tolist(),
-        "rate": {"t_s": (edges_us[:-1] / 1e6).tolist(), "bytes_per_s": (carried / _STEP_S).tolist()},
-        "demand_bytes_per_s": float(arrivals["size_bytes"][:-1].sum() / offered_s),
-        "policies": lanes,
-    }

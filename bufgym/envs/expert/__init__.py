@@ -9,11 +9,11 @@ the environment is in when it is asked.
 """
 
 from bufgym.envs.expert import dataset
-from bufgym.envs.expert.experts import PolicyExpert, online, policy
+from bufgym.envs.expert.experts import PolicyExpert, online
 from bufgym.envs.expert.hindsight import Clairvoyant
 from bufgym.envs.expert.player import Player
 
-clairvoyant = Clairvoyant
-"""The expert that knows the whole episode, named like the others."""
+clairvoyant, policy = Clairvoyant, PolicyExpert
+"""The expert that knows the whole episode, and any policy as one, named like the others."""
 
 __all__ = ["Clairvoyant", "Player", "PolicyExpert", "clairvoyant", "dataset", "online", "policy"]

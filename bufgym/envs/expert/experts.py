@@ -24,7 +24,7 @@ def rows_of(env: Any) -> Rows:
     rows = getattr(getattr(env, "unwrapped", env), "rows", None)
     if not isinstance(rows, Rows):
         raise BufgymError(f"expert: {env!r} is no environment of bufgym, nor a native batch of them")
-    if rows.guiding and rows.guiding.acts:
+    if rows.options.acts_guided:
         raise BufgymError("actions = 'guided': an expert answers with slots; make the environment with actions='slots'")
     return rows
 
@@ -32,22 +32,20 @@ def rows_of(env: Any) -> Rows:
 class PolicyExpert:
     """One policy, asked about the decisions of an environment that anybody may play.
 
-    Ask at every decision, so that the policy's memory misses nothing. Asked twice, it gives the same answer.
+    ``policy`` is a ``Policy``, or a registered name with settings such as ``"decimate:every=2"``. Ask at every
+    decision, so that its memory misses nothing. Asked twice, it gives the same answer.
     """
 
-    def __init__(self, env: Any, policy: Policy) -> None:
-        self.rows = rows_of(env)
-        if isinstance(self.rows, FleetRows) and policy.privileged is not None:
-            raise BufgymError(f"policy {policy.name}: it plans with a link of its own, which no robot in a cell has")
+    def __init__(self, env: Any, policy: str | Policy) -> None:
+        self.rows, self.policy = rows_of(env), policies.get(policy)
+        if isinstance(self.rows, FleetRows) and self.policy.privileged is not None:
+            raise BufgymError(
+                f"policy {self.policy.name}: it plans with a link of its own, which no robot in a cell has"
+            )
         n = len(self.rows)
-        self._player = Player(policy, n)
+        self._player = Player(self.policy, n)
         self._asked = np.full((n, 1 + len(_STATE)), -1)
         self._actions = np.zeros(n, np.int64)
-
-    @property
-    def policy(self) -> Policy:
-        """The policy that chooses the actions."""
-        return self._player.policy
 
     def actions(self) -> NDArray[np.int64]:
         """int64[n]: the policy's actions now; L, which has no effect, where no decision is due."""
@@ -58,11 +56,6 @@ class PolicyExpert:
             self._actions[new] = self._player.actions(senders, new)[new]
             self._asked[new] = state[new]
         return self._actions.copy()
-
-
-def policy(env: Any, name: str | Policy) -> PolicyExpert:
-    """Make any policy an expert: a ``Policy``, or a registered name with settings such as ``"decimate:every=2"``."""
-    return PolicyExpert(env, policies.get(name))
 
 
 def online(env: Any) -> PolicyExpert:

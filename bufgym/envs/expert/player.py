@@ -20,7 +20,7 @@ from bufgym.sim.view import arrival_of, view
 
 
 class Player:
-    """Owns a policy's memory for each of ``n`` senders and turns its decisions into an environment's actions.
+    """Owns a policy's ``memory``, float64[n, entries], and turns its decisions into an environment's actions.
 
     Just before a decision the policy is called once for every departure since the last one, with the buffer as it is
     now. Uniform draws belong to the episode; if an environment drew the episode, they come from its seed. The policy is
@@ -35,14 +35,9 @@ class Player:
         self.policy = policy
         self._parameters = policy.parameter_array
         self._functions = tuple(map(located, signatures(), policy.compiled)) if policy.compile else None
-        self._memory = np.zeros((n, 1))
+        self.memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)
-
-    @property
-    def memory(self) -> NDArray[np.float64]:
-        """float64[n, entries], with the policy's scratch."""
-        return self._memory
 
     def rewrite(self, numbers: NDArray[np.float64]) -> None:
         """Give the policy other parameters or weights, as many as it has."""
@@ -58,7 +53,7 @@ class Player:
             raise BufgymError(f"sender {i}: no decision is due")
         self._begin(senders, np.array([i]))
         batch = named(senders.batch._replace(parameters=self._parameters))
-        sender, buffer, memory = batch.senders[i], python_view(batch, i), self._memory[i]
+        sender, buffer, memory = batch.senders[i], python_view(batch, i), self.memory[i]
         if self.policy.hears_departures:
             for _ in range(int(sender.dequeued - self._heard[i])):
                 self.policy.on_departure(buffer, memory)
@@ -89,7 +84,7 @@ class Player:
         on_arrival, on_departure, _, on_send = self._functions
         hears, answers = self.policy.hears_departures, actions.copy()
         compiled_ask(bool(batch.several))(
-            batch, self._memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers
+            batch, self.memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers
         )
         for sends in (False, True):
             asked = rows[waiting[rows] == (SOCKET_WAITS if sends else ARRIVAL_WAITS)]
@@ -101,12 +96,12 @@ class Player:
         for i in rows[self._begun[rows] != senders.begun[rows]].tolist():
             senders.draw_uniforms(i)
             memory = senders.new_memory(self.policy, i)
-            if len(memory) > self._memory.shape[1]:
-                wider = np.zeros((len(self._memory), len(memory)))
-                wider[:, : self._memory.shape[1]] = self._memory
-                self._memory = wider
-            self._memory[i] = 0.0
-            self._memory[i, : len(memory)] = memory
+            if len(memory) > self.memory.shape[1]:
+                wider = np.zeros((len(self.memory), len(memory)))
+                wider[:, : self.memory.shape[1]] = self.memory
+                self.memory = wider
+            self.memory[i] = 0.0
+            self.memory[i, : len(memory)] = memory
             self._heard[i] = 0
             self._begun[i] = senders.begun[i]
 

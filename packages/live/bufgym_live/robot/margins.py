@@ -48,7 +48,7 @@ def margins(runs: Sequence[LiveRun], reference: str = "afr") -> list[Margin]:
         live, simulated, best = (weights @ sums).T
         known = best > 0
         numbers = ratio(live, best, known), ratio(simulated, best, known), ratio(live, simulated, simulated > 0)
-        found.append(Margin(policy, reference, len(sums), *(percentile_interval(n, 0.95) for n in numbers)))
+        found.append(Margin(policy, reference, len(sums), *(percentile_interval(n) for n in numbers)))
     return found
 
 

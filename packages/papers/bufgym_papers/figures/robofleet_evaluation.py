@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.benchmark.run import draw
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream
+from bufgym.scenario.numbered import draw
 from bufgym.traces import Trace
 from bufgym_papers.figures.figure import COLOURS, Figure, at_least_0, whole
 from bufgym_papers.figures.rows import FigureRows
