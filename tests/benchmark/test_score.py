@@ -202,7 +202,7 @@ def test_neither_order_nor_company_matters(monkeypatch: pytest.MonkeyPatch) -> N
         assert score.scores(random.Random(k).sample(rows, len(rows))) == made
     third = [{**row, "policy": "third"} for row in rows if row["policy"] == "afr"]
     assert standing_of(score.scores([*third, *rows]), "afr") == standing_of(made, "afr")
-    monkeypatch.setattr(score, "SEED", 1)
+    monkeypatch.setattr("bufgym.benchmark.bootstrap.SEED", 1)
     assert score.scores(rows) != made
 
 
@@ -280,7 +280,7 @@ def test_means_leave_out_what_is_missing_and_come_best_first() -> None:
 
 
 def scored(policy: str, seed: int, qoi: float, best: float = 9.0, **more: Any) -> dict[str, Any]:
-    more = {"trace": "t", "seed": seed, "clairvoyant": best, "regret": 1 - qoi / best, **more}
+    more = {"scenario": "s", "trace": "t", "seed": seed, "clairvoyant": best, "regret": 1 - qoi / best, **more}
     return row(policy, 8, qoi, **more)
 
 

@@ -224,7 +224,7 @@ def test_links_are_drawn_jointly_by_hand() -> None:
 
 
 def test_on_one_link_episodes_are_drawn() -> None:
-    drawn = links_drawn({"one": [("a", 0), ("a", 1), ("a", 2)]}, resamples=500)["one"]
+    drawn = links_drawn({"one": [("a", 0), ("a", 1), ("a", 2)]})["one"]
     assert (drawn.sum(axis=1) == 3).all() and set(drawn[1:].ravel()) == {0, 1, 2, 3}
 
 
