@@ -17,7 +17,6 @@ from bufgym import scenario as scenarios
 from bufgym.ground import files
 from bufgym.model import observe, qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.policies import learned
 from bufgym.policies import weights as weights_file
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
@@ -79,7 +78,7 @@ def twin(made):
 @given(cases(), VALUES, weights(), st.integers(1, 20))
 def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
     case = replace(case, capacity=capacity)
-    policy = learned.policy("random-weights", made)
+    policy = made.policy("random-weights")
     ours, again, memory = case.run(policy, v), case.senders(v), policy.new_memory(1, capacity)
     memory[:] = np.nan  # what the scratch held before does not matter, nor what the episode left
     for _ in range(2):
@@ -108,7 +107,7 @@ def start(fields, seen):
     inputs, nothing = np.zeros(len(fields), np.float32), np.zeros(0, np.float32)
     drop = Network(inputs.copy(), np.float32([0]), (), nothing)
     drop.skip[fields.index(seen)] = -10
-    return learned.policy("linear", Weights(fields, drop, Network(inputs, np.float32([5]), (), nothing)))
+    return Weights(fields, drop, Network(inputs, np.float32([5]), (), nothing)).policy("linear")
 
 
 @kernels
