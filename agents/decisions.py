@@ -58,7 +58,7 @@ class DecisionLearner(Learner[Decisions]):
 
     def agent_of(self, model: Any, name: str) -> Agent:
         """The agent of a model, by its name."""
-        return weights.policy_of(name, self.weights_of(model))
+        return self.weights_of(model).policy(name)
 
     def agent(self, run: Run) -> Agent:
         """A policy if the run kept a file of weights, or its model."""

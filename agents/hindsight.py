@@ -117,7 +117,7 @@ class Rows:
         place = (rng.permutation(n) + rng.random()) / n
         self._ruled = place < shares[0]
         led = place < sum(shares)
-        self._players = [(Player(learned.policy("player", start), n), np.flatnonzero(who)) for who in (led, ~led)]
+        self._players = [(Player(start.policy("player"), n), np.flatnonzero(who)) for who in (led, ~led)]
 
     def _observe(self, *weights: Weights) -> tuple[NDArray[np.int64], Lesson]:
         """Everyone's actions, and what is seen, by the weights of leader and student; no regrets yet."""
@@ -253,10 +253,10 @@ class HindsightLearner(Learner[Hindsight]):
             ended = school.steps >= settings.steps or school.seconds >= self.seconds
             if ended or school.steps - checked >= CHECK or school.best == math.inf:
                 checked = school.steps
-                school.compare(lambda agent: objective.fitness(learned.policy(objective.name, agent), 0))
+                school.compare(lambda agent: objective.fitness(agent.policy(objective.name), 0))
             if validations.due(school.steps, last=ended):
                 agent = school.leader.weights()
-                measures = objective.validate(learned.policy(objective.name, agent))
+                measures = objective.validate(agent.policy(objective.name))
                 if validations.add(school.steps, school.seconds, measures):
                     weights.save(home / MODEL, agent, self.notes(seed, settings.algo))
                 report = objective.message.format(*measures)

@@ -148,7 +148,7 @@ def test_a_run_leaves_an_agent_and_a_table(short_episodes: None, monkeypatch: Pa
     printed = capsys.readouterr().out
     assert "agent (seed 0)" in printed and "robofleet" in printed and "best on validation: seed 0" in printed
     assert (home / "model.safetensors").read_bytes() == (home / "seed-0" / "model.safetensors").read_bytes()
-    made, noted = weights.read_any(home / "model.safetensors")
+    made, noted = weights.read(home / "model.safetensors")
     assert isinstance(made, SchedulerWeights)
     assert (noted["suite"], noted["algo"], noted["seeds"]) == (suite.name, "evolve", [0])
     with (home / "rows.csv").open(newline="", encoding="utf-8") as file:

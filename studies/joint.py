@@ -134,7 +134,7 @@ def page(files: Sequence[Path], split: str, data: str | None) -> str:
         sums += [share for share, _ in found]
         print(" | ".join(shares[-1]), flush=True)
     shares.append(["mean", *(f"{total / len(less):.3f}" for total in sums)])
-    notes = weights.read_any(files[0])[1]
+    notes = weights.read(files[0])[1]
     return PAGE.format(
         seed=notes["seeds"][0],
         command=notes["training"].replace("agents.joint", "studies.joint"),  # where this module was when it ran

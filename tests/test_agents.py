@@ -238,7 +238,7 @@ TOPICS = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetenso
 @pytest.mark.parametrize("name", {**SHIPPED, **TOPICS, **NAMED})
 def test_its_file_is_small_and_tells_how_it_was_made(name: str) -> None:
     file = {**SHIPPED, **TOPICS, **NAMED}[name]
-    _, told = weights.read_any(file)
+    _, told = weights.read(file)
     policy = policies.get(name)
     assert file.stat().st_size < (8_000 if name not in NAMED else 200_000)
     assert told["name"] == name and told["training"].startswith(("python train.py --suite ", "python -m agents.joint "))

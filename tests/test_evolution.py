@@ -162,7 +162,7 @@ def test_the_search_begins_at_the_rule_and_leaves_a_file(tmp_path: Path, monkeyp
     assert family.share(joint.agent(np.zeros(320)).policy("plain")) == family.share(policies.get("gap-price"))
     file = tmp_path / "agent.safetensors"
     joint.main(seed=3, generations=2, out=file)
-    found, notes = weights.read_any(file)
+    found, notes = weights.read(file)
     assert isinstance(found, guided.GuidedWeights) and 0 < np.abs(found.weight).max() < 1
     assert notes["training"] == "python -m studies.joint --seed 3 --generations 2"
     joint.main(file, out=tmp_path / "page.md")

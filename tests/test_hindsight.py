@@ -46,7 +46,7 @@ def test_mean_regret_by_hand() -> None:
 
 def test_an_untrained_student_is_the_rule() -> None:
     """Row by row the outcomes of gap-price, with equal sizes and with a spread of them."""
-    student = learned.policy("student", Student(8).weights())
+    student = Student(8).weights().policy("student")
     for scenario in (SHORT, dataclasses.replace(SHORT, size_cv=0.5)):
         episodes = [draw(scenario, seed) for seed in range(6)]
         plain, rule = dataclasses.replace(student, compile=False), policies.get("gap-price")
@@ -60,7 +60,7 @@ def test_fields_show_the_rule_and_keep_their_limits() -> None:
     env = SenderVectorEnv(16, dataclasses.replace(SHORT, size_cv=0.5), L, decide_at="arrival", info="mask")
     env.reset(seed=1)
     senders, wild = env.rows.senders, random_student(0).weights()
-    student, rule = Player(learned.policy("wild", wild), 16), Player(policies.get("gap-price"), 16)
+    student, rule = Player(wild.policy("wild"), 16), Player(policies.get("gap-price"), 16)
     low, high = (np.array([getattr(f, end) for f in RULE_FIELDS]) for end in ("low", "high"))
     slot_low, slot_high = (np.array([getattr(f, end) for f in RULE_SLOT_FIELDS]) for end in ("low", "high"))
     differ = 0
@@ -194,5 +194,5 @@ def test_accepting_at_an_idle_socket_is_never_unlearned() -> None:
     """A student of any usual size sends when the socket is idle and the queue empty, so that it is never silent."""
     env = SenderVectorEnv(8, SHORT, L, decide_at="arrival", info="mask")
     env.reset(seed=3)
-    player = Player(learned.policy("wild", random_student(5, size=0.02).weights()), 8)
+    player = Player(random_student(5, size=0.02).weights().policy("wild"), 8)
     assert (player.actions(env.rows.senders) == L + 1).all() and ACCEPT < 0

@@ -14,7 +14,7 @@ from bufgym.envs.options import GUIDED, Options
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel, stretch
-from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, follow, inputs, linear, recall
+from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, GuidedWeights, follow, inputs, recall
 from bufgym.sim.state import Batch
 from bufgym.sim.view import arrival_of, view
 
@@ -64,7 +64,8 @@ class Guiding:
     """The guided part of n rows."""
 
     def __init__(self, n: int, options: Options) -> None:
-        memory = linear(GUIDED, np.zeros((N_OUTPUTS, N_INPUTS))).new_memory(n, options.capacity)
+        plain = GuidedWeights(np.zeros((N_OUTPUTS, N_INPUTS), np.float32)).policy(GUIDED)
+        memory = plain.new_memory(n, options.capacity)
         self.guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(options.acts_guided), int(options.sees_guided))
         self._nothing = np.zeros(n, np.int64)
         self.action_space = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)

@@ -73,8 +73,7 @@ _value = getattr(value, "py_func", value)  # plain Python: compiling does not pa
 class Value:
     """A concave V with V(0) = 0, never decreasing, at most 1.
 
-    ``exponential``, ``saturating`` and ``tabulated`` make one. Calling it returns V(d). A d that is negative or no
-    number raises a BufgymError.
+    ``exponential``, ``saturating`` and ``tabulated`` make one. Calling it returns V(d); BufgymError unless d >= 0.
     """
 
     name: str
@@ -206,8 +205,7 @@ def parse(text: str) -> Value:
 def load(v: Any) -> Value:
     """Make a ``Value`` from a scenario's setting: a ``Value``, a function V(d), or text.
 
-    The text is for ``parse``, or ``module:function`` names V(d) itself or a function without arguments that returns a
-    V.
+    The text is for ``parse``, or ``module:function`` names V(d), or a function without arguments that returns a V.
     """
     name = ""
     if isinstance(v, str):

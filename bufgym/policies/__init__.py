@@ -2,7 +2,6 @@
 
 import functools
 import os
-from pathlib import Path
 
 from bufgym.ground import files
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, has_space, is_first
@@ -37,13 +36,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
     return weights.load(path)
 
 
-def _load_shipped(name: str, path: Path) -> Policy:
-    from bufgym.policies import weights
-
-    return weights.load_shipped(name, path)
-
-
 for _folder, _rules in (("", {}), ("/topics", {"for_topics": True}), ("/named", {"named_only": True})):
     _shipped = files.shipped(f"agents{_folder}", f"agents/pretrained{_folder}", "*.safetensors")
     for _name, _path in _shipped.items():
-        register_later(_name, functools.partial(_load_shipped, _name, _path), **_rules)
+        register_later(_name, functools.partial(load, _path), **_rules)

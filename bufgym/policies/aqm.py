@@ -1,7 +1,6 @@
 """Active queue management of the Internet, CoDel and RED, designed to keep a router's queue short.
 
-Both drop early to tell TCP senders to slow down. A camera does not slow down, so here they show the cost of early
-drops.
+Both drop early to tell TCP senders to slow down. A camera does not, so here they show the cost of early drops.
 """
 
 import math

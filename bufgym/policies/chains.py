@@ -6,8 +6,7 @@ behind them. A step from message i to message j is worth
     V(x_j - x_i) - price x bytes of j
 
 and the step to the end, which costs nothing, V(x_end - x_i). The *advantage* of dropping k is the best chain without k
-less the best chain through k. Both come from one pass from the end and one from the begin. A step skips at most
-``SPAN`` - 1 messages.
+less the best chain through k, by one pass from the end and one from the begin. A step skips < ``SPAN`` messages.
 """
 
 from typing import Any

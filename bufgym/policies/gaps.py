@@ -12,8 +12,7 @@ from bufgym.model.qoi import value
 from bufgym.policies.registry import Arrival, Memory, built_in
 
 TIE = 1e-12
-"""QoI up to which two messages count as equal, so that rounding never decides. Structural: above the rounding of sums
-of V."""
+"""QoI up to which two messages count as equal, so that rounding never decides. Structural: above that of sums of V."""
 
 
 @kernel

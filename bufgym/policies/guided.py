@@ -20,8 +20,9 @@ there the plain rule keeps an early message of each burst, which most outputs me
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,13 +71,11 @@ SPREAD_US = 10e6  # Time over which the spread of the link's rate is measured, u
 SLOW_US = 20e6
 """Time over which the mean rate says how heavy the load is, us. A shorter one opens the gate in every outage."""
 HEAVY, HEAVIER = 0.7, 1.5
-"""Logarithm of messages that come for one that the link carries: where h begins to rise, and how much more makes it
-1."""
+"""Log of messages that come for one that the link carries: where h begins to rise, and how much more makes it 1."""
 
 LOG_RATE, LOG_RATE_VARIANCE, SLOW_RATE, RULE = range(4)  # Own entries of the memory, before those of the rule
 REMEMBERED = {"log_rate": 0.0, "log_rate_variance": 0.0, "slow_rate": 0.0, **price_dp.REMEMBERED}
-"""Memory: mean and variance of the logarithm of the link's rate, bytes/s; its mean over ``SLOW_US``; and what the rule
-remembers."""
+"""Memory: mean and variance of the log of the link's rate, bytes/s; its mean over ``SLOW_US``; what the rule keeps."""
 BASE = np.array(list(price_dp.PARAMETERS.values()))  # The rule's numbers as they stand
 NUMBERS, N_OUTPUTS = len(BASE), len(OUTPUTS)
 
@@ -295,27 +294,37 @@ class GuidedWeights:
         return self.CONTEXT_NAMES
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
-        """Make the policy of these weights."""
-        return linear(name, self.weight, about, source)
+        """Make the policy with outputs W c for the inputs c. W = 0 is gap-price."""
+        numbers = self.numbers(name, BASE)
+        policy = Policy(name, on_arrival, weights=numbers, memory=REMEMBERED, work=WORK, compile=True, reads_rate=True)
+        return replace(policy, about=about, source=source)
+
+    def numbers(self, name: str, base: Numbers) -> tuple[float, ...]:
+        """The rule's numbers and W as the weights of that policy. W_light alone gets W_heavy = 0."""
+        W = np.asarray(self.weight, np.float64)
+        if W.shape == self.LIGHT != self.SHAPE:
+            W = np.concatenate([W, np.zeros_like(W)])
+        if W.shape != self.SHAPE or not np.isfinite(W).all():
+            rule = f"must be {self.SHAPE[0]} x {self.SHAPE[1]} finite numbers"
+            raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")
+        return tuple(np.concatenate([base, W.reshape(-1)]).tolist())
 
     def tensors(self) -> dict[str, NDArray[np.float32]]:
-        """The numbers by name."""
-        return {"weight": self.weight}
+        """The numbers by name, as in a file."""
+        return {f"{self.NETWORKS[0]}.weight": self.weight}
 
+    @classmethod
+    def definition(cls, fields: Sequence[str]) -> list[Any]:
+        """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
+        return cls.TABLE
 
-def numbers_of(name: str, base: Numbers, weights: NDArray[Any], shape: tuple[int, int]) -> tuple[float, ...]:
-    """The rule's numbers and W, which must have this shape, as a policy's weights. W_light alone gets W_heavy = 0."""
-    W = np.asarray(weights, np.float64)
-    if W.shape == GuidedWeights.LIGHT != shape:
-        W = np.concatenate([W, np.zeros_like(W)])
-    if W.shape != shape or not np.isfinite(W).all():
-        rule = f"must be {shape[0]} x {shape[1]} finite numbers"
-        raise BufgymError(f"policy {name!r}: weights of shape {list(W.shape)}: {rule}")
-    return tuple(np.concatenate([base, W.reshape(-1)]).tolist())
+    @classmethod
+    def shapes(cls, inputs: int, widths: Sequence[int], given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+        """The shapes of ``tensors`` by name; of two that are possible, the ``given`` one."""
+        name = f"{cls.NETWORKS[0]}.weight"
+        return {name: cls.LIGHT if given.get(name) == cls.LIGHT else cls.SHAPE}
 
-
-def linear(name: str, weights: NDArray[np.floating[Any]], about: str = "", source: str = "") -> Policy:
-    """Make the policy with outputs W c for the inputs c; ``weights`` is W [outputs, inputs]. W = 0 is gap-price."""
-    numbers = numbers_of(name, BASE, weights, GuidedWeights.SHAPE)
-    policy = Policy(name, on_arrival, weights=numbers, memory=REMEMBERED, work=WORK, compile=True, reads_rate=True)
-    return replace(policy, about=about, source=source)
+    @classmethod
+    def of(cls, fields: Sequence[str], tensors: Mapping[str, NDArray[np.float32]]) -> Self:
+        """Make the weights of these ``tensors``."""
+        return cls(*tensors.values())

@@ -22,7 +22,7 @@ from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, fill, is_first, lo
 from bufgym.model.observe.declare import writer
 from bufgym.model.observe.topics import largest
 from bufgym.model.topics import NO_DEADLINE_US
-from bufgym.policies.guided import GuidedWeights, declared, lg, numbers_of
+from bufgym.policies.guided import GuidedWeights, declared, lg
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.robofleet import next_no_drop
 from bufgym.policies.schedulers import fits, make_room, makes_room, topic_of
@@ -141,6 +141,6 @@ class SchedulerWeights(GuidedWeights):
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights, for any topics and every L."""
-        numbers = numbers_of(name, BASE, self.weight, self.SHAPE)
+        numbers = self.numbers(name, BASE)
         policy = Policy(name, on_arrival, on_send=on_send, weights=numbers, compile=True, reads_rate=True)
         return replace(policy, about=about, source=source, for_topics=True, work=(N_OUTPUTS + N_INPUTS, 0))

@@ -3,8 +3,9 @@
 See docs/methods.md, "Slot scorers".
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, newcomer_stays
 from bufgym.model.observe import (
     CONTEXT_FIELDS,
+    FIELDS,
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
     SLOT_FIELDS,
@@ -20,13 +22,13 @@ from bufgym.model.observe import (
     observe_on_board,
     observe_on_board_slots,
 )
-from bufgym.policies import chains
+from bufgym.policies import chains, price_dp
 from bufgym.policies.guided import REMEMBERED
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.policies.scoring import DROP, KEEP, Network, Scorer, Scratch, begin, divide, score, unpack
 
-__all__ = ["NAMES", "Network", "Weights", "policy"]
+__all__ = ["NAMES", "Network", "Weights"]
 
 SLOT_NAMES = tuple(field.name for field in (*SLOT_FIELDS, *ON_BOARD_SLOT_FIELDS))
 CONTEXT_NAMES = tuple(field.name for field in (*CONTEXT_FIELDS, *ON_BOARD_FIELDS))
@@ -34,7 +36,8 @@ NAMES = SLOT_NAMES + CONTEXT_NAMES
 SLOTS, CONTEXT = len(SLOT_NAMES), len(CONTEXT_NAMES)
 # Fields beyond these are observed only if they are read.
 TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
-RULE_NAMES = tuple(field.name for field in (*RULE_SLOT_FIELDS, *RULE_FIELDS))
+BESIDE = (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS)
+BY_RULE = (*RULE_SLOT_FIELDS, *RULE_FIELDS)
 ALL_SLOTS, ALL_CONTEXT = SLOTS + len(RULE_SLOT_FIELDS), CONTEXT + len(RULE_FIELDS)
 RULE_SCRATCH = len(REMEMBERED) + chains.SCRATCH[0]
 
@@ -153,27 +156,42 @@ class Weights:
         header = [len(self.fields), len(self.context), *self.widths, len(networks[0])]
         return np.concatenate([header, places, *networks])
 
+    def tensors(self) -> dict[str, NDArray[np.float32]]:
+        """The numbers by name, as in a file."""
+        return {f"{n}.{name}": tensor for n in self.NETWORKS for name, tensor in getattr(self, n).tensors().items()}
 
-def policy(name: str, weights: Weights, summary: str = "", source: str = "") -> Policy:
-    """Make the policy of these weights; it works for every L."""
-    on_link = {field.name for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS) if field.group == "link"}
-    numbers, (first, second) = tuple(weights.parameters().tolist()), weights.widths
-    work = 2 * len(weights.fields) - len(weights.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
-    policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_left=True, built_in=True)
-    if not set(RULE_NAMES).isdisjoint(weights.fields):
+    def policy(self, name: str, about: str = "", source: str = "") -> Policy:
+        """Make the policy of these weights; it works for every L."""
+        on_link = any(field.group == "link" for field in BESIDE if field.name in self.fields)
+        numbers, (first, second) = tuple(self.parameters().tolist()), self.widths
+        work = 2 * len(self.fields) - len(self.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
+        policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_left=True, built_in=True)
+        policy = replace(policy, reads_rate=on_link, about=about, source=source)
+        if all(field.name not in self.fields for field in BY_RULE):
+            return policy
         work = work[0] + len(RULE_FIELDS) + chains.SCRATCH[0], ALL_SLOTS + chains.SCRATCH[1]
-        policy = replace(policy, on_arrival=on_arrival_by_rule, memory=REMEMBERED, work=work, reads_rate=True)
-    reads_rate = policy.reads_rate or not on_link.isdisjoint(weights.fields)
-    return replace(policy, reads_rate=reads_rate, about=summary, source=source)
+        return replace(policy, on_arrival=on_arrival_by_rule, memory=REMEMBERED, work=work, reads_rate=True)
+
+    @staticmethod
+    def definition(fields: Sequence[str]) -> list[Any]:
+        """What defines the observation; fields beside the table count only if they are among ``fields``."""
+        beside = [field for field in (*BESIDE, *BY_RULE) if field.name in fields]
+        table: list[Any] = [(field.name, field.per, field.unit, field.meaning) for field in (*FIELDS, *beside)]
+        return [*table, price_dp.PARAMETERS] if set(BY_RULE) & set(beside) else table
+
+    @classmethod
+    def shapes(cls, inputs: int, widths: Sequence[int], given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+        """The shapes of ``tensors`` for so many fields and hidden layers of these widths, by name."""
+        return {f"{n}.{name}": shape for n in cls.NETWORKS for name, shape in Network.shapes(inputs, widths).items()}
+
+    @classmethod
+    def of(cls, fields: Sequence[str], tensors: Mapping[str, NDArray[np.float32]]) -> "Weights":
+        """Make the weights of these fields and ``tensors``."""
+        return cls(tuple(fields), *(Network.of(tensors, f"{n}.") for n in cls.NETWORKS))
 
 
 def seen(memory: Memory, weights: Weights, capacity: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What policies that know the rule saw at their last decision with L = ``capacity``.
-
-    Args:
-        memory: float64[n, entries], theirs.
-        weights: say which fields they read.
-        capacity: L.
+    """What policies that know the rule saw at their last decision with L = ``capacity``, from their memory.
 
     Returns:
         (float64[n, context fields], float64[n, L + 1, slot fields]), fields in the order of ``weights.fields``.

@@ -6,8 +6,7 @@ A byte sent now is not there for a later message. So bytes have a price, in QoI 
 
 At the gap g the message between two gaps is worth 2 V(g) - V(2 g); kappa times that is the price of a mean message. It
 is the *unit* below. Where g is unknown, g is the even gap that the queue has now, (x_new - x_dequeued) / (s + 1).
-``chains`` finds the *advantage* of dropping each message at that price, the chains' end lying ``tail`` g behind the
-newcomer.
+``chains`` finds the *advantage* of dropping each message at that price. Chains end ``tail`` g behind the newcomer.
 
     if a queued message adds nothing: it goes
     elif there is room, and the queue is empty or the socket idle: accept
@@ -27,11 +26,9 @@ Where V is straight at g, a message between two gaps g adds nothing, so bytes ha
 
 Each candidate is then worth (1 - a) (threshold g - its discounted gap) / g, as target-gap has it, plus a (its advantage
 in units - price_threshold); the best candidate goes, the oldest of equal ones. The head is asked likewise, with
-target-gap's wish for it. A share that also follows the load was better on random links, and worse in outages and on
-light links.
+target-gap's wish for it. A share by load, too, was better on random links, worse in outages and on light links.
 
-Under B a newcomer that takes the place of several messages goes itself, unless better candidates make
-room for it.
+Under B a newcomer in the place of several messages goes itself, unless better candidates make room for it.
 """
 
 import math

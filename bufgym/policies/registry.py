@@ -12,8 +12,7 @@ to evict for the newcomer, 0 being the oldest. Settings are ``parameters``, whic
 sender. Both follow the order of the registration. ``arrival.uniform`` is a uniform draw in [0, 1) for policies that
 randomise; the functions themselves are deterministic.
 
-docs/guide/own-policy.md has an example. The name then works like a built-in policy's. With ``compile=True`` the same
-function runs compiled.
+docs/guide/own-policy.md has an example. The name then works like a built-in one's; ``compile=True`` compiles it.
 """
 
 from __future__ import annotations
@@ -248,9 +247,7 @@ class Later(NamedTuple):
     """A policy that is made at its first use."""
 
     make: Callable[[], Policy]
-    """The function that makes it."""
-    for_topics: bool
-    """As in ``Policy``, like the next field."""
+    for_topics: bool  # as in ``Policy``, like the others
     named_only: bool
     built_in: bool = True
 
@@ -331,7 +328,10 @@ def get(spec: str | Policy | OnArrival) -> Policy:
     _, numbers = named_settings("policy", spec)
     entry = _REGISTRY[name]
     if isinstance(entry, Later):
-        entry = _REGISTRY[name] = replace(entry.make(), named_only=entry.named_only, built_in=True)
+        made = entry.make()
+        if made.name != name:
+            raise BufgymError(f"policy {name!r}: its file names it {made.name!r}: must be the same")
+        entry = _REGISTRY[name] = replace(made, named_only=entry.named_only, built_in=True)
     return entry.with_parameters(**numbers)
 
 

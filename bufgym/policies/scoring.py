@@ -40,8 +40,7 @@ class Scorer(NamedTuple):
     fields: NDArray[np.float64]
     """[inputs]: position of each field in the observation of its kind, the context's fields first."""
     networks: NDArray[np.float64]
-    """One after another, ``size`` numbers each: skip and b, then W1 (a row for each input) and b1, then W2 and b2, then
-    w."""
+    """One after another, ``size`` numbers each: skip and b, W1 (a row for each input) and b1, W2 and b2, then w."""
     size: int
     """Numbers of one network."""
 
@@ -171,11 +170,12 @@ class Network:
         return tensors | {"out": self.out}
 
     @staticmethod
-    def of(tensors: Mapping[str, NDArray[np.float32]]) -> Network:
-        """Make the network of these ``tensors``."""
-        hidden = sum(name.endswith(".weight") for name in tensors)
-        layers = tuple((tensors[f"{k}.weight"], tensors[f"{k}.bias"]) for k in range(hidden))
-        return Network(tensors["skip"], tensors["bias"], layers, tensors["out"])
+    def of(tensors: Mapping[str, NDArray[np.float32]], prefix: str) -> Network:
+        """Make the network of the ``tensors`` whose names begin with this."""
+        own = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+        hidden = sum(name.endswith(".weight") for name in own)
+        layers = tuple((own[f"{k}.weight"], own[f"{k}.bias"]) for k in range(hidden))
+        return Network(own["skip"], own["bias"], layers, own["out"])
 
     @staticmethod
     def shapes(inputs: int, widths: Sequence[int]) -> dict[str, tuple[int, ...]]:

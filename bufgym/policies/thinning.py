@@ -1,7 +1,6 @@
 """Thinning to the link: a queue with room drops messages that the link could not send in time anyway.
 
-On a steady link this is the only rule for a queue with room; on other links it applies until there is a target
-(``target_gap``).
+On a steady link this is the only rule for a queue with room, on others until there is a target (``target_gap``).
 
 Messages leave a slow link every so many arrivals. If queued messages lie closer together than that, the server gets a
 run of near neighbours, and later a hole as long as they took to send. So a message goes at once, room or not, if its

@@ -20,8 +20,7 @@ MOST_S = 3.0  # Most seconds of the target rate in the bucket
 MOST_DROPS_S = 4.0  # Longest run of dropped frames, s
 LARGE = 3.0  # A frame larger than the average by this factor is large
 SIZE_ALPHA, RATIO_ALPHA, FAST_RATIO_ALPHA = 0.9, 0.9, 0.8
-"""Shares of the old value that the filters keep: of frame size, of drop ratio, and of drop ratio while the bucket runs
-far over."""
+"""Old value's share that the filters keep: of frame size, of drop ratio, and of that while the bucket runs far over."""
 MOST_RATIO = 0.96
 FORGETS_S = 1e6  # Time for which an old target holds until a message has shown another
 

@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import numpy as np
 import safetensors
@@ -18,14 +18,10 @@ from safetensors.numpy import save as serialized
 from bufgym.ground import __version__, strict_json
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_whole, replaced
-from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS
-from bufgym.policies import learned, price_dp
 from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.registry import Policy
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
-from bufgym.policies.scoring import Network
 
 StrPath = str | os.PathLike[str]
 Tensors = dict[str, NDArray[np.float32]]
@@ -39,25 +35,9 @@ KEY = "bufgym"  # The entry of the header's metadata that holds the JSON text
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")  # Metadata that ``save`` itself writes
 
 
-def observation_hash(names: Sequence[str] = ()) -> str:
-    """SHA-256 of the fields' definitions: weights trained on other definitions would decide nonsense.
-
-    Fields beside the table count only if they are in ``names``.
-    """
-    by_rule = (*RULE_SLOT_FIELDS, *RULE_FIELDS)
-    beside = [field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS, *by_rule) if field.name in names]
-    fields = [*FIELDS, *beside]
-    table: list[Any] = [(field.name, field.per, field.unit, field.meaning) for field in fields]
-    if set(by_rule) & set(beside):
-        table.append(price_dp.PARAMETERS)
-    return hashlib.sha256(json.dumps(table).encode()).hexdigest()
-
-
-def _definition(kind: Kind, names: Sequence[str]) -> str:
-    """The ``observation`` of a file of this kind."""
-    if issubclass(kind, GuidedWeights):
-        return hashlib.sha256(json.dumps(kind.TABLE).encode()).hexdigest()
-    return observation_hash(names)
+def observation_hash(kind: Kind, fields: Sequence[str] = ()) -> str:
+    """SHA-256 of the fields' definitions: weights trained on other definitions would decide nonsense."""
+    return hashlib.sha256(json.dumps(kind.definition(fields)).encode()).hexdigest()
 
 
 def load(path: StrPath) -> Policy:
@@ -66,39 +46,21 @@ def load(path: StrPath) -> Policy:
     Raises:
         BufgymError: no such file, or one that breaks a rule of the format.
     """
-    weights, metadata = read_any(path)
-    name, about = metadata["name"], metadata.get("about", "")
+    weights, metadata = read(path)
     source = f"{Path(path).name}, sha256 {metadata['sha256'][:12]}"
-    return policy_of(name, weights, about, source)
-
-
-def policy_of(name: str, weights: AnyWeights, about: str = "", source: str = "") -> Policy:
-    """Make the policy of these weights."""
-    if isinstance(weights, GuidedWeights):
-        return weights.policy(name, about, source)
-    return learned.policy(name, weights, about, source)
-
-
-def load_shipped(name: str, path: Path) -> Policy:
-    """Load an agent that comes with bufgym; its metadata must name it as its file does."""
-    policy = load(path)
-    if policy.name != name:
-        raise BufgymError(where(path, None, policy.name, f"must be {name}, as the file", field="name"))
-    return policy
+    return weights.policy(metadata["name"], metadata.get("about", ""), source)
 
 
 def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
     """Write a learned policy, whole or not at all.
 
-    Args:
-        path: the file; an existing one is replaced.
-        weights: the policy's weights.
-        about: ``name`` of the policy, ``about`` (a sentence), and further notes of the author, as JSON can hold them.
+    ``about`` holds the policy's ``name``, ``about`` (a sentence), and further notes of the author that JSON can hold.
 
     Raises:
         BufgymError: the file cannot be written, or could not be read again.
     """
-    target, tensors = Path(path), _tensors(weights)
+    # Little-endian and in C order, as in the file.
+    target, tensors = Path(path), {n: np.ascontiguousarray(t, "<f4") for n, t in weights.tensors().items()}
     reserved = sorted(set(WRITTEN) & set(about))
     if reserved:
         raise BufgymError(f"{target}: metadata {', '.join(reserved)}: written by save itself")
@@ -106,7 +68,7 @@ def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
         "format": FORMAT,
         **about,
         "fields": list(weights.fields),
-        "observation": _definition(type(weights), weights.fields),
+        "observation": observation_hash(type(weights), weights.fields),
         "bufgym": __version__,
         "sha256": _sha256(weights.fields, tensors),
     }
@@ -124,15 +86,6 @@ def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
     return target
 
 
-def _tensors(weights: AnyWeights) -> Tensors:
-    """Name -> tensor, little-endian and in C order, as in the file."""
-    return {
-        f"{network}.{name}": np.ascontiguousarray(tensor, "<f4")
-        for network in weights.NETWORKS
-        for name, tensor in cast(Any, getattr(weights, network, weights)).tensors().items()
-    }
-
-
 def _sha256(fields: Sequence[str], tensors: Tensors) -> str:
     """Hash of the fields, and of the tensors' names, shapes and bytes in the order of the names."""
     state = hashlib.sha256(",".join(fields).encode())
@@ -142,21 +95,12 @@ def _sha256(fields: Sequence[str], tensors: Tensors) -> str:
     return state.hexdigest()
 
 
-def read(path: StrPath) -> tuple[Weights, dict[str, Any]]:
-    """(weights, metadata) of a slot scorer for one queue that ``save`` wrote.
+def read(path: StrPath) -> tuple[AnyWeights, dict[str, Any]]:
+    """(weights, metadata) of a file that ``save`` wrote.
 
     Raises:
         BufgymError: no such file, or one that breaks a rule of the format.
     """
-    weights, metadata = read_any(path)
-    if isinstance(weights, Weights):
-        return weights, metadata
-    what = "a scheduler for several topics" if isinstance(weights, SchedulerWeights) else "an agent that guides a rule"
-    raise BufgymError(f"{path}: {what}, not a slot scorer for one queue")
-
-
-def read_any(path: StrPath) -> tuple[AnyWeights, dict[str, Any]]:
-    """As ``read``, for either kind."""
     return _parsed(path, read_whole(path, MAX_BYTES))
 
 
@@ -174,14 +118,8 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     tensors = _checked_tensors(path, entries, metadata["fields"], kind)
     if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
         rule = "fields and tensors have another one: the file was changed"
-        raise BufgymError(where(path, None, metadata["sha256"], rule, field="sha256"))
-    if issubclass(kind, GuidedWeights):
-        return kind(*tensors.values()), metadata
-    networks = [
-        Network.of({name.removeprefix(f"{n}."): tensors[name] for name in tensors if name.startswith(f"{n}.")})
-        for n in kind.NETWORKS
-    ]
-    return cast(Any, kind)(tuple(metadata["fields"]), *networks), metadata
+        raise _wrong(path, "sha256", rule, metadata["sha256"])
+    return kind.of(metadata["fields"], tensors), metadata
 
 
 def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
@@ -198,36 +136,36 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     if not isinstance(metadata, dict):
         raise BufgymError(f"{path}: metadata must be a JSON object")
 
-    def refuse(key: str, rule: str) -> NoReturn:
-        raise BufgymError(where(path, None, metadata.get(key, "(absent)"), rule, field=key))
+    def wrong(key: str, rule: str) -> BufgymError:
+        return _wrong(path, key, rule, metadata.get(key, "(absent)"))
 
     if metadata.get("format") != FORMAT:
-        refuse("format", f"this bufgym reads format {FORMAT}")
+        raise wrong("format", f"this bufgym reads format {FORMAT}")
     for key in ("name", "observation", "bufgym", "sha256"):
         if not isinstance(metadata.get(key), str):
-            refuse(key, "must be text")
+            raise wrong(key, "must be text")
     name, about, fields = metadata["name"], metadata.get("about", ""), metadata.get("fields")
     if not name or not name.isprintable() or any(c in ":,= " for c in name):
-        refuse("name", "must be non-empty, without spaces, ':', ',' or '='")
+        raise wrong("name", "must be non-empty, without spaces, ':', ',' or '='")
     if not isinstance(about, str) or not about.isprintable():
-        refuse("about", "must be one line of text")
-    if metadata["observation"] != _definition(kind, fields if isinstance(fields, list) else ()):
+        raise wrong("about", "must be one line of text")
+    if metadata["observation"] != observation_hash(kind, fields if isinstance(fields, list) else ()):
         versions = f"(bufgym {metadata['bufgym']} wrote it, this is {__version__})"
-        refuse("observation", f"trained on other observations than this bufgym's: train it again {versions}")
+        raise wrong("observation", f"trained on other observations than this bufgym's: train it again {versions}")
     if not isinstance(fields, list) or not fields:
-        refuse("fields", "must be a list of at least one field")
+        raise wrong("fields", "must be a list of at least one field")
     known = (*kind.SLOT_NAMES, *kind.CONTEXT_NAMES)
     for field in fields:
         if field not in known:
-            raise BufgymError(where(path, None, field, f"unknown; known: {', '.join(known)}", field="field"))
+            raise _wrong(path, "field", f"unknown; known: {', '.join(known)}", field)
         if fields.count(field) > 1:
-            raise BufgymError(where(path, None, field, "given more than once", field="field"))
+            raise _wrong(path, "field", "given more than once", field)
     return metadata
 
 
-def _refuse(path: StrPath, name: str, rule: str, *, what: str = "", value: object = None) -> NoReturn:
-    """Raise an error for a broken rule: ``what``, by default the tensor ``name`` itself."""
-    raise BufgymError(where(path, None, value, rule, field=f"{what}tensor {name}"))
+def _wrong(path: StrPath, what: str, rule: str, value: object = None) -> BufgymError:
+    """The error that ``what`` in the file breaks a rule."""
+    return BufgymError(where(path, None, value, rule, field=what))
 
 
 def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[str], kind: Kind) -> Tensors:
@@ -237,43 +175,37 @@ def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[st
     tensors: Tensors = {}
     for name, entry in entries.items():
         if entry["dtype"] != "F32":
-            _refuse(path, name, "must be F32", what="type of ", value=entry["dtype"])
+            raise _wrong(path, f"type of tensor {name}", "must be F32", entry["dtype"])
         # A copy: an array over the file's bytes could not be written to.
         tensors[name] = np.frombuffer(bytes(entry["data"]), "<f4").reshape(shapes[name]).copy()
         if not np.isfinite(tensors[name]).all():
-            _refuse(path, name, "must hold finite numbers alone")
+            raise _wrong(path, f"tensor {name}", "must hold finite numbers alone")
     return tensors
 
 
 def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: Sequence[str], kind: Kind) -> None:
     """Check that the tensors are complete and fit each other."""
 
-    def refuse_shape(name: str, rule: str) -> NoReturn:
-        _refuse(path, name, rule, what="shape of ", value=list(shapes[name]))
+    def misshapen(name: str, rule: str) -> BufgymError:
+        return _wrong(path, f"shape of tensor {name}", rule, list(shapes[name]))
 
     widths: list[int] = []
     for k in range(kind.LAYERS):
         name = f"drop.{k}.bias"
         if name not in shapes:
             if f"drop.{k}.weight" in shapes:
-                _refuse(path, name, "is missing")
+                raise _wrong(path, f"tensor {name}", "is missing")
             break
         if len(shapes[name]) != 1 or not 1 <= shapes[name][0] <= MAX_WIDTH:
-            refuse_shape(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
+            raise misshapen(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
         widths += shapes[name]
-    required = {
-        f"{network}.{name}": shape
-        for network in kind.NETWORKS
-        for name, shape in Network.shapes(len(fields), widths).items()
-    }
-    if issubclass(kind, GuidedWeights):
-        name = f"{kind.NETWORKS[0]}.weight"
-        required = {name: shapes[name] if shapes.get(name) in (kind.SHAPE, kind.LIGHT) else kind.SHAPE}
+    required = kind.shapes(len(fields), widths, shapes)
     for name in (*required, *shapes):
         if name not in shapes:
-            _refuse(path, name, "is missing")
+            raise _wrong(path, f"tensor {name}", "is missing")
         if name not in required:
-            _refuse(path, name, f"has no place in networks of {len(widths)} hidden layers ({kind.LAYERS} at most)")
+            rule = f"has no place in networks of {len(widths)} hidden layers ({kind.LAYERS} at most)"
+            raise _wrong(path, f"tensor {name}", rule)
     for name, shape in required.items():
         if shapes[name] != shape:
-            refuse_shape(name, f"must be {list(shape)} for {len(fields)} fields and hidden layers of {widths}")
+            raise misshapen(name, f"must be {list(shape)} for {len(fields)} fields and hidden layers of {widths}")

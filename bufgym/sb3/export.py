@@ -37,9 +37,9 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
         BufgymError: ``model`` is no agent that scores slots, or ``out`` cannot be written.
     """
     path = Path(model)
-    weights = files.read_any(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
+    weights = files.read(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
     notes = {"name": name, "about": about, **run_notes(path)}
-    policy = files.policy_of(name, weights)
+    policy = weights.policy(name)
     return files.save(out, weights, notes if policy.for_topics else {**notes, "regret": regrets(policy)})
 
 

@@ -18,7 +18,6 @@ from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies import Policy
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, REMEMBERED, SCALES, WORK, follow, inputs, recall
-from bufgym.policies.learned import policy as slot_policy
 from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.export import read_policy, weights_of
@@ -57,7 +56,7 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     masked = takes_masks(agent) and getattr(network, "masked", True)
     decisions = _Decisions(name, agent, masked)
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
-        return slot_policy(name, weights_of(network), about)
+        return weights_of(network).policy(name, about)
     if not decisions.for_topics:
         return Policy(name, decisions.on_arrival, about=about, reads_rate=True)
     return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True)

@@ -125,11 +125,8 @@ class Uplink:
             x = f"the camera's motion, in fields of view, {source}" if self.motion else "the frame index"
         else:
             shared = "; all topics share one queue" if len(self.workload.topics) > 1 else ""
-            sent, places = (
-                f"Played over {links}",
-                "from random places" if self.random_offset else "from the trace's start",
-            )
-            places += shared
+            sent = f"Played over {links}"
+            places = ("from random places" if self.random_offset else "from the trace's start") + shared
             moves = self.motion or self.workload.x is not None
             x = f"the motion, {source}, in fields of view" if moves else "the number of the message"
         return f"{sent}, {places}.\n{how_rated(self)}\nx is {x}."
@@ -143,7 +140,8 @@ class Uplink:
         if self.workload is None:
             arrivals = self.stream(streams.arrival)
         else:
-            arrivals = _replayed(self.workload)
+            arrivals = messages(self.workload.arrival_us, self.workload.size_bytes, self.workload.x)
+            arrivals["topic"] = self.workload.topic
             self._move(arrivals, streams.arrival)
         trace, offset_us = place_link(self._links, streams.link, self.random_offset, self.link_offset_s)
         ends_us = None
@@ -186,13 +184,6 @@ class Uplink:
         draws = derived_generator(rng, _TIMES).random(n) if self.jitter else np.zeros(0)
         skip(rng, jitter_draws)
         return draws
-
-
-def _replayed(workload: Workload) -> NDArray[Any]:
-    """MESSAGE[n] of a recording."""
-    arrivals = messages(workload.arrival_us, workload.size_bytes, workload.x)
-    arrivals["topic"] = workload.topic
-    return arrivals
 
 
 RGBD_BYTES = 1280 * 720 * (3 + 2)

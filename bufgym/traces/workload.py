@@ -34,7 +34,7 @@ class Workload:
     """int64[n], n >= 1, microseconds, non-decreasing from 0."""
     size_bytes: Int64Array
     """int64[n], at least 1."""
-    topic: Int64Array | None = None
+    topic: Int64Array = None  # type: ignore[assignment]
     """int64[n], which of `topics`; by default all 0."""
     topics: tuple[str, ...] = ("",)
     """The topics' names."""
@@ -85,12 +85,10 @@ class Workload:
 
     def topic_of(self, message: int) -> str:
         """The name of a message's topic."""
-        assert self.topic is not None
         return self.topics[int(self.topic[message])]
 
     def summary(self) -> list[TopicSummary]:
         """One entry for each topic that has messages, most bytes first."""
-        assert self.topic is not None
         total = int(self.size_bytes.sum())
         by_topic = np.argsort(self.topic, kind="stable")
         ends = np.cumsum(np.bincount(self.topic, minlength=len(self.topics)))

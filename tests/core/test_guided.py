@@ -12,7 +12,7 @@ from test_price_dp import equal, queue
 
 from bufgym import policies
 from bufgym.policies import guided, price_dp, target_gap
-from bufgym.policies.guided import INPUTS, OUTPUTS
+from bufgym.policies.guided import INPUTS, OUTPUTS, GuidedWeights
 from bufgym.scenario import suites
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
@@ -25,13 +25,13 @@ ZERO = np.zeros((len(OUTPUTS), len(INPUTS)))
 @given(cases(max_messages=25), VALUES, st.booleans())
 def test_without_weights_it_is_gap_price(case, v, equals):
     case = equal(case) if equals else case
-    assert same(case.run(guided.linear("zero", ZERO), v), case.run(policies.get("gap-price"), v))
+    assert same(case.run(GuidedWeights(ZERO).policy("zero"), v), case.run(policies.get("gap-price"), v))
 
 
 @kernels
 @given(cases(max_messages=25), VALUES, st.integers(0, 2**32))
 def test_weights_decide_the_same_compiled_or_not(case, v, seed):
-    policy = guided.linear("some", np.random.default_rng(seed).normal(0, 0.3, ZERO.shape))
+    policy = GuidedWeights(np.random.default_rng(seed).normal(0, 0.3, ZERO.shape)).policy("some")
     assert same(case.run(policy, v), case.run(replace(policy, compile=False), v))
 
 
@@ -50,7 +50,7 @@ def test_the_smallest_outputs_change_next_to_nothing(case, v, equals):
             buffers.append((plain, guided.follow(buffer, arrival, memory, numbers, np.full(len(OUTPUTS), 1e-12))))
         return guided.follow(buffer, arrival, memory, guided.BASE, np.zeros(len(OUTPUTS)))
 
-    case.run(replace(guided.linear("watched", ZERO), on_arrival=watched, compile=False), v)
+    case.run(replace(GuidedWeights(ZERO).policy("watched"), on_arrival=watched, compile=False), v)
     assert sum(plain != general for plain, general in buffers) <= 1
 
 
@@ -120,7 +120,11 @@ def test_a_ratio_is_never_endless(a, b, ratio):
 
 def test_weights_of_another_shape_are_refused():
     for weights in (np.zeros((16, 10)), np.full(ZERO.shape, np.nan)):
-        refuse(r"policy 'mine': weights of shape \[.*: must be 20 x 16 finite numbers", guided.linear, "mine", weights)
+        refuse(
+            r"policy 'mine': weights of shape \[.*: must be 20 x 16 finite numbers",
+            GuidedWeights(weights).policy,
+            "mine",
+        )
 
 
 @kernels

@@ -12,7 +12,6 @@ from weight_cases import network, score
 
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.policies import learned
 from bufgym.policies.learned import NAMES, Network, Weights
 from bufgym.policies.registry import Policy
 
@@ -69,7 +68,7 @@ def twin(made):
 @given(cases(), VALUES, weights(), st.integers(1, 20))
 def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
     case = replace(case, capacity=capacity)
-    policy = learned.policy("random-weights", made)
+    policy = made.policy("random-weights")
     ours, again, memory = case.run(policy, v), case.senders(v), policy.new_memory(1, capacity)
     memory[:] = np.nan  # what the scratch held before does not matter, nor what the episode left
     for _ in range(2):

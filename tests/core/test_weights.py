@@ -30,7 +30,7 @@ def path(tmp_path):
 @pytest.mark.parametrize("before", [made(*widths) for widths in [(), (1,), (16, 4), (256,)]], ids=str)
 def test_what_is_written_comes_back_bit_for_bit(path, before):
     assert weights.save(path, before, ABOUT) == path
-    after, metadata = weights.read_any(path)
+    after, metadata = weights.read(path)
     assert type(after) is type(before)
     assert (after.fields, after.widths) == (before.fields, before.widths)
     assert after.parameters().tobytes() == before.parameters().tobytes()
@@ -64,8 +64,8 @@ def test_a_loaded_policy_is_one_like_any_other(path):
     assert policies.get(policy) is policy
     episodes, v = [Interruption(t_max=30).episode(T) for T in (5, 17, 30)], qoi.exponential(0.618)
     ours = run(policy, episodes, 4, v)
-    assert same(ours, run(learned.policy("same", before), episodes, 4, v))
-    assert not same(ours, run(learned.policy("other", made(4, seed=1)), episodes, 4, v))
+    assert same(ours, run(before.policy("same"), episodes, 4, v))
+    assert not same(ours, run(made(4, seed=1).policy("other"), episodes, 4, v))
 
 
 def test_reading_a_policy_needs_no_torch(path):
@@ -81,9 +81,8 @@ def test_a_scheduler_is_no_policy_for_one_queue(path):
     weights.save(path, made(kind=TOPICS), ABOUT)
     policy = policies.load(path)
     assert policy.schedules and policy.for_topics and policy.ranked
-    refuse(r"a scheduler for several topics, not a slot scorer for one", weights.read, path)
     before = made(kind=TOPICS)
-    assert weights.read_any(path)[0].weight.tobytes() == before.weight.tobytes()
+    assert weights.read(path)[0].weight.tobytes() == before.weight.tobytes()
     # Nor is it one whose network has another name.
     put(path, {"guided.weight": before.weight}, parts_of(path)[1])
     refused(path, "trained on other observations")
@@ -92,7 +91,7 @@ def test_a_scheduler_is_no_policy_for_one_queue(path):
 def test_a_policy_for_one_queue_may_not_read_what_only_topics_have(path):
     refuse("field = waited: unknown", weights.save, path, random_weights(["waited"]), ABOUT)
     weights.save(path, random_weights(["service_ratio"]), ABOUT)
-    assert isinstance(weights.read_any(path)[0], QUEUE)
+    assert isinstance(weights.read(path)[0], QUEUE)
     assert not policies.load(path).schedules
 
 
@@ -138,13 +137,13 @@ def test_shipped_agents_are_read_when_they_are_asked_for(path, monkeypatch):
     renamed = path.rename(path.with_name("renamed.safetensors"))
     weights.save(path, made(3), ABOUT)
     for file in (path, broken, renamed):
-        registry.register_later(file.stem, lambda file=file: weights.load_shipped(file.stem, file))
+        registry.register_later(file.stem, lambda file=file: weights.load(file))
     assert list(policies.names())[-3:] == ["small", "broken", "renamed"]
     small = policies.get("small")
     assert small.summary == ABOUT["about"]
     assert policies.get("small") is small
     refuse(r"broken\.safetensors: no safetensors file", policies.get, "broken")
-    refuse(r"name = small: must be renamed, as the file", policies.get, "renamed")
+    refuse(r"policy 'renamed': its file names it 'small'", policies.get, "renamed")
     refuse("unknown parameter", policies.get, "small:w0=1")
     for name in ("small", "broken"):
         refuse("a built-in policy has this name", policies.register, name)
@@ -154,12 +153,12 @@ def test_shipped_agents_are_read_when_they_are_asked_for(path, monkeypatch):
 
 def test_fields_beside_the_tables_are_read_by_name(path):
     # What weights were trained on before these fields came is still what it was.
-    assert weights.observation_hash(names=("rank",)) == weights.observation_hash()
+    assert weights.observation_hash(QUEUE, ("rank",)) == weights.observation_hash(QUEUE)
     fields = ("rank", "rate_short", "rate_long", "time_to_free")
     weights.save(path, random_weights(fields), ABOUT)
     read, metadata = weights.read(path)
     assert read.context == fields[1:]
-    assert metadata["observation"] == weights.observation_hash(names=fields) != weights.observation_hash()
+    assert metadata["observation"] == weights.observation_hash(QUEUE, fields) != weights.observation_hash(QUEUE)
     assert policies.load(path).measures
     weights.save(path, random_weights(["rank"]), ABOUT)
     assert not policies.load(path).measures
@@ -216,7 +215,7 @@ def test_metadata_that_are_no_json_object_are_refused(path, text, rule):
         (QUEUE, "about", ["no", "text"], "must be one line of text"),
         (QUEUE, "bufgym", None, "must be text"),
         (QUEUE, "observation", "0" * 64, "trained on other observations than this bufgym's: train it again"),
-        (TOPICS, "observation", weights.observation_hash(), "trained on other observations than this bufgym's"),
+        (TOPICS, "observation", weights.observation_hash(QUEUE), "trained on other observations than this bufgym's"),
         (QUEUE, "fields", "time_merged", "must be a list of at least one field"),
         (TOPICS, "fields", [], "must be a list of at least one field"),
         (QUEUE, "fields", ["time_merged", ["service_ratio"]], "unknown; known: occupied, rank"),
@@ -239,8 +238,8 @@ def test_metadata_that_break_a_rule_are_refused(path, kind, key, value, rule):
 
 def test_a_changed_meaning_of_a_field_refuses_older_weights(path, monkeypatch):
     weights.save(path, made(3), ABOUT)
-    first, *others = weights.FIELDS
-    monkeypatch.setattr(weights, "FIELDS", (replace(first, meaning=first.meaning + " now"), *others))
+    first, *others = learned.FIELDS
+    monkeypatch.setattr(learned, "FIELDS", (replace(first, meaning=first.meaning + " now"), *others))
     refused(path, "trained on other observations")
 
 

@@ -56,7 +56,7 @@ def made(*widths, kind=QUEUE, fields=FIELDS, seed=0):
 
 def parts_of(path):
     """The tensors and the metadata of a valid file, to be changed and written again by ``put``."""
-    return tensors_of(path.read_bytes()), weights.read_any(path)[1]
+    return tensors_of(path.read_bytes()), weights.read(path)[1]
 
 
 def put(path, tensors, metadata):
@@ -74,7 +74,7 @@ def put_changed(path, name, tensor):
 
 def refused(path, *phrases):
     """Whoever reads it gets one line that names the file and holds these phrases."""
-    for reads in (weights.read, weights.read_any, policies.load):
+    for reads in (weights.read, policies.load):
         with pytest.raises(BufgymError) as error:
             reads(path)
         message = str(error.value)

@@ -13,7 +13,7 @@ import bufgym
 from bufgym import policies
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv, expert
 from bufgym.model import qoi
-from bufgym.policies.guided import INPUTS, OUTPUTS, SCALES, linear
+from bufgym.policies.guided import INPUTS, OUTPUTS, SCALES, GuidedWeights
 from bufgym.scenario import Uplink
 from bufgym.sim import run
 
@@ -60,7 +60,7 @@ def test_actions_are_the_outputs_of_a_policy_over_their_scales(case: str) -> Non
     weights = np.zeros((len(OUTPUTS), len(INPUTS)))
     weights[:, list(INPUTS).index("one")] = action * SCALES
     env, gone = played(case, lambda seen: action * (1 - seen["plain"]))
-    assert np.array_equal(gone, rolled(env, case, linear("constant", weights)))
+    assert np.array_equal(gone, rolled(env, case, GuidedWeights(weights).policy("constant")))
 
 
 def test_memory_begins_anew_with_the_episode() -> None:

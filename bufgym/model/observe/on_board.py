@@ -1,7 +1,6 @@
 """Built-in fields outside the tables, computed if an environment's ``fields`` or a learned policy names them.
 
-They describe the link's rate as the robot's own socket shows it, bytes beside what the link carries, and each slot's
-gaps counted in messages or per byte.
+They describe the link's rate as the socket shows it, bytes beside that, and gaps counted in messages or per byte.
 """
 
 import math

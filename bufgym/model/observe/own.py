@@ -47,8 +47,7 @@ class OwnTerm(RewardTerm):
     memory: Mapping[str, float] = entry(default_factory=dict)
     """Names and initial values of its memory, float64[entries], at an episode's begin."""
     one_queue: bool = False
-    """Whether the function is for one queue only. With several topics the term is missing, or among
-    ``TOPIC_REWARD_TERMS``."""
+    """Whether it is for one queue only; with several topics it is missing, or one of ``TOPIC_REWARD_TERMS``."""
     compile: bool = False
     """As in ``Field``."""
     at_end: bool = False
@@ -113,37 +112,24 @@ def field(
     return add
 
 
-def reward_term(
-    name: str,
-    *,
-    unit: str = "",
-    parameters: Mapping[str, float] | None = None,
-    memory: Mapping[str, float] | None = None,
-    one_queue: bool = False,
-    compile: bool = False,
-    at_end: bool = False,
-    prepare: Callable[[], object] | None = None,
-    built_in: bool = False,
-) -> Callable[[Function], Function]:
+def reward_term(name: str, *, unit: str = "", **fields: Any) -> Callable[[Function], Function]:
     """Register the decorated function ``f(step, memory)`` as the reward term ``name``; it comes back unchanged.
 
     Environments whose ``reward`` names it compute it at each step. ``reward={"retained": 1, "late:deadline_s=2": 0.1}``
     sets a parameter. A weight of 0 reports the term without counting it. ``step`` is a ``bufgym.envs.own.Step``, and
-    ``memory`` is float64[entries] for each sender and episode. The other arguments are as in ``OwnTerm`` and ``field``.
+    ``memory`` is float64[entries] for each sender and episode. Keywords are the fields of ``OwnTerm``: ``parameters``,
+    ``memory``, ``one_queue``, ``compile``, ``at_end``, ``prepare``.
 
     Raises:
-        BufgymError: the name is taken or no name, the function does not take two arguments, or ``at_end`` and
-            ``compile`` are both asked for.
+        BufgymError: the name is taken or no name, not two arguments, or ``at_end`` with ``compile``.
     """
     _check_name("reward term", name, (known.name for known in REWARD_TERMS), OWN_TERMS)
-    if at_end and compile:
+    if fields.get("at_end") and fields.get("compile"):
         raise BufgymError(f"reward term {name!r}: at_end = True: is for plain Python, so compile must be False")
 
     def add(function: Function) -> Function:
         _check_function("reward term", name, function, 2)
-        settings: Any = {"parameters": dict(parameters or {}), "memory": dict(memory or {}), "one_queue": one_queue}
-        settings |= {"compile": compile, "at_end": at_end, "prepare": prepare, "built_in": built_in}
-        OWN_TERMS[name] = OwnTerm(name, unit, modules.first_line(function), function=function, **settings)
+        OWN_TERMS[name] = OwnTerm(name, unit, modules.first_line(function), function=function, **fields)
         return function
 
     return add

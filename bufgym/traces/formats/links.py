@@ -77,7 +77,6 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
 
     Raises:
         TraceError: the file is missing, empty, damaged, of no known format, of two, or breaks a rule of its format.
-            The message names the file, the line, the value and the rule.
         BufgymError: an unknown `format`, `after` or `column`.
     """
     origin = "requested"

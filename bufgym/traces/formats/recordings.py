@@ -115,7 +115,6 @@ def _with_topics(workload: Workload, patterns: Sequence[str] | None) -> Workload
     """The workload with these topics alone; its clock and its x begin with their first message."""
     if patterns is None:
         return workload
-    assert workload.topic is not None
     names, chosen, topic = _on_topics(workload.source, workload.topics, workload.topic, patterns)
     arrival_us = workload.arrival_us[chosen]
     return replace(

@@ -66,8 +66,7 @@ def read_poses(path: StrPath, *, format: str | None = None, times: StrPath | Non
     Raises:
         TraceError: the file cannot be read, or a line breaks a rule: as many finite numbers as the format has,
             positions within 10**7 m, a quaternion of unit norm (a rotation matrix) within 1 %, times that never
-            decrease and span at most 10**7 s, at least two lines, most poses 0.1 ms apart or more. The message names
-            file, line, value and rule.
+            decrease and span at most 10**7 s, at least two lines, most poses 0.1 ms apart or more.
         BufgymError: an unknown format, or `times` with another format than KITTI's.
     """
     unit = _OWN_UNIT.get(format or "", "s")

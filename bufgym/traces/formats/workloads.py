@@ -68,7 +68,6 @@ def write_workload_csv(workload: Workload, path: StrPath) -> None:
     for name in workload.topics:
         if workload.topics != ("",) and (not name or name != name.strip() or "," in name or not name.isprintable()):
             raise BufgymError(f"topic {name!r}: a name in a CSV file must be printable, without commas, and not empty")
-    assert workload.topic is not None
     columns = {"time_s": [f"{t // US_PER_S}.{t % US_PER_S:06d}" for t in workload.arrival_us.tolist()]}
     columns["bytes"] = list(map(str, workload.size_bytes.tolist()))
     if workload.topics != ("",):

@@ -1,7 +1,4 @@
-"""LTE-like links from a seed, for users without recordings.
-
-See docs/methods.md, "LTE-like links from a seed".
-"""
+"""LTE-like links from a seed, for users without recordings: docs/methods.md, "LTE-like links from a seed"."""
 
 import math
 from bisect import bisect_right

@@ -14,7 +14,8 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.policies import Policy, guided, learned
+from bufgym.policies import Policy
+from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.learned import NAMES
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
@@ -86,12 +87,13 @@ def driver(folder, text, *flags):
 
 def every_field() -> Policy:
     """A random agent of two layers that reads every field there is."""
-    return learned.policy("every-field", random_weights(NAMES, 7, 5, seed=3))
+    return random_weights(NAMES, 7, 5, seed=3).policy("every-field")
 
 
 def every_output() -> Policy:
     """A random agent that changes every number of the rule it guides."""
-    return guided.linear("every-output", 0.4 * np.random.default_rng(4).normal(size=guided.GuidedWeights.SHAPE))
+    weight = 0.4 * np.random.default_rng(4).normal(size=GuidedWeights.SHAPE)
+    return GuidedWeights(weight).policy("every-output")
 
 
 AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
