@@ -22,9 +22,12 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor, get_monitor_files
 
 import bufgym
+from bufgym import cli, policies
 from bufgym.benchmark.run import draw
 from bufgym.envs import SenderVectorEnv
 from bufgym.ground.errors import BufgymError
+from bufgym.model.observe import FIELDS as FIELDS_OF_ALL
+from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv, SlotPolicy, as_policy, make_vec_env
 from bufgym.scenario import Interruption
 from bufgym.scenario import get as scenario_of
@@ -223,6 +226,37 @@ def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Pat
         assert policy.name == "slots" and policy.compile
         assert repr(reached(policy)) == repr(reached_in_env(model, "dict", FIELDS))
         assert (run(policy, EPISODES, 20, SCENARIO.value).batch.senders["invalid"] == 0).all()
+
+
+def test_export_takes_over_what_the_run_noted(tmp_path: Path) -> None:
+    untrained(MaskablePPO, SlotPolicy, policy_kwargs={"width": 8}).save(tmp_path / "model.zip")
+    model, notes, out = tmp_path / "model.zip", tmp_path / "notes.json", tmp_path / "one.safetensors"
+    exported(model, out, "--name", "alone")
+    assert "training" not in weights.read(out)[1]
+    noted = {"training": "python train.py --capacity 5", "seeds": [3], "scores": {"qoi": 9.5, "drop-oldest": 7.25}}
+    notes.write_text(json.dumps(noted), encoding="utf-8")
+    exported(model, out, "--name", "one", "--about", "Random.")
+    agent, metadata = weights.read(out)
+    assert {key: metadata[key] for key in noted} == noted
+    policy = policies.load(out)
+    assert (policy.name, policy.summary) == ("one", "Random.")
+    assert agent.widths == (8, 8) and set(agent.fields) == {field.name for field in FIELDS_OF_ALL}
+    notes.write_text("{", encoding="utf-8")
+    refuse(r"notes\.json: cannot be read", exported, model, tmp_path / "two.safetensors", "--name", "two")
+    untrained(MaskablePPO, "MultiInputPolicy").save(tmp_path / "plain.zip")
+    (tmp_path / "text.zip").write_text("hello", encoding="utf-8")
+    for name, says in (
+        ("plain.zip", "only an agent that scores slots"),
+        ("other.zip", "no such file"),
+        ("text.zip", r"text\.zip: no model of stable-baselines3"),
+    ):
+        refuse(says, exported, tmp_path / name, tmp_path / "out.safetensors", "--name", "none")
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def exported(*words: object) -> None:
+    """``bufgym export`` with these words."""
+    cli.app()(["export", *map(str, words)])
 
 
 @pytest.mark.parametrize(("form", "network"), [("dict", "MultiInputPolicy"), ("flat", "MlpPolicy")])

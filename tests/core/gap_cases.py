@@ -5,6 +5,8 @@
 
 import itertools
 
+from naive_policies import least
+
 from bufgym.model.link import FOREVER
 from bufgym.policies import ACCEPT, REJECT
 from bufgym.policies.thinning import SOON_US
@@ -22,17 +24,11 @@ def gaps_left(buffer, arrival):
 
 
 def least_gap(buffer, arrival, discount=0.0):
-    """What leaves the smallest gap; of equals the oldest. Slot k of s counts ``discount`` (1 - k / s) less.
-
-    Under B the newcomer goes where those that leave no larger a gap don't make room; once one has gone, it stays.
-    """
+    """What leaves the smallest gap; slot k of s counts ``discount`` (1 - k / s) less."""
     *queued, newcomer = gaps_left(buffer, arrival)
     gaps = [gap * (1 - discount * (1 - k / len(queued))) for k, gap in enumerate(queued)]
-    if not gaps or (buffer.evictions == 0 and newcomer < min(gaps)):
-        return REJECT
     excess = buffer.backlog_bytes + int(arrival["size_bytes"]) - buffer.max_bytes
-    freed = sum(int(m["size_bytes"]) for m, gap in zip(buffer.slots, gaps, strict=True) if gap <= newcomer)
-    return gaps.index(min(gaps)) if buffer.evictions > 0 or freed >= excess else REJECT
+    return least(gaps, newcomer, buffer.slots["size_bytes"].tolist(), excess, buffer.evictions > 0)
 
 
 def fits(buffer, arrival):

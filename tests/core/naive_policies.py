@@ -92,20 +92,22 @@ def gaps_left(sender, queue, newcomer, key):
     return [after - before for before, after in zip(at, at[2:], strict=False)]
 
 
-def min_gap(key):
-    """Drop what leaves the smallest gap between its neighbours, ties to the oldest.
+def least(gaps, own, sizes, excess, again):
+    """What leaves the smallest gap, ties to the oldest.
 
     Under B the newcomer goes where those that leave no larger a gap don't make room; once one has gone, it stays.
     """
+    if not gaps or (not again and own < min(gaps)):
+        return queues.REJECT
+    freed = sum(size for size, gap in zip(sizes, gaps, strict=True) if gap <= own)
+    return gaps.index(min(gaps)) if again or freed >= excess else queues.REJECT
 
+
+def min_gap(key):
     def full(sender, queue, newcomer):
         *gaps, own = gaps_left(sender, queue, newcomer, key)
-        again = sender.evictions > 0
-        if not gaps or (not again and own < min(gaps)):
-            return queues.REJECT
-        excess = sum(m["bytes"] for m in [*queue, newcomer]) - sender.max_bytes
-        freed = sum(m["bytes"] for m, gap in zip(queue, gaps, strict=True) if gap <= own)
-        return gaps.index(min(gaps)) if again or freed >= excess else queues.REJECT
+        sizes = [m["bytes"] for m in queue]
+        return least(gaps, own, sizes, sum(sizes) + newcomer["bytes"] - sender.max_bytes, sender.evictions > 0)
 
     return queues.Policy(full)
 

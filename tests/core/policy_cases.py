@@ -5,11 +5,9 @@ from cases import order
 
 from bufgym import policies
 from bufgym.model import qoi
-from bufgym.model.link import Link
-from bufgym.scenario import Episode, Interruption, messages
+from bufgym.scenario import Interruption
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
-from bufgym.traces import Trace
 
 V = qoi.exponential(0.618)
 
@@ -30,9 +28,3 @@ def worst_ratio(spec, L, lengths):
     scenario = Interruption(t_max=max(lengths))
     senders = run(policies.get(spec), [scenario.episode(T) for T in lengths], L, V)
     return max(outcome(senders, i).longest_gap / ((T + 1) / (L + 1)) for i, T in enumerate(lengths))
-
-
-def stream(spec, n, period_us, capacity, *, size_bytes=1_000, bytes_per_s=1e6, x=None):
-    """n arrivals, one a period, at a steady link: 1000 bytes cross in 1 ms."""
-    arrivals = messages(np.arange(n, dtype=np.int64) * period_us, size_bytes, x)
-    return run(policies.get(spec), [Episode(arrivals, Link(Trace.constant(bytes_per_s, 60)))], capacity, V)

@@ -139,15 +139,6 @@ def drawn_episodes(robots, count=2, **parameters):
     return made, [made.draw(Streams.seeded(k)) for k in range(count)]
 
 
-@pytest.mark.parametrize("name", ["afr", "codel"])
-def test_a_python_policy_does_what_the_compiled_one_does(name):
-    made, episodes = drawn_episodes(3)
-    compiled = policies.get(name)
-    python = replace(compiled, name="test-python", compile=False)
-    ours, theirs = (run_fleet(policy, episodes, 4, made.value).senders for policy in (compiled, python))
-    assert cases.same(ours, theirs)
-
-
 @pytest.mark.parametrize(("hook", "given"), [("on_arrival", None), ("on_dequeue", "1"), ("on_send", 0.5)])
 def test_an_answer_must_be_a_whole_number(hook, given):
     made, episodes = drawn_episodes(2)

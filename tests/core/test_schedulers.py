@@ -1,18 +1,20 @@
-"""Schedulers and Robofleet's rivals: what goes next by hand, and their clients. (All else: ``test_topics_twin``.)"""
+"""Schedulers and Robofleet's rivals: their clients, and settings that are refused. (All else: ``test_topics_twin``.)"""
 
 import naive_schedulers
 import numpy as np
 import pytest
 from cases import order, trace
+from refusal_cases import refused
 
 from bufgym import policies
 from bufgym.ground import files
 from bufgym.model import qoi
+from bufgym.model.checks import check_window
 from bufgym.model.link import Link
-from bufgym.model.topics import Topic
+from bufgym.model.topics import Topic, check_topics
 from bufgym.policies import registry
 from bufgym.scenario import Episode, messages
-from bufgym.sim import run
+from bufgym.sim import Senders, run
 
 pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.618)
@@ -38,37 +40,6 @@ def topics(a=1.0, b=2.0, c=3.0, **more):
     """A, B, C with these priorities (or settings), and N, which may not be dropped."""
     rules = [given if isinstance(given, dict) else {"priority": given} for given in (a, b, c)]
     return [*(Topic(name, **given) for name, given in zip("ABC", rules, strict=True)), Topic("N", no_drop=True, **more)]
-
-
-WEIGHTED = topics({"weight": 1.0}, {"weight": 1.0}, {"weight": 3.0})
-TIMED = topics(1.0, {"deadline_s": 0.05}, {"deadline_s": 0.02})
-
-
-@pytest.mark.parametrize(
-    ("name", "script", "rules", "sent"),
-    [
-        ("fifo", "0 A, 1 C, 2 B, 3 A, 4 C, 5 N", topics(), [0, 1, 2, 3, 4, 5]),
-        # B and C are equal: first in, first out among them, before all of A.
-        ("strict-priority", "0 A, 1 A, 2 C, 3 A, 4 B, 5 C", topics(1, 2, 2), [0, 2, 4, 5, 1, 3]),
-        # At 101 ms: of A 0 was sent, which came at 0: age 101. B was never sent, its oldest came at 10: 91. C: 3 x 31 =
-        # 93. So A's next, 2, which leaves no A. At 102: B 92, C 3 x 32 = 96. Then both of B.
-        ("age-greedy", "0 A, 10 B, 20 A, 30 B, 70 C", WEIGHTED, [0, 2, 4, 1, 3]),
-        # Due: 1 never, 2 at 60, 3 at 70, 4 at 55, 5 at 65. All are late when the link opens, and are sent all the same.
-        ("edf", "0 A, 5 A, 10 B, 20 B, 35 C, 45 C", TIMED, [0, 4, 2, 5, 3, 1]),
-        # At 101 ms A (sent at 0) and B (never) wait alike: A, then B. At 103 ms A waits since 101, B since 102,
-        # whenever what now waits of them arrived.
-        ("robofleet", "0 A, 10 B, 20 A, 102.5 B, 102.6 A", topics(1, 1), [0, 2, 1, 4, 3]),
-        # Round again: A (101), B (102), N, then of A alone; neither priority nor no_drop count.
-        ("ros-native", "0 A, 1 A, 2 A, 3 A, 4 N, 5 B, 6 B", topics(), [0, 1, 5, 4, 2, 6, 3]),
-    ],
-)
-def test_what_goes_next(name, script, rules, sent):
-    assert order(played(name, script, rules)) == sent
-
-
-def test_rosbridge_keeps_everything():
-    senders = played("rosbridge", ", ".join(f"{k} {'ABCN'[k % 4]}" for k in range(20)), topics(), capacity=2)
-    assert order(senders) == list(range(20))
 
 
 def test_clients():
@@ -99,3 +70,43 @@ def test_your_own_can_be_made_for_topics(monkeypatch):
     assert "lifo" in policies.names(for_topics=True) and "lifo" not in policies.names(for_topics=False)
     assert policies.get("lifo").schedules and not policies.get("drop-oldest").schedules
     assert order(played("lifo", "0 A, 1 B, 2 A, 3 B", topics())) == [0, 1, 3, 2]
+
+
+def episode(times_ms, topic=0, **more):
+    """Messages of 1000 bytes over a link of 1 MB/s."""
+    arrivals = messages(np.array(times_ms) * MS, 1_000)
+    arrivals["topic"] = topic
+    return Episode(arrivals, Link(trace([(0, 0), (1_000 * MS, 1_000_000)], "loop")), **more)
+
+
+def after_run(played, topics=()):
+    return run(policies.get("drop-newest"), [played], 5, V, topics=topics)
+
+
+A_B = (Topic("a"), Topic("b"))
+
+
+test_what_is_refused = refused(
+    (lambda: Topic(""), "topic '': a name must be a non-empty text"),
+    *((lambda p=p: Topic("a", priority=p), "must be a number >= 0") for p in (-1, None, True, np.inf, 10**400)),
+    *((lambda hz=hz: Topic("a", rate_limit_hz=hz), "must be a number > 0") for hz in (0, "10")),
+    (lambda: Topic("a", weight=float("nan")), "weight = nan: must be a number >= 0"),
+    *((lambda s=s: Topic("a", deadline_s=s), r"deadline_s = .*: must be a number > 0") for s in (0, 1e300)),
+    (lambda: Topic("a", no_drop=1), "no_drop = 1: must be true or false"),
+    *((lambda n=n: Topic("a", limit=n), "must be a whole number from 1") for n in (0, 1.5)),
+    (lambda: Topic("a", value=0.618), "value = 0.618: must be a V of bufgym.model.qoi"),
+    (lambda: Topic("a", no_drop=True, limit=3), "limit = 3: a no_drop topic can't have a limit"),
+    (lambda: Senders(1, 2, V, max_messages=1, topics=[*A_B, Topic("a")]), "topic 'a': two topics have this name"),
+    (lambda: check_topics(["a"]), "'a' is not a bufgym"),
+    (lambda: check_topics([Topic(str(k)) for k in range(257)]), "257 topics: must be at most 256"),
+    (lambda: after_run(episode([0, 1], [0, 2]), A_B), "episode: unknown topic 2; the senders know 2, from 0 on"),
+    (lambda: after_run(episode([0, 1], [0, -1]), A_B), "message 1: topic = -1: must be >= 0"),
+    *((lambda n=n: check_window(n), "n_T must be a whole number from 1") for n in (0, 1.0, True, "2", 10**6 + 1)),
+    (lambda: after_run(episode([0], window=0)), "n_T must be a whole number from 1"),
+    *((lambda us=us: episode([0], ack_delay_us=us), "must be a whole number from 0 to") for us in (-1, 0.5, None)),
+)
+
+
+def test_the_slowest_rate_limit():
+    # Slower than any episode is long: the first message and no other.
+    assert order(after_run(episode([0, 1, 10**9]), (Topic("a", rate_limit_hz=1e-300),))) == [0]

@@ -8,13 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import log, same, trace, watched
-from refusal_cases import refuse
+from cases import same, trace, watched
+from refusal_cases import refused
 
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.policies import ACCEPT, REJECT
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders, run
 from bufgym.sim.metrics import ages_s, outcome, received
@@ -76,45 +75,18 @@ def test_peak_backlog():
     assert senders.batch.senders[0]["backlog_bytes"] == 0
 
 
-@kernels
-@pytest.mark.parametrize(
-    ("given_", "rule"),
-    [
-        ({"capacity": 0}, "capacity = 0: L must be a whole number from 1"),
-        ({"capacity": 2.0}, "capacity = 2.0"),
-        ({"capacity": True}, "capacity = True"),
-        ({"max_bytes": 0}, "max_bytes = 0: B must be"),
-        ({"decide_at": "departure"}, "decide_at = 'departure': must be 'arrival' or 'overflow'"),
-    ],
+SMALL = {"capacity": 2, "v": V, "max_messages": 3}
+test_errors = refused(
+    (lambda: Senders(1, **SMALL | {"capacity": 0}), "capacity = 0: L must be a whole number from 1"),
+    (lambda: Senders(1, **SMALL | {"capacity": 2.0}), "capacity = 2.0"),
+    (lambda: Senders(1, **SMALL | {"capacity": True}), "capacity = True"),
+    (lambda: Senders(1, **SMALL | {"max_bytes": 0}), "max_bytes = 0: B must be"),
+    (
+        lambda: Senders(1, **SMALL | {"decide_at": "departure"}),
+        "decide_at = 'departure': must be 'arrival' or 'overflow'",
+    ),
+    (lambda: run(policies.get("afr"), [], 2, V), "no episode to run"),
 )
-def test_errors(given_, rule):
-    refuse(rule, Senders, 1, **{"capacity": 2, "v": V, "max_messages": 3, **given_})
-
-
-@kernels
-def test_no_episode():
-    refuse("no episode to run", run, policies.get("afr"), [], 2, V)
-
-
-@kernels
-def test_asks_again_about_the_same_arrival():
-    def on_arrival(buffer, arrival, memory):
-        if buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes:
-            return ACCEPT
-        return REJECT if arrival.seq == 5 and buffer.evictions == 1 else 0
-
-    policy, asked = watched(lambda b, arrival: (int(arrival.seq), b.slots.seq.tolist(), b.evictions), on_arrival)
-    # Nothing but message 0 is in the socket for a second.
-    slow = Link(trace([(0, 0), (1_000_000, 100), (2_000_000, 10_000_000)], "hold"))
-    at_once = messages(np.zeros(7, np.int64), np.array([100, 1_000, 1_000, 500, 2_000, 2_400, 2_501]))
-    senders = run(policy, [Episode(at_once, slow)], 8, V, max_bytes=2_500)
-    four = [(4, [1, 2, 3], 0), (4, [2, 3], 1)]
-    five = [(5, [3, 4], 0), (5, [4], 1)]  # and rejects: what it evicted is gone all the same
-    # 6 is larger than B and is dropped unasked.
-    assert asked == [(0, [], 0), (1, [], 0), (2, [1], 0), (3, [1, 2], 0), *four, *five]
-    told = outcome(senders, 0)
-    assert log(senders)["dropped_us"].keys() == {1, 2, 3, 5, 6}
-    assert (told.invalid, told.dropped, told.delivered) == (0, 5, 2)
 
 
 RANKED = [p for p in map(policies.get, policies.names(for_topics=False)) if p.ranked and not p.weights]

@@ -116,6 +116,7 @@ def moments(draw):
     known |= {"medium_rate_bytes_per_s": mean * pick(1.0, 0.995, 0.98), "left_bytes": int(rng.integers(1, 1000))}
     known |= {"remaining_us": pick(FOREVER, FOREVER, 2_000_000, 200_000, 1, 0), "drained_us": pick(0, 1000)}
     known |= {"evictions": 0, "v": pick(V, qoi.saturating(9), qoi.tabulated([0, 9, 20], [0, 0.7, 1])).array}
+    known |= {"dequeued_arrival_us": 33_333 * pick(0, 0, 0, int(frames[-1]))}
     buffer, arrival = frames_at_30_hz(*frames[:-1], now=int(frames[-1]), per_frame=pick(0.5, 2.0), **known)
     arrival["size_bytes"] = pick(1000, 28_000)
     return buffer, arrival, memory, seen

@@ -108,29 +108,22 @@ def test_an_episode_is_the_rollout_of_the_same_policy(reward):
         env.step({})
 
 
-def test_what_a_step_hands_out_is_never_written_again():
-    env = FleetEnv(robots=2, mask_in_observation=True, **SMALL)
-    seen, infos = env.reset(seed=0)
+@pytest.mark.parametrize("where", [True, "rllib"])
+def test_what_a_step_hands_out_has_the_robots_mask_and_fields_and_is_never_written_again(where):
+    env, plain = FleetEnv(robots=2, mask_in_observation=where, **SMALL), FleetEnv(robots=2, **SMALL)
+    (seen, infos), (before, _) = env.reset(seed=0), plain.reset(seed=0)
     held, copies = [], []
     while env.agents:
-        held.append({**seen["robot_1"], "mask": infos["robot_1"]["action_mask"]})
-        copies.append({name: array.copy() for name, array in held[-1].items()})
-        assert np.array_equal(held[-1]["action_mask"], held[-1]["mask"])
-        seen, _, _, _, infos = env.step(dict.fromkeys(env.agents, L + 1))
-    assert all(same(now, then) for now, then in zip(held, copies, strict=True))
-
-
-def test_a_nested_observation_has_the_robots_mask_and_fields():
-    env, plain = FleetEnv(robots=3, mask_in_observation="rllib", **SMALL), FleetEnv(robots=3, **SMALL)
-    (seen, infos), (before, _) = env.reset(seed=4), plain.reset(seed=4)
-    for _ in range(9):
         for agent in env.agents:
-            assert list(seen[agent]) == ["observations", "action_mask"]
             assert env.observation_space(agent).contains(seen[agent])
-            assert same(seen[agent]["observations"], before[agent])
-            assert np.array_equal(seen[agent]["action_mask"], infos[agent]["action_mask"])
-        actions = dict.fromkeys(env.agents, 0)
+            mask, fields = seen[agent]["action_mask"], seen[agent]["observations"] if where == "rllib" else seen[agent]
+            assert np.array_equal(mask, infos[agent]["action_mask"])
+            held.append({"mask": mask, **{name: fields[name] for name in before[agent]}})
+            assert same(held[-1], {"mask": mask, **before[agent]})
+            copies.append({name: array.copy() for name, array in held[-1].items()})
+        actions = dict.fromkeys(env.agents, L + 1)
         (seen, _, _, _, infos), (before, *_) = env.step(actions), plain.step(actions)
+    assert all(same(now, then) for now, then in zip(held, copies, strict=True))
 
 
 def test_np_random_is_the_generator_of_the_seed():

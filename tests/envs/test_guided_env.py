@@ -63,27 +63,6 @@ def test_actions_are_the_outputs_of_a_policy_over_their_scales(case: str) -> Non
     assert np.array_equal(gone, rolled(env, case, linear("constant", weights)))
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("fields", ["guided", None])
-def test_a_row_of_a_batch_is_the_single_environment(case: str, fields: str | None) -> None:
-    scenario, options = CASES[case]
-    options = {**options, "actions": "guided", "fields": fields}
-    envs, single = SenderVectorEnv(N, scenario, L, **options), [SenderEnv(scenario, L, **options) for _ in range(N)]
-    seen, _ = envs.reset(seed=5)
-    one = [env.reset(seed=5 + i)[0] for i, env in enumerate(single)]
-    rng, over = np.random.default_rng(2), [False] * N
-    while True:
-        for i in range(N):
-            assert same({name: column[i] for name, column in seen.items()}, one[i])
-        if any(over):
-            break
-        actions = rng.uniform(-1, 1, (N, len(OUTPUTS))).astype(np.float32)
-        seen, rewards, ends, _, _ = envs.step(actions)
-        for i, env in enumerate(single):
-            one[i], reward, over[i], _, _ = env.step(actions[i])
-            assert (reward, over[i]) == (rewards[i], ends[i])
-
-
 def test_memory_begins_anew_with_the_episode() -> None:
     scenario, _ = CASES["unequal"]
     used, fresh = (SenderEnv(scenario, L, actions="guided", fields="guided") for _ in range(2))

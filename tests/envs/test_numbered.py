@@ -1,6 +1,7 @@
-"""Episodes by their numbers in a benchmark, suites as environments, what an episode was worth, arguments as text."""
+"""Episodes by their numbers in a benchmark or from a pool, suites as environments, their worth, arguments as text."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,12 @@ from refusal_cases import refuse, refused
 from bufgym import policies
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.envs import SenderEnv, SenderVectorEnv
+from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
 from bufgym.envs.expert import Player
+from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
-from bufgym.scenario import Interruption, Uplink, suites
-from bufgym.scenario.numbered import draw
+from bufgym.scenario import Interruption, Streams, Uplink, suites
+from bufgym.scenario.numbered import Pool, draw
 from bufgym.traces import Trace, drive_motion, write_csv
 
 PLAYED = ("random", "drop-oldest")
@@ -236,3 +238,56 @@ def test_a_randomised_policy_is_random_in_an_environment(env_id: str) -> None:
     env.reset(seed=0)
     Player(policies.get("random")).action(env.unwrapped.rows.senders)
     assert env.unwrapped.rows.senders.episodes[0].arrivals["uniform"].any()
+
+
+UPLINK = Uplink(traces=(Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)]),), jitter=0.8, duration_s=0.4)
+CAPACITY = 3
+
+
+def test_each_is_drawn_once_and_every_one_comes() -> None:
+    drawn: list[Any] = []
+
+    def draw(streams: Streams) -> Any:
+        drawn.append(UPLINK.draw(streams))
+        return drawn[-1]
+
+    pool, streams = Pool(draw, 5), Streams.seeded(1)
+    taken = Counter(id(pool(streams)) for _ in range(500))
+    assert len(pool) == len(drawn) == len(taken) == 5
+    # Each is taken 100 times of 500 on average; the standard deviation is 9.
+    assert min(taken.values()) > 50
+
+
+def test_the_set_is_the_same_for_every_row_and_seed() -> None:
+    """A single environment, and the rows of a batch, play no other episodes than those of the pool."""
+    arrivals = set()
+    for seed in range(4):
+        batch, single = SenderVectorEnv(3, UPLINK, CAPACITY, pool=2), SenderEnv(UPLINK, CAPACITY, pool=2)
+        batch.reset(seed=seed)
+        single.reset(seed=seed)
+        played = [*batch.rows.senders.episodes, *single.rows.senders.episodes]
+        arrivals |= {episode.arrivals["arrival_us"].tobytes() for episode in played if episode is not None}
+    assert len(arrivals) == 2
+
+
+def test_fleets_have_one_too() -> None:
+    envs = FleetVecEnv(4, 2, UPLINK, CAPACITY, pool=1)
+    envs.reset(seed=1)
+    links = {(episode.link.trace.name, episode.link.offset_us) for episode in envs.rows.senders.episodes if episode}
+    assert len(links) == 1
+
+
+@pytest.mark.parametrize("pool", [0, -1, 1.5, "many", True])
+def test_a_pool_is_a_whole_number(pool: Any) -> None:
+    refuse(r"pool = .*: must be a whole number from 1 to 1000000", SenderEnv, UPLINK, CAPACITY, pool=pool)
+
+
+def test_a_reset_that_is_refused_touches_no_row() -> None:
+    """Of three episodes given the last is too long: the rows before it go on with what they have."""
+    batch = SenderVectorEnv(3, UPLINK, CAPACITY)
+    batch.reset(seed=1)
+    before = batch.rows.senders.batch.arrivals.copy()
+    long = Uplink(traces=UPLINK.traces, duration_s=2.0).draw(Streams.seeded(3))
+    with pytest.raises(BufgymError, match="these senders have room for"):
+        batch.reset(options={"episodes": [UPLINK.draw(Streams.seeded(2)), None, long]})
+    assert (batch.rows.senders.batch.arrivals == before).all() and batch.rows.senders.begun.tolist() == [1, 1, 1]

@@ -1,4 +1,4 @@
-"""The single environment: Gymnasium's own checks, rewards worked by hand, masks, observations, wrong use."""
+"""The single environment: Gymnasium's own checks, rewards by hand, masks, wrong use; what it hands out."""
 
 import copy
 import math
@@ -14,11 +14,12 @@ from refusal_cases import refused
 
 import bufgym
 from bufgym.envs import SenderEnv
+from bufgym.envs.observation import Handed, ObservationForm
 from bufgym.ground.kernel import named
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
-from bufgym.model.observe import FIELDS
+from bufgym.model.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
 from bufgym.sim.rollout import python_view
 from bufgym.traces import Trace, drive_motion
@@ -263,3 +264,46 @@ def test_an_episode_that_has_ended_takes_no_step() -> None:
         env.step(0)
     env.reset()
     env.step(0)
+
+
+FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, 3)
+NUMBERS = FORM.numbers
+
+
+def numbered_row(number: float) -> Any:
+    return np.full(NUMBERS, number, np.float32)
+
+
+def test_what_someone_holds_stays_as_it_is() -> None:
+    """The dict, one of its arrays, a part of one, or what shares an array's memory."""
+    handed = Handed(FORM)
+    dict_held = handed.of(numbered_row(1))
+    array_held = handed.of(numbered_row(2))["rank"]
+    part_held = handed.of(numbered_row(3))["loss"][1:]
+    shared = memoryview(handed.of(numbered_row(4))["size"])
+    for number in range(5, 12):
+        assert handed.of(numbered_row(number))["busy"][0] == number
+    assert all((array == 1).all() for array in dict_held.values())
+    assert (array_held == 2).all() and (part_held == 3).all() and list(shared) == [4] * 4
+
+
+@pytest.mark.parametrize("id", ["bufgym/Uplink-v0", "bufgym/Topics-v0"])
+def test_compact_is_the_context_fields_of_all_fields(id: str) -> None:
+    whole, compact = (gym.make_vec(id, 3, capacity=5, **options) for options in ({}, {"fields": "compact"}))
+    (seen, _), (part, _) = whole.reset(seed=1), compact.reset(seed=1)
+    for action in range(60):
+        context = [name for name, numbers in seen.items() if numbers.shape[1] == 1]
+        assert list(part) == context
+        assert all((part[name] == seen[name]).all() for name in context)
+        (seen, *_), (part, *_) = whole.step(np.full(3, action % 7)), compact.step(np.full(3, action % 7))
+
+
+def test_what_an_owner_does_to_a_batch_s_dicts_changes_no_other() -> None:
+    batch = gym.make_vec("bufgym/Uplink-v0", 2, capacity=3)
+    batch.reset(seed=1)
+    for _ in range(9):
+        seen, *_, info = batch.step(np.zeros(2, np.int64))
+        assert {"rank", "busy"} <= set(seen) and {"qoi", "_qoi"} <= set(info) and "retained" in info["reward_terms"]
+        seen.clear()
+        info["reward_terms"].clear()
+        info.clear()

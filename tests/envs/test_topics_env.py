@@ -1,14 +1,13 @@
 """``bufgym/Topics-v0``: two kinds of event, worked by hand, on copies of the sender, and in Gymnasium's forms."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from env_cases import LINKS, client, same, text, valid_action
+from env_cases import LINKS, client, text, valid_action
 from refusal_cases import refuse
 
-from bufgym.envs import SenderEnv, SenderVectorEnv, render
+from bufgym.envs import SenderEnv, render
 from bufgym.envs.render import scene
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
@@ -173,18 +172,6 @@ def test_a_client_of_one_topic_without_weight_is_rewarded_nothing() -> None:
         assert reward == 0.0
     assert met == {ARRIVAL_WAITS, SOCKET_WAITS}
     assert info["invalid"] == 0 and 0 < info["dropped"] and info["qoi"] == 0 < info["delivered"]
-
-
-def test_given_episodes() -> None:
-    env, envs = SenderEnv(BY_HAND, 3), SenderVectorEnv(2, BY_HAND, 3)
-    first = env.reset(seed=0, options={"episode": three_topics()})[0]
-    seen, _ = envs.reset(seed=0, options={"episodes": [None, three_topics()]})
-    assert same({name: seen[name][1] for name in seen}, first)
-    assert env.rows.senders.episodes[0].arrivals["topic"].tolist() == [0, 1, 2, 0, 1, 0, 2]
-    arrivals = three_topics().arrivals.copy()
-    arrivals["topic"][3] = 3
-    unknown = replace(three_topics(), arrivals=arrivals)
-    refuse("unknown topic 3; the senders know 3", env.reset, options={"episode": unknown})
 
 
 def test_a_frame_of_text_has_a_lane_a_topic() -> None:

@@ -71,8 +71,11 @@ def pick(batch: dict[str, Any], i: int) -> dict[str, Any]:
     return {name: array[i] for name, array in batch.items()}
 
 
-def actions_of(rng: np.random.Generator, masks: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def actions_of(rng: np.random.Generator, envs: SenderVectorEnv) -> np.ndarray[Any, Any]:
     """Half of them valid for sure, the others at random."""
+    if isinstance(envs.single_action_space, gym.spaces.Box):
+        return rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
+    masks = envs.action_masks()
     valid = [valid_action(mask, rng) for mask in masks]
     return np.where(rng.random(len(masks)) < 0.5, valid, rng.integers(L + 2, size=len(masks)))
 
@@ -88,6 +91,9 @@ FORMS: list[dict[str, Any]] = [
 ]
 
 
+GUIDED = [("fading", "guided"), ("fading", None), ("dying", "guided"), ("interruption", "guided")]
+
+
 @pytest.mark.parametrize("mode", [NEXT_STEP, SAME_STEP])
 @pytest.mark.parametrize(
     ("case", "limit", "options"),
@@ -95,6 +101,7 @@ FORMS: list[dict[str, Any]] = [
         *((case, None, {}) for case in CASES),
         *((case, 4, {}) for case in (*CASES,)[:-1]),
         *((case, None, form) for case in ("fading", "topics") for form in FORMS),
+        *((case, None, {"actions": "guided", "fields": fields}) for case, fields in GUIDED),
     ],
 )
 def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: Any, limit: Any, options: Any) -> None:
@@ -128,7 +135,7 @@ def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, steps
         assert_same(row(infos, i), row(expected_infos, i))
     rng, truncations, episodes, questions = np.random.default_rng(1), 0, 0, set()
     for _ in range(steps):
-        actions = actions_of(rng, envs.action_masks())
+        actions = actions_of(rng, envs)
         questions.add(frozenset(envs.rows.senders.batch.senders["waiting"].tolist()))
         step, expected = envs.step(actions), sync.step(actions)
         for a, b in zip(step[:4], expected[:4], strict=True):
@@ -163,7 +170,7 @@ def test_threads_change_nothing(case: str) -> None:
         envs.reset(seed=8)
     rng = np.random.default_rng(1)
     for _ in range(60):
-        actions = actions_of(rng, one.action_masks())
+        actions = actions_of(rng, one)
         step, *others = (envs.step(actions) for envs in (one, two, many))
         for other in others:
             for result, expected in zip(other, step, strict=True):
@@ -185,7 +192,7 @@ def test_the_forms_hold_the_same_numbers(case: str) -> None:
         assert_same(seen["slots"]["context"], np.concatenate(list(fields.values())[len(per_slot) :], axis=1))
         for form, envs in several.items():
             assert envs.observation_space.contains(seen[form])
-        actions = actions_of(rng, several["dict"].action_masks())
+        actions = actions_of(rng, several["dict"])
         seen = {form: envs.step(actions)[0] for form, envs in several.items()}
 
 
@@ -240,7 +247,7 @@ def test_arrays_handed_out_are_never_written_again(mode: str, form: str) -> None
     for k in range(50):
         masks = envs.action_masks()
         keep(masks)
-        keep(envs.step(actions_of(rng, masks)))
+        keep(envs.step(actions_of(rng, envs)))
         done = held[-1][2] | held[-1][3]
         if mode == "Disabled" and done.any():
             keep(envs.reset(options={"reset_mask": done}))

@@ -1,4 +1,4 @@
-"""Whatever comes in, it ends in a result or in one line: files of every kind, command lines, random episodes.
+"""Whatever comes in, it ends in a result or in one line: files of every kind, command lines.
 
 A failure names the seed and the number of its input. Each night has 10,000 files of each kind and 1,000 command lines.
 """
@@ -17,21 +17,15 @@ from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from link_files import SAMPLES
 from mutations import COUNT, SEED, limited, mutated
 
 from bufgym import policies
 from bufgym.benchmark import leaderboard, report
 from bufgym.ground.errors import BufgymError, TraceError
-from bufgym.model import qoi
 from bufgym.policies import weights as weight_files
-from bufgym.scenario import Streams, Uplink, read_client
-from bufgym.sim.metrics import outcome
-from bufgym.sim.senders import run
+from bufgym.scenario import read_client
 from bufgym.traces import FORMATS, Trace, load_motion, read_motion, read_trace, read_workload
 from bufgym.traces.datasets.unpack import unpack
 
@@ -183,33 +177,3 @@ def test_command_lines() -> None:
     command = [sys.executable, str(HERE / "commands.py"), str(max(30, COUNT // 10)), SEED]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
     assert done.returncode == 0, done.stderr[-3000:]
-
-
-STEPS = st.tuples(st.sampled_from([0.01, 0.3, 2]), st.sampled_from([0, 0, 1, 3e3, 1e5]))
-LINKS = st.builds(
-    lambda steps, after: (Trace.steps([*steps, (0.2, 5e3)], after=after),),
-    *(st.lists(STEPS, min_size=1, max_size=5), st.sampled_from(["loop", "hold"])),
-)
-OF_UPLINKS = {"rate_hz": [5, 30, 1000], "duration_s": [0.2, 0.5, 1.0], "jitter": [0, 0.1, 1], "size_cv": [0, 0.5, 3]}
-OF_UPLINKS |= {"size_bytes": [1, 40, 1000, 10**6]}
-VALUES = st.sampled_from([qoi.exponential(), qoi.exponential(0.01), qoi.saturating(7)])
-UPLINKS = st.builds(
-    Uplink, traces=LINKS, value=VALUES, **{name: st.sampled_from(chosen) for name, chosen in OF_UPLINKS.items()}
-)
-POLICIES = [name for name in policies.names(for_topics=False) if name != "clairvoyant"]
-CAPACITIES, LIMITS = st.sampled_from([1, 2, 3, 8, 40]), st.sampled_from([None, None, 2 * 10**6])
-
-
-@given(UPLINKS, st.sampled_from(POLICIES), CAPACITIES, LIMITS, st.integers(0, 2**31))
-def test_random_episodes_keep_invariants(met: Uplink, name: str, capacity: int, limit: int | None, first: int) -> None:
-    """Each message ends somewhere, once; no more than L wait; H is within its bounds."""
-    policy, episodes = policies.get(name), []
-    for i in range(8):
-        streams = Streams.seeded(first + i)
-        episodes.append(met.draw(streams).with_uniforms(streams.policy))
-    senders = run(policy, episodes, capacity, met.value, max_bytes=limit)
-    for i in range(8):
-        end = outcome(senders, i)
-        assert end.arrived == end.delivered + end.dropped + end.in_transmission + end.buffered
-        assert end.buffered <= capacity or not policy.ranked
-        assert 0 <= end.qoi <= max(1, end.arrived) + 1e-9 and np.isfinite(end.qoi)
