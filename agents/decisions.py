@@ -58,7 +58,8 @@ class DecisionLearner(Learner[Decisions]):
 
     def agent_of(self, model: Any, name: str) -> Agent:
         """The agent of a model, by its name."""
-        return self.weights_of(model).policy(name)
+        agent: Agent = self.weights_of(model).policy(name)
+        return agent
 
     def agent(self, run: Run) -> Agent:
         """A policy if the run kept a file of weights, or its model."""

@@ -1,4 +1,4 @@
-"""The page over made-up robots that send each type of message: troubles, layers, cameras, commands; on a desk and on a phone."""
+"""The page over made-up robots that send each type of message, on a desk and on a phone."""
 
 import asyncio
 import itertools
@@ -142,7 +142,7 @@ def test_what_is_old_looks_old_and_an_absent_relay_covers_the_page(browser: Any,
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_map_shows_layers_of_one_frame(browser: Any, fleet: Fleet, width: int) -> None:
-    """The plan lies in odom, 4 m along the map's x: it is drawn where tf leads it, and the picture changes with a layer."""
+    """The plan lies in odom, 4 m along the map's x: it is drawn where tf leads it, as long as its layer is on."""
     fleet.robot("one", *drawn())
     boxes = "[...document.querySelectorAll('#layers label')].map(one => one.textContent).join()"
     colours = f"({SEES})(document.querySelector('#map'))"
@@ -151,7 +151,8 @@ def test_the_map_shows_layers_of_one_frame(browser: Any, fleet: Fleet, width: in
         all = "laser walls,trails,map,plan,particles,goal_pose,markers,markers people,markers zones"
         until(page, f"{boxes} === '{all}'", f"{colours} > 20")
         orange = "(c => { const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0;"
-        orange += "for (let k = 0; k < d.length; k += 4) n += d[k] > 240 && d[k + 1] > 110 && d[k + 1] < 150 && d[k + 2] < 30;"
+        orange += "for (let k = 0; k < d.length; k += 4) "
+        orange += "n += d[k] > 240 && d[k + 1] > 110 && d[k + 1] < 150 && d[k + 2] < 30;"
         orange += "return n; })(document.querySelector('#map'))"
         until(page, f"{orange} > 50")
         page.click("#layers-box summary")
@@ -162,7 +163,8 @@ def test_the_map_shows_layers_of_one_frame(browser: Any, fleet: Fleet, width: in
           const {Place, within} = await import("./frames.js"), {tree} = new Place("one");
           tree.add({frame: "map", child: "odom", at: [4, 0, 0], turn: [0, 0, Math.SQRT1_2, Math.SQRT1_2]});
           tree.add({frame: "odom", child: "base_link", at: [1, 0, 0], turn: [0, 0, 0, 1]});
-          const {x, y} = within(tree.between("odom", "map"), {x: 2, y: 0}), back = within(tree.between("map", "odom"), {x, y});
+          const {x, y} = within(tree.between("odom", "map"), {x: 2, y: 0});
+          const back = within(tree.between("map", "odom"), {x, y});
           return [x, y, back.x, back.y].map(value => Math.round(1000 * value) / 1000 + 0);
         }""")
         assert at == [4, 2, 2, 0]
