@@ -1,6 +1,6 @@
 """Futures of a made-up link and of a drive, drawn from their laws given what a robot has seen so far.
 
-The laws are those of the generators ``synthetic_lte`` and ``drive_motion``. A robot sees no hidden state. It sees how
+The laws stand in the generators ``synthetic_lte`` and ``drive_motion``. A robot sees no hidden state. It sees how
 many bytes left its socket between two arrivals, and how far the scene has moved.
 
 **The link** keeps its rate for a second of the trace, so the first arrivals of a second tell that second's rate, and a

@@ -62,7 +62,7 @@ core's of its name, and do more."""
 
 
 def app() -> App:
-    """The command with the core's commands, then those of installed packages."""
+    """Make the command: the core's commands come first, then what installed packages add."""
     root = App(
         name="bufgym",
         help="A robot's send buffer is full: which message should go?",

@@ -1,4 +1,4 @@
-"""What the tests of sockets share. pytest-asyncio runs those that are coroutines, in one loop for each module."""
+"""What the tests of sockets share. pytest-asyncio runs coroutines, in one loop for each module."""
 
 import asyncio
 import contextlib
