@@ -187,6 +187,7 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 ELSEWHERE = {
     "docs/guide/on-a-robot.md": "packages/live/tests/robot/test_ros1.py, test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
+    "docs/guide/trainers.md": "tests/test_trainers.py",
     "docs/guide/yours-to-change.md": "below",
     "docs/fleet.md": "it trains for minutes; what it imports is looked at above",
 }

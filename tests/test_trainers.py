@@ -1,0 +1,50 @@
+"""Each program of docs/guide/trainers.md runs, where its library is installed.
+
+A library that pins other versions than bufgym's tests use has an environment of its own: ``BUFGYM_TRAINERS`` names a
+folder of them, ``venv-skrl`` for ``skrl``. The interpreter that runs the tests serves the others.
+"""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parent.parent
+PAGE = (REPO / "docs" / "guide" / "trainers.md").read_text(encoding="utf-8")
+PROGRAMS: dict[str, str] = dict(re.findall(r"^```python\n# (\w+)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
+"""Package that a program's first line names -> the program."""
+QUICK = ("torch", "torchrl")
+"""Those that run with every test, if they are installed."""
+FOLDER = "BUFGYM_TRAINERS"
+
+
+def interpreter(package: str) -> str | None:
+    """Python of the package's own environment, or of this one; None where the package is missing."""
+    own = Path(os.environ[FOLDER], f"venv-{package}", "bin", "python") if FOLDER in os.environ else None
+    if own and own.exists():
+        return str(own)
+    return sys.executable if importlib.util.find_spec(package) else None
+
+
+def test_every_library_of_the_table_has_a_program() -> None:
+    listed = re.findall(r"^\| [^|]+ \| `(\w+)` \|", PAGE, re.MULTILINE)
+    assert len(listed) > 2 and sorted(listed) == sorted(PROGRAMS)
+
+
+@pytest.mark.parametrize(
+    "package", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.nightly) for name in PROGRAMS]
+)
+def test_the_program_of_the_page_runs(package: str, tmp_path: Path) -> None:
+    python = interpreter(package)
+    if python is None:
+        pytest.skip(f"{package} is not installed")
+    path = os.pathsep.join(str(REPO / part) for part in ("", "packages/live", "packages/papers"))
+    where = os.environ | {"PYTHONPATH": path, "MINARI_DATASETS_PATH": str(tmp_path / "data")}
+    (tmp_path / "program.py").write_text(PROGRAMS[package])
+    command = [python, "program.py"]
+    done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
