@@ -251,7 +251,7 @@ class MadeUp:
         return {"battery": round(max(0.0, charge), 3), "ok": True, "text": text, "commands": commands}
 
     async def on_command(self, command: Any) -> None:
-        """``stop`` stands still, ``goal`` drives straight to ``x``, ``y``, ``yaw``, ``cancel`` goes on round the table."""
+        """Obey ``stop`` (stand still), ``goal`` (drive straight to x, y) or ``cancel`` (go on round the table)."""
         self._move()
         match command:
             case {"command": "stop"}:
@@ -266,7 +266,7 @@ class MadeUp:
             }:
                 if not (abs(x) <= HALF_M[0] and abs(y) <= HALF_M[1]):
                     raise BufgymError(f"goal {x}, {y}: must be in the room, {HALF_M} m from its middle")
-                self._stands, self._goal = False, Pose(x, y, float(more.get("yaw", 0.0)))
+                self._stands, self._goal = False, Pose(x, y, yaw)
             case _:
                 raise BufgymError(f"command {command!r}: must be stop, goal or cancel")
 
