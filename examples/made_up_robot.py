@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 
+from bufgym import BufgymError
 from bufgym.scenario import Stream, read_client
 from bufgym_live.relay import Robot
 
@@ -181,6 +182,8 @@ BEAMS: Final = np.radians(np.arange(-180, 180, 2.0))
 _DRAIN_S: Final = 3600.0
 """Time for a full battery to run empty."""
 _TURN_S: Final = 0.05
+SPEED_M_S: Final = 0.6
+"""Speed on the way to a goal, and back to the loop."""
 
 
 class MadeUp:
@@ -189,7 +192,11 @@ class MadeUp:
     def __init__(self, number: int = 0, streams: tuple[Stream, ...] | None = None) -> None:
         self.number = number
         self.streams = read_client(CONFIG).streams if streams is None else streams
-        self._began_s = time.monotonic()
+        self._began_s = self._moved_s = time.monotonic()
+        self._loop_s = 0.0
+        """How long it has been on its loop; it does not count while it stands or drives elsewhere."""
+        self._at, self._stands = pose_at(number, 0.0), False
+        self._goal: Pose | None = None
 
     async def run(self, robot: Robot) -> None:
         makers = {"odom": self._odometry, "scan": self._scan, "camera": self._camera}
@@ -204,29 +211,64 @@ class MadeUp:
             await asyncio.sleep(max(0.0, min(due_s.values()) - time.monotonic()))
 
     def _odometry(self, robot: Robot) -> None:
-        now_s, now_us = self._now()
-        pose, later = pose_at(self.number, now_s), pose_at(self.number, now_s + 0.1)
-        speed_m_s = math.hypot(later.x - pose.x, later.y - pose.y) / 0.1
-        robot.publish("odom", odometry(now_us, robot.name, pose, speed_m_s), "cdr", ODOMETRY)
+        before, before_s = self._at, self._moved_s
+        pose = self._move()
+        speed_m_s = math.hypot(pose.x - before.x, pose.y - before.y) / max(1e-3, self._moved_s - before_s)
+        robot.publish("odom", odometry(self._now()[1], robot.name, pose, speed_m_s), "cdr", ODOMETRY)
 
     def _scan(self, robot: Robot) -> None:
-        now_s, now_us = self._now()
-        ranges_m = cast(pose_at(self.number, now_s), BEAMS)[0]
-        robot.publish("scan", scan(now_us, robot.name, BEAMS, ranges_m), "cdr", SCAN)
+        ranges_m = cast(self._move(), BEAMS)[0]
+        robot.publish("scan", scan(self._now()[1], robot.name, BEAMS, ranges_m), "cdr", SCAN)
 
     def _camera(self, robot: Robot) -> None:
-        robot.publish("camera", jpeg(picture(pose_at(self.number, self._now()[0]))), "jpeg")
+        robot.publish("camera", jpeg(picture(self._move())), "jpeg")
 
     def _now(self) -> tuple[float, int]:
         """Return the time in s since it began and in us since 1970."""
         return time.monotonic() - self._began_s, time.time_ns() // 1000
 
+    def _move(self) -> Pose:
+        """Drive on, as far as time has passed, and return where it is."""
+        now_s = time.monotonic()
+        passed_s, self._moved_s = now_s - self._moved_s, now_s
+        target = self._goal or pose_at(self.number, self._loop_s + passed_s)
+        dx, dy = target.x - self._at.x, target.y - self._at.y
+        gap, step = math.hypot(dx, dy), SPEED_M_S * passed_s
+        if self._stands:
+            return self._at
+        if self._goal is None and gap <= 2 * step + 0.2:
+            self._loop_s, self._at = self._loop_s + passed_s, target
+        elif gap <= step:
+            self._at = target
+        else:
+            self._at = Pose(self._at.x + dx * step / gap, self._at.y + dy * step / gap, math.atan2(dy, dx))
+        return self._at
+
     def status(self) -> dict[str, Any]:
         charge = 1 - 0.13 * (self.number % 5) - self._now()[0] / _DRAIN_S
-        return {"battery": round(max(0.0, charge), 3)}
+        text = "stands" if self._stands else "drives to its goal" if self._goal else "drives round"
+        commands = ["stop", "goal", "cancel"]
+        return {"battery": round(max(0.0, charge), 3), "ok": True, "text": text, "commands": commands}
 
     async def on_command(self, command: Any) -> None:
-        """Ignore the command; this robot knows none."""
+        """Obey ``stop`` (stand still), ``goal`` (drive straight to x, y) or ``cancel`` (go on round the table)."""
+        self._move()
+        match command:
+            case {"command": "stop"}:
+                self._stands = True
+            case {"command": "cancel"}:
+                self._stands, self._goal = False, None
+            case {
+                "command": "goal",
+                "x": float() | int() as x,
+                "y": float() | int() as y,
+                "yaw": float() | int() as yaw,
+            }:
+                if not (abs(x) <= HALF_M[0] and abs(y) <= HALF_M[1]):
+                    raise BufgymError(f"goal {x}, {y}: must be in the room, {HALF_M} m from its middle")
+                self._stands, self._goal = False, Pose(x, y, yaw)
+            case _:
+                raise BufgymError(f"command {command!r}: must be stop, goal or cancel")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 A robot's topics lie under ``/robots/NAME/``. Besides its source's topics it publishes ``queue`` five times a second and
 ``status`` once a second, with battery, location, network, queue and the list of topics. The command ``{"command":
-"policy", "policy": "afr"}`` on its topic ``command`` changes its queue's policy.
+"policy", "policy": "afr"}`` on its topic ``command`` changes its queue's policy. Its status answers the latest command
+by the command's ``id``, with the reason ``why`` if it was refused.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ class Source(Protocol):
         """Publish with ``robot.publish`` until there is no more."""
 
     def status(self) -> dict[str, Any]:
-        """Return ``battery``, from 0 to 1, and ``location``, as far as they are known."""
+        """Return ``battery``, ``location``, ``ok``, ``text`` and the like, as far as they are known."""
 
     async def on_command(self, command: Any) -> None:
-        """Take a command that is not the robot's own."""
+        """Take a command that is not the robot's own, or raise a BufgymError that says why not."""
 
 
 class Robot:
@@ -80,6 +81,7 @@ class Robot:
         self.monitor = Monitor([stream.topic for stream in streams], value)
         self._policies = tuple(dict.fromkeys([get(policy).name, *policies]))
         self._kinds: dict[str, dict[str, str]] = {}
+        self._answer: dict[str, Any] = {}
         self.place = Place(odometry)
         self._began_s = time.monotonic()
         settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
@@ -116,6 +118,7 @@ class Robot:
             "queue": queue,
             "publishes": self._kinds,
             "policies": self._policies,
+            "answer": self._answer,
             **self.source.status(),
         }
 
@@ -146,8 +149,15 @@ class Robot:
             command = json.loads(bytes(message.payload))
         except ValueError:
             return  # a sender's mistake is no reason for a robot to stop
-        if isinstance(command, dict) and command.get("command") == "policy":
-            if command.get("policy") in self._policies:
+        why = ""
+        try:
+            if isinstance(command, dict) and command.get("command") == "policy":
+                if command.get("policy") not in self._policies:
+                    raise BufgymError(f"policy {command.get('policy')!r}: must be one of {', '.join(self._policies)}")
                 await asyncio.to_thread(self.client.change, command["policy"])
-        else:
-            await self.source.on_command(command)
+            else:
+                await self.source.on_command(command)
+        except BufgymError as error:
+            why = str(error)
+        self._answer = {"id": str(command.get("id"))[:64] if isinstance(command, dict) else "", "why": why[:300]}
+        self.say("status", self.status())

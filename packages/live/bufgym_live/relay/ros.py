@@ -8,6 +8,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
+from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Stream
 from bufgym_live.relay import ros_messages, wire
 from bufgym_live.relay.robot import Robot
@@ -62,11 +63,12 @@ class _RosSource:
             robot.client.subscribe(f"^{before}/", take)
 
     def status(self) -> dict[str, Any]:
-        """Return nothing, because ROS has no standard topic for a battery."""
-        return {}
+        """Return the topics that others may publish on, below ``to``."""
+        return {"receives": self._receive}
 
     async def on_command(self, command: Any) -> None:
-        """Ignore the command, because ROS takes commands on topics."""
+        """Refuse the command, because ROS takes commands on topics."""
+        raise BufgymError(f"command {command!r}: this robot takes commands on topics of ROS: {self._receive}")
 
 
 class Ros2(_RosSource):

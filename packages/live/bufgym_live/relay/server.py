@@ -272,7 +272,7 @@ class Server:
                 return pages.response(HTTPStatus.OK, "ok\n")
             case "/metrics":
                 return self._metrics(socket.address)
-        return pages.answer(request.path)
+        return pages.answer(request.path, request.headers)
 
     def _metrics(self, address: str) -> Response:
         if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):

@@ -5,6 +5,7 @@ A hundred of each in a commit; ten thousand in the night.
 
 import asyncio
 import contextlib
+import gzip
 import random
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from mutations import COUNT, SEED, mutated
 from relay_cases import Server, client, connect, relay, settings, stranger, until, wait, within
 from test_identity import Issuer
+from websockets.datastructures import Headers
 from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
@@ -220,10 +222,17 @@ def test_the_page_is_all_that_http_gives(tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("secret")
     (tmp_path / "page" / "index.html").write_text("<h1>")
     found, missing = ("/", "/index.html?x=1"), ("/../secret", "/%2e%2e/secret", "//etc/passwd", "/page")
+    plain, packs = Headers(), Headers({"Accept-Encoding": "br, gzip"})
     for path in (*found, *missing):
-        answer = pages.answer(path, tmp_path / "page")
+        answer = pages.answer(path, plain, tmp_path / "page")
         assert answer.status_code == (200 if path in found else 404) and b"secret" not in (answer.body or b"")
-    assert "frame-ancestors 'none'" in pages.answer("/", tmp_path / "page").headers["Content-Security-Policy"]
+    own = pages.answer("/", plain, tmp_path / "page").headers["Content-Security-Policy"]
+    assert "frame-ancestors 'none'" in own and "unsafe" not in own
+    whole, packed = pages.answer("/app.js", plain), pages.answer("/app.js", packs)
+    assert whole.body is not None and packed.body is not None and gzip.decompress(packed.body) == whole.body
+    assert len(packed.body) < len(whole.body) / 2 and packed.headers["Content-Encoding"] == "gzip"
+    again = pages.answer("/app.js", Headers({"If-None-Match": whole.headers["ETag"]}))
+    assert (again.status_code, again.body) == (304, b"")
 
 
 async def test_a_client_that_reads_nothing_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:

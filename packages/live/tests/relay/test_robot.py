@@ -127,11 +127,19 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
         await until("two of each", lambda: all(len(came[topic]) >= 2 for topic in topics))
         for wrong in ({"command": "policy", "policy": "oracle"}, "stop", 3):
             await wait("an ack", viewer.command(corner.command, wrong))
-        await wait("an ack", viewer.command(corner.command, {"command": "policy", "policy": "drop-newest"}))
+        await wait("an ack", viewer.command(corner.command, {"command": "policy", "policy": "drop-newest", "id": "7"}))
         await until("the policy", lambda: json.loads(bytes(came["queue"][-1].payload))["policy"] == "drop-newest")
+        await until("its answer", lambda: said(came)["answer"] == {"id": "7", "why": ""})
+        await wait("an ack", viewer.command(corner.command, {"command": "goal", "x": 1e9, "y": 0, "yaw": 0, "id": "8"}))
+        await until("a refusal", lambda: "must be in the room" in said(came)["answer"]["why"])
+        await wait("an ack", viewer.command(corner.command, {"command": "stop"}))
+        await until("it stands", lambda: said(came)["text"] == "stands")
+
+    def said(came: Came) -> Any:
+        return json.loads(bytes(came["status"][-1].payload))
 
     came = await watched(corner, MadeUp(), story, policy="drop-oldest", policies=("drop-newest",))
-    status = json.loads(bytes(came["status"][-1].payload))
+    status = said(came)
     assert 0.9 < status["battery"] <= 1 and abs(status["location"]["x"]) < HALF_M[0]
     assert status["policies"] == ["drop-oldest", "drop-newest"]
     assert status["publishes"]["scan"] == {"type": SCAN, "encoding": "cdr"}

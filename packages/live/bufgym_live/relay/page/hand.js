@@ -99,8 +99,7 @@ export class Hand {
     if (this.map.tool && !ways[this.map.tool.kind]) this.take(null);
     if (this.told === "aim") return;
     const {sent} = this;
-    if (sent?.doneMs && Date.now() - sent.doneMs > 5000) this.sent = null;
-    this.tell(this.sent && this.sent.robot === robot ? `${sent.kind}: ${sent.doneMs ? `${robot.name} answers: ${sent.state}` : sent.state}` : "", "sent");
+    this.tell(sent && sent.robot === robot ? `${sent.kind}: ${sent.doneMs ? `${robot.name} answers: ${sent.state}` : sent.state}` : "", "sent");
   }
 
   offerPolicies() {

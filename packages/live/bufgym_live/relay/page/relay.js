@@ -124,9 +124,11 @@ export class Relay {
   }
 
   refuse(said) {
-    if (said.what === "hello") {
+    if (said.what === "hello" && said.code === "unauthorized") {
       this.refused = true;
       this.on.unauthorized(said.why);
+    } else if (said.what === "hello") {
+      return;                                       // it was too slow, or there are too many: it connects again
     } else if (said.what === "publish" && said.topic === this.commands[0]?.topic) {
       this.commands.shift().failed(new Error(said.why));
       this.sendCommand();
