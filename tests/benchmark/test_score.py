@@ -280,7 +280,7 @@ def test_means_leave_out_what_is_missing_and_come_best_first() -> None:
 
 
 def scored(policy: str, seed: int, qoi: float, best: float = 9.0, **more: Any) -> dict[str, Any]:
-    more = {"trace": "t", "seed": seed, "clairvoyant": best, "regret": 1 - qoi / best, **more}
+    more = {"scenario": "", "trace": "t", "seed": seed, "clairvoyant": best, "regret": 1 - qoi / best, **more}
     return row(policy, 8, qoi, **more)
 
 
