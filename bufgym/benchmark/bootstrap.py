@@ -50,7 +50,9 @@ def times_drawn(n: int, resamples: int, rng: np.random.Generator) -> Numbers:
     return np.vstack([np.ones((1, n)), drawn])
 
 
-def links_drawn(episodes: Mapping[str, Sequence[Episode]]) -> dict[str, Numbers]:
+def links_drawn(
+    episodes: Mapping[str, Sequence[Episode]], resamples: int = RESAMPLES, seed: int = SEED
+) -> dict[str, Numbers]:
     """Draw links with replacement, jointly in all scenarios; return the counts of each scenario's episodes,
     [1 + resamples, episodes], where row 0 is ones.
 
@@ -66,18 +68,18 @@ def links_drawn(episodes: Mapping[str, Sequence[Episode]]) -> dict[str, Numbers]
         links: list[Any] = [episode if alone else episode[0] for episode in met]
         place = {link: k for k, link in enumerate(sorted(set(links)))}
         n = len(place)
-        draws.setdefault(n, times_drawn(n, RESAMPLES, stream(SEED, f"{n} links")))
+        draws.setdefault(n, times_drawn(n, resamples, stream(seed, f"{n} links")))
         # In the order of ``times_drawn``, so that sums over row 0 round as they do there.
         counts[scenario] = np.ascontiguousarray(draws[n][:, [place[link] for link in links]])
     return counts
 
 
-def percentile_interval(numbers: Numbers, level: float = CONFIDENCE) -> Interval:
+def percentile_interval(numbers: Numbers, confidence: float = CONFIDENCE) -> Interval:
     """Compute the interval of [1 + resamples] numbers; resamples with an undefined statistic, NaN, are left out."""
     drawn = numbers[1:][~np.isnan(numbers[1:])]
     if np.isnan(numbers[0]) or not len(drawn):
         return UNKNOWN
-    low, high = np.percentile(drawn, [50 * (1 - level), 50 * (1 + level)]).tolist()
+    low, high = np.percentile(drawn, [50 * (1 - confidence), 50 * (1 + confidence)]).tolist()
     return Interval(float(numbers[0]), low, high)
 
 

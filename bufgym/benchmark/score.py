@@ -112,7 +112,7 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     policy is compared with ``against`` by its share of ``REFERENCE``'s regret. See ``episodes.read`` for errors.
     """
     table = episodes.read(rows, BASELINE, against)
-    drawn = links_drawn(table.episodes)
+    drawn = links_drawn(table.episodes, RESAMPLES, SEED)
     base = _resampled(table, BASELINE)
     samples = {cell: _Sample.of(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
     discriminative = [cell for cell in table.cells if samples[cell].discriminative]

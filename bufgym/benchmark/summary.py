@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym.benchmark import episodes
-from bufgym.benchmark.bootstrap import UNKNOWN, Interval, links_drawn, percentile_interval, written
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
 from bufgym.benchmark.table import NOBODY, NONE, RunRows, Unranked, signed
@@ -99,7 +99,7 @@ def summarise(
     # ``read`` makes sure that all met the same episodes, and orders them.
     rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
     table = episodes.read(rows, baseline, against)
-    drawn = links_drawn(table.episodes)
+    drawn = links_drawn(table.episodes, RESAMPLES, SEED)
     cells = list(dict.fromkeys((scenario, capacity) for scenario, capacity, *_ in runs))
 
     def numbers_of(policy: str, cell: Cell) -> Numbers:

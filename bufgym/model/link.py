@@ -48,7 +48,8 @@ class Link:
         """Raise a BufgymError unless every time and byte position of a run over this link stays within 64 bits.
 
         Messages of ``total_bytes`` in all arrive until ``last_us``. The socket pauses ``pauses`` times for acks, each
-        time for ``pause_us``. The bound counts whole laps of the part that repeats, and two more for each (re)start.
+        time for ``pause_us``. The bound counts whole laps of the part that repeats, and two more for each start or
+        restart.
         """
         trace = self.trace
         # Python's integers, which do not overflow.
@@ -122,13 +123,15 @@ class KnotStore:
         self._end = 0
         self._places: dict[int, _Place] = {}
         self._followed: dict[int, _Place] = {}
+        self._idle: dict[int, _Place] = {}
 
     def place(self, trace: Trace, sender: int) -> NDArray[np.int64]:
         """Store ``trace`` for ``sender``; int64[5], its knots, what follows its end, and twice the first segment."""
         left = self._followed.pop(sender, None)
         if left is not None:
             left.senders -= 1
-            self._places[id(left.trace)] = self._places.pop(id(left.trace))  # the last to make room for others
+            if not left.senders:
+                self._idle[id(left.trace)] = left
         place = self._places.get(id(trace))
         if place is None:
             knots = len(trace.time_us)
@@ -136,25 +139,29 @@ class KnotStore:
             here = slice(place.first, place.first + knots)
             self.us[here], self.bytes[here] = trace.time_us, trace.cumulative_bytes
         place.senders += 1
+        self._idle.pop(id(trace), None)
         self._followed[sender] = place
         return place.words
 
     def _room(self, knots: int) -> tuple[int, int]:
         """Find room for so many knots; return (first knot, size of the room)."""
         if self._end + knots > max(KEPT_KNOTS, len(self.us)):
-            idle = {key: place for key, place in self._places.items() if not place.senders}
-            for key, place in idle.items():
+            for place in self._idle.values():
                 if place.room >= knots:
-                    del self._places[key]
+                    self._forget(place)
                     return place.first, place.room
             # No single idle trace leaves enough room; dropping all of them may free enough at the end.
-            self._places = {key: place for key, place in self._places.items() if key not in idle}
+            for place in list(self._idle.values()):
+                self._forget(place)
             self._end = max((place.first + place.room for place in self._places.values()), default=0)
         first, self._end = self._end, self._end + knots
         if self._end > len(self.us):
             more = np.zeros(max(self._end, 2 * len(self.us)) - len(self.us), np.int64)
             self.us, self.bytes = np.concatenate([self.us, more]), np.concatenate([self.bytes, more])
         return first, knots
+
+    def _forget(self, place: _Place) -> None:
+        del self._places[id(place.trace)], self._idle[id(place.trace)]
 
 
 @kernel
