@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
 
+from bufgym.benchmark.tasks import QueueTask
 from bufgym.ground.kernel import JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Uplink
@@ -136,7 +137,7 @@ def test_a_planner_that_is_told_the_future_is_the_clairvoyant(monkeypatch: pytes
 
     monkeypatch.setattr(futures.LinkSeen, "carried", carried)
     monkeypatch.setattr(futures.DriveSeen, "moved", moved)
-    plan = causal_planner.best(episode, 4, scenario)
+    plan = QueueTask().best(episode, 4, scenario)
     assert plan.certified
     assert played(scenario, episode, planner) == pytest.approx(plan.qoi, abs=1e-9)
 

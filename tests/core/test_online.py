@@ -15,7 +15,8 @@ from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.oracle import OnlineOptimum, by_length, ideal, integer, law, online_optimum
+from bufgym.oracle import OnlineOptimum, ideal, integer, law, online_optimum
+from bufgym.oracle.interruption import by_length
 from bufgym.policies import ACCEPT, REJECT, Policy
 from bufgym.scenario import Episode, Interruption, Streams, messages, registry
 from bufgym.sim import run
@@ -212,7 +213,9 @@ def test_one_run_tells_of_every_shorter_interruption():
     """Messages 1, 2, 3 arrive, L = 1: the second evicts the first, the third is rejected; message 4 follows."""
     v = qoi.exponential(0.5)
     # T = 0: 0, 1. T = 1: 0, 1, 2. T = 2: 0, 2, 3. T = 3: 0, 2, 4.
-    assert by_length(np.array([9, 2, 9, 3, 9]), v).tolist() == [1 + v(1), 1 + 2 * v(1), 1 + v(2) + v(1), 1 + 2 * v(2)]
+    h = np.ones(4)
+    by_length(np.array([9, 2, 9, 3, 9]), v.array, np.zeros(5, np.int64), h)
+    assert h.tolist() == [1 + v(1), 1 + 2 * v(1), 1 + v(2) + v(1), 1 + 2 * v(2)]
 
 
 @kernels

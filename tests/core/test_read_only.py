@@ -92,7 +92,7 @@ def test_h_of_several_topics_is_added_up_again() -> None:
     senders = run(policy, [two_topics(10_000)], 3, V, topics=rules)
     senders.check_untouched(policy)
     senders.batch.senders["delivered_gain"] += 1e-3
-    refuse(audit.QOI, senders.check_untouched, policy)
+    refuse(audit.FAULTS[audit.QOI], senders.check_untouched, policy)
 
 
 def test_a_row_above_the_clairvoyant_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,7 +157,7 @@ def test_a_run_is_searched_for_everything_a_policy_may_not_write() -> None:
         rows = np.asarray(getattr(senders.batch, table))
         entries = (rows if table == "senders" else rows[0])[field]
         entries[k] = amount if table == "log" else entries[k] + amount
-        assert audit.touched(*given) == finding, (table, field, k, amount)
+        assert audit.touched(*given) == audit.FAULTS[finding], (table, field, k, amount)
     senders = finished()
     senders.batch.slots[0, 3] = senders.batch.slots[0, 2]  # one message twice
-    assert audit.touched(senders.batch, 0, senders.episodes[0], senders.topic_table) == audit.QUEUED
+    assert audit.touched(senders.batch, 0, senders.episodes[0], senders.topic_table) == audit.FAULTS[audit.QUEUED]

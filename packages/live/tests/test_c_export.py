@@ -201,8 +201,8 @@ def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys):
 TWO = """
 #define OLD_OWN_VALUE
 #define OLD_STRAIGHT 0.0
-static double old_value(double d) { return d < 1.0 ? d : 1.0; }
-static double old_merging_loss(double a, double u, double b, double v) { return u + v - old_value(a + b); }
+static inline double old_value(double d) { return d < 1.0 ? d : 1.0; }
+static inline double old_merging_loss(double a, double u, double b, double v) { return u + v - old_value(a + b); }
 #include "old.h"
 #include "policy.h"
 #include <stdio.h>
