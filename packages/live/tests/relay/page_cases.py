@@ -114,7 +114,7 @@ class Fleet:
                 for said in await one.rest():
                     await one.say("ack", seq=said.seq)
                     self.came.append(command := json.loads(bytes(said.payload)))
-                    answer = {"id": command["id"], "why": "too far" if command.get("x", 0) > 8 else ""}
+                    answer = {"id": command["id"], "why": "too far" if command.get("x", 0) > 1 else ""}
                     self.robots[said.topic.split("/")[2]][0]["answer"] = answer
                 await asyncio.sleep(0.1)
 
