@@ -80,7 +80,7 @@ class Limits(Section, frozen=True):
     The defaults admit 60 robots behind one address, with ten topics of 10 messages a second each.
     """
 
-    message_bytes: Count = 2**23
+    message_bytes: Annotated[int, Meta(ge=1, le=2**25)] = 2**23
     """Size of a frame."""
     topics: Count = 1_024
     """Topics that it publishes on."""

@@ -174,8 +174,9 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             async with asyncio.timeout(hello_s):
                 admitted = await kind.greet(caller)
         except TimeoutError:
-            raise RefusedError("wrong", f"no hello within {hello_s:g} s") from None
+            raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
         numbers = admitted.received, admitted.acked
+        hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"

@@ -31,7 +31,6 @@ from bufgym_live.robot.tasks import Tasks, until_one_ends
 _RETRY_S: Final = 1.0
 _MINUTE_S: Final = 60.0
 _MOST_RELAYS: Final = 1_000
-_MAX_FRAME_BYTES: Final = 2**26
 
 
 class Delays:
@@ -162,7 +161,7 @@ class Peers:
     def _read(self, heard: Any) -> wire.Message | None:
         """Decode a message of another relay; None if it is none, or may not come in."""
         try:
-            message = wire.decode(heard.data, _MAX_FRAME_BYTES)
+            message = wire.decode(heard.data)
             protocol.check_json(message)
         except BufgymError as error:
             self._note(error)

@@ -51,6 +51,10 @@ class Quota:
                 raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
             self.topics.add(topic)
 
+    def left(self, subscriptions: Mapping[str, object]) -> None:
+        """Count the connection with these subscriptions no more."""
+        self.connections = [each for each in self.connections if each is not subscriptions]
+
     def subscribe(self, id: str, before: Mapping[str, object]) -> None:
         """Check that a connection with these subscriptions may have one of this id."""
         if id not in before and sum(map(len, self.connections)) >= self.limits.subscriptions:
@@ -89,7 +93,7 @@ class Quotas:
         try:
             yield quota
         finally:
-            quota.connections = [each for each in quota.connections if each is not subscriptions]
+            quota.left(subscriptions)
             quota.idle_since_s = self._clock()
 
     def tidy(self, kept_s: float = KEPT_S) -> None:

@@ -18,8 +18,9 @@ from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.traces import Trace
 from bufgym_live.relay import backoff
+from bufgym_live.relay.address import security, token
 from bufgym_live.relay.client import RobotClient
-from bufgym_live.relay.session import Session, security, token
+from bufgym_live.relay.session import Session
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wire import Message, RefusedError
 from bufgym_live.robot.shaped import ShapedLink
@@ -234,5 +235,5 @@ def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.M
         refuse(f"{re.escape(url)}: must be ws://HOST:PORT", Session, f"ws://b:1,{url}", "a")
     assert security() is None
     refuse("token: no certificate", security, certificate=str(tmp_path / "token"))
-    refuse(r"subscription '\[': no regular expression", Session("ws://a:1", "a").subscribe, "[", print)
+    refuse(r"pattern '\[': unterminated", Session("ws://a:1", "a").subscribe, "[", print)
     refuse("topic '/b': this client publishes nothing", RobotClient("ws://a:1", "a").publish, "/b", b"")

@@ -52,7 +52,8 @@ def test_rules_are_asked_before_a_subscription(text: str, allowed: bool) -> None
 def test_addresses_are_taken_as_they_are_meant() -> None:
     assert Identity("10.0.0.7").key != Identity("10.0.0.8", "10.0.0.7").key  # an e-mail is nobody's address
     assert plain_address("::ffff:10.0.0.7") == "10.0.0.7"
-    assert plain_address("fe80::1%eth0") == "fe80::1"
+    assert plain_address("fe80::1%eth0") == "fe80::1" and plain_address("::1") == "127.0.0.1"
+    assert Permissions([Rule(address="::1", send=True)], Identity("127.0.0.1")).allow("send", "/a")
 
 
 ADDRESSES = ["10.0.0.1", "10.0.0.2", "10.0.1.1", "192.168.0.1", "fd00::7", "fe80::7"]
