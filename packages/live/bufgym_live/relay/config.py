@@ -86,6 +86,8 @@ class Limits(Section, frozen=True):
     """Topics that it publishes on."""
     subscriptions: Count = 512
     """Subscriptions at a time; and the durable ones that the relay keeps for one session."""
+    queues: Count = 1_024
+    """Queues of its subscriptions; beyond, topics of a subscription share. One of capacity 1,000 takes 0.1 MB."""
     sessions: Count = 256
     """Sessions that the relay keeps, with the messages held for them."""
     connections: Count = 128

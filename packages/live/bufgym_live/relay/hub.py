@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import json
 import time
@@ -93,6 +94,7 @@ class Hub:
         self.store = Store(config, self.audit, self._settled, clock)
         self.recorder = Recorder.of(config, self.audit)
         self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
+        self.making = asyncio.Lock()  # whose turn it is to make a queue
         self._failed: set[str] = set()
         self.received = 0
         self._sent = 0

@@ -265,8 +265,10 @@ class Server:
             return None
         match request.path.partition("?")[0]:
             case "/healthz":
-                if self._ticking is None or self._ticking.done():
-                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n")
+                stuck = self._ticking is None or self._ticking.done()
+                if stuck or not self.hub.store.there:
+                    why = "stuck" if stuck else "the store's file was deleted"
+                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, f"{why}\n")
                 return pages.response(HTTPStatus.OK, "ok\n")
             case "/metrics":
                 return self._metrics(socket.address)

@@ -315,7 +315,6 @@ class Session:
                     if inspect.isawaitable(done):
                         await done
                 except Exception as error:  # the program's fault, which no new connection mends
-                    self.note(f"topic {message.topic}: {type(error).__name__}: {error}")
                     about = {"message": f"on_message of {message.topic}", "exception": error}
                     asyncio.get_running_loop().call_exception_handler(about)
         if message.no_drop:

@@ -7,10 +7,11 @@ room is refused to its sender; but a receiver that acks nothing loses its own ol
 """
 
 import math
+import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -84,6 +85,7 @@ class Store:
             self._db.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
+        self._file = None if config.folder is None else (path, os.stat(path).st_ino)
         self.sessions: dict[tuple[str, str], StoredSession] = {}
         self._by_id: dict[int | None, StoredSession] = {}
         self._load()
@@ -247,6 +249,13 @@ class Store:
         self._audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
         self.forget(session)
 
+    @property
+    def there(self) -> bool:
+        """Whether the file is still where a relay that starts anew looks for it."""
+        with suppress(OSError):
+            return self._file is None or os.stat(self._file[0]).st_ino == self._file[1]
+        return False
+
     def close(self) -> None:
         """Close the file; everything is on disk already."""
         self._db.close()
@@ -254,6 +263,8 @@ class Store:
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         """Raises RefusedError: the disk cannot be written; then nothing has changed."""
+        if not self.there:
+            raise RefusedError("store_full", "the store cannot be written: its file was deleted")
         try:
             self._db.execute("BEGIN IMMEDIATE")
             yield

@@ -35,10 +35,6 @@ class Unanswered:
         self._refused = 0  # refusals since the last ack, while more are to come
         self._check: Callable[[wire.Message], object] = lambda message: None
 
-    def __len__(self) -> int:
-        """Number of messages that the relay has not answered."""
-        return len(self._waiting) + len(self._sent) + len(self._again)
-
     def put(self, message: wire.Message) -> asyncio.Future[None]:
         """Add a message; the future is done once the relay holds it."""
         pending = Pending(message, asyncio.get_running_loop().create_future())

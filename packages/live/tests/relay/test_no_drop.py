@@ -178,10 +178,11 @@ async def test_sessions_beyond_the_limit_take_the_place_of_the_dead(tmp_path: Pa
                 async with client(server.port, session=f"dead-{k}") as robot:
                     await robot.subscribe("command$", durable=True)
                 await until("its end", lambda: len(server.hub.members) == 1)
-            await operator.acked(COMMAND, 1)
+                if k == 0:
+                    await operator.acked(COMMAND, 1)
             async with client(server.port, session="a") as old, client(server.port, session="b") as other:
                 assert (await operator.next(), other.welcome["op"]) == (
-                    {"op": "delivered", "seq": 1, "receivers": 2, "lost": 1},
+                    {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1},
                     "welcome",
                 )
                 async with client(server.port, session="a") as new, client(server.port, session="c") as more:

@@ -48,7 +48,7 @@ async def test_a_client_outlives_any_end_of_its_connection(
     how: str, corner: Corner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At each of its sends, pings and receipts in turn its connection ends. It comes back, and sends what it has to."""
-    for name, time_s in (("wire.PING_S", 0.02), ("wire.PONG_S", 0.1), ("session.CLOSE_S", 0.02)):
+    for name, time_s in (("wire.PING_S", 0.05), ("wire.PONG_S", 1.0), ("session.CLOSE_S", 0.05)):
         monkeypatch.setattr(f"bufgym_live.relay.{name}", time_s * (how == "silence") or 60.0)
     topic, came, commands, connect = corner.topic("camera"), set[int](), list[bytes](), Session._connect
     async with corner.client() as viewer:
@@ -107,11 +107,12 @@ async def test_what_is_too_large_is_refused_by_its_size(corner: Corner) -> None:
     camera, came = corner.topic("camera"), list[Message]()
     async with relay(settings(limits=Limits(message_bytes=1_000))) as server:
         robot, viewer = (RobotClient(f"ws://127.0.0.1:{server.port}", name, topics=(Topic(camera),)) for name in "ab")
-        viewer.subscribe("^/", came.append)
+        viewer.subscribe("^/robots/", came.append)
         robot.publish(camera, bytes(1_000), "jpeg")
         early = [asyncio.ensure_future(robot.command(corner.command, text)) for text in ("a" * 1_000, "stop")]
-        async with beside(viewer.run(), robot.run()):
-            await wait("both", asyncio.gather(robot.ready.wait(), viewer.ready.wait()))
+        async with beside(viewer.run()) as running:
+            await wait("the viewer", viewer.ready.wait())
+            running.append(asyncio.ensure_future(robot.run()))
             with pytest.raises(RefusedError, match=f"topic {corner.command}: 10.. bytes: must be at most 1000"):
                 await wait("the refusal", early[0])
             await wait("the stop", early[1])
@@ -139,9 +140,10 @@ async def test_what_waiting_mends_ends_no_client(
     greet, tries = Connection.greet, itertools.count(1)
 
     async def refusing(caller: Any) -> Any:
+        admitted = await greet(caller)
         if next(tries) == 2:
             raise RefusedError(code, "not now")
-        return await greet(caller)
+        return admitted
 
     monkeypatch.setattr(Connection, "greet", staticmethod(refusing))
     one = Session(corner.url, "a", token=proof)
@@ -171,7 +173,8 @@ async def test_a_fault_in_the_program_ends_no_client(corner: Corner) -> None:
     one.subscribe(f"^{corner.command}$", take)
     async with beside(one.run()), corner.client() as operator:
         await wait("its subscription", one.ready.wait())
-        await operator.acked(corner.command, 1, 2)
+        for seq in (1, 2):
+            await operator.command(seq, corner.command)
         await until("both", lambda: came == [b"1", b"2"])
     asyncio.get_running_loop().set_exception_handler(None)
     assert [str(fault) for fault in faults] == ["a fault", "a fault"]

@@ -24,7 +24,7 @@ from bufgym_live.relay.wire import Message, RefusedError, WireError
 
 
 def test_tries_spread_out_and_begin_anew_after_a_connection_that_held() -> None:
-    """At most 0.2 s, twice as long each time, at most 8 s; two clients of one fleet never agree. At most 1.5 s if nobody answers."""
+    """At most 0.2 s, twice as long each time, at most 8 s, and 1.5 s if nobody answers; no two clients agree."""
     now_s, drawn = 0.0, random.Random(3)
     one, other = (Backoff(random.Random(seed), lambda: now_s) for seed in (3, 4))
     for most_s in (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 8.0, 8.0, 1.5):
