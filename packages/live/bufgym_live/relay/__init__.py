@@ -14,13 +14,14 @@ with needs("msgspec", "bufgym-live[relay]", "bufgym_live.relay"):  # the other l
     import msgspec  # noqa: F401
 
 if TYPE_CHECKING:
+    from bufgym_live.relay.address import security, token
     from bufgym_live.relay.bag import BagSource
     from bufgym_live.relay.client import RobotClient
     from bufgym_live.relay.config import Config, Foxglove, Limits, Nats, Rotation, Rule, StoreLimits, Tls, Tokens, load
     from bufgym_live.relay.policies import compiled
     from bufgym_live.relay.robot import Robot, Source
     from bufgym_live.relay.server import Server, serve_forever
-    from bufgym_live.relay.session import Session, security, token
+    from bufgym_live.relay.session import Session
     from bufgym_live.relay.wire import Message, RefusedError
 
 __all__ = [
@@ -32,6 +33,6 @@ __getattr__ = on_demand(__name__, {
     "BagSource": "bag", "RobotClient": "client", "Config": "config", "Foxglove": "config", "Limits": "config",
     "Nats": "config", "Rotation": "config", "Rule": "config", "StoreLimits": "config", "Tls": "config",
     "Tokens": "config", "load": "config", "compiled": "policies", "Robot": "robot", "Source": "robot",
-    "Server": "server", "serve_forever": "server", "Session": "session", "security": "session", "token": "session",
+    "Server": "server", "serve_forever": "server", "Session": "session", "security": "address", "token": "address",
     "Message": "wire", "RefusedError": "wire"
 })  # fmt: skip

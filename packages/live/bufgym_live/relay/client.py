@@ -61,7 +61,7 @@ class RobotClient(Session):
         capacity: int = 32,
         window: int | None = None,
         value: Value | None = None,
-        token: str | None = None,
+        token: str | Callable[[], str | None] | None = None,
         tls: ssl.SSLContext | None = None,
         log: Callable[[int, Record], None] | None = None,
         say: Callable[[str], None] = lambda text: None,
@@ -124,13 +124,15 @@ class RobotClient(Session):
             type: as in ROS, ``sensor_msgs/msg/LaserScan``.
             x: coordinate of the scene; None means 1 more than the last.
             stamp_us: us since 1970; None: now.
+
+        Raises RefusedError: it is larger than the relay takes.
         """
         if topic not in self._numbers:
             raise BufgymError(f"topic {topic!r}: this client publishes {', '.join(self._numbers) or 'nothing'}")
         self._seqs[topic] += 1
         stamp_us = time.time_ns() // 1000 if stamp_us is None else stamp_us
         message = wire.Message(topic, payload, encoding, type, "", self._seqs[topic], stamp_us)
-        size_bytes = len(wire.encode(message))
+        size_bytes = self.check_size(message)
         while True:
             queue = self.queue
             try:
@@ -163,12 +165,20 @@ class RobotClient(Session):
 
     async def _send(self, away: _Away) -> None:
         message = away.item.message
-        if away.held is None and not any(pattern.fullmatch(message.topic) for pattern in self._no_drop):
-            await self._connection.send(wire.encode(message))
-            away.pong = await self._connection.ping()
-        elif away.held is None:
-            away.held = self._unanswered.put(message._replace(no_drop=True))
-            self._wanted.set()
+        if away.held is None:
+            try:
+                self.check_size(message)
+            except wire.RefusedError as refused:  # it was queued before the relay said how much it takes
+                self.note(str(refused))
+                self._away.remove(away)
+                away.leave()
+                return
+            if any(pattern.fullmatch(message.topic) for pattern in self._no_drop):
+                away.held = self._unanswered.put(message._replace(no_drop=True))
+                self._wanted.set()
+            else:
+                await self._connection.send(wire.encode(message))
+                away.pong = await self._connection.ping()
         self._moved.set()
 
     async def _leave_all(self) -> None:

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
@@ -25,9 +26,10 @@ class SessionOptions:
     """With wss: file (.pem) of this one's own, with its key."""
 
     def settings(self) -> dict[str, Any]:
-        from bufgym_live.relay.session import security, token
+        from bufgym_live.relay.address import security, token
 
-        return {"token": token(self.token_file), "tls": security(self.ca, self.certificate)}
+        token(self.token_file)  # a file that cannot be read ends the start
+        return {"token": partial(token, self.token_file), "tls": security(self.ca, self.certificate)}
 
 
 def say(text: str) -> None:

@@ -80,12 +80,14 @@ class Limits(Section, frozen=True):
     The defaults admit 60 robots behind one address, with ten topics of 10 messages a second each.
     """
 
-    message_bytes: Count = 2**23
+    message_bytes: Annotated[int, Meta(ge=1, le=2**25)] = 2**23
     """Size of a frame."""
     topics: Count = 1_024
     """Topics that it publishes on."""
     subscriptions: Count = 512
     """Subscriptions at a time; and the durable ones that the relay keeps for one session."""
+    queues: Count = 1_024
+    """Queues of its subscriptions; beyond, topics of a subscription share. One of capacity 1,000 takes 0.1 MB."""
     sessions: Count = 256
     """Sessions that the relay keeps, with the messages held for them."""
     connections: Count = 128

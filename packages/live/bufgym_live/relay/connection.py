@@ -28,6 +28,8 @@ class Connection:
     """A ``hub.Member`` on a WebSocket, made once its client is let in."""
 
     acks = True
+    policies: tuple[str, ...] = ()
+    """Policies that its kind of client may choose beside the configuration's."""
 
     def __init__(self, caller: Caller, admitted: Admitted, session: StoredSession, quota: Quota) -> None:
         self._caller, self._admitted, self._quota = caller, admitted, quota
@@ -94,6 +96,7 @@ class Connection:
     async def _replay(self, said: Mapping[str, Any]) -> None:
         may = partial(self.permissions.allow, "receive")
         asked = said["file"], said["from_us"], said["most_bytes"]
+        await self._caller.pace(min(said["most_bytes"], replay.MOST_BYTES))
         try:
             part = await asyncio.to_thread(replay.piece, self._recordings, *asked, may)
         except BufgymError as error:
@@ -139,9 +142,12 @@ class Connection:
             self._quota.message(0, self._hub.clock())
             self.permissions.check_subscription(said["topic"])
             # A policy that nobody has asked for yet is compiled, while others are served.
-            policy = await asyncio.to_thread(policies.warm, name) if name in config.policies else None
+            policy = (
+                await asyncio.to_thread(policies.warm, name) if name in (*config.policies, *self.policies) else None
+            )
             self._quota.subscribe(said["id"], self.subscriptions)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
+            subscription.may_grow = self._quota.may_have_queue
             self._hub.subscribe(self, subscription)
         except BufgymError as error:
             self._caller.refuse("subscribe", error, id=said["id"])
@@ -174,8 +180,9 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             async with asyncio.timeout(hello_s):
                 admitted = await kind.greet(caller)
         except TimeoutError:
-            raise RefusedError("wrong", f"no hello within {hello_s:g} s") from None
+            raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
         numbers = admitted.received, admitted.acked
+        hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"

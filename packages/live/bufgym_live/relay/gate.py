@@ -49,10 +49,11 @@ class Gate:
             await server.serve_forever()
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._open += 1
+        counted = False
         with suppress(OSError, EOFError, TimeoutError, asyncio.LimitOverrunError), closing(writer):
             async with asyncio.timeout(_HEAD_S):
                 head = await reader.readuntil(b"\r\n\r\n")
+            self._open, counted = self._open + 1, True  # who says nothing keeps nobody out
             if self._open <= _MOST and self._origins.issuperset(_ORIGIN.findall(head)):
                 answers, asks = await asyncio.open_connection(*self._inside)
                 with closing(asks):
@@ -60,7 +61,7 @@ class Gate:
                     await until_one_ends(_copied(reader, asks), _copied(answers, writer))
             else:
                 writer.write(_REFUSED)
-        self._open -= 1
+        self._open -= counted
 
     def close(self) -> None:
         """Close the port; connections end with the server."""

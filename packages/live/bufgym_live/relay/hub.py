@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import json
 import time
@@ -93,6 +94,7 @@ class Hub:
         self.store = Store(config, self.audit, self._settled, clock)
         self.recorder = Recorder.of(config, self.audit)
         self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
+        self.making = asyncio.Lock()  # whose turn it is to make a queue
         self._failed: set[str] = set()
         self.received = 0
         self._sent = 0
@@ -100,12 +102,17 @@ class Hub:
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
         self.peers: Peers | None = None  # the other relays, if it shares topics with any
 
-    def join(self, member: Member) -> None:
-        """Add a member that has said hello; end any other connection of its session."""
-        other = self.members.get(member.session)
-        if other is not None:
+    def take_over(self, identity: str, name: str) -> None:
+        """End the connection of this session, if it has one, and free its place for the next."""
+        session = self.store.sessions.get((identity, name))
+        if session in self.members:
+            other = self.members[session]
             self._detach(other)
+            self.quotas.of(identity).left(other.subscriptions)
             other.end("taken over by another connection")
+
+    def join(self, member: Member) -> None:
+        """Add a member that has said hello."""
         self.members[member.session] = member
 
     def leave(self, member: Member) -> None:
@@ -252,9 +259,7 @@ class Hub:
         if self.recorder is not None:
             self.recorder.flush()
         self.quotas.tidy()
-        for session in self.store.expired(list(self.members)):
-            self.audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
-            self.store.forget(session)
+        self.store.forget_expired()
 
     def close(self) -> None:
         """Finish the files."""

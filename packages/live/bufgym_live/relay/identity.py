@@ -67,7 +67,8 @@ class Verifier:
     async def _key(self, kid: str | None) -> Any:
         async with self._fetching:
             age_s = self._clock() - self._fetched_s
-            if age_s > KEYS_AGE_S or (kid not in self._keys and age_s > AGAIN_S):
+            asked = age_s > KEYS_AGE_S or (kid not in self._keys and age_s > AGAIN_S)
+            if asked:
                 self._fetched_s = self._clock()
                 try:
                     text = await asyncio.to_thread(self._text)
@@ -75,11 +76,11 @@ class Verifier:
                 except (OSError, BufgymError, self._jwt.PyJWTError, *_NO_KEYS) as error:
                     if age_s > KEYS_AGE_S:
                         self._keys = {}
-                    raise _unauthorized(f"the issuer's keys cannot be read: {error}") from None
+                    raise RefusedError("unavailable", f"the issuer's keys cannot be read: {error}") from None
         if kid is None and len(self._keys) == 1:
             return next(iter(self._keys.values()))
         if kid not in self._keys:
-            raise _unauthorized(f"token: unknown key {str(kid)[:60]!r}")
+            raise RefusedError("unauthorized" if asked else "unavailable", f"token: unknown key {str(kid)[:60]!r}")
         return self._keys[kid]
 
     def _text(self) -> str:

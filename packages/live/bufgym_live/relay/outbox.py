@@ -12,7 +12,7 @@ from websockets.exceptions import WebSocketException
 from bufgym_live.relay import wire
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.hub import Member, Outgoing
-from bufgym_live.relay.subscriber import next_lane
+from bufgym_live.relay.subscriber import make_one, next_lane
 from bufgym_live.relay.wire import WireError
 
 MAX_ANSWERS: Final = 4_096  # Limit on unsent answers; a client that asks on without reading is closed
@@ -61,11 +61,12 @@ class Outbox:
         member = self._member
         if self._sent_number < member.session.numbered and await self._no_drop(member):
             return True
-        now_s = self._hub.clock()
-        lane = next_lane(list(member.subscriptions.values()), now_s)
+        subscriptions = list(member.subscriptions.values())
+        made, now_s = await make_one(subscriptions, self._hub.making), self._hub.clock()
+        lane = next_lane(subscriptions, now_s)
         item = None if lane is None else lane.take(now_s)
         if lane is None or item is None:
-            return False
+            return made
         await self._send(item.message)
         lane.gone()
         return True

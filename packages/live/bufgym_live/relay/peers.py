@@ -25,13 +25,12 @@ from bufgym_live.relay.hub import CONNECTED, Hub, Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import NATS, Permissions
 from bufgym_live.relay.store import StoredSession
-from bufgym_live.relay.subscriber import Subscription, next_lane
+from bufgym_live.relay.subscriber import Subscription, make_one, next_lane
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 _RETRY_S: Final = 1.0
 _MINUTE_S: Final = 60.0
 _MOST_RELAYS: Final = 1_000
-_MAX_FRAME_BYTES: Final = 2**26
 
 
 class Delays:
@@ -133,6 +132,8 @@ class Peers:
         while True:
             await self._awake.wait()
             self._awake.clear()
+            while await make_one(list(self.subscriptions.values()), self._hub.making):
+                pass
             while (lane := next_lane(list(self.subscriptions.values()), self._hub.clock())) is not None:
                 item = lane.take(self._hub.clock())
                 if item is not None:
@@ -162,7 +163,7 @@ class Peers:
     def _read(self, heard: Any) -> wire.Message | None:
         """Decode a message of another relay; None if it is none, or may not come in."""
         try:
-            message = wire.decode(heard.data, _MAX_FRAME_BYTES)
+            message = wire.decode(heard.data)
             protocol.check_json(message)
         except BufgymError as error:
             self._note(error)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from bufgym_live.relay.config import Limits
 from bufgym_live.relay.wire import RefusedError
@@ -33,7 +34,7 @@ class Quota:
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
         self.json = Bucket(limits.json_bytes_per_s)
         self.topics: set[str] = set()
-        self.connections: list[Mapping[str, object]] = []  # the subscriptions of each of its connections, by id
+        self.connections: list[Mapping[str, Any]] = []  # the subscriptions of each of its connections, by id
 
     def message(self, size_bytes: int, now_s: float) -> None:
         """Count a published message.
@@ -51,7 +52,15 @@ class Quota:
                 raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
             self.topics.add(topic)
 
-    def subscribe(self, id: str, before: Mapping[str, object]) -> None:
+    def left(self, subscriptions: Mapping[str, Any]) -> None:
+        """Count the connection with these subscriptions no more."""
+        self.connections = [each for each in self.connections if each is not subscriptions]
+
+    def may_have_queue(self) -> bool:
+        """Whether it may have one more queue, over all its connections."""
+        return sum(one.queues for each in self.connections for one in each.values()) < self.limits.queues
+
+    def subscribe(self, id: str, before: Mapping[str, Any]) -> None:
         """Check that a connection with these subscriptions may have one of this id."""
         if id not in before and sum(map(len, self.connections)) >= self.limits.subscriptions:
             raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
@@ -77,7 +86,7 @@ class Quotas:
         return self._quotas[key]
 
     @contextmanager
-    def connection(self, key: str, subscriptions: Mapping[str, object]) -> Iterator[Quota]:
+    def connection(self, key: str, subscriptions: Mapping[str, Any]) -> Iterator[Quota]:
         """Count a connection of an identity, with whatever subscriptions it gets, until the block ends.
 
         Raises RefusedError: too many.
@@ -89,7 +98,7 @@ class Quotas:
         try:
             yield quota
         finally:
-            quota.connections = [each for each in quota.connections if each is not subscriptions]
+            quota.left(subscriptions)
             quota.idle_since_s = self._clock()
 
     def tidy(self, kept_s: float = KEPT_S) -> None:

@@ -27,7 +27,6 @@ class Recorder:
 
     def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Audit) -> None:
         self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
         self._rotation, self._permissions, self._audit = rotation, permissions, audit
         self._file: McapFile | None = None
         self._full = False  # whether it was said of this file
@@ -69,18 +68,20 @@ class Recorder:
             self._audit("recording_full", file=self._file.path.name, topic=message.topic, sender=message.sender)
 
     def _next(self) -> McapFile:
-        """Begin the next file and delete the oldest."""
-        files = sorted(self.folder.glob("*.mcap"))
+        """Begin the next file and delete the oldest. Names begin with a number, because clocks are set back."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        files = sorted(self.folder.glob(8 * "[0-9]" + "-*.mcap"))
+        number = 1 + max((int(path.name[:8]) for path in files), default=0)
         for path in files[: max(0, len(files) + 1 - self._rotation.files)]:
             path.unlink()
-        now_s, now_ns = divmod(time.time_ns(), 10**9)  # a single clock reading keeps names in the order of the files
-        return McapFile(self.folder / f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime(now_s))}-{now_ns:09}.mcap", "xb")
+        return McapFile(self.folder / f"{number:08}-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}.mcap", "xb")
 
     def flush(self) -> None:
         """Flush the file."""
         try:
             if self._file is not None:
                 self._file.flush()
+                self._file.path.stat()  # it may have been deleted
         except OSError as error:
             self._failed(error)
 

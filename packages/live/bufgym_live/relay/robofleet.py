@@ -7,19 +7,16 @@ unchanged. A message of type ``amrl_msgs/RobofleetSubscription`` is a request to
 hello and no ack.
 """
 
-import asyncio
 import json
 import secrets
 import struct
 from typing import Any, Final, NamedTuple
 
-from bufgym.ground.errors import BufgymError
-from bufgym_live.relay import policies, protocol, wire
+from bufgym_live.relay import protocol, wire
 from bufgym_live.relay.caller import Caller
-from bufgym_live.relay.config import DEFAULT_CAPACITY, SKIP_PENDING
+from bufgym_live.relay.config import SKIP_PENDING
 from bufgym_live.relay.connection import Connection
 from bufgym_live.relay.hub import ROBOFLEET, Outgoing
-from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.subscriber import Subscription
@@ -83,6 +80,7 @@ class RobofleetConnection(Connection):
     """Connection of a client that Robofleet released."""
 
     acks = False
+    policies = (SKIP_PENDING,)
 
     @staticmethod
     async def greet(caller: Caller) -> Admitted:
@@ -115,18 +113,8 @@ class RobofleetConnection(Connection):
         """Subscribe or unsubscribe; as at Robofleet's server, a client with bytes pending is skipped."""
         if not flat.subscribe:
             self._hub.unsubscribe(self, flat.pattern)
-            return
-        try:
-            self._quota.message(0, self._hub.clock())
-            self.permissions.check_subscription(flat.pattern)
-            chosen = pattern(flat.pattern)
-            warmed = await asyncio.to_thread(policies.warm, SKIP_PENDING)
-            self._quota.subscribe(flat.pattern, self.subscriptions)
-        except BufgymError as error:
-            self._caller.refuse("subscribe", error)
-            return
-        left_bytes = self._socket.transport.get_write_buffer_size
-        self._hub.subscribe(self, Subscription(flat.pattern, chosen, warmed, DEFAULT_CAPACITY, left_bytes=left_bytes))
+        else:
+            await self._subscribe({"id": flat.pattern, "topic": flat.pattern, "policy": SKIP_PENDING})
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message if it is a flatbuffer, the only encoding that the client reads."""

@@ -98,7 +98,10 @@ class Robot:
         self._kinds[topic] = {"type": type, "encoding": encoding}
         self.place.take(topic, payload, type, encoding)
         x = self.place.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
-        self.client.publish(self.topic(topic), payload, encoding, type, x, stamp_us)
+        try:
+            self.client.publish(self.topic(topic), payload, encoding, type, x, stamp_us)
+        except wire.RefusedError as refused:  # too large: no reason for a robot to stop
+            self.client.note(str(refused))
 
     def say(self, topic: str, data: Any) -> None:
         """Publish ``data`` as JSON."""

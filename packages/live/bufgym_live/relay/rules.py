@@ -44,10 +44,13 @@ NATS = Identity(email="\0nats", own="nats")
 
 
 def plain_address(text: str) -> str:
-    """Normalize an address for rules: unwrap IPv4 in IPv6, as in ``::ffff:10.0.0.1``, and strip a scope."""
+    """Normalize an address for rules: unwrap IPv4 in IPv6, as in ``::ffff:10.0.0.1``, and strip a scope.
+
+    This machine is 127.0.0.1, whichever way ``localhost`` was resolved.
+    """
     address = ipaddress.ip_address(text.partition("%")[0])
     mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
-    return str(mapped or address)
+    return "127.0.0.1" if str(address) == "::1" else str(mapped or address)
 
 
 def means(rule: Rule, identity: Identity) -> bool:
@@ -56,7 +59,9 @@ def means(rule: Rule, identity: Identity) -> bool:
         return rule.own == identity.own
     if rule.email:
         return rule.email.lower() == identity.email.lower()
-    return ipaddress.ip_address(identity.address) in ipaddress.ip_network(rule.address)
+    return ipaddress.ip_address(identity.address) in ipaddress.ip_network(
+        "127.0.0.1" if rule.address == "::1" else rule.address
+    )
 
 
 class Permissions:

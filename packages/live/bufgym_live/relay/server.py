@@ -36,8 +36,6 @@ from bufgym_live.robot.tasks import until_one_ends
 if TYPE_CHECKING:
     from bufgym_live.relay.foxglove import Window
 
-_PING_S: Final = 20.0
-_PONG_S: Final = 60.0  # time for a pong, which on a slow link waits long behind the message being sent
 TICK_S: Final = 1.0  # Time between two ticks, which publish the relay's state and forget what has expired
 _QUIET: Final = logging.getLogger("bufgym.relay.websockets")
 """Silenced logger; clients' faults go to the audit log, not to tracebacks."""
@@ -197,8 +195,8 @@ class Server:
                 write_limit=(1, 0),  # a message has left when the system has all of it
                 open_timeout=limits.hello_s,
                 close_timeout=1.0,
-                ping_interval=_PING_S,
-                ping_timeout=_PONG_S,
+                ping_interval=wire.PING_S,
+                ping_timeout=wire.PONG_S,
                 logger=_QUIET,
                 server_header=None,
                 ssl=self._tls,
@@ -267,8 +265,10 @@ class Server:
             return None
         match request.path.partition("?")[0]:
             case "/healthz":
-                if self._ticking is None or self._ticking.done():
-                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, "stuck\n")
+                stuck = self._ticking is None or self._ticking.done()
+                if stuck or not self.hub.store.there:
+                    why = "stuck" if stuck else "the store's file was deleted"
+                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, f"{why}\n")
                 return pages.response(HTTPStatus.OK, "ok\n")
             case "/metrics":
                 return self._metrics(socket.address)

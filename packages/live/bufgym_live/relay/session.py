@@ -17,24 +17,20 @@ import ssl
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 from urllib.parse import SplitResult
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import read_utf8
 from bufgym_live.relay import address, wire
 from bufgym_live.relay.backoff import Backoff
+from bufgym_live.relay.patterns import for_client
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import unsent_bytes
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
-TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
-_MAX_TOKEN_BYTES: Final = 2**16
-_MAX_FRAME_BYTES: Final = 2**26
-_PASSING: Final = ("store_full", "too_fast")  # Codes of refusals after which it is tried again
+CLOSE_S: Final = 1.0  # Time for the relay to answer that the connection is closed
+_FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting mends
 
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
 
@@ -51,26 +47,6 @@ class SubscriptionRequest(NamedTuple):
     fields: dict[str, Any]
 
 
-def token(path: str | Path | None = None) -> str | None:
-    """Read the token from this file or from the environment's ``BUFGYM_RELAY_TOKEN``; None without either."""
-    if path is not None:
-        return read_utf8(path, _MAX_TOKEN_BYTES).strip()
-    return os.environ.get(TOKEN_VARIABLE) or None
-
-
-def security(authority: str | None = None, certificate: str | None = None) -> ssl.SSLContext | None:
-    """Set up TLS for ``wss`` from PEM files: the relay's authority, and the client's certificate with its key."""
-    if authority is None and certificate is None:
-        return None
-    try:
-        context = ssl.create_default_context(cafile=authority)
-        if certificate is not None:
-            context.load_cert_chain(certificate)
-    except (OSError, ssl.SSLError) as error:
-        raise BufgymError(f"{certificate or authority}: no certificate: {error}") from None
-    return context
-
-
 class Session:
     """One name at a relay, over as many connections as needed."""
 
@@ -79,7 +55,7 @@ class Session:
         url: str,
         name: str,
         *,
-        token: str | None = None,
+        token: str | Callable[[], str | None] | None = None,
         tls: ssl.SSLContext | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
@@ -88,7 +64,8 @@ class Session:
             url: the relay's, ``ws://HOST:PORT`` or ``wss://HOST:PORT``; of several with commas between them, the
                 first is home, and the others stand in while it is away.
             name: sender's name as others see it.
-            token: proof of identity if the relay wants one; ``token()`` finds it.
+            token: proof of identity if the relay wants one, or a function that reads it for each connection, such as
+                ``address.token``; once let in, a client waits for the next token when one has ended.
             tls: for ``wss``, with a client's certificate if the relay knows it by that (default: the system's).
             say: called with a line for each refusal and each connection's end.
         """
@@ -139,6 +116,7 @@ class Session:
         encoding = "cdr" if type else "json"
         payload = data if type else json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
         message = wire.Message(topic, payload, encoding, type, stamp_us=time.time_ns() // 1000, no_drop=True)
+        self.check_size(message)
         answered = self._unanswered.put(message)
         self._wanted.set()
         await answered
@@ -160,22 +138,17 @@ class Session:
         id = str(len(self._subscriptions))
         chosen = {"policy": policy, "capacity": capacity, "durable": durable or None}
         fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
-        try:
-            self._subscriptions[id] = SubscriptionRequest(re.compile(pattern), on_message, fields)
-        except re.error as error:
-            raise BufgymError(f"subscription {pattern!r}: no regular expression: {error}") from None
+        self._subscriptions[id] = SubscriptionRequest(for_client(pattern), on_message, fields)
         self.ready.clear()
         if self.connected.is_set() and not (self.stands_in and durable):
             self._tasks.begin(self._say_it("subscribe", **fields))
 
     async def run(self) -> None:
-        """Connect, and again whenever the connection ends, until cancelled.
+        """Connect, and again whenever the connection ends or could not be made, until cancelled.
 
         Raises:
-            RefusedError: the relay does not let this client in.
+            RefusedError: the relay does not let this client in, and waiting does not mend it: a wrong key or name.
         """
-        from websockets.exceptions import WebSocketException
-
         backoff = Backoff()
         try:
             while True:
@@ -185,16 +158,19 @@ class Session:
                     self._at = 0
                     continue
                 except RefusedError as refused:
-                    if not self.stands_in:
+                    next_token = callable(self._token) and self.welcome and refused.code == "unauthorized"
+                    if refused.code in _FOR_GOOD and not (self.stands_in or next_token):
                         raise
                     self.note(str(refused))
-                except (OSError, TimeoutError, wire.WireError, WebSocketException) as error:
+                    away = False
+                except Exception as error:  # closing connections raise many kinds, also by faults of libraries
                     # A relay that refuses this address says why in its HTTP answer.
                     page = getattr(getattr(error, "response", None), "body", None) or b""
                     self.note(f"{type(error).__name__}: {error} {page.decode(errors='replace')}".strip())
+                    away = not page and isinstance(error, OSError)
                 self._at = (self._at + 1) % len(self._addresses)
                 if not self.stands_in:
-                    await asyncio.sleep(backoff.delay_s())
+                    await asyncio.sleep(backoff.delay_s(away))
         finally:
             self._unanswered.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
@@ -213,9 +189,20 @@ class Session:
             self.connected.clear()
             self.ready.clear()
             self._confirmed.clear()
-            if self._connection is not None:
-                self._connection.transport.abort()
-                self._connection = None
+            connection, self._connection = self._connection, None
+            if connection is not None:
+                with contextlib.suppress(AttributeError):  # asyncio's of 3.11, if the connection has ended already
+                    connection.transport.abort()
+
+    def check_size(self, message: wire.Message) -> int:
+        """Return the bytes of a message's frame.
+
+        Raises RefusedError: they are more than the relay takes, as far as its last welcome says.
+        """
+        size_bytes, most = len(wire.encode(message)), self.welcome.get("max_message_bytes", wire.MAX_FRAME_BYTES)
+        if size_bytes > most:
+            raise RefusedError("too_large", f"topic {message.topic}: {size_bytes} bytes: must be at most {most}")
+        return size_bytes
 
     def note(self, fault: str) -> None:
         """Report a fault, once however often it comes in a row."""
@@ -229,15 +216,17 @@ class Session:
 
         secure = self.address.scheme == "wss"
         return await connect(
-            f"{self.address.scheme}://{self.address.netloc}{wire.PATH}",
+            f"{self.address.scheme}://{self.address.netloc}{self.address.path.rstrip('/')}{wire.PATH}",
             sock=await address.reached(self.address),
             subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
             ssl=(self._tls or ssl.create_default_context()) if secure else None,
             server_hostname=self.address.hostname if secure else None,
             compression=None,
-            ping_interval=None,  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
+            ping_interval=wire.PING_S,
+            ping_timeout=wire.PONG_S,
+            close_timeout=CLOSE_S,
             proxy=None,
-            max_size=_MAX_FRAME_BYTES,
+            max_size=wire.MAX_FRAME_BYTES,
             write_limit=(1, 0),
         )
 
@@ -246,8 +235,8 @@ class Session:
 
     async def _greet(self) -> None:
         hello: dict[str, Any] = {"version": wire.VERSION, "name": self.name, "form": "binary"}
-        if self._token is not None:
-            hello["token"] = self._token
+        if (token := self._token() if callable(self._token) else self._token) is not None:
+            hello["token"] = token
         if self.stands_in:  # for a session that ends with the connection
             self._received[1] = 0
         else:
@@ -259,9 +248,9 @@ class Session:
         if said["op"] != "welcome":
             raise wire.WireError(f"op {said['op']!r}: must be welcome")
         self.welcome = said
-        self._no_drop = tuple(re.compile(pattern) for pattern in said.get("no_drop", ()))
+        self._no_drop = tuple(map(for_client, said.get("no_drop", ())))
         if not self.stands_in:
-            self._unanswered.resume(said["received"], max(1, said["window"]))
+            self._unanswered.resume(said["received"], max(1, said["window"]), self.check_size)
         for subscription in self._asked:
             await self._say_it("subscribe", **subscription.fields)
         self.connected.set()
@@ -282,7 +271,7 @@ class Session:
 
     async def _until_home(self) -> None:
         while True:
-            await asyncio.sleep(self._home.delay_s())
+            await asyncio.sleep(self._home.delay_s(away=True))
             with contextlib.suppress(OSError, TimeoutError):
                 async with asyncio.timeout(PATIENCE_S):
                     (await address.reached(self._addresses[0])).close()
@@ -304,16 +293,14 @@ class Session:
 
     async def ping(self) -> None:
         """Measure ``round_trip_s``, unless the connection ends before the answer."""
-        from websockets.exceptions import WebSocketException
-
-        with contextlib.suppress(WebSocketException):
+        with contextlib.suppress(Exception):  # as in ``run``, which notes it
             if self._connection is not None:
                 self.round_trip_s = await (await self._connection.ping())
 
     async def _take_all(self) -> None:
         async for frame in self._connection:
             if isinstance(frame, bytes):
-                await self._take(wire.decode(frame, _MAX_FRAME_BYTES))
+                await self._take(wire.decode(frame))
             else:
                 self._answer(wire.heard(frame))
         raise ConnectionResetError("the relay has closed the connection")
@@ -323,9 +310,13 @@ class Session:
             return  # it came before the connection broke
         for subscription in list(self._subscriptions.values()):
             if subscription.pattern.search(message.topic):
-                done = subscription.on_message(message)
-                if inspect.isawaitable(done):
-                    await done
+                try:
+                    done = subscription.on_message(message)
+                    if inspect.isawaitable(done):
+                        await done
+                except Exception as error:  # the program's fault, which no new connection mends
+                    about = {"message": f"on_message of {message.topic}", "exception": error}
+                    asyncio.get_running_loop().call_exception_handler(about)
         if message.no_drop:
             self._received[self.stands_in] = message.seq
             await self._say_it("ack", seq=message.seq)
@@ -339,7 +330,7 @@ class Session:
         elif said["op"] == "refused":
             if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])
-            elif said["what"] == "subscribe" and said["code"] in _PASSING:
+            elif said["what"] == "subscribe" and said["code"] not in _FOR_GOOD:
                 raise ConnectionResetError(f"subscribe refused: {said['code']}: {said['why']}")  # and once more
             else:
                 self.note(f"{said['what']} refused: {said['code']}: {said['why']}")

@@ -6,10 +6,12 @@ once however often it is sent again, and a killed relay resumes where it was. Sp
 room is refused to its sender; but a receiver that acks nothing loses its own oldest before others wait for it.
 """
 
+import math
+import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -45,7 +47,7 @@ class StoredSession:
     held: int = 0  # number of messages for it that are not acked
     held_bytes: int = 0
     durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
-    away_s: float = 0.0  # beginning of its absence, by the store's clock
+    away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
     id: int | None = None  # id in the store; None while there is nothing to remember
 
     @property
@@ -83,6 +85,7 @@ class Store:
             self._db.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
+        self._file = None if config.folder is None else (path, os.stat(path).st_ino)
         self.sessions: dict[tuple[str, str], StoredSession] = {}
         self._by_id: dict[int | None, StoredSession] = {}
         self._load()
@@ -104,15 +107,21 @@ class Store:
     def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> StoredSession:
         """Open the session of this name; a new session begins at the client's numbers.
 
-        Raises RefusedError: the identity has too many sessions.
+        If the identity has too many, the one goes that has been away for longest.
+
+        Raises RefusedError: all of them are here.
         """
         session = self.sessions.get((identity.key, name))
         if session is None:
-            if sum(key == identity.key for key, _ in self.sessions) >= self._quota.sessions:
-                raise RefusedError("too_many", f"must be at most {self._quota.sessions} sessions")
+            own = [one for (key, _), one in self.sessions.items() if key == identity.key]
+            if len(own) >= self._quota.sessions:
+                oldest = min(own, key=lambda one: one.away_s)
+                if oldest.away_s == math.inf:
+                    raise RefusedError("too_many", f"must be at most {self._quota.sessions} sessions")
+                self._expire(oldest)
             session = StoredSession(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
-        session.identity, session.away_s = identity, self._clock()
+        session.identity, session.away_s = identity, math.inf
         session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
         if session.id is not None:
             with self._bearable():
@@ -230,11 +239,22 @@ class Store:
         with self._bearable():
             self._settle(session, number, number, 1)
 
-    def expired(self, connected: Sequence[StoredSession]) -> list[StoredSession]:
-        """List the sessions that have been away for too long, counted while the relay runs."""
-        before_s = self._clock() - self.limits.keep_s
-        here = set(map(id, connected))
-        return [each for each in self.sessions.values() if id(each) not in here and each.away_s < before_s]
+    def forget_expired(self) -> None:
+        """Forget the sessions that have been away for too long, counted while the relay runs."""
+        for session in list(self.sessions.values()):
+            if session.away_s < self._clock() - self.limits.keep_s:
+                self._expire(session)
+
+    def _expire(self, session: StoredSession) -> None:
+        self._audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
+        self.forget(session)
+
+    @property
+    def there(self) -> bool:
+        """Whether the file is still where a relay that starts anew looks for it."""
+        with suppress(OSError):
+            return self._file is None or os.stat(self._file[0]).st_ino == self._file[1]
+        return False
 
     def close(self) -> None:
         """Close the file; everything is on disk already."""
@@ -243,6 +263,8 @@ class Store:
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         """Raises RefusedError: the disk cannot be written; then nothing has changed."""
+        if not self.there:
+            raise RefusedError("store_full", "the store cannot be written: its file was deleted")
         try:
             self._db.execute("BEGIN IMMEDIATE")
             yield

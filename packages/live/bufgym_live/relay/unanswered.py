@@ -6,6 +6,7 @@ messages under way are answered, the messages behind the refused one are sent ag
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from bufgym.ground.errors import BufgymError
@@ -32,10 +33,7 @@ class Unanswered:
         self._sent: deque[Pending] = deque()
         self._again: list[Pending] = []
         self._refused = 0  # refusals since the last ack, while more are to come
-
-    def __len__(self) -> int:
-        """Number of messages that the relay has not answered."""
-        return len(self._waiting) + len(self._sent) + len(self._again)
+        self._check: Callable[[wire.Message], object] = lambda message: None
 
     def put(self, message: wire.Message) -> asyncio.Future[None]:
         """Add a message; the future is done once the relay holds it."""
@@ -44,11 +42,20 @@ class Unanswered:
         return pending.answered
 
     def next(self) -> wire.Message | None:
-        """Number the next message to send; None if nothing waits, the window is full or refusals are to come."""
-        if not self._waiting or self._refused or len(self._sent) >= self.window:
-            return None
-        self._sent.append(self._waiting.popleft())
-        return self._sent[-1].message._replace(seq=self.acked + len(self._sent))
+        """Number the next message to send; None if nothing waits, the window is full or refusals are to come.
+
+        A message that was put before the relay said how much it takes fails here if it is too large.
+        """
+        while self._waiting and not self._refused and len(self._sent) < self.window:
+            pending = self._waiting.popleft()
+            try:
+                self._check(pending.message)
+            except BufgymError as error:
+                _settle(pending, error)
+            else:
+                self._sent.append(pending)
+                return pending.message._replace(seq=self.acked + len(self._sent))
+        return None
 
     def ack(self, seq: int) -> None:
         """Note that the relay holds this message and all before it."""
@@ -77,9 +84,14 @@ class Unanswered:
             self._waiting.extendleft(reversed(self._again))
             self._again.clear()
 
-    def resume(self, received: int, window: int) -> None:
-        """Resume after a reconnect: the relay holds all up to ``received``, and the rest is sent again."""
-        self.window = window
+    def resume(
+        self, received: int, window: int, check: Callable[[wire.Message], object] = lambda message: None
+    ) -> None:
+        """Resume after a reconnect: the relay holds all up to ``received``, and the rest is sent again.
+
+        ``check`` raises BufgymError for a message that this relay does not take.
+        """
+        self.window, self._check = window, check
         self.ack(received)
         self._waiting.extendleft(reversed([*self._again, *self._sent]))
         self._again.clear()

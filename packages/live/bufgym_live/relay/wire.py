@@ -21,6 +21,9 @@ from bufgym.ground.errors import BufgymError
 PATH: Final = "/relay"
 SUBPROTOCOL: Final = "bufgym.relay.v1"
 OWN: Final = "relay"  # The relay's name as a sender, and the prefix of its topics
+MAX_FRAME_BYTES: Final = 2**26
+PING_S: Final = 20.0  # Time between two pings of either end
+PONG_S: Final = 60.0  # Time for a pong, which on a slow link waits long behind the message being sent
 MAX_JSON_BYTES: Final = 2**20  # Size limit of a text frame and of a JSON payload, which take time to read
 VERSION: Final = 1
 MESSAGE: Final = 1  # The one kind of binary frame
@@ -74,7 +77,7 @@ def encode(message: Message) -> bytes:
     return b"".join((header, *names, message.payload))
 
 
-def decode(data: bytes, max_bytes: int = 2**26) -> Message:
+def decode(data: bytes, max_bytes: int = MAX_FRAME_BYTES) -> Message:
     """The message of a binary frame of at most ``max_bytes``.
 
     Raises WireError: it is none.
@@ -141,7 +144,13 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
         **dict.fromkeys(("name?", "session?", "token?", "form?"), str),
         **dict.fromkeys(("received?", "acked?"), Number),
     },
-    "welcome": {"version": Number, "received": Number, "window": Number, "rules": list[Any]},
+    "welcome": {
+        "version": Number,
+        "received": Number,
+        "window": Number,
+        "rules": list[Any],
+        "max_message_bytes?": Number,
+    },
     "subscribe": {
         "id": str,
         "topic": str,

@@ -17,6 +17,7 @@ import sys
 from typing import Any, Final
 
 UNSENT_BYTES: Final = 16_384  # TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel
+NEXT_ADDRESS_S: Final = 1.0  # Time for one of a host's addresses to answer before the next is tried
 DEAD_AFTER_S: Final = 20.0  # Time without acks after which a connection is given up, where the system can tell
 _SIOCOUTQNSD: Final = 0x894B  # of linux/sockios.h; Python's termios lacks it
 
@@ -93,20 +94,24 @@ def set_option(connection: socket.socket, option: str, number: int) -> None:
 
 
 async def connected(host: str, port: int, small: bool = True) -> socket.socket:
-    """Connect a sender's TCP socket."""
+    """Connect a sender's TCP socket to the first of the host's addresses that answers; ``localhost`` has two."""
     loop = asyncio.get_running_loop()
-    family, kind, protocol, _, address = (await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM))[0]
-    connection = socket.socket(family, kind, protocol)
-    try:
-        connection.setblocking(False)
-        if small:
-            little_unsent(connection)
-            set_option(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
-        await loop.sock_connect(connection, address)
-    except BaseException:
-        connection.close()
-        raise
-    return connection
+    found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    while True:
+        (family, kind, protocol, _, address), *found = found
+        connection = socket.socket(family, kind, protocol)
+        try:
+            connection.setblocking(False)
+            if small:
+                little_unsent(connection)
+                set_option(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
+            async with asyncio.timeout(NEXT_ADDRESS_S if found else None):
+                await loop.sock_connect(connection, address)
+            return connection
+        except BaseException as error:
+            connection.close()
+            if not (found and isinstance(error, OSError)):
+                raise
 
 
 def free_port(host: str) -> int:

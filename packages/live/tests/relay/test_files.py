@@ -1,14 +1,17 @@
 """What the relay writes: recordings that other commands read, an audit log that does not grow for ever."""
 
 import base64
+import itertools
 import json
 import os
+import shutil
 import signal
+import time
 from pathlib import Path
 
 import pytest
 from refusal_cases import refuse
-from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, until, wait, within
+from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, stranger, until, wait, within
 
 from bufgym.traces.formats import bags
 from bufgym_live.relay.audit import FILE, Audit
@@ -62,11 +65,39 @@ def recorder(folder: Path, payloads: list[bytes], file_bytes: int = 10**6) -> Re
     return one
 
 
-def test_recordings_take_turns(tmp_path: Path) -> None:
-    recorder(tmp_path, [bytes(1_000)] * 50, 10_000).close()
+def test_recordings_take_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest goes, though the clock is set back an hour for each file. Files of others stay."""
+    clock, own = itertools.count(10**9, -3_600), tmp_path / FOLDER / "own.mcap"
+    own.parent.mkdir()
+    own.write_bytes(b"")
+    monkeypatch.setattr("time.gmtime", lambda gmtime=time.gmtime: gmtime(next(clock)))
+    recorder(tmp_path, [bytes([k]) * 1_000 for k in range(50)], 10_000).close()
+    own.unlink()
     files = sorted((tmp_path / FOLDER).glob("*.mcap"))
     assert len(files) == 3 and all(file.stat().st_size < 13_000 for file in files)
     assert sum(len(bags.read_bag(file).size_bytes) for file in files) < 50
+    assert bytes([49]) * 1_000 in files[-1].read_bytes()
+
+
+async def test_a_deleted_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recordings begin anew. No command is acked that a restart would not find, and the relay says that it is ill."""
+    monkeypatch.setattr("bufgym_live.relay.recorder.PAUSE_S", 0.0)
+    async with relay(settings(folder=tmp_path / "relay", rules=(ALL, RECORD))) as server:
+        async with client(server.port) as robot, client(server.port) as viewer:
+            await viewer.subscribe("command$")
+            await robot.put("/robots/a/camera")
+            await robot.acked("/robots/a/command", 1)
+            shutil.rmtree(tmp_path / "relay")
+            await robot.command(2, "/robots/a/command")
+            said = await robot.next()
+            assert said["code"] == "store_full" and "its file was deleted" in said["why"]
+            server.hub.tick()
+            await robot.put("/robots/a/camera")
+            await robot.rest()
+        assert len(recordings(tmp_path / "relay" / FOLDER)) == 1
+        async with stranger(server.port) as (reader, writer):
+            writer.write(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            assert b"503" in await wait("an answer", reader.readline())
 
 
 def test_ever_new_types_fill_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -158,13 +158,38 @@ def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatc
     year_s = time.time() + 366 * 86_400
     monkeypatch.setattr("time.time", lambda: year_s)
     now_s += 99
-    assert store.expired([]) == []
+    store.forget_expired()
     store.close()
     store, now_s = opened(), now_s + 99
-    assert store.expired([]) == []
+    store.open("here", Identity("1.1.1.1"), False, 0, 0)
+    store.forget_expired()
+    assert len(store.sessions) == 2
     now_s += 2
-    assert [one.name for one in store.expired([])] == ["robot"] and store.expired(list(store.sessions.values())) == []
+    store.forget_expired()
+    assert list(store.sessions) == [("1.1.1.1", "here")]
     store.close()
+
+
+async def test_sessions_beyond_the_limit_take_the_place_of_the_dead(tmp_path: Path) -> None:
+    """Two connections and three sessions at most. One's own is taken over; the longest away goes, and is told."""
+    async with relay(settings(folder=tmp_path, limits=Limits(connections=2, sessions=3))) as server:
+        async with client(server.port, local="127.0.0.2") as operator:
+            for k in range(2):
+                async with client(server.port, session=f"dead-{k}") as robot:
+                    await robot.subscribe("command$", durable=True)
+                await until("its end", lambda: len(server.hub.members) == 1)
+                if k == 0:
+                    await operator.acked(COMMAND, 1)
+            async with client(server.port, session="a") as old, client(server.port, session="b") as other:
+                assert (await operator.next(), other.welcome["op"]) == (
+                    {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1},
+                    "welcome",
+                )
+                async with client(server.port, session="a") as new, client(server.port, session="c") as more:
+                    await wait("the end of the old", old.socket.wait_closed())
+                    assert new.welcome["op"] == "welcome" and more.welcome["code"] == "too_many"
+        forgotten = [entry["session"] for entry in server.hub.audit.recent if entry["event"] == "forgotten"]
+        assert forgotten == ["dead-0"] and ("127.0.0.1", "dead-1") in server.hub.store.sessions
 
 
 async def test_the_same_session_takes_over(corner: Corner) -> None:

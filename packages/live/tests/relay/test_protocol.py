@@ -11,27 +11,31 @@ from hypothesis import strategies as st
 from refusal_cases import refuse
 from relay_cases import settings
 
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 from bufgym_live.relay import backoff, protocol, wire
 from bufgym_live.relay.backoff import Backoff
-from bufgym_live.relay.config import Limits, Rule
+from bufgym_live.relay.config import Config, Limits, Rule
+from bufgym_live.relay.patterns import for_client, pattern
 from bufgym_live.relay.quota import Quota, Quotas
 from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.relay.session import Session
 from bufgym_live.relay.wire import Message, RefusedError, WireError
 
 
 def test_tries_spread_out_and_begin_anew_after_a_connection_that_held() -> None:
-    """At most 0.25 s, twice as long each time, at most 8 s; two clients of one fleet never agree."""
+    """At most 0.2 s, twice as long each time, at most 8 s, and 1.5 s if nobody answers; no two clients agree."""
     now_s, drawn = 0.0, random.Random(3)
     one, other = (Backoff(random.Random(seed), lambda: now_s) for seed in (3, 4))
-    for most_s in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 8.0):
-        assert one.delay_s() == drawn.uniform(0.0, most_s) != other.delay_s()
-    for held_s, most_s in ((backoff.HELD_S - 0.1, 8.0), (backoff.HELD_S, 0.25), (0.0, 0.5)):
+    for most_s in (0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 8.0, 8.0, 1.5):
+        away = most_s == 1.5
+        assert one.delay_s(away) == drawn.uniform(0.0, most_s) != other.delay_s()
+    for held_s, most_s in ((backoff.HELD_S - 0.1, 8.0), (backoff.HELD_S, 0.2), (0.0, 0.4)):
         one.connected()
         now_s += held_s
         assert one.delay_s() == drawn.uniform(0.0, most_s)
     now_s += 100.0  # no connection held, however long the tries took
-    assert one.delay_s() == drawn.uniform(0.0, 1.0)
+    assert one.delay_s() == drawn.uniform(0.0, 0.8)
 
 
 ANNA = Identity("10.0.0.7", "anna@x.org")
@@ -197,3 +201,31 @@ TWO = {2: "version 1", 3: "kind 1", 4: "a known flag"}
 def test_each_fault_is_named(read: Any, given: Any, error: str) -> None:
     with pytest.raises(WireError, match=error):
         read(given)
+
+
+UNLIKE = [
+    r"\pL+", "(?U)a", r"\z", r"\Aa", "[[:alnum:]-]+", "[a[:alpha:]]", "[]a]", "[a--b]", "a++", "a*+", "a{,3}",
+    "(?P<a>b)", "(?i)a", "(?=a)", r"\x{61}", "a**",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", UNLIKE)
+def test_no_pattern_is_taken_that_clients_read_otherwise(text: str) -> None:
+    refuse("pattern", pattern, text)
+    refuse("pattern", Session("ws://a:1", "a").subscribe, text, print)
+    refuse("pattern", Config, no_drop=(text,))
+
+
+PIECES = [
+    *"a-^$.*+?|()[]{},2:&~é", r"\d", r"\w", r"\W", r"\b", r"\]", r"\[", r"\\", r"\.", r"\pL", r"\z", r"\A", "(?:",
+    "(?i)", "[:", ":]", "{2}", "{,2}", "[^",
+]  # fmt: skip
+
+
+@given(st.lists(st.sampled_from(PIECES), max_size=8).map("".join), st.lists(st.text("a-^2:&~é[]\\ .,{|", max_size=4)))
+def test_what_is_taken_means_the_same_to_all(text: str, topics: list[str]) -> None:
+    with contextlib.suppress(BufgymError):
+        taken = pattern(text)
+        for topic in ["", "a", "aa", "-", *topics]:
+            assert taken.whole(topic) == bool(for_client(text).fullmatch(topic)), topic
+            assert taken.part(topic) == bool(for_client(text).search(topic)), topic

@@ -18,8 +18,9 @@ from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.traces import Trace
 from bufgym_live.relay import backoff
+from bufgym_live.relay.address import security, token
 from bufgym_live.relay.client import RobotClient
-from bufgym_live.relay.session import Session, security, token
+from bufgym_live.relay.session import Session
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wire import Message, RefusedError
 from bufgym_live.robot.shaped import ShapedLink
@@ -52,7 +53,7 @@ async def test_a_refused_number_is_used_again() -> None:
     unanswered.refuse("out_of_order", "2 first")
     assert [sent() for _ in range(3)] == [(2, b"2"), (3, b"3"), (4, b"4")]
     unanswered.ack(4)
-    assert len(unanswered) == 0 and all(future.done() for future in futures)
+    assert unanswered.next() is None and all(future.done() for future in futures)
     with pytest.raises(BufgymError, match="topic /a: refused: store_full: no room"):
         await futures[1]
 
@@ -234,5 +235,5 @@ def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.M
         refuse(f"{re.escape(url)}: must be ws://HOST:PORT", Session, f"ws://b:1,{url}", "a")
     assert security() is None
     refuse("token: no certificate", security, certificate=str(tmp_path / "token"))
-    refuse(r"subscription '\[': no regular expression", Session("ws://a:1", "a").subscribe, "[", print)
+    refuse(r"pattern '\[': unterminated", Session("ws://a:1", "a").subscribe, "[", print)
     refuse("topic '/b': this client publishes nothing", RobotClient("ws://a:1", "a").publish, "/b", b"")

@@ -22,11 +22,11 @@ from bufgym import cli
 from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym_live.relay import policies
-from bufgym_live.relay.config import Config, Foxglove, Rotation, Rule, load
+from bufgym_live.relay.config import Config, Foxglove, Limits, Rotation, Rule, load
 from bufgym_live.relay.hub import Hub, Outgoing
 from bufgym_live.relay.patterns import MAX_CHARACTERS, pattern
 from bufgym_live.relay.plain import Latest
-from bufgym_live.relay.quota import Bucket, Quotas
+from bufgym_live.relay.quota import Bucket, Quota, Quotas
 from bufgym_live.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
 from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription, next_lane
@@ -52,7 +52,8 @@ def test_rules_are_asked_before_a_subscription(text: str, allowed: bool) -> None
 def test_addresses_are_taken_as_they_are_meant() -> None:
     assert Identity("10.0.0.7").key != Identity("10.0.0.8", "10.0.0.7").key  # an e-mail is nobody's address
     assert plain_address("::ffff:10.0.0.7") == "10.0.0.7"
-    assert plain_address("fe80::1%eth0") == "fe80::1"
+    assert plain_address("fe80::1%eth0") == "fe80::1" and plain_address("::1") == "127.0.0.1"
+    assert Permissions([Rule(address="::1", send=True)], Identity("127.0.0.1")).allow("send", "/a")
 
 
 ADDRESSES = ["10.0.0.1", "10.0.0.2", "10.0.1.1", "192.168.0.1", "fd00::7", "fe80::7"]
@@ -201,9 +202,14 @@ def subscription(policy: str, capacity: int = 8, priority: float = 1.0) -> Subsc
     return Subscription("a", pattern(".*"), policies.policy(policy), capacity, priority=priority)
 
 
+def made(*subscriptions: Subscription) -> int:
+    return sum(one.make() for one in subscriptions for _ in range(100))
+
+
 def sent(*subscriptions: Subscription, now_s: float = 0.0) -> list[object]:
     """All that goes, one after the other, a second for each."""
     went = []
+    made(*subscriptions)
     while (lane := next_lane(subscriptions, now_s)) is not None:
         item = lane.take(now_s)
         assert item is not None
@@ -222,6 +228,7 @@ def test_the_policy_decides(policy: str, went: str) -> None:
     one = subscription(policy, 2)
     for k in range(5):
         one.offer("/a", str(k), 10)
+        made(one)
     assert len(one) == len(went) - 1 and one.dropped == 5 - len(went)
     assert sent(one) == list(went)
     one.offer("/a", "5", 10)
@@ -249,9 +256,12 @@ def test_topics_of_a_policy_that_knows_none_do_not_push_each_other_out() -> None
     one = subscription("drop-oldest", 1)
     one.offer("/rare", "rare", 10)
     one.offer("/rare", "rare 2", 10)
+    made(one)
+    one.offer("/often", "first", 10)
+    made(one)
     for k in range(100):
         one.offer("/often", k, 10)
-    assert sorted(map(str, sent(one))) == ["0", "99", "rare", "rare 2"]
+    assert sorted(map(str, sent(one))) == ["99", "first", "rare", "rare 2"]
 
 
 def test_priority_times_wait() -> None:
@@ -268,6 +278,20 @@ def test_queues_and_topics_are_bounded() -> None:
     for k in range(200):
         one.offer(f"/{k}", k, 10)
     assert len(one.lanes) == 64 and len(one._topics) == 64
+
+
+def test_queues_are_made_in_turns_and_an_identity_has_only_so_many() -> None:
+    """Five for two connections: 3 and 2. A publisher makes none of them, and each message arrives."""
+    quota, (one, other) = Quota(Limits(queues=5), 0.0), (subscription("drop-oldest") for _ in "ab")
+    for each in (one, other):
+        quota.connections.append({"a": each})
+        each.may_grow = quota.may_have_queue
+    for k in range(8):
+        for each in (one, other):
+            each.offer(f"/{k}", k, 10)
+    assert (len(one.lanes), len(other.lanes), one.make(), len(one.lanes)) == (0, 0, True, 1)
+    assert (one.queues, other.queues, made(one, other)) == (3, 2, 4)
+    assert sorted(sent(one)) == sorted(sent(other)) == list(range(8))
 
 
 async def test_a_subscriber_that_reads_nothing_slows_nobody(corner: Corner) -> None:
