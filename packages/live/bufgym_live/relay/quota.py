@@ -58,7 +58,8 @@ class Quota:
 
     def may_have_queue(self) -> bool:
         """Whether it may have one more queue, over all its connections."""
-        return sum(one.queues for each in self.connections for one in each.values()) < self.limits.queues
+        queues: int = sum(one.queues for each in self.connections for one in each.values())
+        return queues < self.limits.queues
 
     def subscribe(self, id: str, before: Mapping[str, Any]) -> None:
         """Check that a connection with these subscriptions may have one of this id."""
