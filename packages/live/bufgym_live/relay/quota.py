@@ -58,7 +58,7 @@ class Quota:
 
     def may_have_queue(self) -> bool:
         """Whether it may have one more queue, over all its connections."""
-        return sum(one.queues for each in self.connections for one in each.values()) < self.limits.queues
+        return self.limits.queues > sum(int(one.queues) for each in self.connections for one in each.values())
 
     def subscribe(self, id: str, before: Mapping[str, Any]) -> None:
         """Check that a connection with these subscriptions may have one of this id."""
