@@ -202,7 +202,7 @@ def test_neither_order_nor_company_matters(monkeypatch: pytest.MonkeyPatch) -> N
         assert score.scores(random.Random(k).sample(rows, len(rows))) == made
     third = [{**row, "policy": "third"} for row in rows if row["policy"] == "afr"]
     assert standing_of(score.scores([*third, *rows]), "afr") == standing_of(made, "afr")
-    monkeypatch.setattr("bufgym.benchmark.bootstrap.SEED", 1)
+    monkeypatch.setattr(score, "SEED", 1)
     assert score.scores(rows) != made
 
 

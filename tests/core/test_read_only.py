@@ -143,7 +143,7 @@ FORGERIES = [
     *((audit.LOG, "senders", field, 0, amount) for field in COUNTS for amount in (1, -1)),
     *((audit.TOPIC, "topics", field, 0, 1) for field in RULES),
     *((audit.QOI, "senders", "delivered_gain", 0, amount) for amount in (1e-6, -1e-6)),
-    ("", "senders", "delivered_gain", 0, 1e-10),  # rounding
+    (0, "senders", "delivered_gain", 0, 1e-10),  # rounding
 ]
 """What is found, and what was written: a time into the log, or something added to the k-th entry of a table."""
 

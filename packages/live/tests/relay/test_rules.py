@@ -170,7 +170,7 @@ def test_tables_and_files_beside_the_configuration(tmp_path: Path) -> None:
         ('[[rules]]\naddress = "10.0.0.1/8"\nsend = true', "has host bits set"),
         ('[[rules]]\naddress = "robot"\nsend = true', "does not appear to be"),
         (f"{ANY_EMAIL}send = 1", "Expected `bool`, got `int` - at `$.rules[0].send`"),
-        (f'{ANY_ADDRESS}send = true\ntopic = "("', "pattern '(': missing ): ( - at `$.rules[0]`"),
+        (f'{ANY_ADDRESS}send = true\ntopic = "("', "pattern '(': missing ), unterminated subpattern at position 0 - at `$.rules[0]`"),
         (f"{ANY_EMAIL}send = true\ntopic = '(a)\\1'", "invalid escape sequence"),
         ("[limits]\ntopics = 0", "Expected `int` >= 1 - at `$.limits.topics`"),
         ("[limits]\nhello_s = -1", "Expected `float` > 0.0 - at `$.limits.hello_s`"),
