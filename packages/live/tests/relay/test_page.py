@@ -61,7 +61,7 @@ def browser() -> Iterator[Any]:
 def until(page: Any, *expressions: str) -> None:
     """Wait until these have held on the page, one after the other."""
     for expression in expressions:
-        for _ in range(6_000):  # the page's own rules forbid it to wait for text that is evaluated there
+        for _ in range(1_500):  # the page's own rules forbid it to wait for text that is evaluated there
             if page.evaluate(expression):
                 break
             page.wait_for_timeout(20)

@@ -134,7 +134,6 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
     fleet.robots["one"] = {"location": PLACE}, (("front", "", RED), ("rear", "", bomb))
     until(page, f"{text('#name')} === 'one'")
     page.evaluate("location.hash = '#/robot/one/cameras'")
-    until(page, f"{text('#cameras figcaption')}.endsWith('rear: 30000 × 30000 pixels are too many')")
     until(page, f"({SEES})(document.querySelector('#cameras canvas')) >= 1")
     page.click("#cameras figure")
     until(page, f"document.querySelector('#large').open && ({SEES})(document.querySelector('#large canvas')) >= 1")
@@ -166,7 +165,6 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
     stop, near, _ = fleet.came
     assert (stop["command"], near["command"], near["frame"]) == ("stop", "goal", "map")
     assert near["yaw"] == pytest.approx(np.pi / 2, abs=0.01) and near["y"] == pytest.approx(0, abs=0.1)
-    assert "goal: too far" in page.text_content("#notices")
     fleet.robots["one"] = {"location": PLACE}, ()
     until(page, f"{text('#stop')} === 'one takes no stop'")
     assert page.is_disabled("#stop") and page.is_hidden("#goal")

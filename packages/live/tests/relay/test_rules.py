@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mutations import COUNT, SEED
 from refusal_cases import refuse
-from relay_cases import Corner, Server, relay, settings
+from relay_cases import Corner, settings
 
 from bufgym import cli
 from bufgym.ground.errors import BufgymError
@@ -170,7 +170,10 @@ def test_tables_and_files_beside_the_configuration(tmp_path: Path) -> None:
         ('[[rules]]\naddress = "10.0.0.1/8"\nsend = true', "has host bits set"),
         ('[[rules]]\naddress = "robot"\nsend = true', "does not appear to be"),
         (f"{ANY_EMAIL}send = 1", "Expected `bool`, got `int` - at `$.rules[0].send`"),
-        (f'{ANY_ADDRESS}send = true\ntopic = "("', "pattern '(': missing ), unterminated subpattern at position 0 - at `$.rules[0]`"),
+        (
+            f'{ANY_ADDRESS}send = true\ntopic = "("',
+            "pattern '(': missing ), unterminated subpattern at position 0 - at `$.rules[0]`",
+        ),
         (f"{ANY_EMAIL}send = true\ntopic = '(a)\\1'", "invalid escape sequence"),
         ("[limits]\ntopics = 0", "Expected `int` >= 1 - at `$.limits.topics`"),
         ("[limits]\nhello_s = -1", "Expected `float` > 0.0 - at `$.limits.hello_s`"),
@@ -340,11 +343,3 @@ def test_quotas_are_remembered_for_a_while() -> None:
     now_s = 161.0
     quotas.tidy()
     assert quotas.of("a") is not quota
-
-
-async def test_a_port_that_is_taken() -> None:
-    async with relay() as server:
-        other = Server(settings(port=server.port))
-        with pytest.raises(BufgymError, match=r"127\.0\.0\.1"):
-            await other.start()
-        await other.close()

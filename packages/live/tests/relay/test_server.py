@@ -17,6 +17,7 @@ from refusal_cases import refuse
 from relay_cases import Client, Corner, client, nothing, relay, settings, until, wait
 
 from bufgym.ground import processes
+from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, registry
 from bufgym_live.relay import policies
 from bufgym_live.relay import server as serving
@@ -230,3 +231,11 @@ def test_the_command_names_what_is_wrong(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     fails(["relay", "robot", *words], naming, capsys)
+
+
+async def test_a_port_that_is_taken() -> None:
+    async with relay() as server:
+        other = serving.Server(settings(port=server.port))
+        with pytest.raises(BufgymError, match=r"127\.0\.0\.1"):
+            await other.start()
+        await other.close()
