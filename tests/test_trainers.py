@@ -17,7 +17,7 @@ REPO = Path(__file__).resolve().parent.parent
 PAGE = (REPO / "docs" / "guide" / "trainers.md").read_text(encoding="utf-8")
 PROGRAMS: dict[str, str] = dict(re.findall(r"^```python\n# (\w+)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
 """Package that a program's first line names -> the program."""
-QUICK = ("torch", "torchrl")
+QUICK = ("tianshou", "torch", "torchrl")
 """Those that run with every test, if they are installed."""
 FOLDER = "BUFGYM_TRAINERS"
 
@@ -43,7 +43,7 @@ def test_the_program_of_the_page_runs(package: str, tmp_path: Path) -> None:
     if python is None:
         pytest.skip(f"{package} is not installed")
     path = os.pathsep.join(str(REPO / part) for part in ("", "packages/live", "packages/papers"))
-    where = os.environ | {"PYTHONPATH": path, "MINARI_DATASETS_PATH": str(tmp_path / "data")}
+    where = os.environ | {"PYTHONPATH": path, "MINARI_DATASETS_PATH": str(tmp_path / "data"), "OMP_NUM_THREADS": "1"}
     (tmp_path / "program.py").write_text(PROGRAMS[package])
     command = [python, "program.py"]
     done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, check=False)
