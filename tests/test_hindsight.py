@@ -44,6 +44,7 @@ def test_mean_regret_by_hand() -> None:
     assert float(mean_regret(scores, regret)) == pytest.approx(0.25 * 1.0 + 0.75 * 0.2)
 
 
+@pytest.mark.kernels
 def test_an_untrained_student_is_the_rule() -> None:
     """Row by row the outcomes of gap-price, with equal sizes and with a spread of them."""
     student = Student(8).weights().policy("student")

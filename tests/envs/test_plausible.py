@@ -39,6 +39,7 @@ def begun(scenario: Any, L: int, n: int = 1) -> Rows:
     return rows
 
 
+@pytest.mark.kernels
 def test_in_an_interruption_the_two_smallest_gaps_may_go() -> None:
     """L = 4, and nothing leaves. x counts the messages, and 0 has crossed. All are accepted up to 4; to let 5 in, 2
     goes; to let 6 in, 4 goes: the queue is 1 3 5 6, asked for 7. Its gaps if one goes are 3 - 0, 5 - 1, 6 - 3, 7 - 5.
@@ -68,6 +69,7 @@ def slow_twin(rows: Rows, i: int) -> list[int]:
     return [valid[k] and int(k in kept) for k in range(rows.capacity)] + valid[-2:]
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize("L", [1, 2, 6])
 def test_over_a_switching_link_it_is_what_sorting_says(L: int) -> None:
     rng, rows = np.random.default_rng(L), begun(SWITCHING, L, 3)
