@@ -81,6 +81,7 @@ class Bus:
             self._stream = self._client.jetstream(timeout=ANSWER_S)
             await self._take_place(known)
             await self._client.subscribe(MESSAGE, cb=heard)
+            await self._client.flush(ANSWER_S)  # from here on the server sends what others publish
         self._open = True
 
     async def _take_name(self) -> None:
