@@ -35,6 +35,12 @@ A queue of up to ``SHORT_QUEUE`` messages holds too little to wait for a target.
         if the head's neighbours lie no farther apart than the scene moves in
            (early + early_full f) arrivals + (slow - slow_full f) S + mean_full f M: the head goes
 
+On a steady link a queue of fewer than ``LEAST`` messages knows at least how far apart the link sends. Its head is asked
+by that, and a queue with one place at every arrival:
+
+    e <- motion since the message dequeued last was taken, by time: what comes while the link sends one message
+    if the link is steady, and soon or L = 1, and the message behind the head lies nearer to e than the head: the head goes
+
 The numbers are the policy's parameters. ``python -m agents.tune SUITE --policies target-gap --split train`` finds them
 again. The other constants are structural, and are not tuned.
 """
@@ -51,7 +57,7 @@ from bufgym.model.observe.on_board import mean_bytes
 from bufgym.model.qoi import EXPONENTIAL, SATURATING
 from bufgym.policies.gaps import gap_left, smallest_gap
 from bufgym.policies.registry import Arrival, Memory, built_in
-from bufgym.policies.thinning import places, spare, steady, within
+from bufgym.policies.thinning import places, send_us, spare, steady, within
 
 PARAMETERS = {
     "horizon_s": 5.0,
@@ -175,15 +181,20 @@ def needless(buffer: Buffer, arrival: Arrival) -> int:
 
 
 @kernel
+def head_lies_worse(buffer: Buffer, arrival: Arrival, g: float) -> bool:
+    """Whether the gap to the message behind the head is nearer to ``g`` than the gap to the head."""
+    head, after = motion_gaps(buffer, arrival, 0)
+    return bool(abs(head + after - g) < abs(head - g))
+
+
+@kernel
 def approach(buffer: Buffer, arrival: Arrival, g: float, numbers: Numbers) -> int:
     """The decision that brings the gaps to ``g``."""
     s, room = len(buffer.slots), has_space(buffer, arrival)
     if room and (s == 0 or not buffer.busy):
         return ACCEPT
-    if s > 0 and free_soon(buffer, numbers[NEAR]):
-        head, after = motion_gaps(buffer, arrival, 0)
-        if abs(head + after - g) < abs(head - g):
-            return 0
+    if s > 0 and free_soon(buffer, numbers[NEAR]) and head_lies_worse(buffer, arrival, g):
+        return 0
     victim = smallest_gap(buffer, arrival, False, s + 1, numbers[DISCOUNT])
     if room and gap_left(buffer, arrival, victim) > WITHIN * g:
         return ACCEPT
@@ -206,12 +217,24 @@ def last_chance(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbe
 
 
 @kernel
+def falls_behind(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> bool:
+    """Whether the head of a short queue goes since a steady link sends farther apart, by the module's text."""
+    L, elapsed_us = places(buffer, arrival), float(arrival.arrival_us - buffer.dequeued_arrival_us)
+    if len(buffer.slots) == 0 or L >= LEAST or not buffer.busy or elapsed_us <= 0 or len(buffer.topics) > 1:
+        return False
+    if not steady(buffer) or bursty(memory) or (L > 1 and not free_soon(buffer, numbers[NEAR])):
+        return False
+    e = (arrival.x - buffer.dequeued_x) * send_us(buffer, arrival) / elapsed_us
+    return head_lies_worse(buffer, arrival, e)
+
+
+@kernel
 def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> int:
     """The rule of the module's text, once ``remember`` has been called."""
     extra = needless(buffer, arrival)
     if extra >= 0:
         return extra
-    if last_chance(buffer, arrival, memory, numbers):
+    if last_chance(buffer, arrival, memory, numbers) or falls_behind(buffer, arrival, memory, numbers):
         return 0
     g = target(buffer, arrival, memory, numbers)
     if g > 0 and not steady(buffer):

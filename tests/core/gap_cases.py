@@ -119,6 +119,18 @@ class Seen:
         us = (1.0 + 1.09 * f) * period + (0.76 - 0.92 * f) * S + 0.076 * f * M
         return gaps_left(buffer, arrival)[0] <= running_mean(self.moved, 15e6) * us
 
+    def falls_behind(self, buffer, arrival):
+        """Whether the head of a queue of one to three goes on a steady link, which sends farther apart."""
+        s, L = len(buffer.slots), places(buffer, arrival)
+        elapsed_us = float(arrival["arrival_us"] - buffer.dequeued_arrival_us)
+        if s == 0 or L > 3 or not buffer.busy or elapsed_us <= 0 or len(buffer.topics) > 1:
+            return False
+        if not level(buffer) or self.bursty or (L > 1 and not free_soon(buffer)):
+            return False
+        rate = max(getattr(buffer, f"{span}_rate_bytes_per_s") for span in ("short", "medium", "long"))
+        send_us = 1e6 * (buffer.backlog_bytes + arrival["size_bytes"]) / (s + 1) / rate
+        return lies_worse(buffer, arrival, float(arrival["x"] - buffer.dequeued_x) * send_us / elapsed_us)
+
     def target(self, buffer, arrival):
         """g, or None where it cannot be told."""
         L, s = places(buffer, arrival), len(buffer.slots)
@@ -157,6 +169,16 @@ def running_mean(steps, window_us):
     return mean
 
 
+def free_soon(buffer):
+    """Whether the socket is free before 1.5 more arrivals."""
+    return buffer.left_bytes * 1e6 < 1.5 * buffer.period_us * buffer.short_rate_bytes_per_s
+
+
+def lies_worse(buffer, arrival, g):
+    """Whether the gap that the head would leave is nearer to ``g`` than the gap before it."""
+    return abs(gaps_left(buffer, arrival)[0] - g) < abs(float(buffer.slots[0]["x"] - buffer.dequeued_x) - g)
+
+
 def approached(buffer, arrival, g):
     """The decision that brings the gaps to ``g``."""
     s = len(buffer.slots)
@@ -164,10 +186,8 @@ def approached(buffer, arrival, g):
     if room and (s == 0 or not buffer.busy):
         return ACCEPT
     left = gaps_left(buffer, arrival)
-    free_soon = buffer.left_bytes * 1e6 < 1.5 * buffer.period_us * buffer.short_rate_bytes_per_s
-    if s and free_soon:
-        if abs(left[0] - g) < abs(float(buffer.slots[0]["x"] - buffer.dequeued_x) - g):
-            return 0
+    if s and free_soon(buffer) and lies_worse(buffer, arrival, g):
+        return 0
     victim = least_gap(buffer, arrival, discount=0.165)
     if room and left[s if victim == REJECT else victim] > 1.001 * g:
         return ACCEPT

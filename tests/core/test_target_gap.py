@@ -15,7 +15,18 @@ from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import FOREVER, Link
 from bufgym.policies import Policy, target_gap
-from bufgym.policies.target_gap import PACE, PARAMETERS, PERIOD, RATE, SEEN_US, SENT_US, SQUARE, last_chance, needless
+from bufgym.policies.target_gap import (
+    PACE,
+    PARAMETERS,
+    PERIOD,
+    RATE,
+    SEEN_US,
+    SENT_US,
+    SQUARE,
+    falls_behind,
+    last_chance,
+    needless,
+)
 from bufgym.policies.thinning import spare, steady
 from bufgym.scenario import Episode, messages, suites
 from bufgym.scenario.numbered import by_trace, draw
@@ -26,6 +37,7 @@ from bufgym.traces import Trace
 POLICY = policies.get("target-gap")
 NUMBERS = np.array(list(PARAMETERS.values()))
 V = qoi.exponential(0.618)
+RULES = ("target-gap", "min-motion-gap", "drop-oldest")
 kernels = pytest.mark.kernels
 
 
@@ -109,7 +121,7 @@ def moments(draw):
         past = past._replace(previous_us=int(arrival["arrival_us"]) - (33_333 if even else int(rng.integers(0, 10**7))))
         seen.remember(past, arrival)
         remember(past, arrival, memory)
-    s, L, mean = draw(st.integers(0, 9)), pick(2, 3, 4, 5, 9, 30), pick(*RATES)
+    s, L, mean = draw(st.integers(0, 9)), pick(1, 2, 3, 4, 5, 9, 30), pick(*RATES)
     frames = np.cumsum(rng.integers(1, 4, s + 1))
     known = {"capacity": max(L, s), "max_bytes": pick(10**12, 9_000, 3_999), "busy": pick(0, 1, 1, 1)}
     known |= {"short_rate_bytes_per_s": mean * pick(1.0, 1.015, 1.03, 2.0, 0.3), "long_rate_bytes_per_s": mean}
@@ -132,6 +144,7 @@ def test_each_rule_is_its_twins_at_any_moment(moment):
     assert memory.tolist() == pytest.approx([*means, seen.seen_us, *faded(seen.periods)])
     assert steady(buffer) == level(buffer)
     assert last_chance(buffer, arrival, memory, NUMBERS) == seen.last_chance(buffer, arrival)
+    assert falls_behind(buffer, arrival, memory, NUMBERS) == seen.falls_behind(buffer, arrival)
     needless_, g = seen.needless(buffer, arrival), seen.target(buffer, arrival)
     assert needless(buffer, arrival) == (-1 if needless_ is None else needless_)
     assert target(buffer, arrival, memory) == pytest.approx(g or 0.0)
@@ -150,7 +163,7 @@ def twin():
         extra = seen.needless(buffer, arrival)
         if extra is not None:
             return extra
-        if seen.last_chance(buffer, arrival):
+        if seen.last_chance(buffer, arrival) or seen.falls_behind(buffer, arrival):
             return 0
         g = seen.target(buffer, arrival)
         if g is not None and not level(buffer):
@@ -201,6 +214,18 @@ def test_on_a_steady_link_the_server_gets_an_even_stream(share):
     thinned, full = streams
     assert np.diff(thinned).max() <= np.floor(1 / share) + 1  # the queue fills meanwhile, in a minute and more
     assert np.diff(thinned).std() < 0.8 * np.diff(full).std()
+
+
+def test_one_place_takes_each_newcomer_until_the_steady_link_is_free():
+    """It sends one frame in ten, and what waits in the end. To keep the first that finds room loses half a gap twice."""
+    x = received(run(POLICY, [episode(1 / 10)], 1, V), 0)["x"]
+    assert x.tolist() == [*range(0, 600, 10), 599]
+
+
+@pytest.mark.parametrize("capacity", [1, 2, 3])
+def test_short_queues_on_a_steady_link_lose_no_more_than_simple_rules(capacity):
+    H = {name: outcome(run(policies.get(name), [episode(1 / 10)], capacity, V), 0).qoi for name in RULES}
+    assert H["target-gap"] == max(H.values()) > H["min-motion-gap"]
 
 
 def test_a_link_that_keeps_up_loses_nothing():

@@ -94,6 +94,27 @@ static inline int bufgym_last_chance(const struct bufgym_queue *q, const struct 
     return bufgym_gap_left(q, arrival, 0) <= q->memory[BUFGYM_PACE] * us;
 }
 
+/* Whether the gap to the message behind the head is nearer to g than the gap to the head. */
+static inline int bufgym_head_lies_worse(
+    const struct bufgym_queue *q, const struct bufgym_message *arrival, double g)
+{
+    const struct bufgym_gaps head = bufgym_gaps_of(q, arrival, 0);
+    return fabs(head.before_x + head.after_x - g) < fabs(head.before_x - g);
+}
+
+/* Whether the head of a short queue goes since a steady link sends farther apart. */
+static inline int bufgym_falls_behind(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    const int L = bufgym_places(q, arrival);
+    const double elapsed_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
+    if (q->occupancy == 0 || L >= @LEAST@ || q->busy == 0 || elapsed_us <= 0.0)
+        return 0;
+    if (!bufgym_steady(q) || bufgym_bursty(q) || (L > 1 && !bufgym_free_soon(q, @NEAR@)))
+        return 0;
+    return bufgym_head_lies_worse(
+        q, arrival, (arrival->x - q->dequeued_x) * bufgym_send_us(q, arrival) / elapsed_us);
+}
+
 /* The decision that brings the gaps to g. */
 static inline int bufgym_approach(
     const struct bufgym_queue *q, const struct bufgym_message *arrival, double g)
@@ -102,11 +123,8 @@ static inline int bufgym_approach(
     int victim;
     if (room && (s == 0 || q->busy == 0))
         return BUFGYM_ACCEPT;
-    if (s > 0 && bufgym_free_soon(q, @NEAR@)) {
-        const struct bufgym_gaps head = bufgym_gaps_of(q, arrival, 0);
-        if (fabs(head.before_x + head.after_x - g) < fabs(head.before_x - g))
-            return 0;
-    }
+    if (s > 0 && bufgym_free_soon(q, @NEAR@) && bufgym_head_lies_worse(q, arrival, g))
+        return 0;
     victim = bufgym_smallest_gap(q, arrival, 0, s + 1, @DISCOUNT@);
     if (room && bufgym_gap_left(q, arrival, victim) > @WITHIN@ * g)
         return BUFGYM_ACCEPT;
@@ -120,7 +138,7 @@ static inline int bufgym_follow_gap(const struct bufgym_queue *q, const struct b
     int victim = bufgym_needless(q, arrival);
     if (victim >= 0)
         return victim;
-    if (bufgym_last_chance(q, arrival))
+    if (bufgym_last_chance(q, arrival) || bufgym_falls_behind(q, arrival))
         return 0;
     g = bufgym_target(q, arrival);
     if (g > 0.0 && !bufgym_steady(q))
