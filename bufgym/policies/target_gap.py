@@ -39,7 +39,8 @@ On a steady link a queue of fewer than ``LEAST`` messages knows at least how far
 by that, and a queue with one place at every arrival:
 
     e <- motion since the message dequeued last was taken, by time: what comes while the link sends one message
-    if the link is steady, and soon or L = 1, and the message behind the head lies nearer to e than the head: the head goes
+    if the link is steady, and soon or L = 1:
+        if the message behind the head lies nearer to e than the head: the head goes
 
 The numbers are the policy's parameters. ``python -m agents.tune SUITE --policies target-gap --split train`` finds them
 again. The other constants are structural, and are not tuned.

@@ -217,7 +217,7 @@ def test_on_a_steady_link_the_server_gets_an_even_stream(share):
 
 
 def test_one_place_takes_each_newcomer_until_the_steady_link_is_free():
-    """It sends one frame in ten, and what waits in the end. To keep the first that finds room loses half a gap twice."""
+    """It sends one frame in ten, and what waits in the end. The first one to find room would leave too early."""
     x = received(run(POLICY, [episode(1 / 10)], 1, V), 0)["x"]
     assert x.tolist() == [*range(0, 600, 10), 599]
 

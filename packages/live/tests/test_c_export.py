@@ -16,7 +16,7 @@ from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy
 from bufgym.policies.guided import GuidedWeights
-from bufgym.policies.learned import NAMES
+from bufgym.policies.learned import BY_RULE, NAMES
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received
@@ -85,6 +85,9 @@ def driver(folder, text, *flags):
     return compiled(folder, "gcc", "c99", folder / "driver.c", text, *flags)
 
 
+RULE = tuple(field.name for field in BY_RULE)
+
+
 def every_field() -> Policy:
     """A random agent of two layers that reads every field there is."""
     return random_weights(NAMES, 7, 5, seed=3).policy("every-field")
@@ -98,6 +101,10 @@ def every_output() -> Policy:
 
 AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
 AGENTS |= {"every-field": every_field(), "every-output": every_output()}
+AGENTS |= {
+    "by-rule": random_weights(RULE, 7, 5, seed=5).policy("by-rule"),
+    "by-rule-and-more": random_weights((*RULE, *NAMES), 7, seed=6).policy("by-rule-and-more"),
+}
 
 
 def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, flags=("-O0",)):
@@ -125,6 +132,12 @@ def test_it_decides_in_c_as_in_python(name, whole, tmp_path):
     """A million decisions in the night."""
     most = (250_000 if name in AGENTS else 20_000, SETTINGS, []) if whole else (2_000, SETTINGS[3:], ["-O0"])
     check(tmp_path, AGENTS.get(name) or policies.get(name), *most)
+
+
+@pytest.mark.parametrize("L", [1, 2, 3])
+def test_short_queues_too_decide_in_c_as_in_python(L, tmp_path):
+    """What they do on a steady link is theirs alone: each link of an episode holds for some seconds."""
+    check(tmp_path, policies.get("target-gap"), 20_000, [(L, EXPONENTIAL, None)], ["-O0"])
 
 
 def test_with_a_window_several_messages_are_in_the_socket(tmp_path):

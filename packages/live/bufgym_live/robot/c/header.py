@@ -16,7 +16,8 @@ from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
 from bufgym.policies import Policy, chains, gaps, guided, learned, price_dp, target_gap, thinning
-from bufgym.policies.scoring import unpack
+from bufgym.policies.learned import Weights
+from bufgym.policies.scoring import Scorer, unpack
 from bufgym.policies.target_gap import straight
 from bufgym.traces.formats.text import write_text
 from bufgym_live.robot.c.calls import random_episode, recorded
@@ -31,10 +32,15 @@ _HELPERS = {
     "bufgym_remember(": "target_gap.h",
     "bufgym_weigh(": "chains.h",
     "bufgym_priced(": "price_dp.h",
+    "bufgym_look(": "inputs.h",
     "bufgym_thin(": "thin.h",
 }
 """Parts that rules share, each before its callers."""
-_LEARNED = ("features.h", "scorer.h")  # Parts of a learned agent
+_OBSERVE = {
+    "features.h": "bufgym_observe_context(q, arrival);\n    bufgym_observe_slots(q, arrival);",
+    "rule_fields.h": "bufgym_observe_rule(q, arrival);",
+}
+"""Parts that observe fields, and their calls."""
 _CONSTANTS = {
     thinning: "WAITING SOON_US STEADY",
     target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
@@ -71,9 +77,14 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     check_limits(capacity, max_bytes)
     if re.fullmatch("[a-z][a-z0-9_]*", prefix) is None:
         raise BufgymError(f"prefix {prefix!r}: must be small letters, digits and _, as names in C begin")
-    learns, guides = policy.on_arrival is learned.on_arrival, policy.on_arrival is guided.on_arrival
-    body = "".join(map(_part, _LEARNED)) if learns else _rule(policy, guides)
-    parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False)) if guides else policy.parameters
+    learns = policy.on_arrival in (learned.on_arrival, learned.on_arrival_by_rule)
+    guides = policy.on_arrival is guided.on_arrival
+    body = _network(policy) if learns else _rule(policy, guides)
+    parameters = policy.parameters
+    if policy.on_arrival is learned.on_arrival_by_rule:
+        parameters = price_dp.PARAMETERS
+    elif guides:
+        parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False))
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
     unlimited, rng = max_bytes is None, np.random.default_rng(_SEED)
@@ -109,7 +120,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "CALLS": "".join(f"    {{{', '.join(map(repr, call.item()))}}},\n" for call in calls),
     }
     if learns:
-        numbers |= _scorer(policy)
+        numbers |= _numbers(policy, _scorer(policy))
     text = _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
     named = re.sub(r"\bbufgym_", f"{prefix}_", text)
     return re.sub(r"\bBUFGYM_", f"{prefix.upper()}_", named)
@@ -121,7 +132,21 @@ def _rule(policy: Policy, guides: bool) -> str:
     if not guides and (name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival):
         known = ", ".join(SUPPORTED)
         raise BufgymError(f"policy {policy.name}: has no C; known: {known}, and learned agents for one queue")
-    rule = _part("guided.h") if guides else (_RULES / f"{name}.h").read_text(encoding="utf-8")
+    return _helped(_part("guided.h") if guides else (_RULES / f"{name}.h").read_text(encoding="utf-8"))
+
+
+def _network(policy: Policy) -> str:
+    """Write the C of a learned agent for one queue, after the parts that observe what it reads."""
+    scorer = _scorer(policy)
+    context, slots = scorer.fields[: scorer.context], scorer.fields[scorer.context :]
+    observed = ["features.h"] if (context < learned.CONTEXT).any() or (slots < learned.SLOTS).any() else []
+    observed += ["rule_fields.h"] if policy.on_arrival is learned.on_arrival_by_rule else []
+    body = _part("fields.h") + "".join(map(_part, observed)) + _part("scorer.h")
+    return _helped(body).replace("@OBSERVE@", "\n    ".join(_OBSERVE[part] for part in observed))
+
+
+def _helped(rule: str) -> str:
+    """Put the parts that it shares before ``rule``."""
     helpers = ""
     for call, part in reversed(_HELPERS.items()):  # a helper may call the one before it
         if call in helpers + rule and _part(part) not in helpers:
@@ -129,24 +154,32 @@ def _rule(policy: Policy, guides: bool) -> str:
     return helpers + rule
 
 
-def _scorer(policy: Policy) -> dict[str, Any]:
+def _scorer(policy: Policy) -> Scorer:
+    found: Scorer = getattr(unpack, "py_func", unpack)(np.array(policy.weights))
+    return found
+
+
+def _numbers(policy: Policy, scorer: Scorer) -> dict[str, Any]:
     """Collect the values for a learned policy's C: its scorer, the scratch and the fields."""
-    scorer = getattr(unpack, "py_func", unpack)(np.array(policy.weights))
     inputs, units = len(scorer.fields), max(1, 2 * scorer.first + scorer.second)
     text = _array("int", "bufgym_fields", scorer.fields.astype(int))
     text += _array("double", "bufgym_networks", scorer.networks)
     sizes = ", ".join(map(str, (inputs, scorer.context, scorer.first, scorer.second, scorer.size)))
     text += f"static const struct bufgym_scorer bufgym_scorer = {{{sizes}, bufgym_fields, bufgym_networks}};\n"
+    by_rule = policy.on_arrival is learned.on_arrival_by_rule
+    slots, context = (
+        (Weights.SLOT_NAMES, Weights.CONTEXT_NAMES) if by_rule else (learned.SLOT_NAMES, learned.CONTEXT_NAMES)
+    )
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
-        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{learned.CONTEXT}];\n"
-        f"    double rows[{learned.SLOTS}][BUFGYM_CAPACITY + 1];\n"
+        f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{len(context)}];\n"
+        f"    double rows[{len(slots)}][BUFGYM_CAPACITY + 1];\n"
     )
     return {
         "WEIGHTS": text,
-        "SCRATCH": scratch,
-        "SLOT_FIELDS": _enum(learned.SLOT_NAMES),
-        "CONTEXT_FIELDS": _enum(learned.CONTEXT_NAMES),
+        "SCRATCH": scratch + (_part("places.h") if by_rule else ""),
+        "SLOT_FIELDS": _enum(slots),
+        "CONTEXT_FIELDS": _enum(context),
     }
 
 

@@ -1,6 +1,3 @@
-/* What the policy reads: of each candidate (the newcomer last), and of the context. */
-@SLOT_FIELDS@
-@CONTEXT_FIELDS@
 
 /* g / (g + reference), in [0, 1]; 0 where both are 0. */
 static inline double bufgym_squash(double g, double reference)
