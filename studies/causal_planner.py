@@ -87,8 +87,8 @@ class CausalPlanner:
         n, messages = planning.futures, 2 + round(planning.horizon_s * scenario.rate_hz)
         self._batch = new_batch(n, capacity, messages, 1, scenario.value.array)
         c, between, idle, begin, stop = np.zeros((5, n, messages), np.int64)
-        latest, gain, follow = np.zeros(ROOM, np.int64), np.zeros(ROOM), np.zeros(ROOM, np.int32)
-        self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, latest, gain, follow)
+        lead, pool = np.zeros((n, messages)), (np.zeros(ROOM, np.int64), np.zeros(ROOM), np.zeros(ROOM, np.int32))
+        self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, lead, *pool)
         self._steps = [np.zeros((2, STEPS), kind) for kind in (np.int64, np.float64, np.int32)]
         self._work, self._values = new_work(capacity, messages), np.zeros((n, capacity + 2))
         self._mask = np.zeros((n, capacity + 2), np.int8)
@@ -137,8 +137,8 @@ class CausalPlanner:
             find_idle(c, sizes, limit, limit, between, idle)
             while (end := find_steps(batch, self._ahead, i, place, *self._steps)) < 0:
                 if end == NO_ROOM:
-                    pool: list[NDArray[Any]] = [np.resize(array, 2 * len(array)) for array in self._ahead[6:]]
-                    self._ahead = Ahead(*self._ahead[:6], *pool)
+                    pool: list[NDArray[Any]] = [np.resize(array, 2 * len(array)) for array in self._ahead[7:]]
+                    self._ahead = Ahead(*self._ahead[:7], *pool)
                 else:
                     self._steps = [np.zeros((2, 2 * array.shape[1]), array.dtype) for array in self._steps]
             place = end

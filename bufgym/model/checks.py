@@ -56,7 +56,7 @@ def check_name(what: str, name: Any) -> None:
 
 def constants(numbers: Iterable[float]) -> NDArray[np.float64]:
     """The numbers as a read-only array for kernels."""
-    array = np.array(list(numbers), np.float64)
+    array = np.array(numbers if isinstance(numbers, np.ndarray) else list(numbers), np.float64)
     array.flags.writeable = False
     return array
 

@@ -27,6 +27,8 @@ class Ahead(NamedTuple):
         between, idle: int64[n, messages], as in ``programme.Problem``.
         link: int64[n, 3], b (bytes of every message), R (messages for which there is room), the link's last byte.
         begin, stop: int64[n, messages], the steps of a message are ``begin : stop`` of the arrays below.
+        lead: float64[n, messages], the most by which the gain after a message exceeds that after the next one, if both
+            find room; infinite for the last.
         latest: int64[room], F(i, e) >= ``gain`` for e <= ``latest``; falls within a message, beginning at ``ALWAYS``.
         gain: float64[room], rises within a message, beginning at 0.
         follow: int32[room], the message to send next for this gain; -1 for none.
@@ -38,6 +40,7 @@ class Ahead(NamedTuple):
     link: Ints
     begin: Ints
     stop: Ints
+    lead: Floats
     latest: Ints
     gain: Floats
     follow: NDArray[np.int32]
@@ -59,7 +62,7 @@ def find_steps(
             enough, top = _ends_before(ahead, i, m, j)
             if top < 0:
                 break
-            if top < enough:
+            if top < enough or _beaten(batch, ahead, i, m, j):
                 continue
             if held + at(ahead.stop, i, j) - at(ahead.begin, i, j) > latest.shape[1]:
                 return NO_WORK_SPACE
@@ -72,7 +75,40 @@ def find_steps(
             ahead.latest[place + k], ahead.gain[place + k] = latest[now, k], gain[now, k]
             ahead.follow[place + k] = follow[now, k]
         place += held
+        ahead.lead[i, m] = _lead(batch, ahead, i, m)
     return place
+
+
+@kernel
+def _beaten(batch: Batch, ahead: Ahead, i: int, m: int, j: int) -> bool:
+    """Whether j + 1 follows ``m`` better than ``j`` after every byte."""
+    if ahead.lead[i, j] == np.inf or at(ahead.between, i, j + 1) > m:
+        return False
+    v, x = batch.v[batch.senders[i].v_start :], at(batch.arrivals, i, m).x
+    added = value(v, at(batch.arrivals, i, j + 1).x - x) - value(v, at(batch.arrivals, i, j).x - x)
+    return bool(added > ahead.lead[i, j] + TIE)
+
+
+@kernel
+def _lead(batch: Batch, ahead: Ahead, i: int, m: int) -> float:
+    """``Ahead.lead`` of a message."""
+    b = ahead.link[i, 0]
+    if m + 1 == batch.senders[i].arrivals or at(ahead.c, i, m + 1) + b > ahead.link[i, 2]:
+        return np.inf
+    # Both gains fall with the byte at which a message ends; they differ most just after the other's has fallen.
+    first, last = at(ahead.c, i, m) + b, at(ahead.c, i, m) + (ahead.link[i, 1] + 1) * b
+    k, stop = at(ahead.begin, i, m), at(ahead.stop, i, m)
+    other, end = at(ahead.begin, i, m + 1), at(ahead.stop, i, m + 1)
+    least, most = at(ahead.c, i, m + 1) + b, 0.0
+    while k + 1 < stop and ahead.latest[k + 1] >= last:
+        k += 1
+    while k < stop and ahead.latest[k] >= first:
+        e = max(min(ahead.latest[k], last), least)
+        while other + 1 < end and ahead.latest[other + 1] >= e:
+            other += 1
+        most = max(most, ahead.gain[k] - ahead.gain[other])
+        k += 1
+    return float(most)
 
 
 @kernel

@@ -27,7 +27,9 @@ class Work(NamedTuple):
     slots: Ints  # int64[L + 1], messages queued after the action
     arrived: Ints  # int64[L + 2], arrivals after the newcomer by the time of the t-th transmission
     future: Floats  # float64[messages], gain after each later arrival
-    forced: Floats  # float64[2, L + 1 + messages], gain of each candidate
+    places: Floats  # float64[L + 1 + messages], coordinate of each candidate of ``forced``
+    best: Ints  # int64[L + 1 + messages], its best predecessor
+    forced: Floats  # float64[2, L + 1 + messages], its gain
 
 
 def new_work(capacity: int, messages: int) -> Work:
@@ -44,6 +46,8 @@ def new_work(capacity: int, messages: int) -> Work:
         np.zeros(L + 1, np.int64),
         np.zeros(L + 2, np.int64),
         np.zeros(messages),
+        np.zeros(L + 1 + messages),
+        np.zeros(L + 1 + messages, np.int64),
         np.zeros((2, L + 1 + messages)),
     )
 
@@ -109,28 +113,45 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
             while n + 1 + count < sender.arrivals and at(ahead.c, i, n + 1 + count) < e + (t - 1) * b:
                 count += 1
             work.arrived[t] = count
-        u = e + (t - 1) * b  # t - 1 of the queue are sent, then a later arrival
-        known, chosen = n, n + 1
-        for k in range(max(0, t - 2), own if t > 1 else 1):
-            # The best successor of a later message is no earlier: V is concave.
-            most, target, m = 0.0, -1, chosen
-            while m < sender.arrivals:
-                if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= u:
-                    break  # another message could be sent in the meantime
-                if m > known:
-                    work.future[m] = sends(ahead, i, m, u)
-                    known = m
+        # V is concave: the best successor of a later message is no earlier. So that of the last bounds all others.
+        first, last, chosen = max(0, t - 2), own - 1 if t > 1 else 0, n + 1
+        stop = look_ahead(batch, ahead, work, i, e, t, last) + 1
+        for k in range(first, last):
+            most, target = 0.0, -1
+            for m in range(chosen, stop):
                 after = work.future[m]
-                if after < -1 or (after >= 0 and after + 1 <= most):
+                if after >= 0 and after + 1 <= most:
                     break  # a later message has no larger gain after it
                 if after >= 0:
-                    x = at(batch.arrivals, i, m).x
-                    added = value(v, x - (last_x if t == 1 else work.x[k])) if sent or t > 1 else 1.0
-                    if added + after > most + TIE or target < 0:
-                        most, target = added + after, m
-                m += 1
+                    gain = value(v, at(batch.arrivals, i, m).x - work.x[k]) + after
+                    if gain > most + TIE or target < 0:
+                        most, target = gain, m
             work.jump[t - 1, k], work.target[t - 1, k] = most, target
             chosen = target if target >= 0 else chosen
+
+
+@kernel
+def look_ahead(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, t: int, k: int) -> int:
+    """Find what follows t - 1 messages of the queue of which k is the last; return it, and -1 for none.
+
+    Fills ``jump`` and ``target`` of k, and ``future`` up to the arrival found.
+    """
+    sender = batch.senders[i]
+    v, u, n = batch.v[sender.v_start :], e + (t - 1) * ahead.link[i, 0], sender.next
+    x = at(batch.slots, i, sender.first - 1).x if t == 1 else work.x[k]
+    most, target = 0.0, -1
+    for m in range(n + 1, sender.arrivals):
+        if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= u:
+            break  # another message could be sent in the meantime
+        work.future[m] = after = sends(ahead, i, m, u)
+        if after < -1 or (after >= 0 and after + 1 <= most):
+            break  # a later message has no larger gain after it
+        if after >= 0:
+            added = value(v, at(batch.arrivals, i, m).x - x) if sender.dequeued > 0 or t > 1 else 1.0
+            if added + after > most + TIE or target < 0:
+                most, target = added + after, m
+    work.jump[t - 1, k], work.target[t - 1, k] = most, target
+    return target
 
 
 @kernel
@@ -177,29 +198,38 @@ def possible(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, plan: tuple
 def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, until: int) -> float:
     """Compute ``best_from`` with the condition kept by each of the first ``until`` transmissions.
 
-    Candidates are numbered: the queue from 0 on, later arrivals from ``count`` on.
+    Candidates are numbered: the queue from 0 on, later arrivals from ``count`` on. V is concave: of a later candidate the
+    best predecessor is no earlier. So every second one is done first, and bounds those between.
     """
     b, n = ahead.link[i, 0], batch.senders[i].next
     v = batch.v[batch.senders[i].v_start :]
     last_x = at(batch.slots, i, batch.senders[i].first - 1).x
+    known = until + work.arrived[until]
+    for m in range(known):
+        work.places[m] = work.x[work.slots[m]] if m < count else at(batch.arrivals, i, n + 1 + m - count).x
+    for m in range(1 + work.arrived[1]):
+        work.forced[1, m] = work.first[work.slots[m]] if m < count else value(v, work.places[m] - last_x)
+    for t in range(2, until + 1):
+        gains, before = work.forced[(t - 1) % 2], work.arrived[t - 1] + t - 1
+        first, stop, step = t - 1, t + work.arrived[t], 1
+        while step < stop - first:
+            step *= 2
+        while step > 0:
+            for m in range(first + step - 1, stop, 2 * step):
+                low = work.best[m - step] if m - step >= first else t - 2
+                high = work.best[m + step] + 1 if m + step < stop else before
+                gain = -1.0
+                for j in range(low, min(m, before, high)):
+                    g = gains[j] + value(v, work.places[m] - work.places[j])
+                    if g > gain:
+                        gain, work.best[m] = g, j
+                work.forced[t % 2, m] = gain
+            step //= 2
     most = 0.0
-    for t in range(1, until + 1):
-        arrived, before = work.arrived[t], work.arrived[t - 1]
-        for m in range(t - 1, t + arrived):
-            queued = m < count
-            x = work.x[work.slots[m]] if queued else at(batch.arrivals, i, n + 1 + m - count).x
-            gain = -1.0
-            if t == 1:
-                gain = work.first[work.slots[m]] if queued else value(v, x - last_x)
-            else:
-                for j in range(t - 2, min(m, before + t - 1)):
-                    x_j = work.x[work.slots[j]] if j < count else at(batch.arrivals, i, n + 1 + j - count).x
-                    gain = max(gain, work.forced[(t - 1) % 2, j] + value(v, x - x_j))
-            work.forced[t % 2, m] = gain
-            if t == until:
-                if queued:
-                    gain += work.jump[t, work.slots[m]]
-                else:
-                    gain += ahead.gain[step_of(ahead, i, n + 1 + m - count, e + t * b)]
-                most = max(most, gain)
+    for m in range(until - 1, known):
+        if m < count:
+            after = work.jump[until, work.slots[m]]
+        else:
+            after = ahead.gain[step_of(ahead, i, n + 1 + m - count, e + until * b)]
+        most = max(most, work.forced[until % 2, m] + after)
     return most

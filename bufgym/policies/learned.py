@@ -150,10 +150,11 @@ class Weights:
 
     def parameters(self) -> NDArray[np.float64]:
         """The scorer as parameters for ``unpack``."""
-        order = [self.fields.index(name) for name in (*self.context, *self.slot)]
-        places = [*map(self.CONTEXT_NAMES.index, self.context), *map(self.SLOT_NAMES.index, self.slot)]
+        context, slot = self.context, self.slot
+        order = [self.fields.index(name) for name in (*context, *slot)]
+        places = [*map(self.CONTEXT_NAMES.index, context), *map(self.SLOT_NAMES.index, slot)]
         networks = [getattr(self, name).flat(order) for name in self.NETWORKS]
-        header = [len(self.fields), len(self.context), *self.widths, len(networks[0])]
+        header = [len(self.fields), len(context), *self.widths, len(networks[0])]
         return np.concatenate([header, places, *networks])
 
     def tensors(self) -> dict[str, NDArray[np.float32]]:
@@ -199,6 +200,6 @@ def seen(memory: Memory, weights: Weights, capacity: int) -> tuple[NDArray[np.fl
     first, second = weights.widths
     begin = RULE_SCRATCH + chains.COLUMNS * (capacity + 1) + 2 * len(weights.fields) - len(weights.context)
     begin += 2 * first + second
-    rows = memory[:, begin + ALL_CONTEXT :][:, : ALL_SLOTS * (capacity + 1)].reshape(-1, ALL_SLOTS, capacity + 1)
     context = [begin + weights.CONTEXT_NAMES.index(name) for name in weights.context]
-    return memory[:, context], rows[:, [*map(weights.SLOT_NAMES.index, weights.slot)]].swapaxes(1, 2)
+    slots = begin + ALL_CONTEXT + (capacity + 1) * np.array([weights.SLOT_NAMES.index(name) for name in weights.slot])
+    return memory[:, context], memory[:, np.arange(capacity + 1)[:, None] + slots]

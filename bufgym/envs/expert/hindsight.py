@@ -37,8 +37,9 @@ class Clairvoyant:
         n, messages = len(self.rows), senders.batch.arrivals.shape[1]
         numbers = (np.zeros((n, messages), np.int64) for _ in range(5))
         c, between, idle, begin, stop = numbers
+        lead = np.zeros((n, messages))
         pool = np.zeros(_ROOM, np.int64), np.zeros(_ROOM), np.zeros(_ROOM, np.int32)
-        self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, *pool)
+        self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, lead, *pool)
         self._steps = [np.zeros((2, 64), array.dtype) for array in pool]
         self._span = np.zeros((n, 2), np.int64)  # each row's part of the pool
         self._end = 0
