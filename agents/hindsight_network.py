@@ -29,7 +29,8 @@ class Scorer(nn.Module):
     def __init__(self, width: int, prior: dict[str, float]) -> None:
         super().__init__()
         inputs = len(CONTEXT) + len(SLOT)
-        self.first, self.second, self.out = nn.Linear(inputs, width), nn.Linear(width, width), nn.Linear(width, 1)
+        half = max(1, width // 2)
+        self.first, self.second, self.out = nn.Linear(inputs, width), nn.Linear(width, half), nn.Linear(half, 1)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
         skip = torch.zeros(inputs)

@@ -65,6 +65,7 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         padded_slots: int = 0,
         reward: str = "retained",
         decide_at: str = "arrival",
+        fields: str | None = None,
     ) -> None:
         largest = max(cell.capacity for cell in cells)
         self.padded_slots = padded_slots or largest
@@ -72,7 +73,9 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"{self.padded_slots} padded slots: a cell has L = {largest}")
 
         def rows(cell: Cell, size: int) -> Rows:
-            return Rows(size, cell.scenario, Options(capacity=cell.capacity, decide_at=decide_at, reward=reward))
+            return Rows(
+                size, cell.scenario, Options(capacity=cell.capacity, decide_at=decide_at, reward=reward, fields=fields)
+            )
 
         self.groups = [rows(cell, size) for cell, size in zip(cells, sizes, strict=True)]
         self.num_envs = sum(sizes)

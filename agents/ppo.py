@@ -43,7 +43,7 @@ class SlotPPO(SlotLearner[PPO]):
 def network_of(settings: PPO) -> tuple[Any, dict[str, Any]]:
     """The actor-critic class and its arguments: the slot network, or a plain one over all numbers at once."""
     if settings.network == "slots":
-        return SlotPolicy, {"width": settings.width, "masked": not settings.unmasked}
+        return SlotPolicy, {"width": settings.width, "masked": not settings.unmasked, "prior": settings.prior}
     plain = MultiInputActorCriticPolicy if settings.unmasked else MaskableMultiInputActorCriticPolicy
     return plain, {"net_arch": [2 * settings.width, 2 * settings.width], "activation_fn": nn.ReLU}
 

@@ -264,6 +264,11 @@ class OnSlots(SingleDecisions):
     """One small network for every slot, or one over all numbers at once."""
 
     @property
+    def fields(self) -> str | None:
+        """What it sees, as the environment's option."""
+        return None
+
+    @property
     def decide_at(self) -> str:
         """When the agent is asked; on suites at every arrival."""
         return "arrival" if self.suites.suite else self.environment.decide_at
@@ -286,12 +291,25 @@ class PPO(OnSlots, ActorCritic):
     """At the start; falls linearly to 0."""
     unmasked: bool = False
     """Without masks: an invalid action does what a queue does."""
+    prior: Least0 = 0.0
+    """Logit of what the rule gap-price chooses, besides the network's; above 0 the agent sees what the rule knows."""
+
+    @property
+    def fields(self) -> str | None:
+        """What the rule knows, where the rule is the prior."""
+        return "rule" if self.prior else None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.kind == "fleet" and (self.network != "slots" or self.unmasked or self.width > MAX_WIDTH):
             rule = f"scores slots with masks, by at most {MAX_WIDTH} hidden units a layer"
             raise BufgymError(f"suite {self.suites.suite[0]}: a fleet's agent {rule}")
+        alone = self.network != "slots" or self.unmasked or self.width > MAX_WIDTH or self.decide_at != "arrival"
+        if self.prior and (self.kind == "fleet" or alone):
+            raise BufgymError(
+                f"prior = {self.prior:g}: the rule is the prior of one queue's slot network with masks, of at most"
+                f" {MAX_WIDTH} hidden units a layer, which is asked at every arrival"
+            )
 
 
 @dataclass(frozen=True)
@@ -326,7 +344,7 @@ class Hindsight(Settings):
     steps: Natural = 200_000
     """Decisions to learn from, for each seed."""
     width: Count = 32
-    """Hidden units a layer."""
+    """Hidden units of the first layer; the second has half as many."""
     num_envs: Count = 64
     """Environments side by side."""
     rule_share: Share = 0.125

@@ -89,7 +89,8 @@ class ObservationForm:
         tables = {"slot": slot_fields, "context": context_fields}
         known = [field.name for field in (*slot_fields, *context_fields)]
         if isinstance(chosen, str):
-            raise BufgymError(f"fields = {chosen!r}: must be a list of names, or 'guided'; known: {', '.join(known)}")
+            rule = "must be a list of names, 'compact', 'guided' or 'rule'"
+            raise BufgymError(f"fields = {chosen!r}: {rule}; known: {', '.join(known)}")
         own: dict[str, Field] = {}
         names = known if chosen is None else list(chosen)
         for k, name in enumerate(names):

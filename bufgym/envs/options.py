@@ -14,6 +14,7 @@ from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
 
 GUIDED = "guided"
+RULE = "rule"
 ACTIONS = ("slots", GUIDED)  # What an action is: the slot that goes, or numbers of the rule
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
@@ -75,9 +76,9 @@ class Options:
         return self.actions == GUIDED
 
     @property
-    def sees_guided(self) -> bool:
-        """Whether an observation holds the inputs of that rule, and nothing else."""
-        return isinstance(self.fields, str) and self.fields == GUIDED
+    def sees(self) -> str:
+        """What an observation holds of that rule, and nothing else: "guided", its inputs; "rule", all it knows; ""."""
+        return self.fields if isinstance(self.fields, str) and self.fields in (GUIDED, RULE) else ""
 
     @property
     def shows_all(self) -> bool:
@@ -110,9 +111,9 @@ class Options:
             )
         if self.mask == "plausible":
             raise BufgymError(f"mask = 'plausible': the plausible actions are known for one queue, not for {what}")
-        if self.acts_guided or self.sees_guided:
-            name = "actions" if self.acts_guided else "fields"
-            raise BufgymError(f"{name} = {GUIDED!r}: the rule serves one queue on a link of its own, not {what}")
+        if self.acts_guided or self.sees:
+            given = f"actions = {GUIDED!r}" if self.acts_guided else f"fields = {self.sees!r}"
+            raise BufgymError(f"{given}: the rule serves one queue on a link of its own, not {what}")
 
 
 _NAMES = tuple(field.name for field in fields(Options))

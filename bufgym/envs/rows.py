@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.guided import Guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
-from bufgym.envs.options import Options
+from bufgym.envs.options import RULE, Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.plausible import keep_plausible
@@ -36,6 +36,7 @@ from bufgym.model.observe import (
 )
 from bufgym.oracle.measure import MEASURED, measured
 from bufgym.policies.guided import INPUT_FIELDS
+from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
@@ -115,7 +116,7 @@ class Rows:
             self._draw = Pool(scenario.draw, options.pool)
         self._threads = Threads(np.arange(n), options.num_threads)
 
-        self.guiding = Guiding(n, options) if options.acts_guided or options.sees_guided else None
+        self.guiding = Guiding(n, options) if options.acts_guided or options.sees else None
         self._guide = self.guiding and self.guiding.guide
         self._acts = self.guiding if options.acts_guided else None
         self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.capacity + 2)
@@ -136,13 +137,15 @@ class Rows:
     def _observed(self) -> ObservationForm:
         """The fields to observe; without slot fields where none is, as a step computes those for every message."""
         options, several_topics = self.options, bool(self.scenario.topics)
-        if options.sees_guided:
-            return ObservationForm(options.observation, (), INPUT_FIELDS, self.capacity, mask=options.mask_keys)
+        if options.sees:
+            slots = RULE_SLOT_FIELDS if options.sees == RULE else ()
+            context = RULE_FIELDS if options.sees == RULE else INPUT_FIELDS
+            return ObservationForm(options.observation, slots, context, self.capacity, mask=options.mask_keys)
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if several_topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if several_topics else ())
-        context = [field.name for field in context_fields]
-        chosen = context if isinstance(options.fields, str) and options.fields == "compact" else options.fields
-        if not self.keeps_slots and chosen and all(name in context or own_field(name) for name in chosen):
+        names = [field.name for field in context_fields]
+        chosen = names if isinstance(options.fields, str) and options.fields == "compact" else options.fields
+        if not self.keeps_slots and chosen and all(name in names or own_field(name) for name in chosen):
             slot_fields = ()
         form = options.observation
         return ObservationForm(form, slot_fields, context_fields, self.capacity, chosen, options.mask_keys)

@@ -198,8 +198,8 @@ def possible(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, plan: tuple
 def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, until: int) -> float:
     """Compute ``best_from`` with the condition kept by each of the first ``until`` transmissions.
 
-    Candidates are numbered: the queue from 0 on, later arrivals from ``count`` on. V is concave: of a later candidate the
-    best predecessor is no earlier. So every second one is done first, and bounds those between.
+    Candidates are numbered: the queue from 0 on, later arrivals from ``count`` on. V is concave: of a later candidate
+    the best predecessor is no earlier. So every second one is done first, and bounds those between.
     """
     b, n = ahead.link[i, 0], batch.senders[i].next
     v = batch.v[batch.senders[i].v_start :]

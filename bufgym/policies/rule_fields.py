@@ -1,7 +1,8 @@
 """Fields that know what the rule gap-price knows: an agent that scores slots may begin at the rule and learn the rest.
 
 Slot fields compare each candidate with the target gap g of ``target_gap`` and with the price of ``price_dp``. Context
-fields are ``guided.INPUTS`` and the state of the socket. All need the rule's memory, so no environment observes them.
+fields are ``guided.INPUTS`` and the state of the socket. All need the rule's memory, so an environment observes either
+these or its own (``fields="rule"``).
 """
 
 from dataclasses import replace

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from torch import nn
+from torch import Tensor, nn
 
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength
@@ -72,14 +72,14 @@ def weights_of(model: Any) -> Weights:
     if not isinstance(features, SlotExtractor) or not isinstance(scorer, SlotScorer):
         raise BufgymError("only an agent that scores slots can be exported (train.py ppo --network slots)")
     fields = (*features.slot_fields, *features.context_fields)
-    return Weights(fields, _network(scorer.score), _network(scorer.accept))
+    return Weights(fields, _network(scorer.score, scorer.priors[0]), _network(scorer.accept, scorer.priors[1]))
 
 
-def _network(perceptron: nn.Sequential) -> Network:
-    """ReLU layers and one output; torch keeps weights as [outputs, inputs]."""
+def _network(perceptron: nn.Sequential, prior: Tensor) -> Network:
+    """ReLU layers, one output and direct weights of the inputs; torch keeps weights as [outputs, inputs]."""
     *hidden, last = [layer for layer in perceptron if isinstance(layer, nn.Linear)]
     return Network(
-        np.zeros((hidden[0] if hidden else last).in_features, np.float32),
+        _array(prior),
         _array(last.bias),
         tuple((np.ascontiguousarray(_array(layer.weight).T), _array(layer.bias)) for layer in hidden),
         _array(last.weight)[0],
