@@ -29,8 +29,7 @@ class Scorer(nn.Module):
     def __init__(self, width: int, prior: dict[str, float]) -> None:
         super().__init__()
         inputs = len(CONTEXT) + len(SLOT)
-        half = max(1, width // 2)
-        self.first, self.second, self.out = nn.Linear(inputs, width), nn.Linear(width, half), nn.Linear(half, 1)
+        self.first, self.second, self.out = nn.Linear(inputs, width), nn.Linear(width, width), nn.Linear(width, 1)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
         skip = torch.zeros(inputs)

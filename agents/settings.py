@@ -344,7 +344,7 @@ class Hindsight(Settings):
     steps: Natural = 200_000
     """Decisions to learn from, for each seed."""
     width: Count = 32
-    """Hidden units of the first layer; the second has half as many."""
+    """Hidden units a layer."""
     num_envs: Count = 64
     """Environments side by side."""
     rule_share: Share = 0.125

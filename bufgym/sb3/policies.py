@@ -17,7 +17,9 @@ from bufgym.ground.errors import BufgymError
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies import Policy
+from bufgym.policies.chains import SCRATCH
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, REMEMBERED, SCALES, WORK, follow, inputs, recall
+from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.export import read_policy, weights_of
@@ -58,7 +60,8 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
         return weights_of(network).policy(name, about)
     if not decisions.for_topics:
-        return Policy(name, decisions.on_arrival, about=about, reads_rate=True)
+        memory: Any = {"memory": REMEMBERED, "work": SCRATCH} if decisions.by_rule else {}
+        return Policy(name, decisions.on_arrival, about=about, reads_rate=True, **memory)
     return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True)
 
 
@@ -96,11 +99,15 @@ class _Decisions:
             observe.SLOT_FIELDS + observe.TOPIC_SLOT_FIELDS,
             observe.CONTEXT_FIELDS + observe.TOPIC_CONTEXT_FIELDS,
         )
+        by_rule = ObservationForm(form, RULE_SLOT_FIELDS, RULE_FIELDS, self.capacity)
+        self.by_rule = space == by_rule.space
         if names is None:
             self.for_topics = numbers == ObservationForm(form, *all_fields, self.capacity).numbers
         else:
             self.for_topics = any(field.name in names for field in observe.TOPIC_FIELDS)
         per_slot, context = all_fields if self.for_topics else (observe.SLOT_FIELDS, observe.CONTEXT_FIELDS)
+        if self.by_rule:
+            per_slot, context = RULE_SLOT_FIELDS, RULE_FIELDS
         known = [field.name for field in per_slot + context]
         for field in names or ():
             if field not in known and observe.own_field(field) is None:
@@ -120,16 +127,18 @@ class _Decisions:
         evictable = [makes_room(buffer, arrival, k) for k in range(len(buffer.slots))]
         no_drop = self.for_topics and buffer.topics[arrival.topic].no_drop == 1
         may_reject = not no_drop or not (room or any(evictable))
-        action = self._action(buffer, arrival, True, [*evictable, may_reject, room])
+        action = self._action(buffer, arrival, memory, True, [*evictable, may_reject, room])
         return action if action < self.capacity else REJECT if action == self.capacity else ACCEPT
 
     def on_send(self, buffer: Buffer, memory: NDArray[np.float64]) -> int:
         """The slot to send, or HOLD."""
         sendable = [is_first(buffer, k) for k in range(len(buffer.slots))]
-        action = self._action(buffer, buffer.slots[0], False, [*sendable, True, False])
+        action = self._action(buffer, buffer.slots[0], memory, False, [*sendable, True, False])
         return action if action < self.capacity else HOLD
 
-    def _action(self, buffer: Buffer, arrival: Any, arriving: bool, valid: Sequence[bool]) -> int:
+    def _action(
+        self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64], arriving: bool, valid: Sequence[bool]
+    ) -> int:
         """The model's action; ``valid`` has an entry for each queued slot's action, then for L and L + 1."""
         L = buffer.capacity
         if L != self.capacity:
@@ -142,6 +151,8 @@ class _Decisions:
         if self.for_topics:
             observe.observe_topic_slots(buffer, arrival, arriving, slots)
             observe.observe_topic_context(buffer, arrival, arriving, context)
+        elif self.by_rule:
+            observe_rule(buffer, arrival, memory, slots, context)
         else:
             observe.observe(buffer, arrival, slots, context)
         for place in self.own:
