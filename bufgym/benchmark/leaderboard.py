@@ -22,7 +22,7 @@ from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import read_utf8
+from bufgym.ground.files import read_utf8, write_text
 from bufgym.ground.kernel.closure import closure
 from bufgym.oracle import kept
 from bufgym.scenario import suites
@@ -166,7 +166,7 @@ def write(board: Sequence[Entry], path: Path) -> None:
             cells = {"quantity": key, **interval._asdict()}
             lines.append({name: cells[name] if name in cells else getattr(entry, name) for name in COLUMNS})
     write_rows(lines, path, COLUMNS)
-    folder.write_text(path.with_suffix(".md"), markdown(board))
+    write_text(path.with_suffix(".md"), markdown(board))
 
 
 def read(path: Path) -> dict[str, Entry]:
