@@ -229,7 +229,7 @@ def _compare_on_suite(
         raise BufgymError(f"{', '.join(frozen)}: a suite's episodes are frozen")
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
-    players = _with_rival(entrants, rival, tasks.TASKS[suites.get(suite).kind])
+    players = _with_rival(entrants, rival, tasks.task_of(suite))
     registered = {*policies.names(), *policies.names(named_only=True)}
     for policy in players:
         base = policy.name.partition(":")[0]

@@ -60,7 +60,7 @@ class Sweep:
 
     @property
     def task(self) -> Task:
-        return tasks.TASKS[suites.get(self.suite).kind]
+        return tasks.task_of(self.suite)
 
     @property
     def policies(self) -> list[policies.Policy]:
