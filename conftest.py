@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from bufgym.ground import kernel
+from bufgym.policies import registry
 
 kernel.compile_silently()  # tests count lines on stderr
 
@@ -44,6 +45,12 @@ def shared_data() -> Path:
         where = "$BUFGYM_SHARED_DATA" if named else "shared/data beside the checkout"
         pytest.skip(f"recorded data absent: {where} is no folder (set BUFGYM_SHARED_DATA)")
     return folder
+
+
+@pytest.fixture
+def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Policies that the test registers are gone after it."""
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
 
 
 @pytest.fixture(scope="session")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
-    "bufgym": 27_390,
-    "tests": 18_150,
+    "bufgym": 27_350,
+    "tests": 18_130,
     "packages/live/bufgym_live": 10_650,
-    "packages/live/tests": 7_200,
+    "packages/live/tests": 7_170,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_160,
 }

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from agents.settings import Settings
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import locked, replaced
+from bufgym.ground.files import locked, write_text
 from bufgym.ground.processes import end_with
 
 RUNS = Path("runs")
@@ -82,8 +82,7 @@ def prepare(settings: Settings) -> Path:
             if changed:
                 changes = ", ".join(f"{name} was {before.get(name)!r}, now {values[name]!r}" for name in changed)
                 raise BufgymError(f"--resume: give the settings that the run in {folder} began with: {changes}")
-        with replaced(folder / "settings.json") as file:
-            file.write_text(text, encoding="utf-8")
+        write_text(folder / "settings.json", text)
     return folder
 
 

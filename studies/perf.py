@@ -31,7 +31,7 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.cli.options import Count
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import replaced
+from bufgym.ground.files import write_text
 from bufgym.ground.kernel import JIT
 from bufgym.ground.tables import Table
 from bufgym.scenario.numbered import draw
@@ -225,8 +225,7 @@ def write_json(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> None
         "sizes": asdict(sizes),
         "figures": [figure._asdict() for figure in figures],
     }
-    with replaced(path) as temporary:
-        temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(document, indent=2) + "\n")
 
 
 def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:

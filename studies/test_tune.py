@@ -13,6 +13,7 @@ from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.tasks import TASKS
 from bufgym.cli.options import OPTIONS
+from bufgym.ground.strict_json import read_object
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, suites
 from studies import tune
@@ -111,7 +112,7 @@ def test_the_command_writes_what_bench_then_reads(capsys: Capsys) -> None:
     refuse("never chosen on test episodes", cli, "tiny-twelve --split test --write", capsys)
     assert not tuned.FILE.exists()
     cli("tiny-twelve --policies decimate,lifespan --seeds 3 --write", capsys)
-    entry = tuned.read()["tiny-twelve"]["decimate"]
+    entry = read_object(tuned.FILE)["tiny-twelve"]["decimate"]
     assert entry["setting"] == "decimate:every=4" and entry["split"] == "validation"
     assert entry["score"] == pytest.approx(1) and entry["score"] > entry["default_score"]
     assert entry["command"] == "python -m studies.tune tiny-twelve --policies decimate,lifespan --seeds 3 --write"
@@ -123,7 +124,7 @@ def test_the_command_writes_what_bench_then_reads(capsys: Capsys) -> None:
 
 def test_what_is_shipped(monkeypatch: Patch) -> None:
     monkeypatch.setattr(tuned, "FILE", Path(tuned.__file__).with_name("tuned.json"))
-    shipped = tuned.read()
+    shipped = read_object(tuned.FILE)
     assert shipped and set(shipped) <= set(suites.SUITES)
     for suite, entries in shipped.items():
         specs = default_policies(suite)

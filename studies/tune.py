@@ -32,7 +32,8 @@ from bufgym.benchmark.table import decimal
 from bufgym.cli.options import Seeds, Whole, command_line, policy_specs
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import replaced
+from bufgym.ground.files import write_text
+from bufgym.ground.strict_json import read_object
 from bufgym.ground.tables import Table
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
@@ -258,7 +259,7 @@ def plain(choices: Sequence[Choice]) -> str:
 
 def keep(suite: str, choices: Sequence[Choice], *, split: str, again: str) -> Path:
     """Write the choices to ``tuned.json``, replacing earlier ones for the same policies; return its path."""
-    suites = tuned.read() if tuned.FILE.exists() else {}
+    suites = read_object(tuned.FILE) if tuned.FILE.exists() else {}
     for choice in choices:
         suites.setdefault(suite, {})[choice.policy] = {
             "setting": choice.chosen.spec,
@@ -271,9 +272,7 @@ def keep(suite: str, choices: Sequence[Choice], *, split: str, again: str) -> Pa
             "bufgym": __version__,
         }
     # Sorted, so that the file does not depend on the order of the runs.
-    with replaced(tuned.FILE) as temporary:
-        temporary.write_text(json.dumps(suites, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    return tuned.FILE
+    return write_text(tuned.FILE, json.dumps(suites, indent=1, sort_keys=True) + "\n")
 
 
 def _rounded(number: float) -> float | None:

@@ -17,8 +17,9 @@ from bufgym.benchmark.run import run
 from bufgym.cli import main
 from bufgym.cli.listing import LISTS
 from bufgym.ground.kernel import JIT
-from bufgym.policies import registry
 from bufgym.traces.shipped import shipped_calls
+
+pytestmark = pytest.mark.usefixtures("own_registry")
 
 
 @pytest.fixture
@@ -84,11 +85,6 @@ def test_play_ends_where_bench_does(capsys: Capsys) -> None:
 
 QUICK = ["--seconds", "1", "--fps", "10", "--seeds", "2", "--capacity", "2"]
 """A benchmark of a few messages."""
-
-
-@pytest.fixture(autouse=True)
-def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
 
 
 def test_bench_writes_rows_and_a_table(trace: str, tmp_path: Path, capsys: Capsys) -> None:

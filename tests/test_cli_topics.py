@@ -10,7 +10,6 @@ from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.tasks.fleet import ROWS as FLEET_ROWS
 from bufgym.benchmark.tasks.topics import ROWS
 from bufgym.cli import main
-from bufgym.policies import registry
 
 CONFIG = """
 duration_s = 2
@@ -74,9 +73,8 @@ def test_the_suite_runs_by_default(capsys: Capsys) -> None:
     assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
 
 
-def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch) -> None:
+def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Capsys, own_registry: None) -> None:
     """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     mine = tmp_path / "mine.py"
     mine.write_text(FAR_OFF.format(True))
     chosen = ["--seeds", "1", "--policies", "far-off", "--policy-file", mine]

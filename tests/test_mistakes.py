@@ -21,7 +21,6 @@ from bufgym.benchmark.rows import read_rows
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 from bufgym.ground.units import bytes_of, rate_of
-from bufgym.policies import registry
 from bufgym.scenario import suites
 
 QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10", "--seeds", "1", "--policies", "afr"]
@@ -86,6 +85,7 @@ TAKES = "(buffer, arrival, memory)"
 UNCOMPILED = "attribute 'no' of type Buffer; File \"mine.py\", line 5\n" if JIT else "line 5: AttributeError"
 
 
+@pytest.mark.usefixtures("own_registry")
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -99,7 +99,6 @@ UNCOMPILED = "attribute 'no' of type Buffer; File \"mine.py\", line 5\n" if JIT 
     ],
 )
 def test_a_rule_that_does_not_fit(text: str, told: str, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(text, encoding="utf-8")
     only = ["--policies", "mine"] if "mine" in text else []

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from cli_cases import Patch
 
 from bufgym import cli, policies
 from bufgym.cli import main
-from bufgym.policies import registry
 from bufgym.scenario.suites import SUITES
 from website import cards, commands, markdown, pages, papers, suites
 from website import policies as policy_page
@@ -144,7 +144,7 @@ def settings_of(line: str) -> str | None:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("line", [line for line in typed() if settings_of(line) is not None])
-def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, own_registry: None, capsys: Any) -> None:
     """In a folder with the guide's programs and the repository's examples and traces."""
     for block in blocks():
         named = re.match(r"# (\w+\.py)\n", block.text) if block.language == "python" else None
@@ -153,7 +153,6 @@ def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     for name in ("examples", "traces"):
         (tmp_path / name).symlink_to(REPO / name)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     if "dataset make" in line:
         pytest.importorskip("minari")
     try:
@@ -198,14 +197,13 @@ PROGRAMS = [block for block in blocks() if block.language == "python" and block.
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
-def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch, own_registry: None) -> None:
     needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:
             pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     program = "\n".join([textwrap.dedent(BEFORE.get(block.page, "")), block.text, AFTER.get(block.page, "")])
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     exec(compile(program, block.page, "exec"), {"__name__": "page"})
 
 

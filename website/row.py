@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bufgym.benchmark import leaderboard
+from bufgym.benchmark.tasks import task_of
 from bufgym.ground.errors import BufgymError
 
 
@@ -20,7 +21,7 @@ def put(folder: Path, policy: str, path: Path) -> None:
     (new,) = found
     board = list(leaderboard.read(path).values())
     suite = [entry for entry in board if entry.suite == new.suite and entry.policy != policy]
-    first = leaderboard.task_of(new.suite).listed[0]
+    first = task_of(new.suite).listed[0]
     ranked = sorted(
         [entry for entry in suite if entry.rank] + ([new] if new.rank else []), key=lambda e: -e.values[first].value
     )

@@ -23,6 +23,7 @@ from bufgym.benchmark.sources import PolicyLike as PolicyLike
 from bufgym.benchmark.sources import make_policy as make_policy
 from bufgym.benchmark.sweep import Sweep
 from bufgym.ground.errors import BufgymError, unknown
+from bufgym.ground.files import write_text
 from bufgym.ground.libraries import library
 from bufgym.ground.modules import is_named
 from bufgym.policies import Policy
@@ -89,7 +90,7 @@ class Comparison:
 
     def report(self, path: str | Path, command: str = "bufgym.compare(...)") -> Path:
         """Write the page of ``bufgym report`` to this file (extra ``report``); return its path."""
-        return folder.write_text(Path(path), self.page(command))
+        return write_text(Path(path), self.page(command))
 
     def write_rows(self, path: str | Path) -> Path:
         """Write the rows to this ``.csv`` or ``.parquet`` file; return its path."""
@@ -97,7 +98,7 @@ class Comparison:
 
     def write_table(self, path: Path) -> Path:
         """Write ``about`` and the table as Markdown to this file; return its path."""
-        return folder.write_text(path, f"{self.about}\n\n{self.markdown}\n")
+        return write_text(path, f"{self.about}\n\n{self.markdown}\n")
 
     def __str__(self) -> str:
         return f"{self.about}\n\n{self.plain}"
@@ -228,7 +229,7 @@ def _compare_on_suite(
         raise BufgymError(f"{', '.join(frozen)}: a suite's episodes are frozen")
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
-    players = _with_rival(entrants, rival, tasks.TASKS[suites.get(suite).kind])
+    players = _with_rival(entrants, rival, tasks.task_of(suite))
     registered = {*policies.names(), *policies.names(named_only=True)}
     for policy in players:
         base = policy.name.partition(":")[0]

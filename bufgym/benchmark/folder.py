@@ -12,11 +12,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bufgym.benchmark.checked_json import check, read_object
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
 from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import replaced
+from bufgym.ground.files import write_text
+from bufgym.ground.strict_json import check, read_object
 
 FORMAT = 2  # Version of the folder's layout, raised when manifest, rows or timeline change their meaning
 
@@ -164,13 +164,6 @@ def read_manifest(path: Path) -> Mapping[str, Any]:
             rule = "must be a number of seconds"
             raise BufgymError(where(path, None, scenario["outage_s"], rule, field=f"scenarios.{label}.outage_s"))
     return manifest
-
-
-def write_text(file: Path, text: str) -> Path:
-    """Write a file, whole or not at all; return its path."""
-    with replaced(file) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return file
 
 
 def _short(entry: object) -> str:

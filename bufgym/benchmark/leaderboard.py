@@ -19,10 +19,10 @@ from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
 from bufgym.benchmark.summary import places, shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import NONE, Table
-from bufgym.benchmark.tasks import TASKS, Task
+from bufgym.benchmark.tasks import task_of
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import read_utf8
+from bufgym.ground.files import read_utf8, write_text
 from bufgym.ground.kernel.closure import closure
 from bufgym.oracle import kept
 from bufgym.scenario import suites
@@ -87,10 +87,6 @@ def stale(board: Mapping[str, Entry]) -> list[str]:
     told = {name: entry for name, entry in board.items() if entry.made_of.startswith(here)}
     now = {policy: made_of(policy) for policy in {entry.policy for entry in told.values()}}
     return [name for name, entry in told.items() if entry.made_of != now[entry.policy]]
-
-
-def task_of(suite: str) -> Task:
-    return TASKS[suites.get(suite).kind]
 
 
 def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> list[Entry]:
@@ -166,7 +162,7 @@ def write(board: Sequence[Entry], path: Path) -> None:
             cells = {"quantity": key, **interval._asdict()}
             lines.append({name: cells[name] if name in cells else getattr(entry, name) for name in COLUMNS})
     write_rows(lines, path, COLUMNS)
-    folder.write_text(path.with_suffix(".md"), markdown(board))
+    write_text(path.with_suffix(".md"), markdown(board))
 
 
 def read(path: Path) -> dict[str, Entry]:

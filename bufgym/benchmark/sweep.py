@@ -30,7 +30,7 @@ from bufgym.benchmark.table import unranked_among
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__, modules
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import locked
+from bufgym.ground.files import locked, write_text
 from bufgym.ground.progress import bar
 from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace
@@ -60,7 +60,7 @@ class Sweep:
 
     @property
     def task(self) -> Task:
-        return tasks.TASKS[suites.get(self.suite).kind]
+        return tasks.task_of(self.suite)
 
     @property
     def policies(self) -> list[policies.Policy]:
@@ -208,7 +208,7 @@ def run_sweep(
                 sweep.policies, rows, lambda row: sweep.setting(row["scenario"], row["seed"] // SEEDS_PER_TRACE)
             )
             if example is not None:
-                folder.write_text(out / "timeline.json", json.dumps(example, indent=1))
+                write_text(out / "timeline.json", json.dumps(example, indent=1))
         shutil.rmtree(parts, ignore_errors=True)
         return rows
 

@@ -151,13 +151,12 @@ def _command(
 
 
 def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], command: str) -> Experiment:
-    from bufgym.benchmark.tasks import TASKS
-    from bufgym.scenario import suites
+    from bufgym.benchmark.tasks import task_of
 
-    frozen = suites.get(suite.suite or "")
+    name = suite.suite or ""
     arguments = {name: value for name, value in given(suite).items() if name != "suite"}
     arguments |= {"seeds": who.seeds, "policy_file": who.policy_file, "changes": changes, "command": command}
-    return Experiment(frozen.name, TASKS[frozen.kind], arguments)
+    return Experiment(name, task_of(name), arguments)
 
 
 def _on_scenario(options: ScenarioOptions, buffer: BufferOptions, asked_seeds: int | None) -> Experiment:

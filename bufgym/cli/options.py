@@ -15,7 +15,7 @@ from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import library
 from bufgym.ground.tables import aligned
-from bufgym.ground.units import bytes_of, rate_or_number
+from bufgym.ground.units import bytes_of, rate_of
 
 if TYPE_CHECKING:
     from bufgym.benchmark.tasks import Task
@@ -60,7 +60,8 @@ Count = Annotated[int, checked(int, lambda number: number >= 1, "a whole number 
 Bytes = Annotated[
     int, checked(bytes_of, lambda number: number >= 1, "a whole number of bytes >= 1, as in 230000, 1e6 or 4.6MB")
 ]
-Rate = Annotated[float, checked(rate_or_number, lambda rate: 0 < rate < math.inf, "bytes/s > 0, or as in 20Mbit/s")]
+_RATE = "bytes/s > 0, or as in 20Mbit/s"
+Rate = Annotated[float, checked(lambda text: rate_of(text) or float(text), lambda rate: 0 < rate < math.inf, _RATE)]
 Natural = Annotated[int, checked(int, lambda number: number >= 0, "a whole number >= 0")]
 PortNumber = Annotated[int, checked(int, lambda number: 0 <= number < 2**16, "a whole number from 0 to 65535")]
 Seeds = Annotated[

@@ -40,12 +40,11 @@ def leaderboard(
         jobs: Processes side by side (default: one a core).
     """
     from bufgym.benchmark import leaderboard as boards
+    from bufgym.benchmark.tasks import task_of
     from bufgym.scenario.suites import SUITES
 
     names = suites or [name for name, suite in SUITES.items() if not suite.needs or data]
-    board = boards.make(
-        file, {name: boards.task_of(name).default_policies(name) for name in names}, data=data, jobs=jobs
-    )
+    board = boards.make(file, {name: task_of(name).default_policies(name) for name in names}, data=data, jobs=jobs)
     print(f"{len(board)} rows in {file}, as Markdown in {file.with_suffix('.md')}")
 
 

@@ -16,6 +16,7 @@ from cyclopts import Parameter
 from bufgym.cli.options import Positive, given, refuse
 from bufgym.ground.errors import BufgymError, printable
 from bufgym.ground.progress import bar
+from bufgym.ground.tables import aligned
 
 if TYPE_CHECKING:
     from bufgym.traces import MotionSettings, Workload
@@ -68,8 +69,6 @@ class RecordingOptions(MotionOptions):
 
 
 def workload_lines(workload: Workload) -> list[str]:
-    from bufgym.ground.tables import aligned
-
     cells = [["topic", "messages", "rate (1/s)", "bytes", "mean bytes", "share"]]
     for topic in workload.summary():
         messages, rate, total_bytes, share = _summary_cells(topic)
@@ -156,7 +155,6 @@ def from_poses(
 
 def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     """List every topic of a recording with its type, topics without messages last."""
-    from bufgym.ground.tables import aligned
     from bufgym.traces.formats.bag_files import BETWEEN_TYPES
     from bufgym.traces.formats.bag_poses import carries_poses
 

@@ -48,7 +48,9 @@ def recordings_of(
     files: Sequence[str], mode: str | None, suite: str | None, data: str | None
 ) -> tuple[dict[str, list[Float64Array]], str]:
     """Collect the rates of recordings by mode; also return the words of a command line that ask for them."""
-    from bufgym.traces.fit import mode_of, rates_of
+    from bufgym.traces import read_trace
+    from bufgym.traces.fit import mode_of
+    from bufgym.traces.trace import US_PER_S
 
     if suite is not None:
         if files or mode:
@@ -60,7 +62,7 @@ def recordings_of(
         raise BufgymError("--data: needs --suite")
     rows: dict[str, list[Float64Array]] = {}
     for file in sorted(set(files)):
-        rows.setdefault(mode or mode_of(file), []).append(rates_of(file))
+        rows.setdefault(mode or mode_of(file), []).append(read_trace(file).samples(US_PER_S)[1])
     words = [*_patterns(files), *(["--mode", mode] if mode else [])]
     return {mode: rows[mode] for mode in sorted(rows)}, " ".join(words)
 

@@ -5,8 +5,6 @@
 
 import difflib
 import importlib.metadata
-import os
-import traceback
 from collections.abc import Iterable
 from os import PathLike
 
@@ -88,16 +86,6 @@ def _quoted(value: object) -> str:
     cut = text if len(text) <= _MOST_CHARACTERS else text[: _MOST_CHARACTERS - 3] + "..."
     plain = cut.isprintable() and cut.isascii() and cut != "" and " " not in cut
     return cut if plain else repr(cut)
-
-
-def line_in(error: Exception, file: str) -> str | None:
-    """The innermost line of ``file`` that raised the error ("mine.py, line 3"), or None."""
-    lines = [
-        line
-        for frame, line in traceback.walk_tb(error.__traceback__)
-        if os.path.abspath(frame.f_code.co_filename) == os.path.abspath(file)
-    ]
-    return f"{file}, line {lines[-1]}" if lines else None
 
 
 def install(extra: str) -> str:

@@ -93,6 +93,13 @@ def replaced(target: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(target: Path, text: str) -> Path:
+    """Write a file of UTF-8, whole or not at all; return its path."""
+    with replaced(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return target
+
+
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Lock ``folder`` for this process while the block runs; the lock ends with the process.

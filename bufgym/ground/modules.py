@@ -9,11 +9,12 @@ import inspect
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError, line_in
+from bufgym.ground.errors import BufgymError
 
 _NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """A setting such as ``decimate:every=2`` does not match, as it has "=" after the colon."""
@@ -82,8 +83,12 @@ def run_file(path: str, option: str) -> None:
 
 
 def line_of(error: Exception) -> str | None:
-    """The line of the caller's code that raised the error, in one of ``FILES``; None if elsewhere."""
-    return next(filter(None, (line_in(error, file) for file in FILES)), None)
+    """The innermost line of one of ``FILES`` that raised the error ("mine.py, line 3"), or None."""
+    places = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    for file in FILES:
+        if lines := [line for path, line in places if os.path.abspath(path) == os.path.abspath(file)]:
+            return f"{file}, line {lines[-1]}"
+    return None
 
 
 def first_line(documented: Any) -> str:

@@ -32,9 +32,3 @@ def rate_of(text: str) -> float | None:
         return None
     count = Fraction(match[1]) * 1000 ** _POWERS[match[2] or match[4] or ""]
     return float(count if match[3] == "B" else count / 8)
-
-
-def rate_or_number(text: str) -> float:
-    """Bytes per second of a rate; a plain number is in bytes per second. Raises ValueError for other text."""
-    rate = rate_of(text)
-    return float(text) if rate is None else rate

@@ -16,10 +16,9 @@ import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath
-from bufgym.traces.formats.links import read_trace
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import LOW_QUANTILES, PROBABILITIES, SHOULDER_S, LinkParameters, OutageParameters
-from bufgym.traces.trace import US_PER_S, Float64Array
+from bufgym.traces.trace import Float64Array
 
 Rates: TypeAlias = Sequence[Float64Array]
 """A row for each recording: float64[n], the rate of each second in bytes/s."""
@@ -43,11 +42,6 @@ _EM_STEPS: Final = 300
 _ROUNDS: Final = 3
 # Seconds generated to measure the correlation that a fit has.
 _TRIAL_S: Final = 40_000
-
-
-def rates_of(path: StrPath) -> Float64Array:
-    """Rate of each second of a recording: float64[n], bytes/s."""
-    return read_trace(path).samples(US_PER_S)[1]
 
 
 def mode_of(path: StrPath) -> str:

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 from sweep_cases import THREE
 
-from bufgym import policies
 from bufgym.benchmark.sweep import Sweep
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
@@ -24,7 +23,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Sweep:
 
 
 @pytest.fixture
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def mine(tmp_path: Path, own_registry: None) -> Path:
     """A policy file: ``mine`` may fail, as the environment says."""
     path = tmp_path / "mine.py"
     path.write_text(
@@ -38,5 +37,4 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "        raise ArithmeticError('on purpose')\n"
         "    return ACCEPT if memory[0] % 2 and len(buffer.slots) < buffer.capacity else REJECT\n"
     )
-    monkeypatch.setattr(policies.registry, "_REGISTRY", dict(policies.registry._REGISTRY))
     return path

@@ -17,7 +17,7 @@ from bufgym.benchmark import folder, sources
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.ground import files
-from bufgym.policies import REJECT, registry
+from bufgym.policies import REJECT
 from bufgym.scenario import FleetScenario
 
 MODULE = """
@@ -57,12 +57,11 @@ ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "
 
 
 @pytest.fixture
-def module(tmp_path: Path, monkeypatch: Patch) -> str:
+def module(tmp_path: Path, monkeypatch: Patch, own_registry: None) -> str:
     """A module of policies in the current folder; its name differs from test to test, as Python imports one once."""
     name = "m" + re.sub(r"\W", "_", tmp_path.name)
     (tmp_path / f"{name}.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     return name
 
 
@@ -201,11 +200,10 @@ def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
 
 
 def test_a_suite_takes_files_and_named_policies_and_those_registered_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch, own_registry: None
 ) -> None:
     """A suite's processes load a file themselves; a policy registered in this process runs in this process."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     shipped = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
     shutil.copy(shipped["learned-ppo"], "mine.safetensors")
     options: dict[str, Any] = {"capacity": 2, "seeds": 1, "progress": False}
@@ -243,9 +241,8 @@ def test_topics_and_fleets_beside_their_baseline(kind: str, policy: str, baselin
     assert done.table().startswith("policy") and head in done.table() and done.to_pandas()["scenario"][0] == "mine"
 
 
-def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: Patch, own_registry: None) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     Path("mine.py").write_text("def every_other(buffer, arrival, memory):\n    return -1 if arrival.seq % 2 else -2\n")
     assert bufgym.make_policy("decimate:every=3").parameters["every"] == 3
     assert bufgym.make_policy(stubborn).name == "stubborn"

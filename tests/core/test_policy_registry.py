@@ -17,6 +17,8 @@ from bufgym.model import qoi
 from bufgym.policies import ACCEPT, REJECT, register, registry
 from bufgym.sim.metrics import outcome
 
+pytestmark = pytest.mark.usefixtures("own_registry")
+
 ALL = tuple(name for name in policies.names() if policies.get(name).privileged is None)
 
 SETTINGS = [
@@ -88,12 +90,6 @@ def test_every_decision_is_possible_compiled_and_as_plain_python(name, case, v):
         assert outcome(senders, 0).invalid == 0
     assert policy.unbounded or senders.batch.senders[0]["peak_backlog_bytes"] <= (case.max_bytes or 2**62)
     assert same(senders, case.run(replace(policy, compile=False), v))
-
-
-@pytest.fixture(autouse=True)
-def own_registry(monkeypatch):
-    """What a test registers is gone after it."""
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
 
 
 def keep_even(buffer, arrival, memory):

@@ -11,8 +11,7 @@ from refusal_cases import refused
 
 from bufgym import scenario
 from bufgym.model.link import FOREVER
-from bufgym.scenario import SCENARIOS, FleetScenario, Interruption, Streams, Uplink, messages
-from bufgym.scenario.arrivals import check_messages
+from bufgym.scenario import SCENARIOS, FleetScenario, Interruption, Streams, Uplink
 from bufgym.scenario.draws import place
 from bufgym.sim import run
 from bufgym.traces import Motion
@@ -139,16 +138,8 @@ test_what_is_refused = refused(
     (lambda: uplink(duration_s=1e9, rate_hz=1e-6), "duration_s = 1000000000.0: must be at most 10000000"),
     (lambda: uplink(rate_hz=1e-300), "rate_hz = 1e-300: must be at most 100000, and at least 1e-07"),
     (lambda: uplink(propagation_us=-5), "propagation_us = -5: must be a whole number from 0 to 10000000000000"),
-    (lambda: checked([], 5), "at least one message"),
-    (lambda: checked([0, 2, 1], 5), "message 2: arrival_us = 1: times must be >= 0, must not decrease"),
-    (lambda: checked([0, 1], [5, 0]), "message 1: size_bytes = 0: must be at least 1 byte"),
-    (lambda: checked([0, 1], 5, np.array([1.0, 0.5])), "message 1: x = 0.5: must be a finite number"),
     (lambda: Streams.seeded(-1), "seed = -1"),
 )
-
-
-def checked(arrival_us, size_bytes, x=None):
-    return check_messages(messages(np.array(arrival_us), np.array(size_bytes), x))
 
 
 def uplink(**parameters):

@@ -1,12 +1,13 @@
 """Small recordings written with the libraries that robots' recorders use."""
 
+import functools
 import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from ros_cases import made
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -27,19 +28,14 @@ def _bytes(message: Any, type: str, store: Any) -> bytes:
 
 def odometry(x_m: float, yaw_deg: float, store: Any = ROS2, scale: float = 1.0, stamp_ms: int = -1) -> bytes:
     """nav_msgs/Odometry at (x, 0, 0), turned about z; ``scale``: length of the quaternion; a negative stamp is none."""
-    t, half = store.types, math.radians(yaw_deg) / 2
-    vector, seq = t["geometry_msgs/msg/Vector3"], {"seq": 0} if store is ROS1 else {}
-    turn = t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=scale * math.sin(half), w=scale * math.cos(half))
-    pose = t["geometry_msgs/msg/Pose"](position=t["geometry_msgs/msg/Point"](x=x_m, y=0.0, z=0.0), orientation=turn)
-    twist = t["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
+    of, half = functools.partial(made, store), math.radians(yaw_deg) / 2
+    turn = of("geometry_msgs/msg/Quaternion", z=scale * math.sin(half), w=scale * math.cos(half))
+    place = of("geometry_msgs/msg/Pose", position=of("geometry_msgs/msg/Point", x=x_m), orientation=turn)
     sec, nanosec = (0, 0) if stamp_ms < 0 else divmod(START_NS + stamp_ms * MS, 10**9)
-    stamp = t["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
-    message = t["nav_msgs/msg/Odometry"](
-        header=t["std_msgs/msg/Header"](stamp=stamp, frame_id="odom", **seq),
-        child_frame_id="base",
-        pose=t["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
-        twist=t["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
-    )
+    stamp = of("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    header = of("std_msgs/msg/Header", stamp=stamp, frame_id="odom")
+    pose = of("geometry_msgs/msg/PoseWithCovariance", pose=place)
+    message = of("nav_msgs/msg/Odometry", header=header, child_frame_id="base", pose=pose)
     return _bytes(message, "nav_msgs/msg/Odometry", store)
 
 

@@ -11,11 +11,11 @@ from refusal_cases import refuse
 
 from bufgym.scenario import suites
 from bufgym.scenario.suites.synthetic import both_values
-from bufgym.traces import markov_link, read_links, write_csv
-from bufgym.traces.fit import autocorrelation, fit_links, mode_of, rates_of, spells
+from bufgym.traces import markov_link, read_links, read_trace, write_csv
+from bufgym.traces.fit import autocorrelation, fit_links, mode_of, spells
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import LINKS, UPLINKS, LinkParameters
-from bufgym.traces.trace import Float64Array
+from bufgym.traces.trace import US_PER_S, Float64Array
 
 
 def recordings(link: LinkParameters = KNOWN) -> list[Float64Array]:
@@ -125,7 +125,7 @@ def test_the_command_fits_what_a_suite_trains_on(monkeypatch: Patch, tmp_path: P
 def test_the_committed_parameters_fit_the_recordings(shared_data: Path, tmp_path: Path, capsys: Capsys) -> None:
     rows: dict[str, list[Float64Array]] = {}
     for file in sorted([*shared_data.glob("belgium_4g/csv/*.csv"), *shared_data.glob("solis_wifi/wifi_*.txt")]):
-        rows.setdefault(mode_of(file), []).append(rates_of(file))
+        rows.setdefault(mode_of(file), []).append(read_trace(file).samples(US_PER_S)[1])
     assert fit_links(rows) == read_links(LINKS)
     names = "uplink-5g-v1,uplink-wifi-v1,uplink-mmwave-v1"
     shown(["trace", "fit", "--suite", names, "--data", shared_data, "-o", tmp_path / "uplinks.json"], capsys)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import policies
-from bufgym.benchmark.folder import SuiteRun, read, write_text
+from bufgym.benchmark.folder import SuiteRun, read
 from bufgym.benchmark.report import page, tables
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.summary import Summary
@@ -21,6 +21,7 @@ from bufgym.benchmark.table import Unranked
 from bufgym.benchmark.tasks import Task
 from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.files import write_text
 from bufgym.policies import Policy
 from bufgym.scenario import about
 from bufgym.scenario.suites import Setting

@@ -14,11 +14,17 @@ from bufgym.benchmark.tasks.stress import StressTask
 from bufgym.benchmark.tasks.task import Task
 from bufgym.benchmark.tasks.topics import TopicsTask
 from bufgym.ground.errors import BufgymError
+from bufgym.scenario import suites
 
-__all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "task_for"]
+__all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "task_for", "task_of"]
 
 TASKS: dict[str, Task] = {task.kind: task for task in (QueueTask(), StressTask(), TopicsTask(), FleetTask())}
 """``Suite.kind`` -> task."""
+
+
+def task_of(suite: str) -> Task:
+    """The task of a suite's scenarios."""
+    return TASKS[suites.get(suite).kind]
 
 
 def task_for(scenario: Any, **settings: Any) -> Task:

@@ -24,12 +24,6 @@ def stream(seed: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(seed))
 
 
-def second_stream(seed: int) -> np.random.Generator:
-    """A stream that never overlaps `stream(seed)`: the same generator, 2**127 draws ahead."""
-    stream(seed)  # checks the seed
-    return np.random.Generator(np.random.PCG64(seed).jumped())
-
-
 def nearly_normal(uniforms: Float64Array) -> Float64Array:
     """float64[n, 12] of uniforms to float64[n] of mean 0 and standard deviation 1, within -6..6."""
     total = uniforms[:, 0].copy()

@@ -10,15 +10,7 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.generate.draws import (
-    NORMAL_UNIFORMS,
-    ar1,
-    checked,
-    nearly_normal,
-    second_stream,
-    stream,
-    whole_seconds,
-)
+from bufgym.traces.generate.draws import NORMAL_UNIFORMS, ar1, checked, nearly_normal, stream, whole_seconds
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
 from bufgym.traces.trace import US_PER_S, Float64Array, Trace
 
@@ -67,7 +59,9 @@ def link_rates(link: LinkParameters, seed: int, count: int) -> Float64Array:
     if link.outages is None:
         return rates
     # Outages just beyond the end lower the last seconds, as they would in a longer trace.
-    outages = list(_outages(link.outages, second_stream(seed), count + SHOULDER_S))
+    # Their draws come from the same generator 2**127 draws ahead, so they never overlap those of the scores.
+    random = np.random.Generator(np.random.PCG64(seed).jumped())
+    outages = list(_outages(link.outages, random, count + SHOULDER_S))
     beside = np.zeros(count, np.bool_)
     for start, low in outages:
         beside[max(0, start - SHOULDER_S) : start + len(low) + SHOULDER_S] = True

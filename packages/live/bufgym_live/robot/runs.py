@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import replaced
+from bufgym.ground.files import write_text
 from bufgym.ground.tables import Table
 from bufgym.oracle.measure import regret
 
@@ -119,8 +119,7 @@ def save(runs: Sequence[LiveRun], about: str, command: str, folder: Path) -> Pat
     kept: dict[str, Any] = {"about": about, "command": command, "runs": [asdict(one) for one in runs]}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with replaced(target) as temporary:
-            temporary.write_text(json.dumps(kept), encoding="utf-8")
+        write_text(target, json.dumps(kept))
     except OSError as error:
         raise BufgymError(f"{target}: {error.strerror or error}") from None
     return target

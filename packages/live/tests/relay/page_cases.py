@@ -1,11 +1,13 @@
 """Messages of the kinds that the page draws, in ROS 2's encoding, and made-up robots that publish them."""
 
 import asyncio
+import functools
 import json
 import threading
 from typing import Any
 
 import numpy as np
+import ros_cases
 from pose_cases import POSE, TF, message
 from relay_cases import ALL, Client, client, relay, settings
 
@@ -13,27 +15,11 @@ from bufgym.traces.formats.bag_poses import typestore
 from bufgym_live.relay.config import Limits
 
 STORE = typestore("cdr")
+made = functools.partial(ros_cases.made, STORE)
 DIAGNOSTICS, GRID, PATH = "diagnostic_msgs/msg/DiagnosticArray", "nav_msgs/msg/OccupancyGrid", "nav_msgs/msg/Path"
 POSES, MARKERS = "geometry_msgs/msg/PoseArray", "visualization_msgs/msg/MarkerArray"
 Topics = tuple[tuple[str, str, bytes], ...]
 """(topic, type, payload) each; without a type it is a JPEG file."""
-
-
-def made(type: str, /, **fields: Any) -> Any:
-    """An object of a type of ROS; fields that are not given are zero, and quaternions turn nothing."""
-    if type == "geometry_msgs/msg/Quaternion":
-        fields.setdefault("w", 1.0)
-    for name, (kind, what) in STORE.fielddefs[type][1]:
-        if name in fields:
-            continue
-        if kind.name == "BASE":
-            fields[name] = "" if what[0] == "string" else 0.0 if "float" in what[0] else 0
-        elif kind.name == "NAME":
-            fields[name] = made(what)
-        else:
-            is_number = what[0][0].name == "BASE" and what[0][1][0] != "string"
-            fields[name] = np.zeros(what[1] if kind.name == "ARRAY" else 0, what[0][1][0]) if is_number else []
-    return STORE.types[type](**fields)
 
 
 def cdr(type: str, /, frame: str = "", **fields: Any) -> bytes:

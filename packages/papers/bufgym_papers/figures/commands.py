@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bufgym.cli.options import columns
 from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.files import read_whole, replaced
+from bufgym.ground.files import read_whole, write_text
 
 
 def reproduce(
@@ -57,8 +57,7 @@ def _claims(page: Path, names: list[str], out: Path, data: Path | None) -> None:
     from bufgym_papers.figures.page import claims_page, renewed
 
     text = renewed(read_whole(page, 2**20).decode(), names, data, out) if names else claims_page(data, out)
-    with replaced(page) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(page, text)
     print(f"claims: {page}")
 
 
