@@ -105,9 +105,8 @@ class _Decisions:
             self.for_topics = numbers == ObservationForm(form, *all_fields, self.capacity).numbers
         else:
             self.for_topics = any(field.name in names for field in observe.TOPIC_FIELDS)
-        per_slot, context = all_fields if self.for_topics else (observe.SLOT_FIELDS, observe.CONTEXT_FIELDS)
-        if self.by_rule:
-            per_slot, context = RULE_SLOT_FIELDS, RULE_FIELDS
+        one_queue = (RULE_SLOT_FIELDS, RULE_FIELDS) if self.by_rule else (observe.SLOT_FIELDS, observe.CONTEXT_FIELDS)
+        per_slot, context = all_fields if self.for_topics else one_queue
         known = [field.name for field in per_slot + context]
         for field in names or ():
             if field not in known and observe.own_field(field) is None:
