@@ -11,7 +11,8 @@ from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import outbox, policies, protocol, replay, wire
-from bufgym_live.relay.caller import POLICY_VIOLATION, Caller
+from bufgym_live.relay.admission import POLICY_VIOLATION
+from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.hub import Outgoing
 from bufgym_live.relay.outbox import Outbox
 from bufgym_live.relay.protocol import Admitted
