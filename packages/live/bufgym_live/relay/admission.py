@@ -17,7 +17,7 @@ from websockets.frames import DATA_OPCODES, Frame
 from websockets.http11 import Request
 from websockets.protocol import Event
 
-from bufgym_live.relay import wire
+from bufgym_live.relay import turns, wire
 from bufgym_live.relay.config import Limits
 from bufgym_live.relay.hub import Hub
 from bufgym_live.relay.rules import Identity, Permissions, plain_address
@@ -178,10 +178,12 @@ class Accepted(ServerConnection):
         self._count()
 
     def data_received(self, data: bytes) -> None:
+        began_s = turns.clock()
         self._count(len(data))
         if not self.ended:
             super().data_received(data)
             self._count()
+        self._admission.hub.turns.note(self.address, began_s)
 
     def process_event(self, event: Event) -> None:
         super().process_event(event)

@@ -62,8 +62,12 @@ class Caller:
     def tell(self, op: str, **fields: Any) -> None:
         """Have this sent before any message."""
         if self._listens:
-            self.answers.append(wire.say(op, **fields))
-            self.told()
+            self.say(wire.say(op, **fields))
+
+    def say(self, text: str) -> None:
+        """Have this text frame sent before any message."""
+        self.answers.append(text)
+        self.told()
 
     def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
         """Tell it of a refusal and the reason. Refusals of messages are audited elsewhere."""

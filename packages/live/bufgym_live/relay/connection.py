@@ -58,7 +58,7 @@ class Connection:
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
         greeted()
-        writer = asyncio.create_task(self._outbox.run())
+        writer = asyncio.create_task(hub.turns.of(caller.identity.key, self._outbox.run()))
         left_s = min(caller.identity.until_s - time.time(), 2**20)
         expiry = asyncio.get_running_loop().call_later(left_s, self.end, "the token has expired")
         try:
@@ -99,11 +99,12 @@ class Connection:
         asked = said["file"], said["from_us"], said["most_bytes"]
         await self._caller.pace(min(said["most_bytes"], replay.MOST_BYTES))
         try:
-            part = await asyncio.to_thread(replay.piece, self._recordings, *asked, may)
+            async with self._hub.replaying:
+                text = await asyncio.to_thread(replay.told, said["id"], self._recordings, *asked, may)
         except BufgymError as error:
             self._caller.refuse("replay", error, id=said["id"])
         else:
-            self.tell("replayed", id=said["id"], **part)
+            self._caller.say(text)
 
     async def _publish(self, message: wire.Message) -> None:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""
@@ -187,7 +188,8 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
         with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"
-            await kind(caller, admitted, session, quota).run(greeted)
+            one = kind(caller, admitted, session, quota)
+            await hub.turns.of(caller.identity.key, one.run(greeted))
     except BufgymError as error:
         caller.refuse(stage, error)
         await caller.close(stage)

@@ -20,6 +20,7 @@ from bufgym_live.relay.recorder import Recorder
 from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.store import Settled, Store, StoredSession
 from bufgym_live.relay.subscriber import Subscription
+from bufgym_live.relay.turns import Turns
 from bufgym_live.relay.wire import RefusedError
 
 if TYPE_CHECKING:
@@ -95,6 +96,8 @@ class Hub:
         self.recorder = Recorder.of(config, self.audit)
         self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
+        self.replaying = asyncio.Lock()  # whose turn it is to read a recording
+        self.turns = Turns()
         self._failed: set[str] = set()
         self.received = 0
         self._sent = 0
@@ -255,6 +258,8 @@ class Hub:
         """Publish the relay's state once a second, and forget what has expired."""
         payload = json.dumps(self.status()).encode()
         self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=time.time_ns() // 1000))
+        for who, long_s in self.turns.take().items():
+            self.audit("slow", who=who, longest_ms=round(1e3 * max(long_s), 1), times=len(long_s))
         self.audit.flush()
         if self.recorder is not None:
             self.recorder.flush()

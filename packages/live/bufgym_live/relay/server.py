@@ -19,7 +19,7 @@ from websockets.typing import Subprotocol
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import needs
-from bufgym_live.relay import connection, pages, policies, wire
+from bufgym_live.relay import connection, pages, policies, turns, wire
 from bufgym_live.relay.admission import Accepted, Admission
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.config import POLICIES, Config
@@ -182,7 +182,9 @@ class Server:
         while True:
             await asyncio.sleep(TICK_S)
             with self.hub.spared("tick"):
+                began_s = turns.clock()
                 self.hub.tick()
+                self.hub.turns.note("tick", began_s)
                 self._admission.incoming.end_late()
 
 
