@@ -110,8 +110,8 @@ class Connection:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""
         hub, who = self._hub, self._caller.identity
         try:
-            no_drop, now_s, received = hub.is_no_drop(message.topic), hub.clock(), self.session.received
-            new = protocol.check(message, received, self.permissions, self._quota, no_drop, now_s)
+            no_drop, now_s = hub.is_no_drop(message.topic), hub.clock()
+            new = protocol.check(message, self.session, self.permissions, self._quota, no_drop, now_s)
             stamp_us = message.stamp_us or time.time_ns() // 1000
             message = message._replace(sender=self._admitted.name, stamp_us=stamp_us)
             if not message.no_drop:

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
+from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quotas
-from bufgym_live.relay.recorder import Recorder
+from bufgym_live.relay.recorder import Recorder, Tape
 from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.store import Settled, Store, StoredSession
 from bufgym_live.relay.subscriber import Subscription
@@ -93,8 +94,10 @@ class Hub:
         self.quotas = Quotas(config.limits, clock)
         self.members: dict[StoredSession, Member] = {}
         self.store = Store(config, self.audit, self._settled, clock)
-        self.recorder = Recorder.of(config, self.audit)
-        self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
+        disk = Disk("recordings", self.audit)
+        recorder = Recorder.of(config, disk)
+        self.tape = None if recorder is None else Tape(recorder, disk)
+        self.own: list[Tape | Window] = [] if self.tape is None else [self.tape]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
         self.replaying = asyncio.Lock()  # whose turn it is to read a recording
         self.turns = Turns()
@@ -261,8 +264,8 @@ class Hub:
         for who, long_s in self.turns.take().items():
             self.audit("slow", who=who, longest_ms=round(1e3 * max(long_s), 1), times=len(long_s))
         self.audit.flush()
-        if self.recorder is not None:
-            self.recorder.flush()
+        if self.tape is not None:
+            self.tape.tick()
         self.quotas.tidy()
         self.store.forget_expired()
 

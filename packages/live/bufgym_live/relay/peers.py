@@ -30,7 +30,7 @@ from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 _RETRY_S: Final = 1.0
 _MINUTE_S: Final = 60.0
-_SLOW_SHARE: Final = 0.25  # of late_s, beyond which a message shows that the link to NATS is too slow
+_SLOW_SHARE: Final = 0.25  # of late_s, beyond which fewer messages are taken at a time
 _MOST_RELAYS: Final = 1_000
 
 
@@ -148,7 +148,7 @@ class Peers:
                 lane.gone()
 
     def _heard(self, heard: Any) -> bool:
-        """Publish a message of another relay here; return whether it is so late that the link seems to be too slow."""
+        """Publish a message of another relay here; return whether fewer should come at a time."""
         headers = heard.headers or {}
         relay, put = headers.get("Relay", ""), headers.get("Put", "")
         if not (relay and re.fullmatch("[0-9]{1,17}", put)):
@@ -162,7 +162,8 @@ class Peers:
             self._note(f"relay {relay}: a message later than late_s = {late_s:g}")
         elif (message := self._read(heard)) is not None and not self._hub.is_no_drop(message.topic):
             self._hub.publish(self, message._replace(no_drop=False))
-        return extra_s > _SLOW_SHARE * late_s
+        in_turns = self._bus is not None and self._bus.most
+        return extra_s > (_SLOW_SHARE * late_s if in_turns else late_s)
 
     def _read(self, heard: Any) -> wire.Message | None:
         """Decode a message of another relay; None if it is none, or may not come in."""

@@ -1,5 +1,6 @@
 """Limits of one identity over all its connections."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -33,7 +34,8 @@ class Quota:
         self.limits, self.idle_since_s = limits, idle_since_s
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
         self.json = Bucket(limits.json_bytes_per_s)
-        self.topics: set[str] = set()
+        self.topics: defaultdict[str, dict[str, None]] = defaultdict(dict)
+        """Session -> the topics that it publishes on, the oldest first."""
         self.connections: list[Mapping[str, Any]] = []  # the subscriptions of each of its connections, by id
 
     def message(self, size_bytes: int, now_s: float) -> None:
@@ -45,12 +47,21 @@ class Quota:
             most = f"{self.limits.messages_per_s} messages and {self.limits.bytes_per_s} bytes a second"
             raise RefusedError("too_fast", f"must be at most {most}")
 
-    def topic(self, topic: str) -> None:
-        """Count a topic that it publishes on."""
-        if topic not in self.topics:
-            if len(self.topics) >= self.limits.topics:
-                raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
-            self.topics.add(topic)
+    def topic(self, topic: str, session: str) -> None:
+        """Count a topic that one of its sessions publishes on; if it has too many, the session with the most loses one.
+
+        So a robot that renames its topics takes no places of its siblings.
+        """
+        if topic not in self.topics[session]:
+            if sum(map(len, self.topics.values())) >= self.limits.topics:
+                most = max(self.topics.values(), key=len)
+                own = len(self.topics[session])
+                for empty in [each for each, topics in self.topics.items() if not topics]:
+                    del self.topics[empty]
+                if own >= len(most):
+                    raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
+                del most[next(iter(most))]
+            self.topics[session][topic] = None
 
     def left(self, subscriptions: Mapping[str, Any]) -> None:
         """Count the connection with these subscriptions no more."""

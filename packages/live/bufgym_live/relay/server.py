@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import signal
+import socket
 from collections.abc import Sequence
 from functools import partial
 from http import HTTPStatus
@@ -28,6 +29,7 @@ from bufgym_live.relay.hub import CONNECTED, STATUS, Hub
 from bufgym_live.relay.identity import Verifier, server_context
 from bufgym_live.relay.robofleet import RobofleetConnection
 from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.robot.sockets import free_port
 from bufgym_live.robot.tasks import until_one_ends
 
 if TYPE_CHECKING:
@@ -42,6 +44,16 @@ _QUIET.setLevel(logging.CRITICAL + 1)
 def _is_ours(request: Request | None) -> bool:
     """Whether the client speaks our protocol."""
     return request is not None and request.path.partition("?")[0] == wire.PATH
+
+
+def _hosts(host: str) -> list[str]:
+    """Give the addresses to listen at; ``localhost`` has two, if this machine has IPv6."""
+    hosts = ["127.0.0.1"] if host == "localhost" else [host]
+    with contextlib.suppress(OSError):
+        if host == "localhost":
+            socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+            hosts.append("::1")
+    return hosts
 
 
 class Server:
@@ -65,7 +77,7 @@ class Server:
 
     async def start(self) -> int:
         """Listen and return the port; policies are imported and compiled while robots reconnect."""
-        limits = self.config.limits
+        limits, hosts = self.config.limits, _hosts(self.config.host)
         if self.config.nats is not None:
             from bufgym_live.relay.peers import Peers  # not at start-up: few need it
 
@@ -79,8 +91,8 @@ class Server:
         try:
             self._server = await serve(
                 self._serve,
-                self.config.host,
-                self.config.port,
+                cast(str, hosts),  # asyncio takes several
+                self.config.port or (free_port(hosts[0]) if len(hosts) > 1 else 0),
                 select_subprotocol=self._subprotocol,
                 process_request=self._request,
                 create_connection=cast(type[Accepted], partial(Accepted, self._admission)),  # it is called, no more
@@ -136,11 +148,11 @@ class Server:
         if self._server is not None:
             await asyncio.wait([self._warming])  # after the files: a first compilation takes long
 
-    async def _serve(self, socket: ServerConnection) -> None:
-        assert isinstance(socket, Accepted)
-        ours = _is_ours(socket.request)
-        caller = Caller(self.hub, socket, self._verifier, listens=ours)
-        await connection.serve(Connection if ours else RobofleetConnection, caller, socket.greeted)
+    async def _serve(self, accepted: ServerConnection) -> None:
+        assert isinstance(accepted, Accepted)
+        ours = _is_ours(accepted.request)
+        caller = Caller(self.hub, accepted, self._verifier, listens=ours)
+        await connection.serve(Connection if ours else RobofleetConnection, caller, accepted.greeted)
 
     def _subprotocol(self, socket: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
         if not _is_ours(socket.request):

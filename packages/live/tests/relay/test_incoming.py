@@ -1,15 +1,19 @@
 """Bytes that have come and are not taken: each identity and address has its share, and nobody else's is less."""
 
+import asyncio
 import contextlib
+import socket
 import struct
 from typing import Any
 
 import pytest
+from refusal_cases import refuse
 from relay_cases import Client, client, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import wire
 from bufgym_live.relay.config import Limits
+from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.wire import Message
 
@@ -96,3 +100,28 @@ async def test_a_message_must_become_whole_in_time(monkeypatch: pytest.MonkeyPat
 def test_two_messages_must_fit() -> None:
     with pytest.raises(BufgymError, match="incoming_bytes = 10: must be at least 20, two messages"):
         Limits(message_bytes=10, incoming_bytes=10)
+
+
+def test_a_robot_that_renames_its_topics_uses_up_its_own_share() -> None:
+    """Of six places it has had all; a sibling gets three of them, and neither gets a fourth of the other's."""
+    quota = Quota(Limits(topics=6), 0.0)
+    for k in range(6):
+        quota.topic(f"/{k}", "renames")
+    refuse("topic /6: must be at most 6 topics", quota.topic, "/6", "renames")
+    for k in range(3):
+        quota.topic(f"/sibling/{k}", "sibling")
+    refuse("topic /sibling/3: must be at most 6", quota.topic, "/sibling/3", "sibling")
+    refuse("topic /0: must be at most 6", quota.topic, "/0", "renames")
+    assert {session: list(topics) for session, topics in quota.topics.items()} == {
+        "renames": ["/3", "/4", "/5"],
+        "sibling": ["/sibling/0", "/sibling/1", "/sibling/2"],
+    }
+
+
+async def test_localhost_is_both_addresses() -> None:
+    async with relay(settings(host="localhost")) as server:
+        assert len(list(server._server.sockets)) == 1 + socket.has_dualstack_ipv6()  # type: ignore[union-attr]
+        for one in server._server.sockets:  # type: ignore[union-attr]
+            assert one.getsockname()[1] == server.port
+            _, writer = await asyncio.open_connection(one.getsockname()[0], server.port)
+            writer.close()
