@@ -149,7 +149,8 @@ class Connection:
             )
             self._quota.subscribe(said["id"], self.subscriptions)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
-            subscription.may_grow = self._quota.may_have_queue
+            who = self._caller.identity
+            subscription.may_grow = partial(self._hub.quotas.may_have_queue, who.key, who.address)
             self._hub.subscribe(self, subscription)
         except BufgymError as error:
             self._caller.refuse("subscribe", error, id=said["id"])
@@ -185,7 +186,7 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
         numbers = admitted.received, admitted.acked
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
-        with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
+        with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"
             one = kind(caller, admitted, session, quota)

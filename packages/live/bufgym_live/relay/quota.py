@@ -67,10 +67,10 @@ class Quota:
         """Count the connection with these subscriptions no more."""
         self.connections = [each for each in self.connections if each is not subscriptions]
 
-    def may_have_queue(self) -> bool:
-        """Whether it may have one more queue, over all its connections."""
-        queues: int = sum(one.queues for each in self.connections for one in each.values())
-        return queues < self.limits.queues
+    @property
+    def queues(self) -> int:
+        """Queues of its subscriptions, over all its connections."""
+        return sum(one.queues for each in self.connections for one in each.values())
 
     def subscribe(self, id: str, before: Mapping[str, Any]) -> None:
         """Check that a connection with these subscriptions may have one of this id."""
@@ -83,7 +83,7 @@ MAX_QUOTAS = 100_000
 
 
 class Quotas:
-    """Quotas of all identities."""
+    """Quotas of all identities, and of all addresses, whose keys begin with "@"."""
 
     def __init__(self, limits: Limits, clock: Callable[[], float]) -> None:
         self._limits, self._clock = limits, clock
@@ -98,20 +98,27 @@ class Quotas:
         return self._quotas[key]
 
     @contextmanager
-    def connection(self, key: str, subscriptions: Mapping[str, Any]) -> Iterator[Quota]:
-        """Count a connection of an identity, with whatever subscriptions it gets, until the block ends.
+    def connection(self, key: str, subscriptions: Mapping[str, Any], address: str = "") -> Iterator[Quota]:
+        """Count a connection of an identity at an address, with whatever subscriptions it gets, until the block ends.
 
         Raises RefusedError: too many.
         """
-        quota = self.of(key)
+        quota, neighbours = self.of(key), self.of(f"@{address}")
         if len(quota.connections) >= self._limits.connections:
             raise RefusedError("too_many", f"must be at most {self._limits.connections} connections")
-        quota.connections.append(subscriptions)
+        for each in (quota, neighbours):
+            each.connections.append(subscriptions)
         try:
             yield quota
         finally:
-            quota.left(subscriptions)
-            quota.idle_since_s = self._clock()
+            for each in (quota, neighbours):
+                each.left(subscriptions)
+                each.idle_since_s = self._clock()
+
+    def may_have_queue(self, key: str, address: str) -> bool:
+        """Whether the identity, and all at its address together, may have one more queue."""
+        limits, neighbours = self._limits, self.of(f"@{address}")
+        return self.of(key).queues < limits.queues and neighbours.queues < limits.queues * limits.identities
 
     def tidy(self, kept_s: float = KEPT_S) -> None:
         """Forget quotas that have not been used for ``kept_s``."""

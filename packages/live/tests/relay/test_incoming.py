@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import socket
 import struct
+from functools import partial
 from typing import Any
 
 import pytest
@@ -13,8 +14,11 @@ from relay_cases import Client, client, relay, settings, until, wait
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import wire
 from bufgym_live.relay.config import Limits
-from bufgym_live.relay.quota import Quota
+from bufgym_live.relay.patterns import pattern
+from bufgym_live.relay.plain import SkipPending
+from bufgym_live.relay.quota import Quota, Quotas
 from bufgym_live.relay.rules import Identity
+from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import Message
 
 LIMITS = Limits(message_bytes=10**6, incoming_bytes=2 * 10**6)
@@ -125,3 +129,18 @@ async def test_localhost_is_both_addresses() -> None:
             assert one.getsockname()[1] == server.port
             _, writer = await asyncio.open_connection(one.getsockname()[0], server.port)
             writer.close()
+
+
+def test_identities_of_one_address_have_a_share_of_queues_together() -> None:
+    """Two each, and twice that at an address: a third there has its first alone, and one elsewhere has both."""
+    quotas, places = Quotas(Limits(queues=2, identities=2), lambda: 0.0), {"a": "x", "b": "x", "c": "x", "d": "y"}
+    queues = list[int]()
+    with contextlib.ExitStack() as stack:
+        for who, address in places.items():
+            one = Subscription("a", pattern(""), SkipPending, 10)
+            stack.enter_context(quotas.connection(who, {"a": one}, address))
+            one.may_grow = partial(quotas.may_have_queue, who, address)
+            for k in range(4):
+                one.offer(f"/{k}", k, 10)
+            queues.append(one.queues)
+    assert queues == [2, 2, 1, 2]
