@@ -40,7 +40,7 @@ class Incoming:
         """Connection -> when its last message was whole or its first byte came, s, and bytes; oldest first."""
 
     def count(self, one: Accepted, size_bytes: int, anew: bool = False) -> None:
-        """Note the bytes that wait of a connection; where its share is full, the one that waits longest is ended.
+        """Note how many bytes of a connection wait; where its share is full, the one that waits longest is ended.
 
         ``anew`` says that one of its messages has become whole.
         """
@@ -68,7 +68,7 @@ class Incoming:
                 one.fail("too_slow", f"message not whole within {wire.PONG_S:g} s")
 
     def shares(self, identity: Identity) -> dict[str, int]:
-        """Give the bytes that an identity may have, and those that its address may."""
+        """Give the most bytes of an identity, and the most of its address."""
         most = self._limits.incoming_bytes
         return {identity.key: most, f"@{identity.address}": most * self._limits.identities}
 
