@@ -7,7 +7,8 @@ faults: an answer that comes after its time ends the library's reader, without a
 import asyncio
 import contextlib
 import ssl
-from collections.abc import Awaitable, Callable
+from collections import deque
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
@@ -25,7 +26,10 @@ STREAM: Final = "bufgym-relay"
 ANSWER_S: Final = 3.0  # Time for the server to answer
 ASK_S: Final = 5.0  # Time between two questions whether the server still knows this relay
 TRIES: Final = 30  # Times that a message is tried for which this relay has no room, once a second
+AHEAD_BYTES: Final = 2**18  # Most bytes on their way to the server of which it has not said that it has them
+MANY: Final = 256  # Messages that are taken at a time before all are taken again
 _TWIN_S: Final = 1.0  # time for another relay of this name to answer
+_BACKLOG_S: Final = 30.0  # time for what the server holds for this relay to come
 _TAKE_S: Final = 10.0  # time after which a message is given again that was neither taken nor put back
 _HEADER_BYTES: Final = 256
 _CREDENTIALS: Final = ("-----BEGIN NATS USER JWT-----", "-----BEGIN USER NKEY SEED-----")
@@ -59,8 +63,8 @@ def options(settings: Nats) -> dict[str, Any]:
 class Bus:
     """One connection, from its beginning to its first fault."""
 
-    def __init__(self, settings: Nats, limits: StoreLimits, note: Callable[[str], None]) -> None:
-        """``note`` is told of faults that leave the connection as it is."""
+    def __init__(self, settings: Nats, limits: StoreLimits, note: Callable[[str], None], most: int) -> None:
+        """``note`` is told of faults that leave the connection as it is; ``most`` as the last connection left it."""
         with needs("nats", "bufgym-live[mesh]", "bufgym_live.relay"):
             import nats.aio.client
         self._library: Any = nats
@@ -69,9 +73,16 @@ class Bus:
         self._open = False
         self._last: Exception | None = None
         self._doubted = asyncio.Event()
+        self._ahead: deque[tuple[asyncio.Task[None], int]] = deque()
+        self._ahead_bytes = 0
+        self._turn, self._late, self._left = asyncio.Event(), False, 0
+        self.most = most
+        """Messages of other relays that are taken at a time, 0 for all."""
 
-    async def open(self, given: dict[str, Any], heard: Callable[[Any], Awaitable[None]], known: set[str]) -> None:
+    async def open(self, given: dict[str, Any], heard: Callable[[Any], bool], known: set[str]) -> None:
         """Connect, and take this relay's place in the stream; other ``known`` relays keep theirs.
+
+        ``heard`` is called with each message of another relay, and says whether it is late.
 
         Raises BufgymError: NATS does not let this relay in, or another relay has its name. Any other error may pass.
         """
@@ -80,9 +91,42 @@ class Bus:
             await self._take_name()
             self._stream = self._client.jetstream(timeout=ANSWER_S)
             await self._take_place(known)
-            await self._client.subscribe(MESSAGE, cb=heard)
+            self._heard = heard
+            self._messages = await self._subscribe()
             await self._client.flush(ANSWER_S)  # from here on the server sends what others publish
         self._open = True
+
+    async def _subscribe(self) -> Any:
+        """Have the server send the next messages of other relays."""
+        self._late, self._left = False, self.most
+
+        async def take(message: Any) -> None:
+            self._late |= self._heard(message)
+            self._left -= 1
+            if self._late or self._left == 0:
+                self._turn.set()
+
+        messages = await self._client.subscribe(MESSAGE, cb=take)
+        if self.most:
+            # The subscription's own limit would lose all but the first of messages that come together.
+            await self._client._send_unsubscribe(messages._id, self.most)
+        return messages
+
+    async def take_turns(self) -> None:
+        """While messages come late, take only as many at a time as come in time, twice as many each time.
+
+        Otherwise the server would hold ever more for a relay behind a slow link, and slow down all who publish.
+        """
+        while True:
+            await self._turn.wait()
+            self._turn.clear()
+            if self._late:
+                self.most = max(1, (self.most or MANY) // 2)
+            else:
+                self.most = 2 * self.most if 2 * self.most <= MANY else 0
+            await self._messages.unsubscribe()
+            await self._client.flush(_BACKLOG_S)
+            self._messages = await self._subscribe()
 
     async def _take_name(self) -> None:
         """Make sure that no other relay has this relay's name."""
@@ -132,19 +176,27 @@ class Bus:
     async def close(self) -> None:
         """End the connection; a server that takes nothing does not hold it up."""
         self._open = False
+        for task, _ in self._ahead:
+            task.cancel()
         with contextlib.suppress(Exception):
             async with asyncio.timeout(ANSWER_S):
                 await self._client.close()
 
     async def publish(self, topic: str, frame: bytes, headers: dict[str, str]) -> None:
-        """Send a message, and wait until the server has it.
+        """Send a message, and wait until the server has all but the last ``AHEAD_BYTES``.
 
         Raises RefusedError: it is too large. At any other error, as if the server takes it too late, the connection
         must be given up.
         """
         self._check_size(topic, frame)
         await self._client.publish(MESSAGE, frame, headers=headers)
-        await self._client.flush(ANSWER_S)
+        taken = asyncio.create_task(self._client.flush(ANSWER_S))
+        taken.add_done_callback(lambda task: task.cancelled() or task.exception())  # this is asked for later, or never
+        self._ahead.append((taken, len(frame)))
+        self._ahead_bytes += len(frame)
+        while self._ahead and (self._ahead_bytes > AHEAD_BYTES or self._ahead[0][0].done()):
+            await self._ahead[0][0]
+            self._ahead_bytes -= self._ahead.popleft()[1]
 
     def _check_size(self, topic: str, frame: bytes) -> None:
         most = self._client.max_payload - _HEADER_BYTES

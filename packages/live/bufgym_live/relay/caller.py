@@ -5,18 +5,17 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
-from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import wire
+from bufgym_live.relay.admission import POLICY_VIOLATION, Accepted
 from bufgym_live.relay.hub import Hub
 from bufgym_live.relay.identity import Verifier, certificate_email
 from bufgym_live.relay.rules import Identity, plain_address
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
-POLICY_VIOLATION: Final = 1008
 _FRAME_BYTES: Final = 500  # bytes of JSON whose parsing takes as long as all else that is done for a frame
 _PACE_S: Final = 0.05
 
@@ -24,7 +23,7 @@ _PACE_S: Final = 0.05
 class Caller:
     """Whoever has connected, before its hello and after."""
 
-    def __init__(self, hub: Hub, socket: ServerConnection, verifier: Verifier | None, *, listens: bool = True) -> None:
+    def __init__(self, hub: Hub, socket: Accepted, verifier: Verifier | None, *, listens: bool = True) -> None:
         """With ``listens`` False it is told nothing, because it would not understand."""
         self.hub, self.socket = hub, socket
         self.identity = Identity(plain_address(socket.remote_address[0]))
@@ -42,11 +41,12 @@ class Caller:
                 raise RefusedError("unauthorized", "token: this relay takes none")
             email, until_s = await self._verifier.email(token)
         self.identity = Identity(self.identity.address, email, until_s=until_s)
+        self.socket.is_of(self.identity)
         return self.identity
 
     async def heard(self) -> bytes | str:
         """Receive a frame; a text frame is kept back until its identity may have it parsed."""
-        data = await self.socket.recv()
+        data: bytes | str = await self.socket.recv()
         if isinstance(data, str):
             await self.pace(len(data) + _FRAME_BYTES)
         return data
@@ -56,12 +56,18 @@ class Caller:
         budget, loop = self.hub.quotas.of(self.identity.key).json, asyncio.get_running_loop()
         while not budget.take(json_bytes, loop.time()):
             await asyncio.sleep(_PACE_S)
+            if self.socket.ended:
+                raise RefusedError("too_many", "the connection has ended")
 
     def tell(self, op: str, **fields: Any) -> None:
         """Have this sent before any message."""
         if self._listens:
-            self.answers.append(wire.say(op, **fields))
-            self.told()
+            self.say(wire.say(op, **fields))
+
+    def say(self, text: str) -> None:
+        """Have this text frame sent before any message."""
+        self.answers.append(text)
+        self.told()
 
     def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
         """Tell it of a refusal and the reason. Refusals of messages are audited elsewhere."""

@@ -95,10 +95,20 @@ class Limits(Section, frozen=True):
     bytes_per_s: Count = 10**8
     json_bytes_per_s: Count = 2**22
     """Bytes of JSON that it may have parsed; beyond, its frames wait. A text frame counts for 500 bytes more."""
+    incoming_bytes: Count = 2**26
+    """Bytes that have come and are not a whole message yet, or not taken. Beyond, the connection ends that waits
+    longest."""
+    identities: Count = 4
+    """How many times the incoming bytes and the queues of one identity all identities of one address may have."""
     all_connections: Count = 4_096
     """Connections of all identities together."""
     hello_s: Seconds = 5.0
     """Time from the connection to its hello."""
+
+    def __post_init__(self) -> None:
+        if self.incoming_bytes < 2 * self.message_bytes:
+            least = f"must be at least {2 * self.message_bytes}, two messages of message_bytes"
+            raise BufgymError(f"limits: incoming_bytes = {self.incoming_bytes}: {least}")
 
 
 class StoreLimits(Section, frozen=True):

@@ -11,7 +11,8 @@ from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import outbox, policies, protocol, replay, wire
-from bufgym_live.relay.caller import POLICY_VIOLATION, Caller
+from bufgym_live.relay.admission import POLICY_VIOLATION
+from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.hub import Outgoing
 from bufgym_live.relay.outbox import Outbox
 from bufgym_live.relay.protocol import Admitted
@@ -57,7 +58,7 @@ class Connection:
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
         greeted()
-        writer = asyncio.create_task(self._outbox.run())
+        writer = asyncio.create_task(hub.turns.of(caller.identity.key, self._outbox.run()))
         left_s = min(caller.identity.until_s - time.time(), 2**20)
         expiry = asyncio.get_running_loop().call_later(left_s, self.end, "the token has expired")
         try:
@@ -98,18 +99,19 @@ class Connection:
         asked = said["file"], said["from_us"], said["most_bytes"]
         await self._caller.pace(min(said["most_bytes"], replay.MOST_BYTES))
         try:
-            part = await asyncio.to_thread(replay.piece, self._recordings, *asked, may)
+            async with self._hub.replaying:
+                text = await asyncio.to_thread(replay.told, said["id"], self._recordings, *asked, may)
         except BufgymError as error:
             self._caller.refuse("replay", error, id=said["id"])
         else:
-            self.tell("replayed", id=said["id"], **part)
+            self._caller.say(text)
 
     async def _publish(self, message: wire.Message) -> None:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""
         hub, who = self._hub, self._caller.identity
         try:
-            no_drop, now_s, received = hub.is_no_drop(message.topic), hub.clock(), self.session.received
-            new = protocol.check(message, received, self.permissions, self._quota, no_drop, now_s)
+            no_drop, now_s = hub.is_no_drop(message.topic), hub.clock()
+            new = protocol.check(message, self.session, self.permissions, self._quota, no_drop, now_s)
             stamp_us = message.stamp_us or time.time_ns() // 1000
             message = message._replace(sender=self._admitted.name, stamp_us=stamp_us)
             if not message.no_drop:
@@ -147,7 +149,8 @@ class Connection:
             )
             self._quota.subscribe(said["id"], self.subscriptions)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
-            subscription.may_grow = self._quota.may_have_queue
+            who = self._caller.identity
+            subscription.may_grow = partial(self._hub.quotas.may_have_queue, who.key, who.address)
             self._hub.subscribe(self, subscription)
         except BufgymError as error:
             self._caller.refuse("subscribe", error, id=said["id"])
@@ -183,10 +186,11 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
         numbers = admitted.received, admitted.acked
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
-        with hub.quotas.connection(caller.identity.key, caller.subscriptions) as quota:
+        with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"
-            await kind(caller, admitted, session, quota).run(greeted)
+            one = kind(caller, admitted, session, quota)
+            await hub.turns.of(caller.identity.key, one.run(greeted))
     except BufgymError as error:
         caller.refuse(stage, error)
         await caller.close(stage)

@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
+from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quotas
-from bufgym_live.relay.recorder import Recorder
+from bufgym_live.relay.recorder import Recorder, Tape
 from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.store import Settled, Store, StoredSession
 from bufgym_live.relay.subscriber import Subscription
+from bufgym_live.relay.turns import Turns
 from bufgym_live.relay.wire import RefusedError
 
 if TYPE_CHECKING:
@@ -92,9 +94,13 @@ class Hub:
         self.quotas = Quotas(config.limits, clock)
         self.members: dict[StoredSession, Member] = {}
         self.store = Store(config, self.audit, self._settled, clock)
-        self.recorder = Recorder.of(config, self.audit)
-        self.own: list[Recorder | Window] = [] if self.recorder is None else [self.recorder]
+        disk = Disk("recordings", self.audit)
+        recorder = Recorder.of(config, disk)
+        self.tape = None if recorder is None else Tape(recorder, disk)
+        self.own: list[Tape | Window] = [] if self.tape is None else [self.tape]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
+        self.replaying = asyncio.Lock()  # whose turn it is to read a recording
+        self.turns = Turns()
         self._failed: set[str] = set()
         self.received = 0
         self._sent = 0
@@ -255,9 +261,11 @@ class Hub:
         """Publish the relay's state once a second, and forget what has expired."""
         payload = json.dumps(self.status()).encode()
         self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=time.time_ns() // 1000))
+        for who, long_s in self.turns.take().items():
+            self.audit("slow", who=who, longest_ms=round(1e3 * max(long_s), 1), times=len(long_s))
         self.audit.flush()
-        if self.recorder is not None:
-            self.recorder.flush()
+        if self.tape is not None:
+            self.tape.tick()
         self.quotas.tidy()
         self.store.forget_expired()
 

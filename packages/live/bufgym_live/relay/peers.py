@@ -30,6 +30,7 @@ from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 _RETRY_S: Final = 1.0
 _MINUTE_S: Final = 60.0
+_SLOW_SHARE: Final = 0.25  # of late_s, beyond which fewer messages are taken at a time
 _MOST_RELAYS: Final = 1_000
 
 
@@ -79,9 +80,9 @@ class Peers:
 
     async def _run(self, policy: Any, tried: asyncio.Future[None]) -> None:
         """Connect, and again whenever the connection ends; say by ``tried`` how the first try ended."""
-        backoff = Backoff()
+        backoff, most = Backoff(), 0
         while True:
-            bus = Bus(self._settings, self._hub.config.store, self._note)
+            bus = Bus(self._settings, self._hub.config.store, self._note, most)
             try:
                 await bus.open(self._options, self._heard, self._known)
                 self._bus = bus
@@ -90,12 +91,12 @@ class Peers:
                 self._becomes(CONNECTED)
                 if not tried.done():
                     tried.set_result(None)
-                await until_one_ends(self._send_all(bus), self._take_all(bus), bus.watch(self._known))
+                await until_one_ends(self._send_all(bus), self._take_all(bus), bus.take_turns(), bus.watch(self._known))
             except Exception as error:  # whatever it is, the relay goes on alone
                 fault = bus.fault(error)
                 self._becomes(str(fault))
             finally:
-                self._bus = None
+                self._bus, most = None, bus.most
                 self._hub.unsubscribe(self, "all")
                 await bus.close()
             if not tried.done():
@@ -146,19 +147,23 @@ class Peers:
                         self._note(refused)
                 lane.gone()
 
-    async def _heard(self, heard: Any) -> None:
+    def _heard(self, heard: Any) -> bool:
+        """Publish a message of another relay here; return whether fewer should come at a time."""
         headers = heard.headers or {}
         relay, put = headers.get("Relay", ""), headers.get("Put", "")
         if not (relay and re.fullmatch("[0-9]{1,17}", put)):
-            return self._note(f"{MESSAGE}: a message without the headers Relay and Put")
+            self._note(f"{MESSAGE}: a message without the headers Relay and Put")
+            return False
         if len(self._delays) > _MOST_RELAYS:
             self._delays.clear()
-        delay_s = time.time() - int(put) / 1e6
-        if self._delays[relay].extra_s(delay_s, self._hub.clock()) > self._settings.late_s:
-            return self._note(f"relay {relay}: a message later than late_s = {self._settings.late_s:g}")
-        message = self._read(heard)
-        if message is not None and not self._hub.is_no_drop(message.topic):
+        delay_s, late_s = time.time() - int(put) / 1e6, self._settings.late_s
+        extra_s = self._delays[relay].extra_s(delay_s, self._hub.clock())
+        if extra_s > late_s:
+            self._note(f"relay {relay}: a message later than late_s = {late_s:g}")
+        elif (message := self._read(heard)) is not None and not self._hub.is_no_drop(message.topic):
             self._hub.publish(self, message._replace(no_drop=False))
+        in_turns = self._bus is not None and self._bus.most
+        return extra_s > (_SLOW_SHARE * late_s if in_turns else late_s)
 
     def _read(self, heard: Any) -> wire.Message | None:
         """Decode a message of another relay; None if it is none, or may not come in."""

@@ -16,6 +16,7 @@ from bufgym_live.relay.config import DEFAULT_CAPACITY, Config, Rule
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError, WireError
 
@@ -101,19 +102,19 @@ def asked(data: bytes | str, max_bytes: int) -> wire.Message | dict[str, Any]:
 
 
 def check(
-    message: wire.Message, received: int, permissions: Permissions, quota: Quota, no_drop: bool, now_s: float
+    message: wire.Message, session: StoredSession, permissions: Permissions, quota: Quota, no_drop: bool, now_s: float
 ) -> bool:
-    """Whether a message is new, when no_drop messages up to ``received`` were taken before; ``no_drop`` is its topic.
+    """Whether a message of this session is new, not taken before; ``no_drop`` is its topic.
 
     Raises RefusedError: its sender may not publish it.
     """
-    topic = message.topic
+    topic, received = message.topic, session.received
     if message.no_drop and 0 < message.seq <= received:
         return False
     quota.message(len(message.payload), now_s)
     if topic.startswith(f"/{wire.OWN}/") or not permissions.allow("send", topic):
         raise RefusedError("unauthorized", f"topic {topic}: no rule allows to send there")
-    quota.topic(topic)
+    quota.topic(topic, session.name)
     if message.no_drop != no_drop:
         raise RefusedError("wrong", f"topic {topic}: is {'not ' if message.no_drop else ''}no_drop here")
     check_json(message)

@@ -1,5 +1,6 @@
 """Limits of one identity over all its connections."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -33,7 +34,8 @@ class Quota:
         self.limits, self.idle_since_s = limits, idle_since_s
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
         self.json = Bucket(limits.json_bytes_per_s)
-        self.topics: set[str] = set()
+        self.topics: defaultdict[str, dict[str, None]] = defaultdict(dict)
+        """Session -> the topics that it publishes on, the oldest first."""
         self.connections: list[Mapping[str, Any]] = []  # the subscriptions of each of its connections, by id
 
     def message(self, size_bytes: int, now_s: float) -> None:
@@ -45,21 +47,30 @@ class Quota:
             most = f"{self.limits.messages_per_s} messages and {self.limits.bytes_per_s} bytes a second"
             raise RefusedError("too_fast", f"must be at most {most}")
 
-    def topic(self, topic: str) -> None:
-        """Count a topic that it publishes on."""
-        if topic not in self.topics:
-            if len(self.topics) >= self.limits.topics:
-                raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
-            self.topics.add(topic)
+    def topic(self, topic: str, session: str) -> None:
+        """Count a topic that one of its sessions publishes on; if it has too many, the session with the most loses one.
+
+        So a robot that renames its topics takes no places of its siblings.
+        """
+        if topic not in self.topics[session]:
+            if sum(map(len, self.topics.values())) >= self.limits.topics:
+                most = max(self.topics.values(), key=len)
+                own = len(self.topics[session])
+                for empty in [each for each, topics in self.topics.items() if not topics]:
+                    del self.topics[empty]
+                if own >= len(most):
+                    raise RefusedError("too_many", f"topic {topic}: must be at most {self.limits.topics} topics")
+                del most[next(iter(most))]
+            self.topics[session][topic] = None
 
     def left(self, subscriptions: Mapping[str, Any]) -> None:
         """Count the connection with these subscriptions no more."""
         self.connections = [each for each in self.connections if each is not subscriptions]
 
-    def may_have_queue(self) -> bool:
-        """Whether it may have one more queue, over all its connections."""
-        queues: int = sum(one.queues for each in self.connections for one in each.values())
-        return queues < self.limits.queues
+    @property
+    def queues(self) -> int:
+        """Queues of its subscriptions, over all its connections."""
+        return sum(one.queues for each in self.connections for one in each.values())
 
     def subscribe(self, id: str, before: Mapping[str, Any]) -> None:
         """Check that a connection with these subscriptions may have one of this id."""
@@ -72,7 +83,7 @@ MAX_QUOTAS = 100_000
 
 
 class Quotas:
-    """Quotas of all identities."""
+    """Quotas of all identities, and of all addresses, whose keys begin with "@"."""
 
     def __init__(self, limits: Limits, clock: Callable[[], float]) -> None:
         self._limits, self._clock = limits, clock
@@ -87,20 +98,27 @@ class Quotas:
         return self._quotas[key]
 
     @contextmanager
-    def connection(self, key: str, subscriptions: Mapping[str, Any]) -> Iterator[Quota]:
-        """Count a connection of an identity, with whatever subscriptions it gets, until the block ends.
+    def connection(self, key: str, subscriptions: Mapping[str, Any], address: str = "") -> Iterator[Quota]:
+        """Count a connection of an identity at an address, with whatever subscriptions it gets, until the block ends.
 
         Raises RefusedError: too many.
         """
-        quota = self.of(key)
+        quota, neighbours = self.of(key), self.of(f"@{address}")
         if len(quota.connections) >= self._limits.connections:
             raise RefusedError("too_many", f"must be at most {self._limits.connections} connections")
-        quota.connections.append(subscriptions)
+        for each in (quota, neighbours):
+            each.connections.append(subscriptions)
         try:
             yield quota
         finally:
-            quota.left(subscriptions)
-            quota.idle_since_s = self._clock()
+            for each in (quota, neighbours):
+                each.left(subscriptions)
+                each.idle_since_s = self._clock()
+
+    def may_have_queue(self, key: str, address: str) -> bool:
+        """Whether the identity, and all at its address together, may have one more queue."""
+        limits, neighbours = self._limits, self.of(f"@{address}")
+        return self.of(key).queues < limits.queues and neighbours.queues < limits.queues * limits.identities
 
     def tidy(self, kept_s: float = KEPT_S) -> None:
         """Forget quotas that have not been used for ``kept_s``."""

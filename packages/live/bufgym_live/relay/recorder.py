@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 from bufgym_live.relay import ros_messages, wire
-from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config, Rotation
+from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.rules import RECORDER, Permissions
 from bufgym_live.robot.mcap_file import McapFile
 
@@ -25,7 +26,7 @@ class Recorder:
     If the disk takes nothing, the recorder pauses for ``PAUSE_S`` and then begins the next file.
     """
 
-    def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Audit) -> None:
+    def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Callable[..., None]) -> None:
         self.folder = folder
         self._rotation, self._permissions, self._audit = rotation, permissions, audit
         self._file: McapFile | None = None
@@ -33,19 +34,23 @@ class Recorder:
         self._again_s = 0.0  # end of the pause after a failure, 0 if there was none
 
     @classmethod
-    def of(cls, config: Config, audit: Audit) -> Recorder | None:
+    def of(cls, config: Config, audit: Callable[..., None]) -> Recorder | None:
         """Make the recorder if the relay has a folder and a rule that lets it record."""
         permissions = Permissions(config.rules, RECORDER)
         if config.folder is None or not permissions.rules:
             return None
         return cls(config.folder / FOLDER, config.recording, permissions, audit)
 
-    def __call__(self, message: wire.Message) -> None:
-        """Write a message if a rule allows it."""
-        if not self._permissions.allow("receive", message.topic) or time.monotonic() < self._again_s:
+    def wants(self, topic: str) -> bool:
+        """Whether a rule allows messages of the topic."""
+        return self._permissions.allow("receive", topic)
+
+    def __call__(self, message: wire.Message, came_ns: int | None = None) -> None:
+        """Write a message, which has come then or now, if a rule allows it."""
+        if not self.wants(message.topic) or time.monotonic() < self._again_s:
             return
         try:
-            self._write(message)
+            self._write(message, came_ns or time.time_ns())
         except OSError as error:
             self._failed(error)
             return
@@ -53,12 +58,12 @@ class Recorder:
             self._again_s = 0.0
             self._audit("recording_resumed")
 
-    def _write(self, message: wire.Message) -> None:
+    def _write(self, message: wire.Message, came_ns: int) -> None:
         if self._file is not None and self._file.file.tell() + len(message.payload) > self._rotation.bytes:
             self.close()
         if self._file is None:
             self._file = self._next()
-        times_ns, encoding = (time.time_ns(), max(0, message.stamp_us) * 1000), message.encoding
+        times_ns, encoding = (came_ns, max(0, message.stamp_us) * 1000), message.encoding
         schema = message.type or ("object" if encoding == "json" else "")
         form: dict[str, Any] = {"encoding": encoding, "schema": schema, "schema_encoding": SCHEMAS.get(encoding, "")}
         form["definition"] = ros_messages.definition(schema, encoding)
@@ -102,3 +107,25 @@ class Recorder:
                 file.close()
             except OSError:
                 file.abandon()  # it can be read as far as it goes
+
+
+class Tape:
+    """A recorder in a thread of its own."""
+
+    def __init__(self, recorder: Recorder, disk: Disk) -> None:
+        self._recorder, self._disk = recorder, disk
+
+    def __call__(self, message: wire.Message) -> None:
+        """Have a message written."""
+        if self._recorder.wants(message.topic):
+            self._disk.soon(len(message.payload), self._recorder, message, time.time_ns())
+
+    def tick(self) -> None:
+        """Have the file flushed."""
+        if self._disk.idle:
+            self._disk.soon(0, self._recorder.flush)
+        self._disk.tick()
+
+    def close(self) -> None:
+        """Finish the file, when all is written."""
+        self._disk.close(self._recorder.close)

@@ -7,6 +7,8 @@ times is kept, so that a piece from its middle can be read directly.
 import base64
 import bisect
 import io
+import json
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import lru_cache
@@ -19,9 +21,12 @@ from mcap.stream_reader import StreamReader
 
 from bufgym.ground import strict_json
 from bufgym.ground.errors import BufgymError
+from bufgym_live.relay import wire
 
 MOST_BYTES: Final = 4 * 2**20  # Limit on the payloads of a piece
 _MAGIC: Final = b"\x89MCAP0\r\n"
+_WORK_S: Final = 0.001  # time without a pause
+_REST_S: Final = 0.002  # length of a pause
 _STEP_BYTES: Final = 2**18  # distance between two indexed places of a file
 
 
@@ -63,6 +68,29 @@ def piece(
         about = {"topic": topic, "type": type, "encoding": encoding, "sender": "", "no_drop": False}
         messages.append({**about, "seq": record.sequence, "stamp_us": time_us, "data": data})
     return {"messages": messages, "next_us": next_us, "first_us": recording.first_us, "last_us": recording.last_us}
+
+
+def told(id: str, *asked: Any) -> str:
+    """Give the text frame with a ``piece``; written bit by bit, because others wait while JSON is written."""
+    part = piece(*asked)
+    texts, breath = list[str](), _Breath()
+    for message in part.pop("messages"):
+        texts.append(json.dumps(message, separators=(",", ":"), allow_nan=False))
+        breath.take()
+    return f'{wire.say("replayed", id=id, **part)[:-1]},"messages":[{",".join(texts)}]}}'
+
+
+class _Breath:
+    """Pauses of a thread that computes, in which the event loop's thread gets on."""
+
+    def __init__(self) -> None:
+        self._since_s = time.monotonic()
+
+    def take(self) -> None:
+        """Pause if the last pause was some time ago."""
+        if time.monotonic() - self._since_s > _WORK_S:
+            time.sleep(_REST_S)
+            self._since_s = time.monotonic()
 
 
 class _WholeReads(io.BufferedReader):
@@ -120,9 +148,11 @@ class _Index:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise BufgymError(f"recording {self.path.name}: must be an MCAP file")
             file.seek(offset)
+            breath = _Breath()
             for record in StreamReader(file, skip_magic=True, emit_chunks=True).records:
                 yield offset, record, file.tell()
                 offset = file.tell()
+                breath.take()
 
 
 @lru_cache(maxsize=16)

@@ -6,12 +6,11 @@ import asyncio
 import contextlib
 import logging
 import signal
-from collections import Counter
+import socket
 from collections.abc import Sequence
 from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, cast
-from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
@@ -21,16 +20,16 @@ from websockets.typing import Subprotocol
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import needs
-from bufgym_live.relay import connection, pages, policies, wire
+from bufgym_live.relay import connection, pages, policies, turns, wire
+from bufgym_live.relay.admission import Accepted, Admission
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.config import POLICIES, Config
 from bufgym_live.relay.connection import HELLO_BYTES, Connection
 from bufgym_live.relay.hub import CONNECTED, STATUS, Hub
 from bufgym_live.relay.identity import Verifier, server_context
 from bufgym_live.relay.robofleet import RobofleetConnection
-from bufgym_live.relay.rules import Identity, Permissions, plain_address
-from bufgym_live.relay.wire import RefusedError
-from bufgym_live.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
+from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.robot.sockets import free_port
 from bufgym_live.robot.tasks import until_one_ends
 
 if TYPE_CHECKING:
@@ -47,106 +46,14 @@ def _is_ours(request: Request | None) -> bool:
     return request is not None and request.path.partition("?")[0] == wire.PATH
 
 
-class Admission:
-    """Admission of connections to the handshake."""
-
-    def __init__(self, hub: Hub) -> None:
-        self.hub = hub
-        self.waiting: Counter[str] = Counter()
-        """Address -> its connections that have not said hello."""
-        self.open: set[Accepted] = set()
-
-    def enter(self, one: Accepted) -> None:
-        """Count a new connection.
-
-        Raises RefusedError: too many.
-        """
-        limits = self.hub.config.limits
-        if len(self.open) >= limits.all_connections:
-            raise RefusedError("too_many", f"must be at most {limits.all_connections} connections in all")
-        if self.waiting[one.address] >= limits.connections:
-            raise RefusedError("too_many", f"must be at most {limits.connections} connections that have not said hello")
-        self.open.add(one)
-        self.waiting[one.address] += 1
-
-    def refusal(self, address: str, request: Request) -> RefusedError | None:
-        """Give the reason to deny this request, or None."""
-        config = self.hub.config
-        by_address = Permissions(config.rules, Identity(address)).rules
-        proves_more = config.tokens is not None or (config.tls is not None and config.tls.clients != "")
-        if not by_address and not (proves_more and any(rule.email for rule in config.rules)):
-            return RefusedError("unauthorized", "no rule allows anything to this address")
-        origins = request.headers.get_all("Origin")
-        if "Upgrade" in request.headers and any(not self._is_own(each, request) for each in origins):
-            return RefusedError("unauthorized", f"origin {origins[0]!r}: a page of another server")
-        return None
-
-    def _is_own(self, origin: str, request: Request) -> bool:
-        """Whether the connecting page is ours or named in the configuration.
-
-        Otherwise a page of any server could use the address of its viewer's machine. A foreign name can resolve to our
-        address, so a host counts as our own only if it is an address, localhost or named in the configuration.
-        """
-        if origin in self.hub.config.origins:
-            return True
-        try:
-            parts = urlsplit(origin)
-            host = parts.hostname or ""
-            if host != "localhost":
-                plain_address(host)
-        except ValueError:
-            return False
-        return parts.netloc in request.headers.get_all("Host")
-
-
-class Accepted(ServerConnection):
-    """A TCP connection, from its first byte on."""
-
-    def __init__(self, admission: Admission, *arguments: Any, **settings: Any) -> None:
-        super().__init__(*arguments, **settings)
-        self._admission = admission
-        self.address = ""
-        self._waits = False
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        try:
-            self.address = plain_address(transport.get_extra_info("peername")[0])
-            self._admission.enter(self)
-        except (TypeError, IndexError):  # the peer has gone already
-            self.transport.abort()
-            return
-        except RefusedError as refused:
-            self.refused(refused.code, refused)
-            self.transport.abort()
-            return
-        self._waits = True
-        tcp = transport.get_extra_info("socket")
-        with contextlib.suppress(OSError):
-            set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
-            if self._admission.hub.config.small_buffers:
-                little_unsent(tcp)
-
-    def greeted(self) -> None:
-        """Note that the client has said hello, or has gone."""
-        if self._waits:
-            self._waits = False
-            self._admission.waiting[self.address] -= 1
-            if not self._admission.waiting[self.address]:
-                del self._admission.waiting[self.address]
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self in self._admission.open:
-            self._admission.open.remove(self)
-            if self.response is None:
-                fault = self.protocol.handshake_exc
-                self.refused("wrong", f"{type(fault).__name__}: {fault}" if fault else "no whole request in time")
-            self.greeted()
-        super().connection_lost(exc)
-
-    def refused(self, code: str, why: object) -> None:
-        """Log why it was not let in."""
-        self._admission.hub.audit.repeated(what="connection", code=code, address=self.address, why=str(why))
+def _hosts(host: str) -> list[str]:
+    """Give the addresses to listen at; ``localhost`` has two, if this machine has IPv6."""
+    hosts = ["127.0.0.1"] if host == "localhost" else [host]
+    with contextlib.suppress(OSError):
+        if host == "localhost":
+            socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+            hosts.append("::1")
+    return hosts
 
 
 class Server:
@@ -170,7 +77,7 @@ class Server:
 
     async def start(self) -> int:
         """Listen and return the port; policies are imported and compiled while robots reconnect."""
-        limits = self.config.limits
+        limits, hosts = self.config.limits, _hosts(self.config.host)
         if self.config.nats is not None:
             from bufgym_live.relay.peers import Peers  # not at start-up: few need it
 
@@ -184,8 +91,8 @@ class Server:
         try:
             self._server = await serve(
                 self._serve,
-                self.config.host,
-                self.config.port,
+                cast(str, hosts),  # asyncio takes several
+                self.config.port or (free_port(hosts[0]) if len(hosts) > 1 else 0),
                 select_subprotocol=self._subprotocol,
                 process_request=self._request,
                 create_connection=cast(type[Accepted], partial(Accepted, self._admission)),  # it is called, no more
@@ -241,11 +148,11 @@ class Server:
         if self._server is not None:
             await asyncio.wait([self._warming])  # after the files: a first compilation takes long
 
-    async def _serve(self, socket: ServerConnection) -> None:
-        assert isinstance(socket, Accepted)
-        ours = _is_ours(socket.request)
-        caller = Caller(self.hub, socket, self._verifier, listens=ours)
-        await connection.serve(Connection if ours else RobofleetConnection, caller, socket.greeted)
+    async def _serve(self, accepted: ServerConnection) -> None:
+        assert isinstance(accepted, Accepted)
+        ours = _is_ours(accepted.request)
+        caller = Caller(self.hub, accepted, self._verifier, listens=ours)
+        await connection.serve(Connection if ours else RobofleetConnection, caller, accepted.greeted)
 
     def _subprotocol(self, socket: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
         if not _is_ours(socket.request):
@@ -287,7 +194,10 @@ class Server:
         while True:
             await asyncio.sleep(TICK_S)
             with self.hub.spared("tick"):
+                began_s = turns.clock()
                 self.hub.tick()
+                self.hub.turns.note("tick", began_s)
+                self._admission.incoming.end_late()
 
 
 async def serve_forever(config: Config, say: Any = print) -> None:

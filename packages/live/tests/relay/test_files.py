@@ -6,19 +6,23 @@ import json
 import os
 import shutil
 import signal
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from refusal_cases import refuse
 from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, stranger, until, wait, within
 
 from bufgym.traces.formats import bags
+from bufgym_live.relay import disk
 from bufgym_live.relay.audit import FILE, Audit
 from bufgym_live.relay.config import Rotation, Rule
 from bufgym_live.relay.recorder import FOLDER, Recorder
 from bufgym_live.relay.replay import piece, recordings
 from bufgym_live.relay.wire import Message
+from bufgym_live.robot.mcap_file import McapFile
 from bufgym_live.robot.sockets import free_port
 
 pytest.importorskip("mcap", reason="no mcap here: the extra relay")
@@ -114,6 +118,7 @@ def test_ever_new_types_fill_no_recording(tmp_path: Path, monkeypatch: pytest.Mo
     bag = bags.read_bag(path)
     assert list(bag.topics) == ["/robots/0", "/robots/1", "/robots/2", "/robots/3", "/robots/a"]
     assert bag.size_bytes.tolist() == [1] * 20 + [5]
+    assert isinstance(record._audit, Audit)
     (said,) = record._audit.recent
     assert (said["event"], said["topic"], said["sender"]) == ("recording_full", "/robots/a", "robot")
 
@@ -168,6 +173,7 @@ async def test_a_recording_outlives_its_relay(tmp_path: Path, end: signal.Signal
         for _ in range(20):
             await robot.put("/robots/a/odom", bytes(1_000))
         await robot.rest()
+        await until("a recording", lambda: list((tmp_path / "held" / FOLDER).glob("*.mcap")))
         (path,) = (tmp_path / "held" / FOLDER).glob("*.mcap")
         if end == signal.SIGKILL:
             await until("a tick, which writes", lambda: path.stat().st_size > 20_000)
@@ -192,6 +198,7 @@ async def test_a_full_disk_stops_no_message(tmp_path: Path, monkeypatch: pytest.
             await viewer.subscribe("^/robots/a/", durable=True)
             await robot.acked("/robots/a/command", 1)
             await viewer.came(1)
+            await until("its record", lambda: any(p.stat().st_size for p in (tmp_path / FOLDER).glob("*.mcap")))
             with full_disk():
                 await viewer.say("subscribe", id="status", topic="^/relay/status$")
                 assert (await viewer.next())["op"] == "subscribed"
@@ -248,3 +255,33 @@ def test_repeated_refusals_are_counted(tmp_path: Path) -> None:
     lines = entries(tmp_path)
     assert [line.get("times") for line in lines] == [None, None, 4, None] and audit.refused == 7
     assert str(lines[0]["topic"]).startswith("/a\\n\\x1b[31m") and len(str(lines[0]["topic"])) < 310
+
+
+async def test_while_the_disk_stalls_messages_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recorder's disk stands still: a viewer gets what the recorder waits to write, and 100 kB are left out."""
+    monkeypatch.setattr("bufgym_live.relay.server.TICK_S", 0.01)
+    monkeypatch.setattr(disk, "STALL_S", 0.05)
+    monkeypatch.setattr(disk, "MOST_BYTES", 100_000)
+    go, write = threading.Event(), McapFile.write
+
+    def stalled(*words: Any, **fields: Any) -> bool:
+        assert go.wait(60.0)
+        return write(*words, **fields)
+
+    monkeypatch.setattr(McapFile, "write", stalled)
+    config = settings(folder=tmp_path, rules=(ALL, RECORD))
+    async with relay(config) as server, client(server.port) as viewer, client(server.port) as robot:
+        await viewer.subscribe("^/robots/a/odom$")
+
+        def events() -> list[str]:
+            return [entry["event"] for entry in server.hub.audit.recent]
+
+        for size in (1, 2, 100_000, 3):
+            await robot.put("/robots/a/odom", bytes(size))
+            assert len((await viewer.next()).payload) == size
+        await until("its log", lambda: "disk_stalls" in events())
+        assert "disk_goes_on" not in events()
+        go.set()
+        await until("its log", lambda: {"disk_goes_on", "left_out"} <= set(events()))
+    (path,) = (tmp_path / FOLDER).glob("*.mcap")
+    assert bags.read_bag(path).size_bytes.tolist() == [1, 2, 3]

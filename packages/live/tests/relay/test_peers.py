@@ -1,15 +1,17 @@
 """Relays that share topics over NATS: robots at one, viewers at another; commands arrive once."""
 
+import asyncio
 import itertools
 import time
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 from nats_cases import SHARED, nats, nats_server, needs_server, shared
 from relay_cases import client, nothing, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
-from bufgym_live.relay import Rule, Server, StoreLimits
+from bufgym_live.relay import Rule, Server, StoreLimits, bus
 from bufgym_live.relay.wire import Message, encode
 from bufgym_live.robot.sockets import free_port
 
@@ -182,3 +184,59 @@ async def test_a_second_relay_of_a_name_is_refused(relays: list[Server]) -> None
     with pytest.raises(BufgymError, match="nats: name = 'a': another relay has it; each needs its own"):
         async with relay(settings(nats=a.config.nats)):
             pass
+
+
+async def test_messages_wait_for_no_answer_of_nats_up_to_some_bytes(
+    relays: list[Server], robot: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 100 kB each the first two may be on their way, and the third fills it up: the fourth waits in its queue."""
+    a, b, _ = relays
+    assert a.hub.peers is not None and a.hub.peers._bus is not None
+    nats_client, answered = a.hub.peers._bus._client, asyncio.Event()
+
+    async def flush(timeout_s: float) -> None:
+        await answered.wait()
+
+    async with client(a.port) as sender, client(b.port) as viewer:
+        await viewer.subscribe(f"^{robot}/")
+        monkeypatch.setattr(nats_client, "flush", flush)
+        for seq in range(1, 5):
+            await sender.put(f"{robot}/odom", bytes(100_000), seq=seq)
+            if seq < 4:
+                assert (await viewer.next()).seq == seq
+        assert await nothing(sender, viewer)
+        answered.set()
+        assert (await viewer.next()).seq == 4
+
+
+async def test_a_relay_behind_a_slow_link_takes_few_messages_at_a_time(
+    relays: list[Server], robot: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 4 at most: the first is late, so 2 come; the last of these is late, so 1; then 2 and 4 in time, then all."""
+    monkeypatch.setattr(bus, "MANY", 4)
+    a, seen, heard = relays[0], list[int](), list[str]()
+    assert a.config.nats is not None
+    port = int(a.config.nats.url.rpartition(":")[2])
+
+    class Late:
+        def extra_s(self, delay_s: float, now_s: float) -> float:
+            heard.append("late" if len(heard) in (0, 2) else "in time")
+            return 9.0 if heard[-1] == "late" else 0.0
+
+    async with shared(port, "slow") as slow, client(a.port) as sender:
+        peers: Any = slow.hub.peers
+        taking = peers._bus
+        monkeypatch.setattr(peers, "_delays", {"a": Late()})
+
+        async def send(k: int) -> None:
+            before = taking._messages
+            await sender.put(f"{robot}/odom", b"1")
+            await until("it", lambda: len(heard) == k)
+            if k in (1, 3, 4, 6, 10):
+                await until("the next turn", lambda: taking._messages is not before)
+                await taking._client.flush()
+            seen.append(taking.most)
+
+        for k in range(1, 13):
+            await send(k)
+    assert seen == [2, 2, 1, 2, 2, 4, 4, 4, 4, 0, 0, 0]

@@ -20,6 +20,7 @@ from bufgym_live.relay.patterns import for_client, pattern
 from bufgym_live.relay.quota import Quota, Quotas
 from bufgym_live.relay.rules import Identity, Permissions
 from bufgym_live.relay.session import Session
+from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.wire import Message, RefusedError, WireError
 
 
@@ -89,7 +90,7 @@ def test_which_messages_are_taken() -> None:
     def code(message: Message) -> bool | str:
         no_drop = message.topic.endswith("command")
         try:
-            return protocol.check(message, 3, permissions, quota, no_drop, 0.0)
+            return protocol.check(message, StoredSession("a", Identity(), False, 3), permissions, quota, no_drop, 0.0)
         except RefusedError as refused:
             return refused.code
 

@@ -129,6 +129,7 @@ async def test_a_flood_of_requests_is_refused_and_fills_no_log() -> None:
         server.hub.clock = lambda: 0.0
         for k in range(7):
             await page.send(wants(f"/{k}"))
+        await wanted(server, 3)
         await page.send(wants("/2", 0))
         await wanted(server, 2)
         server.hub.audit.flush()

@@ -8,6 +8,7 @@ import ipaddress
 import itertools
 import random
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from bufgym_live.relay.config import Config, Foxglove, Limits, Rotation, Rule, l
 from bufgym_live.relay.hub import Hub, Outgoing
 from bufgym_live.relay.patterns import MAX_CHARACTERS, pattern
 from bufgym_live.relay.plain import Latest
-from bufgym_live.relay.quota import Bucket, Quota, Quotas
+from bufgym_live.relay.quota import Bucket, Quotas
 from bufgym_live.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
 from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription, next_lane
@@ -285,13 +286,13 @@ def test_queues_and_topics_are_bounded() -> None:
 
 def test_queues_are_made_in_turns_and_an_identity_has_only_so_many() -> None:
     """Five for two connections: 3 and 2. A publisher makes none of them, and each message arrives."""
-    quota, (one, other) = Quota(Limits(queues=5), 0.0), (subscription("drop-oldest") for _ in "ab")
-    for each in (one, other):
-        quota.connections.append({"a": each})
-        each.may_grow = quota.may_have_queue
-    for k in range(8):
+    quotas, (one, other) = Quotas(Limits(queues=5), lambda: 0.0), (subscription("drop-oldest") for _ in "ab")
+    with quotas.connection("a", {"a": one}), quotas.connection("a", {"a": other}):
         for each in (one, other):
-            each.offer(f"/{k}", k, 10)
+            each.may_grow = partial(quotas.may_have_queue, "a", "")
+        for k in range(8):
+            for each in (one, other):
+                each.offer(f"/{k}", k, 10)
     assert (len(one.lanes), len(other.lanes), one.make(), len(one.lanes)) == (0, 0, True, 1)
     assert (one.queues, other.queues, made(one, other)) == (3, 2, 4)
     assert sorted(sent(one)) == sorted(sent(other)) == list(range(8))

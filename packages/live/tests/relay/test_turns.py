@@ -1,0 +1,96 @@
+"""Nobody keeps the others waiting: long turns of the event loop are logged, and recordings are read one at a time."""
+
+import asyncio
+import contextlib
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loop_cases import beside
+from relay_cases import client, relay, settings, until
+
+from bufgym_live.relay import replay, turns
+
+
+async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages of one client take 30 ms each, and those of another 10: the limit is 20."""
+    now_s = 0.0
+    monkeypatch.setattr(turns, "clock", lambda: now_s)
+    async with relay(settings()) as server, client(server.port, local="127.0.0.2") as slow, client(server.port) as one:
+        publish = server.hub.publish
+
+        def publishing(sender: Any, message: Any) -> None:
+            nonlocal now_s
+            now_s += {"/slow": 0.03, "/quick": 0.01}.get(message.topic, 0.0)
+            publish(sender, message)
+
+        monkeypatch.setattr(server.hub, "publish", publishing)
+        for topic, sender in (("/slow", slow), ("/quick", one)):
+            for _ in range(3):
+                await sender.put(topic)
+                await sender.rest()
+        server.hub.tick()
+        found = [entry for entry in server.hub.audit.recent if entry["event"] == "slow"]
+        assert {entry["who"] for entry in found} == {"127.0.0.2"}
+        assert sum(entry["times"] for entry in found) == 3 and found[0]["longest_ms"] == 30.0
+
+
+async def test_a_task_is_the_same_under_the_watch() -> None:
+    """It gets what it waits for, and the errors that are thrown into it; it returns and raises."""
+
+    async def works(error: Exception | None) -> str:
+        if error is not None:
+            raise error
+        return "done"
+
+    watch = turns.Turns()
+    assert await watch.of("a", works(None)) == "done"
+    with pytest.raises(ValueError, match="no"):
+        await watch.of("a", works(ValueError("no")))
+
+    async def forever() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.append(True)
+
+    ended = list[bool]()
+    async with beside(watch.of("a", forever())):
+        await asyncio.sleep(0)
+    assert ended == [True]
+
+
+async def test_recordings_are_read_one_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of six clients that ask at once; messages go on meanwhile."""
+    go, reading, most = threading.Event(), 0, 0
+
+    def piece(*asked: Any) -> dict[str, Any]:
+        nonlocal reading, most
+        reading += 1
+        most = max(most, reading)
+        assert go.wait(60.0)
+        reading -= 1
+        return {"messages": [{"topic": "/a"}], "next_us": None, "first_us": 0, "last_us": 0}
+
+    monkeypatch.setattr(replay, "piece", piece)
+    async with relay(settings(folder=tmp_path)) as server, contextlib.AsyncExitStack() as stack:
+        clients = [await stack.enter_async_context(client(server.port)) for _ in range(6)]
+        for one in clients:
+            await one.say("replay", id="r", file="x", from_us=0, most_bytes=1)
+        viewer = await stack.enter_async_context(client(server.port, local="127.0.0.2"))
+        await viewer.subscribe("^/a$")
+        robot = await stack.enter_async_context(client(server.port, local="127.0.0.3"))
+        await robot.put("/a")
+        assert (await viewer.next()).topic == "/a"
+        await until("a reader", lambda: reading)
+        go.set()
+        for one in clients:
+            said = await one.next()
+            assert (said["op"], said["id"], said["messages"], said["last_us"]) == (
+                "replayed",
+                "r",
+                [{"topic": "/a"}],
+                0,
+            )
+        assert most == 1
