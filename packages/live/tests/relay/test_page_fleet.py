@@ -134,6 +134,7 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
     fleet.robots["one"] = {"location": PLACE}, (("front", "", RED), ("rear", "", bomb))
     until(page, f"{text('#name')} === 'one'")
     page.evaluate("location.hash = '#/robot/one/cameras'")
+    until(page, f"{text('#cameras figcaption')}.endsWith('rear: 30000 × 30000 pixels are too many')")
     until(page, f"({SEES})(document.querySelector('#cameras canvas')) >= 1")
     page.click("#cameras figure")
     until(page, f"document.querySelector('#large').open && ({SEES})(document.querySelector('#large canvas')) >= 1")
@@ -145,7 +146,7 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
 
 
 def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
-    """A goal by drag looks where the drag went; a refusal stays until it is read. Not every robot takes a stop."""
+    """A goal looks where the drag went; a refusal stays until it is read, then is gone. Not every robot takes a stop."""
     page, fleet = opened
     fleet.robots["one"] = {"location": PLACE, "commands": ["stop", "goal", "cancel"]}, ()
     until(page, f"{text('#stop')} === 'Stop one'", f"{text('#facts')} !== ''")
@@ -165,8 +166,10 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
     stop, near, _ = fleet.came
     assert (stop["command"], near["command"], near["frame"]) == ("stop", "goal", "map")
     assert near["yaw"] == pytest.approx(np.pi / 2, abs=0.01) and near["y"] == pytest.approx(0, abs=0.1)
-    fleet.robots["one"] = {"location": PLACE}, ()
-    until(page, f"{text('#stop')} === 'one takes no stop'")
+    until(page, f"{text('#notices p')}.includes('refused: goal: too far')")
+    page.click("#notices .refused button")
+    fleet.robots["one"] = {"location": PLACE, "answer": fleet.robots["one"][0]["answer"]}, ()  # it says so on and on
+    until(page, f"{text('#stop')} === 'one takes no stop'", f"!{text('#notices p')}.includes('refused')")
     assert page.is_disabled("#stop") and page.is_hidden("#goal")
     small = "[...document.querySelectorAll('button')].filter(one => one.offsetHeight && one.offsetHeight < 44).length"
     assert page.viewport_size["width"] > 1000 or page.evaluate(small) == 0

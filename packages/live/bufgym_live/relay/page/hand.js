@@ -81,7 +81,7 @@ export class Hand {
   answered(robot) {
     const {id, why} = robot.status.answer, {sent} = this;
     const isPolicy = sent?.kind === "policy" && robot.queue?.policy === this.$("policy").value;
-    if (!sent || sent.robot !== robot || (id !== sent.id && !isPolicy)) return;
+    if (!sent || sent.doneMs || sent.robot !== robot || (id !== sent.id && !isPolicy)) return;
     if (why) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
     sent.state = why ? "refused" : "done";
     sent.doneMs = Date.now();
