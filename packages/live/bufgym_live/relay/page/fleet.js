@@ -59,7 +59,7 @@ export class Fleet {
     else if (kind === "battery") robot.charge = charge(message);
     else if (kind === "estop") robot.estop.set(topic, flag(message));
     else if (kind === "diagnostics") this.takeParts(robot, diagnostics(message), ms);
-    if (DRAWN.includes(kind)) this.takeLayer(robot, topic, kind, message, ms);
+    if (DRAWN.includes(kind) || kind === "cloud") this.takeLayer(robot, topic, kind, message, ms);
   }
 
   takeStatus(robot, status, ms) {
