@@ -19,6 +19,7 @@ import {address, replace, route, TABS} from "./route.js";
 const TEXT_MS = 250, GRACE_MS = 2000;               // texts are said so often; so long may a connection be away before the page says so
 const USUAL_POSES = ["odom", "odometry", "localization", "tf", "tf_static"];   // asked for before a robot's status, which comes once a second, names its own
 
+/** @type {(id: string) => any} */
 const $ = id => document.getElementById(id);
 const escaped = text => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 

@@ -11,6 +11,7 @@ export const numbers = (said, ...names) => Object.fromEntries(names.map(name => 
 export const object = value => value !== null && typeof value === "object" ? value : {};
 
 // The turn round z of a quaternion (x, y, z, w).
+/** @type {(turn: number[]) => number} */
 export const yawOf = ([x, y, z, w]) => Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
 
 export class Cdr {

@@ -10,12 +10,16 @@ const SILENT_MS = 3000, GONE_MS = 60_000;           // so long says the better s
 const last = frame => frame.slice(frame.lastIndexOf("/") + 1);
 
 // The product of two quaternions (x, y, z, w), and a point turned by one of them.
-function turned([ax, ay, az, aw], [bx, by, bz, bw]) {
-  return [aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
-    aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz];
-}
+/** @type {(one: number[], other: number[]) => number[]} */
+const turned = ([ax, ay, az, aw], [bx, by, bz, bw]) => [
+  aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
+  aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz,
+];
+/** @type {(turn: number[]) => number[]} */
 const inverse = ([x, y, z, w]) => [-x, -y, -z, w];
+/** @type {(turn: number[], at: number[]) => number[]} */
 const moved = (turn, [x, y, z]) => turned(turned(turn, [x, y, z, 0]), inverse(turn)).slice(0, 3);
+/** @type {(pose: {at: number[], turn: number[], frame?: string}) => {x: number, y: number, yaw: number, frame: string} | undefined} */
 const above = ({at: [x, y], turn, frame = ""}) => place({x, y, yaw: yawOf(turn), frame});
 
 // The frames of tf, each with its parent.
@@ -47,8 +51,8 @@ class Tree {
   // Several robots may be in one tree: the one of this name before others. A map before what only counts wheels.
   find() {
     const worth = frame => {
-      const root = this.above(frame).at(-1), own = frame.startsWith(this.robot + "/");
-      return BASES.includes(last(root)) ? -1 : 8 * own + 4 * (last(root) === "map") + 2 - BASES.indexOf(last(frame));
+      const root = this.above(frame).at(-1), own = Number(frame.startsWith(this.robot + "/"));
+      return BASES.includes(last(root)) ? -1 : 8 * own + 4 * Number(last(root) === "map") + 2 - BASES.indexOf(last(frame));
     };
     const bases = [...this.links.keys()].filter(frame => BASES.includes(last(frame)) && worth(frame) >= 0);
     return bases.sort((one, other) => worth(other) - worth(one))[0] ?? null;

@@ -10,7 +10,9 @@ const css = ([red, green, blue, alpha]) => `rgb(${red * 255} ${green * 255} ${bl
 
 export class Layers {
   constructor(element, onChange) {
-    Object.assign(this, {element, onChange, rows: new Map()});
+    this.element = element;
+    this.onChange = onChange;
+    this.rows = new Map();
     try {
       this.chosen = JSON.parse(localStorage.getItem("layers")) ?? {};
     } catch {
@@ -38,10 +40,11 @@ export class Layers {
   row(name) {
     const row = document.createElement("label");
     row.innerHTML = `<input type="checkbox"><span></span><span class="soft"></span>`;
+    const box = row.querySelector("input");
     row.children[1].textContent = name;
-    row.firstChild.checked = this.isOn(name);
-    row.firstChild.onchange = () => {
-      this.chosen[name] = row.firstChild.checked;
+    box.checked = this.isOn(name);
+    box.onchange = () => {
+      this.chosen[name] = box.checked;
       localStorage.setItem("layers", JSON.stringify(this.chosen));
       this.onChange();
     };

@@ -10,13 +10,13 @@ export function multiply(a, b) {
 }
 
 // What is turned by a quaternion (x, y, z, w) and then moved to ``at``.
-export function rigid({at: [x, y, z], turn: [a, b, c, w]}) {
-  return new Float32Array([
+/** @type {(pose: {at: number[], turn: number[]}) => Float32Array} */
+export const rigid = ({at: [x, y, z], turn: [a, b, c, w]}) =>
+  new Float32Array([
     1 - 2 * (b * b + c * c), 2 * (a * b + c * w), 2 * (a * c - b * w), 0,
     2 * (a * b - c * w), 1 - 2 * (a * a + c * c), 2 * (b * c + a * w), 0,
     2 * (a * c + b * w), 2 * (b * c - a * w), 1 - 2 * (a * a + b * b), 0, x, y, z, 1,
   ]);
-}
 
 // A camera; a metre at a metre's distance is ``zoom`` of the picture's height.
 function perspective(zoom, aspect, near, far) {
@@ -25,12 +25,13 @@ function perspective(zoom, aspect, near, far) {
 }
 
 // How a camera sees the scene: from ``distance`` metres of ``target``, at ``yaw`` round it and ``pitch`` above it, with z upwards.
+/** @param {{target: number[], yaw: number, pitch: number, distance: number}} view */
 export function seen({target: [x, y, z], yaw, pitch, distance}, zoom, aspect) {
   const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
   const right = [-sy, cy, 0], up = [-sp * cy, -sp * sy, cp], back = [cp * cy, cp * sy, sp];
   const along = axis => -(axis[0] * x + axis[1] * y + axis[2] * z);
-  const view = [right, up, back].flatMap((_, column) => [right[column], up[column], back[column], 0]);
-  return multiply(perspective(zoom, aspect, distance / 100, distance * 100), new Float32Array([...view, along(right), along(up), along(back) - distance, 1]));
+  const axes = [0, 1, 2].flatMap(k => [right[k], up[k], back[k], 0]);
+  return multiply(perspective(zoom, aspect, distance / 100, distance * 100), new Float32Array([...axes, along(right), along(up), along(back) - distance, 1]));
 }
 
 // Where a point is on the screen, [x, y] from 0 to 1 from the upper left; undefined for one behind the camera.

@@ -26,7 +26,7 @@ layout(location = 0) in vec3 at; layout(location = 1) in vec4 tint; layout(locat
 uniform mat4 place, stands; uniform vec3 size; out vec4 colour;
 void main() {
   gl_Position = place * vec4(at + mesh * size, 1);
-  colour = vec4(tint.rgb * (0.62 + 0.38 * dot(normalize(mat3(stands) * (normal / max(size, 1e-6))), normalize(vec3(0.4, -0.3, 0.87)))), tint.a);
+  colour = vec4(tint.rgb * (0.76 + 0.24 * dot(normalize(mat3(stands) * (normal / max(size, 1e-6))), normalize(vec3(0.4, -0.3, 0.87)))), tint.a);
 }`;
 const COLOUR = `#version 300 es
 precision mediump float; in vec4 colour; out vec4 pixel;

@@ -16,11 +16,12 @@ const ROBOT = new Float32Array([0.55, 0, 0.05, -0.4, 0.35, 0.05, -0.25, 0, 0.22,
 const flat = at => ({at: [at.x, at.y, at.z ?? 0], turn: at.turn ?? [0, 0, Math.sin(at.yaw / 2), Math.cos(at.yaw / 2)]});
 
 // The same colour for each of some points.
-function alike([red, green, blue, alpha = 255], count) {
+/** @type {(colour: number[], count: number) => Uint8Array} */
+const alike = ([red, green, blue, alpha = 255], count) => {
   const colours = new Uint8Array(4 * count);
   for (let k = 0; k < colours.length; k += 4) colours.set([red, green, blue, alpha], k);
   return colours;
-}
+};
 
 export class Space {
   // ``nowMs()`` is the time by which markers end.
@@ -28,7 +29,9 @@ export class Space {
     this.$ = $;
     this.layers = layers;
     this.nowMs = nowMs;
-    [this.canvas, this.over] = $("space").querySelectorAll("canvas");
+    const [canvas, over] = $("space").querySelectorAll("canvas");
+    this.canvas = canvas;
+    this.over = over;
     this.scene = new Scene(this.canvas);
     this.held = new Map();                          // what is on the graphics card, by what it shows
     this.shade = "";                                // the field that gives a cloud its colours
