@@ -125,7 +125,7 @@ function subscribe() {
 function tried(message) {
   try {
     if (message.topic === "/relay/status") sayRelay(json(message));
-    else fleet.take(message);
+    else fleet.take(message, relay.isLatched(message.topic));
   } catch {
     return;
   }
@@ -217,7 +217,7 @@ function shown() {
 }
 
 function forget() {
-  fleet.robots.clear();
+  fleet.clear();
   list.clear();
   notices.forget();
   chosen = null;
