@@ -158,6 +158,7 @@ function show() {
     hand.take(null);
     map.forget();
     map.follow = true;
+    if (space) space.follow = true;
     if (one) Object.assign(one, {layers: new Map(), cameras: new Map(), scan: undefined, queueChanged: true, scanChanged: true});
   }
   if (one) $("robot").style.setProperty("--robot", tint(one.colour));

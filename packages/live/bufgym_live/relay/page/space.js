@@ -233,7 +233,7 @@ export class Space {
     const clouds = [...robot.layers].filter(([topic, layer]) => layer.kind === "cloud" && this.layers.isOn(topic));
     const said = clouds.map(([topic, {count, fault, lost, ms}]) =>
       `${topic}: ${fault || (lost ? `in ${lost}, and tf does not lead there` : `${count?.toLocaleString("en") ?? "no"} points, ${seconds((nowMs - ms) / 1000)} old`)}`);
-    say(this.$("space").querySelector("figcaption"), said.join(" · ") || "no PointCloud2");
+    say(this.$("space").querySelector("figcaption"), this.scene.lost ? "This browser has lost its graphics: reload the page." : said.join(" · ") || "no PointCloud2");
     aged(this.$("space"), clouds.length ? nowMs - Math.max(...clouds.map(([, layer]) => layer.ms)) : 0);
     const names = ["", ...new Set(clouds.flatMap(([, layer]) => layer.fields ?? []))], select = this.$("shade");
     if (select.dataset.offered !== names.join()) {
