@@ -20,7 +20,7 @@ const inverse = ([x, y, z, w]) => [-x, -y, -z, w];
 /** @type {(turn: number[], at: number[]) => number[]} */
 const moved = (turn, [x, y, z]) => turned(turned(turn, [x, y, z, 0]), inverse(turn)).slice(0, 3);
 /** @type {(pose: {at: number[], turn: number[], frame?: string}) => {x: number, y: number, yaw: number, frame: string} | undefined} */
-const above = ({at: [x, y], turn, frame = ""}) => place({x, y, yaw: yawOf(turn), frame});
+const seenFromAbove = ({at: [x, y], turn, frame = ""}) => place({x, y, yaw: yawOf(turn), frame});
 
 // The frames of tf, each with its parent.
 class Tree {
@@ -70,7 +70,7 @@ class Tree {
     return {at, turn, frame};
   }
 
-  place() { return above(this.from(this.base)); }
+  place() { return seenFromAbove(this.from(this.base)); }
 
   // How a frame lies in another frame, {at, turn}; undefined where tf does not lead from one to the other.
   pose(frame, other) {
@@ -81,7 +81,7 @@ class Tree {
   // The same, seen from above: x, y and yaw.
   between(frame, other) {
     const pose = this.pose(frame, other);
-    return pose && above(pose);
+    return pose && seenFromAbove(pose);
   }
 }
 
