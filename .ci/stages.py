@@ -84,12 +84,14 @@ def files_that_run_uncompiled() -> list[str]:
 
 
 def check() -> list[Stage]:
-    """Format, lint, types, layers, weight, stale rows, workflows."""
-    actionlint = BIN / "actionlint"
+    """Format, lint, types of Python and of the page, layers, weight, stale rows, workflows."""
+    actionlint, tsc = BIN / "actionlint", BIN.parent / "node_modules" / ".bin" / "tsc"
+    no_tsc = "" if tsc.exists() else "TypeScript is not here: npm install --prefix .venv typescript@5.9.3"
     return [
         Stage("format", [str(BIN / "ruff"), "format", "--check", "."]),
         Stage("lint", [str(BIN / "ruff"), "check", "."]),
         Stage("types", [str(BIN / "mypy")]),
+        Stage("page types", [str(tsc), "-p", ".ci/tsconfig.json"], unless=no_tsc),
         Stage("imports", [str(BIN / "lint-imports")]),
         Stage("weight", [PYTHON, ".ci/weight.py"]),
         Stage("leaderboard", [PYTHON, ".ci/leaderboard.py", "stale"]),

@@ -19,6 +19,7 @@ from bufgym_live.relay.patterns import pattern
 
 PORT: Final = 7420
 NO_DROP: Final = ("/robots/[^/]+/command",)
+LATCHED: Final = ("/robots/[^/]+/(.+/)?(map|tf_static)",)
 SKIP_PENDING: Final = "skip-pending"  # Robofleet's server rule, a policy of the relay alone
 POLICIES: Final = ("robofleet", SKIP_PENDING, "drop-oldest", "drop-newest", "afr", "min-motion-gap", "ros-native")
 """Policies that a viewer may choose; each is compiled at its first use."""
@@ -202,6 +203,8 @@ class Config(Section, frozen=True, kw_only=True):
     rules: tuple[Rule, ...] = ()
     no_drop: tuple[str, ...] = NO_DROP
     """Patterns of lossless topics; each must match the whole topic."""
+    latched: tuple[str, ...] = LATCHED
+    """Patterns of topics whose last message a new subscriber gets, too; as ROS does for latched topics."""
     policies: Annotated[tuple[str, ...], Meta(min_length=1)] = POLICIES
     """Policies of subscribers' queues; the first is the default."""
     origins: tuple[str, ...] = ()
@@ -223,7 +226,7 @@ class Config(Section, frozen=True, kw_only=True):
     foxglove: Foxglove | None = None
 
     def __post_init__(self) -> None:
-        for text in self.no_drop:
+        for text in self.no_drop + self.latched:
             pattern(text)
 
 

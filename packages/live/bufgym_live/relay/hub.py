@@ -33,6 +33,7 @@ CONNECTED: Final = "connected"  # State of the connection to the other relays
 ROBOFLEET: Final = "robofleet"
 """Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
+MAX_LATCHED_BYTES: Final = 2**26  # Limit on the last messages of latched topics; beyond, the oldest are forgotten
 
 
 @dataclass(eq=False)
@@ -106,6 +107,8 @@ class Hub:
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
+        self._latched: dict[str, Outgoing] = {}
+        self._latched_bytes = 0
         self.peers: Peers | None = None  # the other relays, if it shares topics with any
 
     def take_over(self, identity: str, name: str) -> None:
@@ -134,12 +137,15 @@ class Hub:
         self._routes.clear()
 
     def subscribe(self, member: Member, subscription: Subscription) -> None:
-        """Add a subscription; it replaces one with the same id.
+        """Add a subscription, with what is latched; it replaces one with the same id.
 
         Raises RefusedError: it is durable, and there are too many or the store cannot be written.
         """
         self.unsubscribe(member, subscription.id, subscription.pattern.text if subscription.durable else None)
         member.subscriptions[subscription.id] = subscription
+        for topic, frame in self._latched.items():
+            if subscription.pattern.part(topic) and member.permissions.allow("receive", topic):
+                member.offer(subscription, frame)
 
     def unsubscribe(self, member: Member, id: str, durable: str | None = None) -> None:
         """Remove a subscription if there is one of this id; messages of the pattern ``durable`` are held all the same.
@@ -159,9 +165,19 @@ class Hub:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
         frame = Outgoing(message)
+        if _any_whole(self.config.latched, message.topic):
+            self._latch(frame)
         for member, subscription in self._route(message.topic):
             if member is not sender:
                 member.offer(subscription, frame)
+
+    def _latch(self, frame: Outgoing) -> None:
+        """Keep it in place of its topic's last message."""
+        before = self._latched.pop(frame.message.topic, None)
+        self._latched[frame.message.topic] = frame
+        self._latched_bytes += frame.size_bytes - (before.size_bytes if before else 0)
+        while self._latched_bytes > MAX_LATCHED_BYTES:
+            self._latched_bytes -= self._latched.pop(next(iter(self._latched))).size_bytes
 
     def _show(self, message: wire.Message) -> None:
         """Count a message, and show it to the relay's own parts."""

@@ -79,6 +79,7 @@ def welcome(config: Config, admitted: Admitted, identity: Identity, received: in
         "identity": identity.as_json(),
         "received": received,
         "no_drop": config.no_drop,
+        "latched": config.latched,
         "window": config.store.window,
         "keep_s": config.store.keep_s,
         "max_message_bytes": config.limits.message_bytes,

@@ -18,6 +18,7 @@ STORE = typestore("cdr")
 made = functools.partial(ros_cases.made, STORE)
 DIAGNOSTICS, GRID, PATH = "diagnostic_msgs/msg/DiagnosticArray", "nav_msgs/msg/OccupancyGrid", "nav_msgs/msg/Path"
 POSES, MARKERS = "geometry_msgs/msg/PoseArray", "visualization_msgs/msg/MarkerArray"
+CLOUD, CODES = "sensor_msgs/msg/PointCloud2", ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 Topics = tuple[tuple[str, str, bytes], ...]
 """(topic, type, payload) each; without a type it is a JPEG file."""
 
@@ -58,6 +59,19 @@ def drawn() -> Topics:
         ("goal_pose", POSE, cdr(POSE, "map", pose=pose(9.5, 1.6))),
         ("markers", MARKERS, bytes(STORE.serialize_cdr(made(MARKERS, markers=shapes), MARKERS))),
     )
+
+
+def cloud(points: Any, frame: str = "base_link") -> bytes:
+    """A PointCloud2 of one row: a structured array, with its names, types, offsets and order of bytes."""
+    kinds, (count,), step = points.dtype, points.shape, points.dtype.itemsize
+    codes = {name: 1 + CODES.index(kinds[name].str[1:]) for name in kinds.names}
+    fields = [
+        made("sensor_msgs/msg/PointField", name=name, offset=kinds.fields[name][1], datatype=code, count=1)
+        for name, code in codes.items()
+    ]
+    size = {"height": 1, "width": count, "point_step": step, "row_step": step * count}
+    is_big, data = kinds["x"].str[0] == ">", np.frombuffer(points.tobytes(), np.uint8)
+    return cdr(CLOUD, frame, fields=fields, is_bigendian=is_big, data=data, **size)
 
 
 def health(level: int, says: str) -> Topics:

@@ -1,8 +1,9 @@
 """The page over made-up robots that send each type of message: troubles, layers, cameras, commands."""
 
+import io
 import itertools
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -14,21 +15,24 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
 from made_up_robot import jpeg  # noqa: E402
-from page_cases import Fleet, drawn, health  # noqa: E402
+from page_cases import CLOUD, Fleet, cloud, drawn, health  # noqa: E402
+from PIL import Image  # noqa: E402
 from test_page import SEES, until  # noqa: E402
 
 pytestmark = compiled
 RED = jpeg(np.full((120, 160, 3), (220, 30, 30), np.uint8))
 PLACE = {"x": 0, "y": 0, "yaw": 0, "frame": "map"}
 WIDTHS = [1400, pytest.param(390, marks=pytest.mark.nightly)]
-ORANGE = """(canvas => {
-  const {data} = canvas.getContext("2d", {willReadFrequently: true}).getImageData(0, 0, canvas.width, canvas.height);
+COUNT = """([red, green, blue]) => {
+  const canvas = document.querySelector("#map"), {data} = canvas.getContext("2d", {willReadFrequently: true})
+    .getImageData(0, 0, canvas.width, canvas.height);
   let found = 0;
   for (let k = 0; k < data.length; k += 4)
-    found += data[k] > 240 && data[k + 1] > 110 && data[k + 1] < 150 && data[k + 2] < 30;
+    found += Math.max(Math.abs(data[k] - red), Math.abs(data[k + 1] - green), Math.abs(data[k + 2] - blue)) < 20;
   return found;
-})(document.querySelector("#map"))"""
-"""How many pixels of the map have the markers' colour."""
+}"""
+ORANGE, WALL = (f"({COUNT})({colour})" for colour in ("[255, 128, 0]", "[140, 150, 163]"))
+"""How many pixels of the map have the colour of the markers, and of the walls of a grid."""
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +104,8 @@ def test_the_map_shows_layers_of_one_frame(opened: tuple[Any, Fleet]) -> None:
     fleet.robots["one"] = {}, drawn()
     layers = "laser walls,trails,map,plan,particles,goal_pose,markers,markers people,markers zones"
     until(page, f"{text('#facts')} === 'at 5.0, 0.0 m in map'", f"{text('#layers label')} === '{layers}'")
+    for _ in range(4):  # on a phone the markers are beyond the edge
+        page.locator("#map").press("-")
     until(page, f"{ORANGE} > 50", f"({SEES})(document.querySelector('#map')) > 8")
     page.click("#layers-box summary")
     for space in ("people", "zones"):
@@ -113,6 +119,74 @@ def test_the_map_shows_layers_of_one_frame(opened: tuple[Any, Fleet]) -> None:
       return [x, y, back.x, back.y];
     }""")
     assert at == pytest.approx([4, 2, 2, 0], abs=1e-9)
+
+
+def test_a_map_that_was_published_before_is_shown(opened: tuple[Any, Fleet]) -> None:
+    page, fleet = opened
+    fleet.robots["one"] = {}, drawn()
+    until(page, f"{text('#layers label')}.includes('markers people')")  # these came after the map
+    kinds = {topic: {"type": type, "encoding": "cdr"} for topic, type, _ in drawn()}
+    fleet.robots["one"] = {"publishes": kinds, "location": PLACE}, ()
+    page.reload()
+    until(page, f"{text('#facts')} === 'at 0.0, 0.0 m in map'", f"{WALL} > 50")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_cloud_has_any_fields(opened: tuple[Any, Fleet], order: str) -> None:
+    """Of four points one has no place. A red and a green one, by rgb; brightness from its lowest to its highest."""
+    layout = {"names": ["ring", "z", "x", "y", "rgb", "light"], "offsets": [0, 1, 9, 13, 18, 23], "itemsize": 27}
+    formats = [f"{order}{kind}" for kind in ("u1", "f8", "f4", "i2", "u4", "u2")]
+    points = np.zeros(4, np.dtype({**layout, "formats": formats}))
+    points["x"], points["y"], points["z"] = [1.5, np.nan, -2, 0], [-3, 0, 7, 1], [0.25, 0, 1e9, -8]
+    points["rgb"], points["light"] = [0xFF0000, 0, 0, 0x00FF00], [100, 0, 0, 60_000]
+    read = """async ([bytes, by]) => {
+      const {cloud} = await import("./cloud.js"), message = {payload: new Uint8Array(bytes)};
+      const {places, colours, ...rest} = cloud(message, by);
+      return {...rest, places: [...places], colours: [...colours]};
+    }"""
+    said = opened[0].evaluate(read, [list(cloud(points)), ""])
+    assert (said["frame"], said["count"], said["by"]) == ("base_link", 2, "rgb")
+    assert said["places"] == [1.5, -3, 0.25, 0, 1, -8] and said["colours"] == [255, 0, 0, 255, 0, 255, 0, 255]
+    low, high = np.reshape(opened[0].evaluate(read, [list(cloud(points)), "light"])["colours"], (2, 4))
+    assert low[2] > low[0] and high[0] > high[2]  # blue, red
+    broken = cloud(points)[:-30]
+    fails = f"cloud => ({read})([cloud, '']).then(() => 'read', error => error.name)"
+    assert opened[0].evaluate(fails, list(broken)) == "RangeError"
+
+
+def test_the_3d_tab_shows_points_and_markers(opened: tuple[Any, Fleet]) -> None:
+    """Magenta points of a wall before the robot, and its orange markers; they turn with the mouse."""
+    page, fleet = opened
+    wall = np.zeros(3000, np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")]))
+    wall["x"], wall["y"], wall["z"], wall["rgb"] = 1, np.arange(3000) / 1500 - 1, np.arange(3000) % 50 / 25, 0xFF00FF
+    fleet.robots["one"] = {}, (*drawn(), ("velodyne", CLOUD, cloud(wall)))
+    until(page, f"{text('#facts')} === 'at 5.0, 0.0 m in map'")
+    loaded = "performance.getEntriesByType('resource').filter(one => one.name.endsWith('scene.js')).length"
+    assert page.evaluate(loaded) == 0
+    page.click("#tabs a:has-text('3-D')")
+    until(page, f"{text('#space figcaption')}.startsWith('velodyne: 3,000 points')")
+
+    def shown(holds: Callable[[int, int], bool]) -> int:
+        """How many points there are in a picture of which it holds, by their number and that of markers' pixels."""
+        for _ in range(600):
+            picture = Image.open(io.BytesIO(page.locator("#space").screenshot())).convert("RGB")
+            seen = np.asarray(picture).reshape(-1, 3).astype(int)
+            points, markers = (int((abs(seen - one) < 40).all(1).sum()) for one in ((255, 0, 255), (255, 128, 0)))
+            if holds(points, markers):
+                return points
+            page.wait_for_timeout(50)
+        pytest.fail(f"at last {points} and {markers}")
+
+    before = shown(lambda points, markers: points > 500 and markers > 50)
+    page.locator("#space").hover()
+    page.mouse.down()
+    page.mouse.move(10, 500, steps=3)
+    page.mouse.up()
+    shown(lambda points, _: points not in (0, before))
+    page.click("#layers-box summary")
+    page.click("#layers label:has-text('velodyne')")
+    until(page, f"{text('#space figcaption')} === 'no PointCloud2'")
+    shown(lambda points, markers: points == 0 and markers > 0)
 
 
 def test_names_do_not_overlap_and_stay_inside(opened: tuple[Any, Fleet]) -> None:
@@ -134,6 +208,7 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
     fleet.robots["one"] = {"location": PLACE}, (("front", "", RED), ("rear", "", bomb))
     until(page, f"{text('#name')} === 'one'")
     page.evaluate("location.hash = '#/robot/one/cameras'")
+    until(page, f"{text('#cameras figcaption')}.endsWith('rear: 30000 × 30000 pixels are too many')")
     until(page, f"({SEES})(document.querySelector('#cameras canvas')) >= 1")
     page.click("#cameras figure")
     until(page, f"document.querySelector('#large').open && ({SEES})(document.querySelector('#large canvas')) >= 1")
@@ -145,7 +220,7 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
 
 
 def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
-    """A goal by drag looks where the drag went; a refusal stays until it is read. Not every robot takes a stop."""
+    """A goal looks where the drag went; a refusal stays until it is read. Not every robot takes a stop."""
     page, fleet = opened
     fleet.robots["one"] = {"location": PLACE, "commands": ["stop", "goal", "cancel"]}, ()
     until(page, f"{text('#stop')} === 'Stop one'", f"{text('#facts')} !== ''")
@@ -165,8 +240,10 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
     stop, near, _ = fleet.came
     assert (stop["command"], near["command"], near["frame"]) == ("stop", "goal", "map")
     assert near["yaw"] == pytest.approx(np.pi / 2, abs=0.01) and near["y"] == pytest.approx(0, abs=0.1)
-    fleet.robots["one"] = {"location": PLACE}, ()
-    until(page, f"{text('#stop')} === 'one takes no stop'")
+    until(page, f"{text('#notices p')}.includes('refused: goal: too far')")
+    page.click("#notices .refused button")
+    fleet.robots["one"] = {"location": PLACE, "answer": fleet.robots["one"][0]["answer"]}, ()  # it says so on and on
+    until(page, f"{text('#stop')} === 'one takes no stop'", f"!{text('#notices p')}.includes('refused')")
     assert page.is_disabled("#stop") and page.is_hidden("#goal")
     small = "[...document.querySelectorAll('button')].filter(one => one.offsetHeight && one.offsetHeight < 44).length"
     assert page.viewport_size["width"] > 1000 or page.evaluate(small) == 0

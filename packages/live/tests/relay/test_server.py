@@ -49,6 +49,23 @@ async def test_a_message_goes_to_each_subscriber_but_its_sender(corner: Corner) 
         assert await nothing(robot, viewer)
 
 
+async def test_the_last_message_of_a_latched_topic_comes_to_who_subscribes_later(
+    corner: Corner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only so many bytes are kept: two messages of 20 bytes, each with a header of 32, are more than 100."""
+    monkeypatch.setattr("bufgym_live.relay.hub.MAX_LATCHED_BYTES", 100)
+    async with corner.client() as robot, corner.client() as viewer:
+        for topic, text in (("a/map", b"1"), ("map", b"2"), ("map", b"3" * 20), ("maps", b"4")):
+            await robot.put(corner.topic(topic), text)
+        await robot.rest()
+        await viewer.subscribe("^" + corner.topic(""))
+        assert [bytes(one.payload) for one in await viewer.rest()] == [b"1", b"3" * 20]
+        await robot.put(corner.topic("tf_static"), b"5" * 20)
+        assert [bytes(one.payload) for one in [await viewer.next()]] == [b"5" * 20] and await nothing(robot, viewer)
+        await viewer.subscribe("^" + corner.topic(".*map|tf"), id="b")
+        assert [bytes(one.payload) for one in await viewer.rest()] == [b"5" * 20]
+
+
 async def test_json_and_binary_are_the_same_message(corner: Corner) -> None:
     async with corner.client(name="page", form="json") as page, corner.client() as robot:
         a, b = corner.topic("a"), corner.topic("b")

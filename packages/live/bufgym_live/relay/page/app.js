@@ -19,10 +19,11 @@ import {address, replace, route, TABS} from "./route.js";
 const TEXT_MS = 250, GRACE_MS = 2000;               // texts are said so often; so long may a connection be away before the page says so
 const USUAL_POSES = ["odom", "odometry", "localization", "tf", "tf_static"];   // asked for before a robot's status, which comes once a second, names its own
 
+/** @type {(id: string) => any} */
 const $ = id => document.getElementById(id);
 const escaped = text => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 
-let chosen = null, tab = TABS[0], textMs = -Infinity, texts = false, stale = false, onMs = null, awayMs = performance.now();
+let chosen = null, tab = TABS[0], textMs = -Infinity, texts = false, stale = false, space = null, onMs = null, awayMs = performance.now();
 
 const nowMs = () => player.replay ? player.nowMs : Date.now();
 const isReplay = () => player.replay !== null;
@@ -47,6 +48,7 @@ const fleet = new Fleet({
   scanned(one, pose, scan) { map.addScan(pose, scan); },
   moved(isLayer = false) {
     map.changed = true;
+    if (space) space.changed = true;
     map.layersChanged ||= isLayer;
   },
 });
@@ -105,6 +107,8 @@ function begin() {
   subscribe();
 }
 
+const layered = () => tab === "3d" ? [...DRAWN, "cloud"] : DRAWN;  // kinds
+
 // Of all robots where they are and what is wrong, of the chosen one all that is drawn.
 function subscribe() {
   if (isReplay()) return;                           // what is drawn now comes from the file
@@ -113,7 +117,7 @@ function subscribe() {
   relay.subscribe("health", "^/robots/[^/]+/" + of(["diagnostics", ...fleet.topics(HEALTH)]));
   if (chosen === null) return;
   const own = kinds => robot() ? fleet.topics(kinds, [robot()]) : [];
-  const pictures = own(["picture"]), topics = ["queue", ...own(["scan"]).slice(0, 1), ...own(DRAWN).filter(topic => layers.isOn(topic))];
+  const pictures = own(["picture"]), topics = ["queue", ...own(["scan"]).slice(0, 1), ...own(layered()).filter(topic => layers.isOn(topic))];
   relay.subscribe("chosen", `^/robots/${escaped(chosen)}/` + of([...topics, ...(tab === "cameras" ? pictures : pictures.slice(0, 1))]));
 }
 
@@ -121,7 +125,7 @@ function subscribe() {
 function tried(message) {
   try {
     if (message.topic === "/relay/status") sayRelay(json(message));
-    else fleet.take(message);
+    else fleet.take(message, relay.isLatched(message.topic));
   } catch {
     return;
   }
@@ -154,15 +158,27 @@ function show() {
     hand.take(null);
     map.forget();
     map.follow = true;
+    if (space) space.follow = true;
     if (one) Object.assign(one, {layers: new Map(), cameras: new Map(), scan: undefined, queueChanged: true, scanChanged: true});
   }
   if (one) $("robot").style.setProperty("--robot", tint(one.colour));
   cameras.redraw = true;
   textMs = -Infinity;
+  if (tab === "3d") openSpace();
   redraw();
   subscribe();
   hand.offerPolicies();
   hand.draw();
+}
+
+// What the 3-D tab draws with comes when it is first opened.
+async function openSpace() {
+  try {
+    const {Space} = await import("./space.js");
+    space ??= new Space($, layers, nowMs);
+  } catch (error) {
+    say($("space").querySelector("figcaption"), error.message);
+  }
 }
 
 function sayState(text = onMs === null ? "not connected" : "live") {
@@ -202,7 +218,7 @@ function shown() {
 }
 
 function forget() {
-  fleet.robots.clear();
+  fleet.clear();
   list.clear();
   notices.forget();
   chosen = null;
@@ -226,6 +242,7 @@ function frame(clockMs) {
   if (one) {
     cameras.draw(one, tab);
     if (tab === "overview") overview.draw(one);
+    else if (tab === "3d") space?.draw(here, one, its);
   }
   if (clockMs - textMs < TEXT_MS / 2) return;
   textMs = clockMs;
@@ -243,10 +260,11 @@ function frame(clockMs) {
 
 function sayChosen(one) {
   overview.facts(one, nowMs());
-  layers.list(one, fleet.topics(DRAWN, [one]));
+  layers.list(one, fleet.topics(layered(), [one]));
   cameras.say(one, fleet.topics(["picture"], [one]), nowMs());
   if (tab === "overview") overview.say(one, nowMs());
   if (tab === "health") health.draw(one, nowMs());
+  else if (tab === "3d") space?.say(one, nowMs());
 }
 
 function redraw() { stale = true; }
@@ -260,6 +278,7 @@ function redrawn() {
   if (robot()) $("robot").style.setProperty("--robot", tint(robot().colour));
   for (const row of $("topics").rows) row.dataset.name = "";
   cameras.redraw = true;
+  if (space) space.changed = true;
   textMs = map.belowMs = -Infinity;
 }
 

@@ -30,7 +30,11 @@ function caption(camera, nowMs) {
 
 export class Cameras {
   constructor(first, all, large) {
-    Object.assign(this, {first, all, large, topic: null, figures: new Map()});
+    this.first = first;
+    this.all = all;
+    this.large = large;
+    this.topic = null;
+    this.figures = new Map();
     first.onclick = () => this.enlarge([...this.robot?.cameras.keys() ?? []][0]);
     large.onclick = () => large.close();
     large.onclose = () => { this.topic = null; };

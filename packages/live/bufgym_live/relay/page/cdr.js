@@ -10,6 +10,10 @@ export function number(value, most = MOST) {
 export const numbers = (said, ...names) => Object.fromEntries(names.map(name => [name, number(said?.[name])]));
 export const object = value => value !== null && typeof value === "object" ? value : {};
 
+// The turn round z of a quaternion (x, y, z, w).
+/** @type {(turn: number[]) => number} */
+export const yawOf = ([x, y, z, w]) => Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
+
 export class Cdr {
   constructor(payload) {
     this.view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
@@ -40,8 +44,8 @@ export class Cdr {
   }
   doubles(count) { return Array.from({length: count}, () => this.double()); }
   pose() {
-    const [x, y, , qx, qy, qz, qw] = this.doubles(7);
-    return {x, y, yaw: Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))};
+    const [x, y, z, ...turn] = this.doubles(7);
+    return {x, y, z, turn, yaw: yawOf(turn)};
   }
   transform() { return {frame: this.header(), child: this.frame(), at: this.doubles(3), turn: this.doubles(4)}; }
   scan() {

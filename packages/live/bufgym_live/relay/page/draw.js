@@ -24,6 +24,13 @@ export function whenColoursChange(redraw) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { colours = {}; redraw(); });
 }
 
+// Red, green and blue, 0 to 255, of a colour of CSS.
+const probe = document.createElement("canvas").getContext("2d");
+export function rgb(css) {
+  probe.fillStyle = css;
+  return String(probe.fillStyle).match(/[0-9a-f]{2}/g).map(pair => parseInt(pair, 16));
+}
+
 // Hues far apart, one after the other, as many as there are topics.
 export const hue = k => tint((210 + k * 137.5) % 360);
 

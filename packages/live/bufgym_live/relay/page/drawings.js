@@ -27,12 +27,13 @@ function poses(cdr) {
   return {frame, places: cdr.list(() => place(cdr.pose())).filter(Boolean)};
 }
 
-const point = cdr => { const [x, y] = cdr.doubles(3); return {x: metres(x), y: metres(y)}; };
+const point = cdr => { const [x, y, z] = cdr.doubles(3).map(metres); return {x, y, z}; };
 const rgba = cdr => Array.from({length: 4}, () => Math.min(1, Math.max(0, number(cdr.float()) ?? 0)));
 
 function marker(cdr) {
   const frame = cdr.header(), space = cdr.string().slice(0, 100), key = `${space}/${cdr.int()}`, shape = cdr.int(), action = cdr.int();
-  const at = place(cdr.pose()) ?? {x: 0, y: 0, yaw: 0}, size = cdr.doubles(3).map(metres), colour = rgba(cdr);
+  const said = cdr.pose(), norm = Math.hypot(...said.turn), isTurned = norm > 0.9 && norm < 1.1;
+  const at = {...place(said) ?? {x: 0, y: 0, yaw: 0}, z: metres(said.z), turn: isTurned ? said.turn.map(part => part / norm) : [0, 0, 0, 1]}, size = cdr.doubles(3).map(metres), colour = rgba(cdr);
   const keepMs = 1000 * cdr.int() + cdr.uint() / 1e6;
   cdr.byte();                                       // whether it stays with its frame: what is drawn always does
   const points = cdr.list(point), colours = cdr.list(rgba);
@@ -55,8 +56,9 @@ function changed(before, markers, ms) {
   return all;
 }
 
-// A layer of the map by a message of a kind that is drawn; ``before`` is what the topic's layer was.
+// A layer of the map by a message of a kind that is drawn; ``before`` is what the topic's layer was. A cloud is read once it is drawn.
 export function layer(kind, message, ms, before) {
+  if (kind === "cloud") return {kind, ms, message};
   const cdr = new Cdr(message.payload);
   if (kind === "markers") {
     const markers = changed(before, message.type.endsWith("Array") ? cdr.list(marker, MOST_MARKERS) : [marker(cdr)], ms);

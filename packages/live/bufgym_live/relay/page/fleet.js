@@ -6,7 +6,7 @@ import {Place, within} from "./frames.js";
 import {charge, diagnostics, DRAWN, flag, json, kindOf, queue, scan, status} from "./messages.js";
 
 export const AWAY_MS = 5000, LOW = 0.25;
-const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, POSES = 100, NEAR_MS = 20, GAP_MS = 400, PARTS = 500, LAYERS = 64;
+const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, POSES = 100, NEAR_MS = 20, GAP_MS = 400, PARTS = 500, LAYERS = 64, EARLY = 1000;
 const LATELY_MS = 10_000, MANY = 0.3;               // a robot that drops so many of its messages lately is in trouble
 const ROBOT = /^\/robots\/([^/]+)\/(.+)$/;
 
@@ -15,6 +15,12 @@ export class Fleet {
   constructor(on) {
     this.on = on;
     this.robots = new Map();
+    this.early = new Map();                         // latched messages of robots that have said nothing yet, by topic
+  }
+
+  clear() {
+    this.robots.clear();
+    this.early.clear();
   }
 
   get(name) { return this.robots.get(name); }
@@ -31,6 +37,10 @@ export class Fleet {
       this.robots.set(name, robot);
       this.blank(robot);
       this.on.added(robot);
+      for (const [topic, message] of this.early) if (ROBOT.exec(topic)[1] === name) {
+        this.early.delete(topic);
+        this.take(message, true);
+      }
     }
     return this.robots.get(name);
   }
@@ -42,11 +52,16 @@ export class Fleet {
     robot.place.forget();
   }
 
-  take(message) {
+  // A latched message may be as old as it likes: it does not say that its robot is there.
+  take(message, isLatched = false) {
     const [, name, topic] = ROBOT.exec(message.topic) ?? [];
     if (!name) return;
+    if (isLatched && !this.robots.has(name)) {
+      if (this.early.size < EARLY) this.early.set(message.topic, message);
+      return;
+    }
     const robot = this.of(name), nowMs = this.on.nowMs();
-    robot.heardMs = nowMs;
+    if (!isLatched) robot.heardMs = nowMs;
     // A robot's clock may be wrong; how late a message is shows beside the promptest of them.
     robot.skewMs = Math.min(robot.skewMs, nowMs - message.stampMs);
     const ms = message.stampMs + robot.skewMs;
@@ -59,7 +74,7 @@ export class Fleet {
     else if (kind === "battery") robot.charge = charge(message);
     else if (kind === "estop") robot.estop.set(topic, flag(message));
     else if (kind === "diagnostics") this.takeParts(robot, diagnostics(message), ms);
-    if (DRAWN.includes(kind)) this.takeLayer(robot, topic, kind, message, ms);
+    if (DRAWN.includes(kind) || kind === "cloud") this.takeLayer(robot, topic, kind, message, ms);
   }
 
   takeStatus(robot, status, ms) {

@@ -1,5 +1,6 @@
 // Where a robot is, in one frame: by tf, where that leads from the world to the robot; otherwise by one topic with poses.
 
+import {yawOf} from "./cdr.js";
 import {place, pose, transforms} from "./messages.js";
 
 const BASES = ["base_link", "base_footprint", "base"], MOST_FRAMES = 1000;
@@ -9,11 +10,17 @@ const SILENT_MS = 3000, GONE_MS = 60_000;           // so long says the better s
 const last = frame => frame.slice(frame.lastIndexOf("/") + 1);
 
 // The product of two quaternions (x, y, z, w), and a point turned by one of them.
-function turned([ax, ay, az, aw], [bx, by, bz, bw]) {
-  return [aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
-    aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz];
-}
-const moved = (turn, [x, y, z]) => turned(turned(turn, [x, y, z, 0]), [-turn[0], -turn[1], -turn[2], turn[3]]).slice(0, 3);
+/** @type {(one: number[], other: number[]) => number[]} */
+const turned = ([ax, ay, az, aw], [bx, by, bz, bw]) => [
+  aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
+  aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz,
+];
+/** @type {(turn: number[]) => number[]} */
+const inverse = ([x, y, z, w]) => [-x, -y, -z, w];
+/** @type {(turn: number[], at: number[]) => number[]} */
+const moved = (turn, [x, y, z]) => turned(turned(turn, [x, y, z, 0]), inverse(turn)).slice(0, 3);
+/** @type {(pose: {at: number[], turn: number[], frame?: string}) => {x: number, y: number, yaw: number, frame: string} | undefined} */
+const seenFromAbove = ({at: [x, y], turn, frame = ""}) => place({x, y, yaw: yawOf(turn), frame});
 
 // The frames of tf, each with its parent.
 class Tree {
@@ -44,14 +51,14 @@ class Tree {
   // Several robots may be in one tree: the one of this name before others. A map before what only counts wheels.
   find() {
     const worth = frame => {
-      const root = this.above(frame).at(-1), own = frame.startsWith(this.robot + "/");
-      return BASES.includes(last(root)) ? -1 : 8 * own + 4 * (last(root) === "map") + 2 - BASES.indexOf(last(frame));
+      const root = this.above(frame).at(-1), own = Number(frame.startsWith(this.robot + "/"));
+      return BASES.includes(last(root)) ? -1 : 8 * own + 4 * Number(last(root) === "map") + 2 - BASES.indexOf(last(frame));
     };
     const bases = [...this.links.keys()].filter(frame => BASES.includes(last(frame)) && worth(frame) >= 0);
     return bases.sort((one, other) => worth(other) - worth(one))[0] ?? null;
   }
 
-  // Where a frame's origin lies in the uppermost frame above it, and how it is turned there.
+  // Where a frame's origin lies in the uppermost frame above it, and how it is turned there: {at, turn, frame}.
   from(frame) {
     let at = [0, 0, 0], turn = [0, 0, 0, 1];
     for (const child of this.above(frame).slice(0, -1)) {
@@ -60,19 +67,21 @@ class Tree {
       turn = turned(link.turn, turn);
       frame = link.frame;
     }
-    const [qx, qy, qz, qw] = turn;
-    return place({x: at[0], y: at[1], yaw: Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)), frame});
+    return {at, turn, frame};
   }
 
-  place() { return this.from(this.base); }
+  place() { return seenFromAbove(this.from(this.base)); }
 
-  // Where a frame's origin lies in another frame, seen from above; undefined where tf does not lead from one to the other.
+  // How a frame lies in another frame, {at, turn}; undefined where tf does not lead from one to the other.
+  pose(frame, other) {
+    const [a, b] = [this.from(frame), this.from(other)], back = inverse(b.turn);
+    if (a.frame === b.frame) return {at: moved(back, a.at.map((value, k) => value - b.at[k])), turn: turned(back, a.turn)};
+  }
+
+  // The same, seen from above: x, y and yaw.
   between(frame, other) {
-    if (frame === other) return {x: 0, y: 0, yaw: 0};
-    const [a, b] = [this.from(frame), this.from(other)];
-    if (!a || !b || a.frame !== b.frame) return;
-    const [dx, dy] = [a.x - b.x, a.y - b.y], [cos, sin] = [Math.cos(b.yaw), Math.sin(b.yaw)];
-    return {x: cos * dx + sin * dy, y: cos * dy - sin * dx, yaw: a.yaw - b.yaw};
+    const pose = this.pose(frame, other);
+    return pose && seenFromAbove(pose);
   }
 }
 

@@ -15,7 +15,13 @@ const KINDS = ["stop", "goal", "pose", "cancel"];
 export class Hand {
   // asks: {robot(), isReplay(), frame(), nowMs()}
   constructor($, relay, map, notices, asks) {
-    Object.assign(this, {$, relay, map, notices, asks, sent: null, number: 0});
+    this.$ = $;
+    this.relay = relay;
+    this.map = map;
+    this.notices = notices;
+    this.asks = asks;
+    this.sent = null;
+    this.number = 0;
     $("stop").onclick = () => this.send("stop");
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
@@ -64,7 +70,7 @@ export class Hand {
     this.draw();
     try {
       if (way.type) {
-        await this.relay.command(way.topic, kind === "stop" ? still() : stamped(way.type === ESTIMATE, fields), {type: way.type, encoding: "cdr"});
+        await this.relay.command(way.topic, kind === "stop" ? still() : stamped(way.type === ESTIMATE, /** @type {any} */ (fields)), {type: way.type, encoding: "cdr"});
         sent.state = "sent to its ROS, which does not answer";
       } else {
         await this.relay.command(way.topic, {command: kind, id, ...fields});
@@ -81,7 +87,7 @@ export class Hand {
   answered(robot) {
     const {id, why} = robot.status.answer, {sent} = this;
     const isPolicy = sent?.kind === "policy" && robot.queue?.policy === this.$("policy").value;
-    if (!sent || sent.robot !== robot || (id !== sent.id && !isPolicy)) return;
+    if (!sent || sent.doneMs || sent.robot !== robot || (id !== sent.id && !isPolicy)) return;
     if (why) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
     sent.state = why ? "refused" : "done";
     sent.doneMs = Date.now();

@@ -1,15 +1,18 @@
 // Layers of the map: which there are, which are on, and how each is drawn. What lies in other frames is led into the map's by tf.
 
-import {colour, say} from "./draw.js";
+import {colour, rgb, say} from "./draw.js";
 import {within} from "./frames.js";
 
-const BASE = ["laser walls", "trails"], HIDDEN = /costmap/, SHAPES = {ARROW: 0, CUBE: 1, SPHERE: 2, CYLINDER: 3, STRIP: 4, LINES: 5, CUBES: 6, SPHERES: 7, POINTS: 8, TEXT: 9, MESH: 10, TRIANGLES: 11};
-const ORDER = ["grid", "path", "poses", "markers", "goal"], HERE = {x: 0, y: 0, yaw: 0};
+const BASE = ["laser walls", "trails"], HIDDEN = /costmap/, HERE = {x: 0, y: 0, yaw: 0};
+export const SHAPES = {ARROW: 0, CUBE: 1, SPHERE: 2, CYLINDER: 3, STRIP: 4, LINES: 5, CUBES: 6, SPHERES: 7, POINTS: 8, TEXT: 9, MESH: 10, TRIANGLES: 11};
+const ORDER = ["grid", "path", "poses", "markers", "goal"];
 const css = ([red, green, blue, alpha]) => `rgb(${red * 255} ${green * 255} ${blue * 255} / ${alpha})`;
 
 export class Layers {
   constructor(element, onChange) {
-    Object.assign(this, {element, onChange, rows: new Map()});
+    this.element = element;
+    this.onChange = onChange;
+    this.rows = new Map();
     try {
       this.chosen = JSON.parse(localStorage.getItem("layers")) ?? {};
     } catch {
@@ -37,10 +40,11 @@ export class Layers {
   row(name) {
     const row = document.createElement("label");
     row.innerHTML = `<input type="checkbox"><span></span><span class="soft"></span>`;
+    const box = row.querySelector("input");
     row.children[1].textContent = name;
-    row.firstChild.checked = this.isOn(name);
-    row.firstChild.onchange = () => {
-      this.chosen[name] = row.firstChild.checked;
+    box.checked = this.isOn(name);
+    box.onchange = () => {
+      this.chosen[name] = box.checked;
       localStorage.setItem("layers", JSON.stringify(this.chosen));
       this.onChange();
     };
@@ -112,14 +116,10 @@ export class Layers {
 }
 
 // A grid's cells as a picture: what is free is paper, what is not is wall, and what nobody knows is neither.
-function painted({width, height, cells}) {
+export function painted({width, height, cells}) {
   const canvas = Object.assign(document.createElement("canvas"), {width, height}), drawing = canvas.getContext("2d");
   const image = drawing.createImageData(width, height), words = new Uint32Array(image.data.buffer), colours = new Uint32Array(256);
-  const parts = name => {
-    drawing.fillStyle = colour(name);
-    return drawing.fillStyle.match(/[0-9a-f]{2}/g).map(pair => parseInt(pair, 16));
-  };
-  const [free, wall] = [parts("paper"), parts("wall")];
+  const [free, wall] = [rgb(colour("paper")), rgb(colour("wall"))];
   for (let value = 0; value <= 100; value++) {
     const [red, green, blue] = free.map((part, k) => Math.round(part + (wall[k] - part) * value / 100));
     colours[value] = new Uint32Array(new Uint8Array([red, green, blue, 255]).buffer)[0];

@@ -8,7 +8,10 @@ const byName = (one, other) => one.name.localeCompare(other.name, undefined, {nu
 
 export class List {
   constructor(element, search, count) {
-    Object.assign(this, {element, search, count, cards: new Map()});
+    this.element = element;
+    this.search = search;
+    this.count = count;
+    this.cards = new Map();
     search.oninput = () => this.find();
   }
 
@@ -36,7 +39,7 @@ export class List {
   update(robots, chosen, tab, nowMs) {
     for (const robot of robots) this.say(robot, chosen, tab, nowMs);
     const rank = robot => robot.troubles[0]?.rank ?? 9;
-    const sorted = [...robots].sort((one, other) => rank(one) - rank(other) || byName(one, other)), focused = document.activeElement;
+    const sorted = [...robots].sort((one, other) => rank(one) - rank(other) || byName(one, other)), focused = /** @type {HTMLElement} */ (document.activeElement);
     sorted.forEach((robot, k) => {
       const card = this.cards.get(robot.name), there = this.element.children[k];
       if (there !== card) this.element.insertBefore(card, there ?? null);

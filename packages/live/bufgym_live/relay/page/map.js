@@ -12,7 +12,9 @@ const OLD_MS = 3000;
 
 export class Map2D {
   constructor(canvas, layers, onPick) {
-    Object.assign(this, {canvas, layers, onPick});
+    this.canvas = canvas;
+    this.layers = layers;
+    this.onPick = onPick;
     this.tool = this.preview = null;                // a tool in hand: {tint, done(at)}; and where it points now
     this.walls = Object.assign(document.createElement("canvas"), {width: CELLS, height: CELLS});
     this.below = document.createElement("canvas");   // trails and walls: drawn some times a second, not with each message

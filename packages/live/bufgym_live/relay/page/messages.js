@@ -42,7 +42,7 @@ const KINDS = {
   "theora_image_transport/msg/Packet": "picture", "foxglove_msgs/msg/CompressedVideo": "picture", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "picture",
   "diagnostic_msgs/msg/DiagnosticArray": "diagnostics", "sensor_msgs/msg/BatteryState": "battery",
   "nav_msgs/msg/OccupancyGrid": "grid", "nav_msgs/msg/Path": "path", "geometry_msgs/msg/PoseArray": "poses",
-  "visualization_msgs/msg/MarkerArray": "markers", "visualization_msgs/msg/Marker": "markers",
+  "visualization_msgs/msg/MarkerArray": "markers", "visualization_msgs/msg/Marker": "markers", "sensor_msgs/msg/PointCloud2": "cloud",
 };
 export const DRAWN = ["grid", "path", "poses", "goal", "markers"], HEALTH = ["diagnostics", "estop", "battery"];   // kinds: of the map's layers, of what is wrong
 

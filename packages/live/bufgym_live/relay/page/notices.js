@@ -47,7 +47,7 @@ export class Notices {
   }
 
   draw(nowMs) {
-    const all = [...this.notices].sort(([, one], [, other]) => (one.overMs !== null) - (other.overMs !== null) || other.ms - one.ms);
+    const all = [...this.notices].sort(([, one], [, other]) => Number(one.overMs !== null) - Number(other.overMs !== null) || other.ms - one.ms);
     const shown = all.slice(0, isNarrow.matches ? 1 : 3), more = all.length - shown.length;
     this.element.hidden = all.length === 0;
     while (this.element.children.length > shown.length + 1) this.element.lastChild.remove();

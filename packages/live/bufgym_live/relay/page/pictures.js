@@ -9,7 +9,7 @@ const VIDEO = {"theora_image_transport/msg/Packet": "theora", "foxglove_msgs/msg
 // Width and height of a PNG or JPEG file, by its first bytes; undefined if it is neither.
 export function dimensions(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  if (view.byteLength > 24 && view.getUint32(0) === 0x89504e47) return [view.getUint32(16), view.getUint32(20)];
+  if (view.byteLength >= 24 && view.getUint32(0) === 0x89504e47) return [view.getUint32(16), view.getUint32(20)];
   if (view.byteLength < 4 || view.getUint16(0) !== 0xffd8) return;
   for (let at = 2; at + 9 < view.byteLength;) {     // segments, until one that begins a frame
     if (view.getUint8(at) !== 0xff) return;

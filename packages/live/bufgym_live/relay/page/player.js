@@ -6,7 +6,10 @@ import {Replay} from "./replay.js";
 export class Player {
   // on: {message(message), begin(), jump(), end()}
   constructor($, relay, on) {
-    Object.assign(this, {$, relay, on, replay: null});
+    this.$ = $;
+    this.relay = relay;
+    this.on = on;
+    this.replay = null;
     $("recordings").onclick = () => relay.say("recordings", {});
     $("live").onclick = () => this.end();
     $("play").onclick = () => {

@@ -99,6 +99,9 @@ export class Relay {
 
   mayCommand(topic) { return (this.welcome?.rules ?? []).some(rule => rule.send && matches(rule.topic, topic)); }
 
+  // Whether the relay keeps a topic's last message for who subscribes later: what comes may be old.
+  isLatched(topic) { return (this.welcome?.latched ?? []).some(pattern => matches(pattern, topic)); }
+
   hear(data) {
     if (typeof data !== "string") return this.take(decode(data));
     const said = JSON.parse(data);

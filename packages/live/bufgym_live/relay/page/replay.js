@@ -6,7 +6,13 @@ const AHEAD_MS = 3000, PIECE_BYTES = 1_000_000;
 
 export class Replay {
   constructor(relay, file, onMessage, onJump) {
-    Object.assign(this, {relay, file, onMessage, onJump, speed: 1, playing: true, number: 0});
+    this.relay = relay;
+    this.file = file;
+    this.onMessage = onMessage;
+    this.onJump = onJump;
+    this.speed = 1;
+    this.playing = true;
+    this.number = 0;
     this.firstMs = this.lastMs = null;
     this.seek(0);
   }

@@ -1,6 +1,6 @@
 // The page's address says what it shows: #/robot/NAME/TAB. So back, forward, reload and a link to a colleague work.
 
-export const TABS = ["overview", "cameras", "health"];
+export const TABS = ["overview", "cameras", "3d", "health"];
 
 export const address = (name, tab = TABS[0]) => name === null ? "#/" : `#/robot/${encodeURIComponent(name)}/${tab}`;
 
