@@ -74,12 +74,12 @@ def test_an_episode_through_the_relay_is_that_of_the_simulator(tmp_path: Path) -
 def test_a_topic_goes_with_each_of_its_messages() -> None:
     topic = Published("/arm/camera", "sensor_msgs/msg/Image", reliable=False, transient_local=True, depth=15)
     assert parse(memoryview(topic.head() + b"image")) == (topic, b"image")
-    assert len(topic.head()) == 5 + len("/arm/camera") + len("sensor_msgs/msg/Image")
+    assert len(topic.head()) == 29 + len("/arm/camera") + len("sensor_msgs/msg/Image")
 
 
 @given(st.binary(max_size=60))
 def test_what_is_no_message_of_a_relay_ends_the_connection(body: bytes) -> None:
-    refuse("no message of a relay", parse, b"\x03\x05\0\0\x01" + b"/a;" + body, kind=FrameError)
+    refuse("no message of a relay", parse, b"\x03\x05\0\0\x01" + bytes(24) + b"/a;" + body, kind=FrameError)
 
 
 def test_topics_that_cannot_be_relayed() -> None:
