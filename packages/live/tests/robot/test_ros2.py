@@ -118,7 +118,7 @@ async def test_a_topic_is_subscribed_again_when_its_publisher_comes_back_otherwi
     monkeypatch.setattr(relay, "published", published)
     monkeypatch.setattr(relay, "LOOK_S", 0.0)
     node = SimpleNamespace(destroy_subscription=gone.append)
-    looking = asyncio.create_task(relay.look(node, ["/odd", "/camera"], found, "me", told.append))
+    looking = asyncio.create_task(relay.look(node, lambda: ["/odd", "/camera"], found, "me", told.append))
     await asyncio.wait_for(ended.wait(), 10)
     looking.cancel()
     assert [topic.reliable for topic in made] == [True, False] and gone == [camera]

@@ -30,9 +30,9 @@ Process = asyncio.subprocess.Process
 @pytest.fixture(scope="module")
 def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A program without ROS over the package's library, with three policies."""
-    for program in ("cmake", "g++"):
-        if shutil.which(program) is None:
-            pytest.skip(f"no {program} here")
+    for needed in ("cmake", "g++"):
+        if shutil.which(needed) is None:
+            pytest.skip(f"no {needed} here")
     folder = tmp_path_factory.mktemp("ros2")
     source = rclcpp.write(folder / "source", roscpp.find("afr,drop-oldest,learned"))
     run("cmake", "-S", source, "-B", folder, "-DCMAKE_BUILD_TYPE=Debug", "-DCMAKE_DISABLE_FIND_PACKAGE_ament_cmake=ON")
@@ -110,12 +110,15 @@ async def test_a_link_cut_and_back(talker: Path, tmp_path: Path) -> None:
 
 
 async def test_another_receiver_goes_on_where_the_first_was(talker: Path, tmp_path: Path) -> None:
-    async with receiving() as (_, port, first), receiving() as (_, other, second):
-        async with talking(talker, "127.0.0.1", port, "drop-oldest", 64, tmp_path, 20, 100_000, 200) as one:
-            assert await told(one) == {}
-            await until(lambda: len(first) == 20)
-            assert await told(one, f"move {other}") == {}
-            numbers = await told(one, "end")
+    async with (
+        receiving() as (_, port, first),
+        receiving() as (_, other, second),
+        talking(talker, "127.0.0.1", port, "drop-oldest", 64, tmp_path, 20, 100_000, 200) as one,
+    ):
+        assert await told(one) == {}
+        await until(lambda: len(first) == 20)
+        assert await told(one, f"move {other}") == {}
+        numbers = await told(one, "end")
     assert {one.seq for one in first + second} == set(range(40)) and len(second) >= 20 and numbers["faults"] == 0
     assert [b.number - a.number for a, b in itertools.pairwise(second)] == [1] * (len(second) - 1)
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError, install
 from bufgym_live.robot.frames import FrameError
+from bufgym_live.robot.ros2.uninstalled import stand_in
 
 DEPTH: Final = 10  # Default history depth, because DDS does not announce a publisher's own
 _MAX_NAME_BYTES: Final = 255
@@ -82,6 +83,14 @@ class Published:
         except (ModuleNotFoundError, AttributeError):
             raise BufgymError(f"topic {self.name}: messages of {self.type}, which is not installed here") from None
 
+    @property
+    def serialized_class(self) -> Any:
+        """Class to relay its messages with, as bytes; one that stands in for it if their package is not installed."""
+        try:
+            return self.message_class
+        except BufgymError:
+            return stand_in(self.type)
+
     def head(self) -> bytes:
         """Header sent before each of its messages."""
         name, kind = self.name.encode(), self.type.encode()
@@ -109,12 +118,12 @@ def parse(body: bytes | memoryview) -> tuple[Published, bytes]:
 
 
 def published(node: Any, name: str, but_not: str) -> Published | None:
-    """Find the topic as the node sees it; None while only nodes named ``but_not`` publish it.
+    """Find the topic as the node sees it; None while only nodes with ``but_not`` in their names publish it.
 
     It is best effort if any publisher is, and transient local if all are, so that one subscription gets them all. So
     with deadline, lifespan and liveliness: the weakest promise of any publisher.
     """
-    found = [one for one in node.get_publishers_info_by_topic(name) if one.node_name != but_not]
+    found = [one for one in node.get_publishers_info_by_topic(name) if but_not not in one.node_name]
     if not found:
         return None
     from rclpy.qos import DurabilityPolicy, LivelinessPolicy, ReliabilityPolicy
