@@ -78,7 +78,7 @@ def main() -> None:
         qos = seen.qos_profile
         [asked] = robot.node.get_subscriptions_info_by_topic("/odd")
         result: dict[str, Any] = {"came": {name: texts[0] for name, texts in base.came.items()}}
-        result["odd"] = odd[0] == serialize_message(String(data="/odd"))
+        result["odd"] = odd[0][8:].rstrip(b"\0").decode()
         result["types"] = dict(base.node.get_topic_names_and_types())["/odd"]
         result["by"] = f"{seen.node_namespace}{seen.node_name}", f"{asked.node_namespace}/{asked.node_name}"
         result["reliability"] = asked.qos_profile.reliability.name

@@ -26,8 +26,8 @@ class Place:
     """Publisher in the user's configuration; None for a topic named without one."""
     name: str | None = None
     """Name with its namespace, once it is known."""
-    _now_s: float = 0.0  # time since the first message by the node's clock, which a simulation may set back
-    _began_s: float | None = None
+    _now_ns: int = 0  # time since the first message by the node's clock, which a simulation may set back
+    _began_ns: int | None = None
 
     @property
     def by_pattern(self) -> bool:
@@ -50,11 +50,11 @@ class Place:
         """Coordinate of a message now; None where messages are counted. ``moved`` is the robot's motion, if known."""
         if self.stream is None or self.stream.moves:
             return moved
-        now_s = node.get_clock().now().nanoseconds * 1e-9
-        if self._began_s is None:
-            self._began_s = now_s
-        self._now_s = max(self._now_s, now_s - self._began_s)
-        return self._now_s * self.stream.unit_hz
+        now_ns = node.get_clock().now().nanoseconds
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        self._now_ns = max(self._now_ns, now_ns - self._began_ns)
+        return self._now_ns / 1e9 * self.stream.unit_hz
 
 
 def places(client: Client | None, topics: Sequence[str], moves: bool) -> list[Place]:
