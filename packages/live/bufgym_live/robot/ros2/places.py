@@ -58,7 +58,7 @@ class Place:
 
 
 def places(client: Client | None, topics: Sequence[str], moves: bool) -> list[Place]:
-    """Number a client's topics, then those of ``topics`` that it does not name.
+    """Number a client's topics, then the other ``topics``.
 
     Raises:
         BufgymError: there is none, or a topic moves and nothing tells how.

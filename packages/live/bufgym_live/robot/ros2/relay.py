@@ -50,7 +50,7 @@ def own_node(name: str, ros_args: Sequence[str] = ()) -> Iterator[Any]:
     """A node of its own context, with arguments as they come after ``--ros-args``.
 
     Raises:
-        BufgymError: ROS 2 does not know such arguments, or a receiver was given a name that hides what it is.
+        BufgymError: ROS 2 does not know such arguments, or a receiver's name lacks ``bufgym_receive``.
     """
     with needs_rclpy():
         import rclpy

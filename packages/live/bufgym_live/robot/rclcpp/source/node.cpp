@@ -27,8 +27,9 @@ using namespace std::chrono_literals;
 using rclcpp_lifecycle::node_interfaces::LifecycleNodeInterface;
 
 // Patterns leave these out, which every node has or which are this node's own.
-const std::vector<std::string> NOT_BY_PATTERN = {"/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics"};
-const char *const RECEIVER = "bufgym_receive";  // its topics are never sent on, so two pairs make no circle
+const std::vector<std::string> NOT_BY_PATTERN = {
+    "/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics"};
+const char *const RECEIVER = "bufgym_receive";  // in its node's name: its topics are never sent on, so two pairs make no circle
 const int64_t LONGEST_NS = INT64_C(1) << 62;
 
 class SenderNode : public rclcpp_lifecycle::LifecycleNode
@@ -38,13 +39,16 @@ public:
 
   explicit SenderNode(const rclcpp::NodeOptions &options) : LifecycleNode("bufgym_sender", options)
   {
-    declare("topics", std::vector<std::string>{}, "Topics to send, also patterns with * and ?; relative names stand in the namespace");
+    declare(
+        "topics", std::vector<std::string>{},
+        "Topics to send, also patterns with * and ?; relative names stand in the namespace");
     declare("host", std::string("127.0.0.1"), "Where bufgym ros2 receive listens; may change at any time");
     declare("port", 7410, "Its port; may change at any time", 1, 65535);
     declare("policy", std::string("learned"), "Which message goes when a queue is full: " + known());
     declare("value", std::string(), "V, one for all nodes of the process: exponential:BASE or saturating:DISTANCE");
     declare("capacity", 15, "L, messages of each queue; also the depth of the subscription", 1, MOST);
-    declare("odometry", std::string(), "Topic of nav_msgs/Odometry from which x is summed; without it x counts messages");
+    declare(
+        "odometry", std::string(), "Topic of nav_msgs/Odometry from which x is summed; without it x counts messages");
     declare("log", std::string(), "Folder for a log of each queue, which bufgym live replay reads");
     declare("autostart", true, "Whether the node configures and activates itself");
     changes_ = add_on_set_parameters_callback(std::bind(&SenderNode::change, this, std::placeholders::_1));
@@ -65,7 +69,9 @@ public:
     policy_ = find(get_parameter("policy").as_string());
     if (!policy_ || !set_value(value))
     {
-      RCLCPP_ERROR(get_logger(), "policy must be one of %s; V = %s must be exponential:BASE or saturating:DISTANCE", known().c_str(), value.c_str());
+      RCLCPP_ERROR(
+          get_logger(), "policy must be one of %s; V = %s must be exponential:BASE or saturating:DISTANCE",
+          known().c_str(), value.c_str());
       return CallbackReturn::FAILURE;
     }
     capacity_ = int(get_parameter("capacity").as_int());
@@ -79,11 +85,13 @@ public:
     if (!odometry.empty())
     {
       motion_ = std::make_unique<Motion>();
-      odometry_ = create_subscription<nav_msgs::msg::Odometry>(odometry, rclcpp::SensorDataQoS().keep_last(100), [this](nav_msgs::msg::Odometry::ConstSharedPtr message) {
-        const auto &p = message->pose.pose.position;
-        const auto &o = message->pose.pose.orientation;
-        motion_->take(message->header.frame_id, rclcpp::Time(message->header.stamp).seconds(), {p.x, p.y, p.z}, {o.x, o.y, o.z, o.w});
-      });
+      odometry_ = create_subscription<nav_msgs::msg::Odometry>(
+          odometry, rclcpp::SensorDataQoS().keep_last(100), [this](nav_msgs::msg::Odometry::ConstSharedPtr message) {
+            const auto &p = message->pose.pose.position;
+            const auto &o = message->pose.pose.orientation;
+            const double time_s = rclcpp::Time(message->header.stamp).seconds();
+            motion_->take(message->header.frame_id, time_s, {p.x, p.y, p.z}, {o.x, o.y, o.z, o.w});
+          });
     }
     look_ = create_wall_timer(200ms, [this] { look(); });
     tell_ = create_wall_timer(1s, [this] { tell(); });
@@ -117,7 +125,8 @@ private:
     rclcpp::GenericSubscription::SharedPtr subscription;
   };
 
-  template <class Default> void declare(const std::string &name, const Default &at, const std::string &about, int64_t from = 0, int64_t to = 0)
+  template <class Default>
+  void declare(const std::string &name, const Default &at, const std::string &about, int64_t from = 0, int64_t to = 0)
   {
     rcl_interfaces::msg::ParameterDescriptor descriptor;
     descriptor.description = about;
@@ -148,7 +157,8 @@ private:
       else if (name == "port")
         to.port = int(one.as_int());
       moves |= name == "host" || name == "port";
-      const bool shapes = name == "topics" || name == "policy" || name == "value" || name == "capacity" || name == "odometry" || name == "log";
+      const bool shapes = name == "topics" || name == "policy" || name == "value" || name == "capacity" ||
+                          name == "odometry" || name == "log";
       if (shapes && get_current_state().id() != lifecycle_msgs::msg::State::PRIMARY_STATE_UNCONFIGURED)
       {
         result.successful = false;
@@ -177,7 +187,9 @@ private:
         continue;
       const bool pattern = name.find_first_of("*?[") != std::string::npos;
       const std::string space = get_namespace(), full = space == "/" ? "/" + name : space + "/" + name;
-      const std::string resolved = !pattern ? get_node_topics_interface()->resolve_topic_name(name) : name[0] == '/' ? name : full;
+      const std::string resolved = !pattern         ? get_node_topics_interface()->resolve_topic_name(name)
+                                   : name[0] == '/' ? name
+                                                    : full;
       for (const auto &[topic, types] : all)
       {
         const bool left_out = pattern && std::count(NOT_BY_PATTERN.begin(), NOT_BY_PATTERN.end(), topic);
@@ -198,7 +210,7 @@ private:
     bool any = false;
     for (const rclcpp::TopicEndpointInfo &one : get_publishers_info_by_topic(name))
     {
-      if (one.node_name() == RECEIVER)
+      if (one.node_name().find(RECEIVER) != std::string::npos)
         continue;
       const rclcpp::QoS &qos = one.qos_profile();
       any = true;
@@ -237,9 +249,10 @@ private:
 
   void subscribe(const Published &topic)
   {
-    rclcpp::QoS qos{rclcpp::KeepLast(size_t(capacity_))};
+    rclcpp::QoS qos{rclcpp::KeepLast(std::max<size_t>(size_t(capacity_), topic.depth))};
     qos.reliability(topic.reliable ? rclcpp::ReliabilityPolicy::Reliable : rclcpp::ReliabilityPolicy::BestEffort);
-    qos.durability(topic.transient_local ? rclcpp::DurabilityPolicy::TransientLocal : rclcpp::DurabilityPolicy::Volatile);
+    qos.durability(
+        topic.transient_local ? rclcpp::DurabilityPolicy::TransientLocal : rclcpp::DurabilityPolicy::Volatile);
     qos.liveliness(topic.manual ? rclcpp::LivelinessPolicy::ManualByTopic : rclcpp::LivelinessPolicy::Automatic);
     if (topic.deadline_ns)
       qos.deadline(rclcpp::Duration(std::chrono::nanoseconds(topic.deadline_ns)));
@@ -263,7 +276,9 @@ private:
         },
         options);
     sendings_[topic.name] = std::move(sending);
-    RCLCPP_INFO(get_logger(), "%s: %s, %s", topic.name.c_str(), topic.type.c_str(), topic.reliable ? "reliable" : "best effort");
+    RCLCPP_INFO(
+        get_logger(), "%s: %s, %s", topic.name.c_str(), topic.type.c_str(),
+        topic.reliable ? "reliable" : "best effort");
   }
 
   void tell()

@@ -392,7 +392,8 @@ void Sender::send(const Message &message)
 {
   const size_t size = message.body->size();
   if (size > most_bytes_)
-    throw Fault("a message of " + std::to_string(size) + " bytes: the receiver takes at most " + std::to_string(most_bytes_));
+    throw Fault(
+        "a message of " + std::to_string(size) + " bytes: the receiver takes at most " + std::to_string(most_bytes_));
   write(header({DATA, uint32_t(size), uint64_t(message.number), uint64_t(message.seq), message.at_us, message.x}), -1);
   write(*message.body, message.number);
   ready(POLLOUT);  // then little of it is unsent
