@@ -1,6 +1,6 @@
 """Classes that stand for messages whose package is not installed, so that rclpy relays them serialized.
 
-rclpy has no generic subscription or publisher. What it needs of a class is its type support, a table of C functions.
+rclpy has no generic subscription or publisher. A class gives it the type support, a table of C functions.
 Serialized messages pass through none of them, so the table of another message does, with names replaced. Fast DDS reads
 names from two tables, one for serializing and one for introspection.
 """
