@@ -173,6 +173,7 @@ class RosSender:
         leaves: Leaves = "sent" if window is None else "acked"
         self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port), leaves)
         self._depth = capacity
+        self._found = asyncio.Event()
         topic, self._odometry = ("", Odometry()) if odometry is None else followed(odometry)
         self._odometry_topic = topic or None
         self._say = say
@@ -191,6 +192,8 @@ class RosSender:
                 await until_one_ends(self.sender.run(), looking, self._tell(node))
 
     async def _tell(self, node: Any) -> None:
+        """Publish each topic's numbers, from the first topic on."""
+        await self._found.wait()
         publish = publisher(node, self._say)
         while True:
             await asyncio.sleep(TELL_S)
@@ -224,6 +227,7 @@ class RosSender:
             deep = replace(topic, depth=max(self._depth, topic.depth)).qos
             kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
             made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
+            self._found.set()
         if topic.name == self._odometry_topic:
             made.append(node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos))
         return made
