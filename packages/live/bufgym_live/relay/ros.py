@@ -14,11 +14,15 @@ from bufgym_live.relay import ros_messages, wire
 from bufgym_live.relay.robot import Robot
 from bufgym_live.robot.ros1 import needs_rospy
 from bufgym_live.robot.ros2.names import Published
-from bufgym_live.robot.ros2.relay import look, matched, own_node, resolved, spinning
+from bufgym_live.robot.ros2.relay import look, matched, own_node, spinning
 
 NODE: Final = "bufgym_robot"
 Outlet = Callable[[bytes], None]
 """Publishes a message in CDR here."""
+
+
+def resolved(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"
 
 
 class _RosSource:
@@ -96,7 +100,7 @@ class Ros2(_RosSource):
 
             self._listen(robot, advertise)
             async with spinning(here):
-                await look(here, self._wanted(robot), subscribe, NODE, robot.client.note)
+                await look(here, lambda: self._wanted(robot), subscribe, NODE, robot.client.note)
 
 
 class Ros1(_RosSource):

@@ -55,18 +55,20 @@ class Side:
         self.executor.spin_once(timeout_sec=0.0)
 
 
+processes: list[subprocess.Popen[str]] = []
+
+
+def start(domain: int, *words: str) -> str:
+    """Start a command of the relay in its domain; its first line."""
+    place = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    command = [sys.executable, "-u", "-m", "bufgym", "ros2", *words]
+    processes.append(subprocess.Popen(command, env=place, stdout=subprocess.PIPE, text=True))
+    stdout = processes[-1].stdout
+    assert stdout is not None
+    return stdout.readline().strip()
+
+
 def main(folder: str) -> None:
-    processes: list[subprocess.Popen[str]] = []
-
-    def start(domain: int, *words: str) -> str:
-        """A command of the relay in its domain; its first line."""
-        place = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
-        command = [sys.executable, "-u", "-m", "bufgym", "ros2", *words]
-        processes.append(subprocess.Popen(command, env=place, stdout=subprocess.PIPE, text=True))
-        stdout = processes[-1].stdout
-        assert stdout is not None
-        return stdout.readline().strip()
-
     robot, base = Side(ROBOT, "robot"), Side(BASE, "base")
     for name, text in CONFIGS.items():
         Path(folder, f"{name}.toml").write_text(text)

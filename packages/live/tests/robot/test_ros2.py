@@ -20,12 +20,16 @@ from ros1_cases import played
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
-from bufgym.scenario import read_client
-from bufgym_live.robot import replay
+from bufgym.model.qoi import exponential
+from bufgym.model.topics import Topic
+from bufgym.scenario import Stream, read_client
+from bufgym_live.robot import PolicyQueue, replay
 from bufgym_live.robot.frames import FrameError
 from bufgym_live.robot.log import of, read_log
 from bufgym_live.robot.ros2 import relay
+from bufgym_live.robot.ros2.diagnostics import Diagnostics
 from bufgym_live.robot.ros2.names import Published, parse
+from bufgym_live.robot.ros2.places import Place, places
 from bufgym_live.robot.ros2.relay import RosSender
 
 REPO = Path(__file__).resolve().parents[4]
@@ -34,7 +38,11 @@ in_ros = pytest.mark.skipif(NO_ROS, reason="needs rclpy (extra ros2), and compil
 
 
 def run(*words: object) -> str:
-    where = {**os.environ, "PYTHONPATH": str(REPO), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    where = {
+        **os.environ,
+        "PYTHONPATH": f"{REPO}:{REPO / 'packages' / 'live'}",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
     return played(where, *words)
 
 
@@ -66,6 +74,25 @@ def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None
 
 @in_ros
 @pytest.mark.nightly
+def test_the_relay_takes_ros_2s_own_words() -> None:
+    """Namespace, remappings at both ends, topics by pattern, all of QoS, /diagnostics; a package that is nowhere."""
+    seen = json.loads(run(REPO / "packages/live/tests/robot/ros2_args_session.py").splitlines()[-1])
+    came = {name: name for name in ("/scan_left", "/scan_right")}
+    assert seen["came"] == {**came, "/robot1/camera": "/front/camera"}
+    assert seen["odd"] == "/odd" and seen["types"] == ["no_such_msgs/msg/Thing"]
+    assert seen["by"] == ["/bufgym_receive_1", "/robot/bufgym_send"]
+    assert seen["qos"] == [[50, 60, 70], "MANUAL_BY_TOPIC"] and seen["reliability"] == "BEST_EFFORT"
+    told = {name: (message, numbers) for name, message, numbers in seen["diagnostics"]}
+    if importlib.util.find_spec("diagnostic_msgs"):
+        topics = ("/front/camera", "/scan_left", "/scan_right", "/odd")
+        assert set(told) == {f"/robot/bufgym_send: {name}" for name in topics}
+    for message, numbers in told.values():
+        assert message == "connected" and numbers["arrived"] == numbers["left"] >= 1
+        assert numbers["QoI"] == pytest.approx(1 + 0.382 * (numbers["left"] - 1))
+
+
+@in_ros
+@pytest.mark.nightly
 def test_an_episode_through_the_relay_is_that_of_the_simulator(tmp_path: Path) -> None:
     run(*VALIDATE, "ros2", "--out", tmp_path)
     assert as_simulated(tmp_path)
@@ -73,13 +100,72 @@ def test_an_episode_through_the_relay_is_that_of_the_simulator(tmp_path: Path) -
 
 def test_a_topic_goes_with_each_of_its_messages() -> None:
     topic = Published("/arm/camera", "sensor_msgs/msg/Image", reliable=False, transient_local=True, depth=15)
+    strict = replace(topic, manual=True, deadline_ns=1, lifespan_ns=2**61, lease_ns=3)
+    assert parse(strict.head()) == (strict, b"")
+    assert parse(replace(strict, lease_ns=2**63 - 1).head())[0].lease_ns == 0  # DDS's "for ever" is no limit
     assert parse(memoryview(topic.head() + b"image")) == (topic, b"image")
-    assert len(topic.head()) == 5 + len("/arm/camera") + len("sensor_msgs/msg/Image")
+    assert len(topic.head()) == 29 + len("/arm/camera") + len("sensor_msgs/msg/Image")
 
 
 @given(st.binary(max_size=60))
 def test_what_is_no_message_of_a_relay_ends_the_connection(body: bytes) -> None:
-    refuse("no message of a relay", parse, b"\x03\x05\0\0\x01" + b"/a;" + body, kind=FrameError)
+    refuse("no message of a relay", parse, b"\x03\x05\0\0\x01" + bytes(24) + b"/a;" + body, kind=FrameError)
+
+
+def test_diagnostics_by_hand() -> None:
+    """Two topics in 4 s: of three messages of the first one is dropped, one has left, one waits for 3 s."""
+    now_s = [0.0]
+    told = Diagnostics([exponential(0.5)] * 2, clock=lambda: now_s[0])
+    queue = PolicyQueue("drop-oldest", 1, topics=[Topic("a"), Topic("b")], log=told, value=exponential(0.5))
+    queue.put("goes", 500_000, 0.0, 0)
+    queue.put("is dropped", 500_000, 1.0, 0)
+    now_s[0] = 1.0
+    queue.put("waits", 500_000, 2.0, 0)
+    queue.get()
+    queue.gone()
+    now_s[0] = 4.0
+    first, second = told.tell()
+    assert first == {
+        **{"arrived": 3, "left": 1, "dropped": 1, "queued": 0, "oldest s": 0.0, "QoI": 1.0},
+        **{"arrived per s": 0.75, "left per s": 0.25, "left Mbit/s": 1.0},
+    }
+    assert set(second.values()) == {0}
+    queue.put("waits behind it", 500_000, 3.0, 0)
+    queue.get()
+    queue.gone()
+    now_s[0] = 6.0
+    first, _ = told.tell()
+    assert (first["left"], first["QoI"], first["left per s"]) == (2, 1.75, 0.5)  # 1 + V(2)
+
+
+def test_places_by_name_and_by_pattern() -> None:
+    """A pattern has eight numbers; names that are taken, of others or of ROS 2 itself, are left out."""
+    node = SimpleNamespace(resolve_topic_name=lambda name: f"/robot/{name}", get_namespace=lambda: "/robot")
+    made = places(None, ["camera", "/scan*", "own*"], moves=False)
+    for place in made:
+        place.resolve(node)
+    published = ["/scan1", "/robot/camera", "/scan2", "/rosout", "/robot/own", "/robot/owner"]
+    for place in made:
+        place.find(published, [one.name for one in made])
+    names = [place.name for place in made]
+    assert names == ["/robot/camera", "/scan1", "/scan2", *[None] * 6, "/robot/own", "/robot/owner", *[None] * 6]
+    every = places(None, ["*"], moves=False)
+    for place in every:
+        place.find(["/rosout", "/clock", "/a"], [one.name for one in every])
+    assert [place.name for place in every[:2]] == ["/a", None]
+    assert every[0].x(node, None) is None and every[0].x(node, 2.5) == 2.5
+    refuse("no topics: name them in --config", places, None, [], False)
+
+
+def test_x_of_a_ruled_topic_is_the_nodes_time() -> None:
+    """At 10 Hz 0.5 s are five steps; a simulation that starts again does not set x back."""
+    now_ns = [0]
+    clock = SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=now_ns[0]))
+    place = Place(Topic("a"), "a", Stream(Topic("a"), rate_hz=10, size_bytes=1))
+    seen = []
+    for now_ns[0] in (7_000_000_000, 7_500_000_000, 0):
+        seen.append(place.x(SimpleNamespace(get_clock=lambda: clock), None))
+    assert seen == [0, 5, 5]
 
 
 def test_topics_that_cannot_be_relayed() -> None:
@@ -118,7 +204,7 @@ async def test_a_topic_is_subscribed_again_when_its_publisher_comes_back_otherwi
     monkeypatch.setattr(relay, "published", published)
     monkeypatch.setattr(relay, "LOOK_S", 0.0)
     node = SimpleNamespace(destroy_subscription=gone.append)
-    looking = asyncio.create_task(relay.look(node, ["/odd", "/camera"], found, "me", told.append))
+    looking = asyncio.create_task(relay.look(node, lambda: ["/odd", "/camera"], found, "me", told.append))
     await asyncio.wait_for(ended.wait(), 10)
     looking.cancel()
     assert [topic.reliable for topic in made] == [True, False] and gone == [camera]
@@ -137,3 +223,23 @@ def test_the_command_names_what_is_wrong(
     for words in (["receive", "--port", "0"], ["send", "--config", str(config)]):
         fails(["ros2", *words], "bufgym_live.robot.ros2 needs rclpy", capsys)
     fails([*VALIDATE[1:], "ros2"], "bufgym_live.robot.ros2 needs rclpy", capsys)
+
+
+@in_ros
+@pytest.mark.nightly
+@pytest.mark.filterwarnings("ignore:module 'sre_")  # a parser of rclpy's imports what Python calls deprecated
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("send --ros-args -p capacity:=7", "no topics: name them in --config"),
+        ("send --ros-args -p capacity:=many", "parameter capacity: "),
+        ("send --ros-args -p topics:=[a] -p value:=linear", "linear"),
+        ("send --ros-args -r a:=", "--ros-args -r a:=: "),
+        ("receive --ros-args -r __node:=ear", "node 'ear': must have bufgym_receive in its name"),
+    ],
+)
+def test_ros_2s_own_words_that_are_wrong(
+    words: str, why: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    fails(["ros2", *words.split()], why, capsys)

@@ -28,18 +28,18 @@ def export(
     /,
     out: str,
     *,
-    to: Literal["safetensors", "c", "roscpp"] = "safetensors",
+    to: Literal["safetensors", "c", "roscpp", "ros2"] = "safetensors",
     weights: WeightOptions = WeightOptions(),
     c: COptions = COptions(),
 ) -> None:
-    """Write a trained agent as a file of weights; a policy in C; or a library for C++ nodes of ROS 1.
+    """Write a trained agent as a file of weights; a policy in C; a library for C++ nodes of ROS 1; a package of ROS 2.
 
     A model.zip holds pickles, so reading it can run any code: export models of your own alone.
 
     Args:
         model: Of a run of train.py: model.safetensors, or model.zip (ppo --network slots). For C: a policy's name, such
-            as afr, or a .safetensors of weights. For roscpp: all, or several of these with commas between.
-        out: File to write; for roscpp a folder of sources, which cmake or catkin compiles on the robot.
+            as afr, or a .safetensors of weights. For roscpp and ros2: all, or several of these with commas between.
+        out: File to write; for roscpp and ros2 a folder of sources, which the robot compiles.
         to: Kind of file.
     """
     if to != "c":
@@ -52,10 +52,10 @@ def export(
     from bufgym_live.robot import c as header
 
     refuse(given(weights), "belongs to --to safetensors")
-    if to == "roscpp":
-        from bufgym_live.robot import roscpp
+    if to in ("roscpp", "ros2"):
+        from bufgym_live.robot import rclcpp, roscpp
 
-        print(f"wrote {roscpp.write(out, roscpp.find(model))}")
+        print(f"wrote {(roscpp if to == 'roscpp' else rclcpp).write(out, roscpp.find(model))}")
         return
     policy = policies.load(model) if model.endswith(".safetensors") else policies.get(model)
     value = qoi.load(c.value or "exponential:0.618")

@@ -1,15 +1,30 @@
 """``bufgym ros2``: a relay between two ROS 2 networks over one uplink that a policy rules."""
 
 import contextlib
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from cyclopts import Parameter
 
 from bufgym.cli.options import Count, PolicyFile, one_policy
+from bufgym.ground.errors import BufgymError
 from bufgym_live.robot.commands import PORT, RECEIVER, Host, Port, Transport, Window, address, listens_at, say
 from bufgym_live.robot.decided_in import Compiled, decide_in_python
+
+RosArgs = Annotated[
+    tuple[str, ...],
+    Parameter(
+        consume_multiple=True,
+        allow_leading_hyphen=True,
+        negative=(),
+        help="ROS 2's own, to the end of the line: -r FROM:=TO, -r __ns:=/robot, -p NAME:=VALUE.",
+    ),
+]
 
 
 async def send(
     *,
-    config: str,
+    config: str | None = None,
     to: str = RECEIVER,
     policies: str | None = None,
     policy_file: PolicyFile = None,
@@ -19,11 +34,15 @@ async def send(
     window: Window = None,
     compiled: Compiled = False,
     log: str | None = None,
+    ros_args: RosArgs = (),
 ) -> None:
     """On the robot: subscribe, and send over one uplink; Ctrl-C ends it.
 
+    Parameters of its node are `topics` (names or patterns as /scan*), `policy`, `value`, `capacity`, `odometry`, `host`
+    and `port`; they come before options, and `qos_overrides./TOPIC.subscription.depth` and the like before all.
+
     Args:
-        config: Topics, as in examples/client.toml.
+        config: Topics with rates and priorities, as in examples/client.toml.
         to: HOST:PORT of the receiver.
         policies: The policy, as in bench (default: afr; for several topics learned-scheduler).
         capacity: L, messages.
@@ -31,32 +50,71 @@ async def send(
         log: Log every decision to this file (.mcap), for live replay.
     """
     decide_in_python(unless=compiled)
+    from bufgym.model import qoi
     from bufgym.scenario import read_client
     from bufgym_live.robot import LogFile
-    from bufgym_live.robot.ros2.relay import RosSender
+    from bufgym_live.robot.ros2.relay import SENDER, RosSender, own_node
 
-    client = read_client(config)
-    policy = one_policy(policies or ("afr" if len(client.streams) == 1 else "learned-scheduler"), policy_file)
+    client = None if config is None else read_client(config)
+    if policies is not None:
+        one_policy(policies, policy_file)
     host, port = address(to)
     with contextlib.ExitStack() as stack:
-        file = None if log is None else stack.enter_context(LogFile(log))
+        node = stack.enter_context(own_node(SENDER, ros_args))
+        options = {"policy": policies or "", "value": "", "capacity": capacity, "odometry": odom or ""}
+        told = _parameters(node, {"topics": [""], **options, "host": host, "port": port})
         robot = RosSender(
             client,
-            host,
-            port,
-            policy=policy,
-            capacity=capacity,
-            odometry=odom,
+            told["host"],
+            told["port"],
+            topics=[name for name in told["topics"] if name],
+            policy=one_policy(told["policy"], policy_file) if told["policy"] else None,
+            capacity=told["capacity"],
+            value=qoi.load(told["value"]) if told["value"] else None,
+            odometry=told["odometry"] or None,
             transport=transport,
             window=window,
-            log=file,
+            log=None if log is None else stack.enter_context(LogFile(log)),
             say=say,
         )
-        await robot.run()
+        await robot.run(node)
+
+
+_ABOUT = {
+    "topics": "Names, or patterns with * and ?, besides the topics in --config",
+    "policy": "Which message goes when the queue is full; empty: afr for one topic, learned-scheduler for several",
+    "value": "V of topics without one, as exponential:0.618 or saturating:4",
+    "capacity": "L, messages of all topics together",
+    "odometry": "Topic with poses, which gives x to the topics that move",
+    "host": "Where bufgym ros2 receive listens",
+    "port": "Its port",
+}
+"""The node's parameters."""
+
+
+def _parameters(node: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Declare the node's parameters; return what the user set them to."""
+    from rcl_interfaces.msg import ParameterDescriptor
+    from rclpy.exceptions import ParameterException
+
+    told = {}
+    for name, default in defaults.items():
+        try:
+            about = ParameterDescriptor(description=_ABOUT[name], read_only=True)
+            told[name] = node.declare_parameter(name, default, about).value
+        except ParameterException as error:
+            raise BufgymError(f"parameter {name}: {error}") from None
+    return told
 
 
 async def receive(
-    at: str | None = None, /, *, port: Port = PORT, host: Host = "127.0.0.1", transport: Transport = "tcp"
+    at: str | None = None,
+    /,
+    *,
+    port: Port = PORT,
+    host: Host = "127.0.0.1",
+    transport: Transport = "tcp",
+    ros_args: RosArgs = (),
 ) -> None:
     """At the other end: receive and republish; Ctrl-C ends it.
 
@@ -67,4 +125,4 @@ async def receive(
     from bufgym_live.robot.ros2 import relay
 
     host, port = listens_at(at, host, port)
-    await relay.receive(port, host, transport, say)
+    await relay.receive(port, host, transport, say, ros_args)

@@ -1,6 +1,6 @@
 """Topic information that a relay sends with each message: name, type and quality of service.
 
-It takes some 60 bytes. Every message has it, so that either end may restart at any time.
+It takes some 90 bytes. Every message has it, so that either end may restart at any time.
 """
 
 import importlib
@@ -13,11 +13,13 @@ from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError, install
 from bufgym_live.robot.frames import FrameError
+from bufgym_live.robot.ros2.uninstalled import stand_in
 
 DEPTH: Final = 10  # Default history depth, because DDS does not announce a publisher's own
 _MAX_NAME_BYTES: Final = 255
-_HEAD: Final = struct.Struct("!BBBH")  # bytes of name and type, flags, depth
-_RELIABLE, _TRANSIENT_LOCAL = 1, 2
+_HEAD: Final = struct.Struct("!BBBHQQQ")  # bytes of name and type, flags, depth, deadline, lifespan, lease
+_RELIABLE, _TRANSIENT_LOCAL, _MANUAL = 1, 2, 4
+_LONGEST_NS: Final = 2**62  # more is no limit, as DDS says it
 _NAME: Final = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _TYPE: Final = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)
 
@@ -42,6 +44,10 @@ class Published:
     reliable: bool = True
     transient_local: bool = False
     depth: int = DEPTH
+    manual: bool = False  # liveliness by topic, asserted by publishing; otherwise automatic
+    deadline_ns: int = 0  # longest time between two messages; 0 is none, as in the two below
+    lifespan_ns: int = 0  # age at which a message is worth nothing
+    lease_ns: int = 0  # of its liveliness
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name) or len(self.name) > _MAX_NAME_BYTES:
@@ -52,12 +58,20 @@ class Published:
     @property
     def qos(self) -> Any:
         """The ``QoSProfile`` to subscribe and to republish with."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+        from rclpy.duration import Duration, Infinite
+        from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+
+        def lasting(ns: int) -> Any:
+            return Duration(nanoseconds=ns) if ns else Infinite
 
         return QoSProfile(
             depth=max(1, self.depth),
             reliability=ReliabilityPolicy.RELIABLE if self.reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.transient_local else DurabilityPolicy.VOLATILE,
+            deadline=lasting(self.deadline_ns),
+            lifespan=lasting(self.lifespan_ns),
+            liveliness=LivelinessPolicy.MANUAL_BY_TOPIC if self.manual else LivelinessPolicy.AUTOMATIC,
+            liveliness_lease_duration=lasting(self.lease_ns),
         )
 
     @property
@@ -69,11 +83,20 @@ class Published:
         except (ModuleNotFoundError, AttributeError):
             raise BufgymError(f"topic {self.name}: messages of {self.type}, which is not installed here") from None
 
+    @property
+    def serialized_class(self) -> Any:
+        """Class to relay its messages with, as bytes; one that stands in for it if their package is not installed."""
+        try:
+            return self.message_class
+        except BufgymError:
+            return stand_in(self.type)
+
     def head(self) -> bytes:
         """Header sent before each of its messages."""
         name, kind = self.name.encode(), self.type.encode()
-        flags = _RELIABLE * self.reliable | _TRANSIENT_LOCAL * self.transient_local
-        return _HEAD.pack(len(name), len(kind), flags, min(self.depth, 2**16 - 1)) + name + kind
+        flags = _RELIABLE * self.reliable | _TRANSIENT_LOCAL * self.transient_local | _MANUAL * self.manual
+        times = self.deadline_ns, self.lifespan_ns, self.lease_ns
+        return _HEAD.pack(len(name), len(kind), flags, min(self.depth, 2**16 - 1), *times) + name + kind
 
 
 def parse(body: bytes | memoryview) -> tuple[Published, bytes]:
@@ -83,30 +106,40 @@ def parse(body: bytes | memoryview) -> tuple[Published, bytes]:
         FrameError: no relay sends such bytes.
     """
     try:
-        name_bytes, type_bytes, flags, depth = _HEAD.unpack_from(body)
+        name_bytes, type_bytes, flags, depth, *times = _HEAD.unpack_from(body)
         start, end = _HEAD.size + name_bytes, _HEAD.size + name_bytes + type_bytes
         name, kind = bytes(body[_HEAD.size : start]).decode(), bytes(body[start:end]).decode()
-        topic = Published(name, kind, bool(flags & _RELIABLE), bool(flags & _TRANSIENT_LOCAL), depth)
+        ruled = [bool(flags & bit) for bit in (_RELIABLE, _TRANSIENT_LOCAL, _MANUAL)]
+        limits = [ns if ns < _LONGEST_NS else 0 for ns in times]
+        topic = Published(name, kind, ruled[0], ruled[1], depth, ruled[2], *limits)
     except (struct.error, UnicodeDecodeError, BufgymError) as error:
         raise FrameError(f"no message of a relay: {error}") from None
     return topic, bytes(body[end:])
 
 
 def published(node: Any, name: str, but_not: str) -> Published | None:
-    """Find the topic as the node sees it; None while only nodes named ``but_not`` publish it.
+    """Find the topic as the node sees it; None while only nodes with ``but_not`` in their names publish it.
 
-    It is best effort if any publisher is, and transient local if all are, so that one subscription gets them all.
+    It is best effort if any publisher is, and transient local if all are, so that one subscription gets them all. So
+    with deadline, lifespan and liveliness: the weakest promise of any publisher.
     """
-    found = [one for one in node.get_publishers_info_by_topic(name) if one.node_name != but_not]
+    found = [one for one in node.get_publishers_info_by_topic(name) if but_not not in one.node_name]
     if not found:
         return None
-    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+    from rclpy.qos import DurabilityPolicy, LivelinessPolicy, ReliabilityPolicy
 
     qualities = [one.qos_profile for one in found]
+
+    def weakest(duration: str) -> int:
+        longest = max(int(getattr(quality, duration).nanoseconds) for quality in qualities)
+        return longest if longest < _LONGEST_NS else 0
+
     return Published(
         name,
         found[0].topic_type,
         all(quality.reliability == ReliabilityPolicy.RELIABLE for quality in qualities),
         all(quality.durability == DurabilityPolicy.TRANSIENT_LOCAL for quality in qualities),
         max(quality.depth for quality in qualities) or DEPTH,
+        all(quality.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC for quality in qualities),
+        *map(weakest, ("deadline", "lifespan", "liveliness_lease_duration")),
     )

@@ -8,12 +8,15 @@ way through a second pair with ``no_drop`` topics.
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
+from bufgym.model import qoi
+from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Client
 from bufgym_live.robot import LogFile, PolicyQueue
@@ -21,30 +24,47 @@ from bufgym_live.robot.channels import TRANSPORTS
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.odometry import Odometry, followed
 from bufgym_live.robot.receiver import Received, Receiver
+from bufgym_live.robot.ros2.diagnostics import Diagnostics, publisher
 from bufgym_live.robot.ros2.names import Published, needs_rclpy, parse, published
+from bufgym_live.robot.ros2.places import places
 from bufgym_live.robot.sender import Leaves, Sender
 from bufgym_live.robot.tasks import until_one_ends
 
 SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 """Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
 LOOK_S: Final = 0.2  # Time between two searches for publishers
+TELL_S: Final = 1.0  # Time between two messages on /diagnostics
 _MATCH_S: Final = 1.0  # longest wait of a new publisher's first message for a subscriber
 
 
-def resolved(name: str) -> str:
-    return name if name.startswith("/") else f"/{name}"
+def overriding() -> Any:
+    """Let parameters such as ``qos_overrides./camera.subscription.depth`` change any quality of service."""
+    from rclpy.qos import QoSPolicyKind
+    from rclpy.qos_overriding_options import QoSOverridingOptions
+
+    return QoSOverridingOptions([kind for kind in QoSPolicyKind if kind.name != "INVALID"])
 
 
 @contextmanager
-def own_node(name: str) -> Iterator[Any]:
-    """A node of its own context."""
+def own_node(name: str, ros_args: Sequence[str] = ()) -> Iterator[Any]:
+    """A node of its own context, with arguments as they come after ``--ros-args``.
+
+    Raises:
+        BufgymError: ROS 2 does not know such arguments, or a receiver's name lacks ``bufgym_receive``.
+    """
     with needs_rclpy():
         import rclpy
         from rclpy.signals import SignalHandlerOptions
     context = rclpy.Context()
-    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node(name, context=context, enable_rosout=False, start_parameter_services=False)
+    words = ["--ros-args", *ros_args] if ros_args else []
     try:
+        rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy's own, of several kinds
+        raise BufgymError(f"--ros-args {' '.join(ros_args)}: {str(error).partition(', at ')[0]}") from None
+    node = rclpy.create_node(name, context=context, enable_rosout=False)
+    try:
+        if name == RECEIVER and RECEIVER not in node.get_name():
+            raise BufgymError(f"node {node.get_name()!r}: must have {RECEIVER} in its name, or senders make a circle")
         yield node
     finally:
         node.destroy_node()
@@ -72,17 +92,21 @@ async def spinning(node: Any) -> AsyncIterator[None]:
 
 
 async def look(
-    node: Any, names: Sequence[str], found: Callable[[Published], list[Any]], but_not: str, say: Callable[[str], None]
+    node: Any,
+    names: Callable[[], Iterable[str]],
+    found: Callable[[Published], list[Any]],
+    but_not: str,
+    say: Callable[[str], None],
 ) -> None:
-    """Call ``found`` for each of these topics that has a publisher not named ``but_not``; never return.
+    """Call ``found`` for each of these topics that has a publisher without ``but_not`` in its name; never return.
 
     ``found`` returns its subscriptions. Where publishers come back with another type or quality of service, these are
-    destroyed and it is called again. A topic whose messages are not installed here is left out, and told once.
+    destroyed and it is called again. A topic that can't be subscribed to is left out, and told once.
     """
     known: dict[str, Published] = {}
     made: dict[str, list[Any]] = {}
     while True:
-        for name in names:
+        for name in names():
             topic = published(node, name, but_not)
             if topic is None or topic == known.get(name):
                 continue
@@ -97,16 +121,18 @@ async def look(
 
 
 class RosSender:
-    """The sending end, which sends the topics of ``client`` over one uplink to ``host`` and ``port``."""
+    """The sending end, which sends topics over one uplink to ``host`` and ``port``."""
 
     def __init__(
         self,
-        client: Client,
+        client: Client | None,
         host: str,
         port: int,
         *,
-        policy: str | Policy = "learned-scheduler",
+        topics: Sequence[str] = (),
+        policy: str | Policy | None = None,
         capacity: int = 32,
+        value: Value | None = None,
         odometry: str | None = None,
         transport: str = "tcp",
         window: int | None = None,
@@ -116,69 +142,118 @@ class RosSender:
         """
         Args:
             client: topics with their rules; ``bufgym.scenario.read_client`` reads one.
-            policy: a drop rule for one topic, a scheduler for several.
-            capacity: L, messages of all topics together.
+            topics: more topics, without rules; their x is the motion with ``odometry``, otherwise it counts messages.
+                A name with ``*`` or ``?``, here or in ``client``, is a pattern, and stands for up to 8 topics.
+            policy: a drop rule for one topic, a scheduler for several; None: afr or learned-scheduler.
+            capacity: L, messages of all topics together, and the least depth of each subscription.
+            value: V of topics without one; None: the client's, or 1 - 0.618^d.
             odometry: a topic with poses, which gives x to topics that move; x of other topics is time. The poses of one
                 frame count (TOPIC:FRAME, of tf TOPIC:PARENT:CHILD, else that of the first).
             window: n_T, messages sent and not yet acked by the receiver, at most; None: as many as fill the link.
             say: called with a line for each topic found.
         """
-        moving = [stream.topic.name for stream in client.streams if stream.moves]
-        if moving and odometry is None:
-            raise BufgymError(f"topic {moving[0]!r}: moves, which needs a topic with odometry")
+        self._places = places(client, topics, odometry is not None)
+        value = value or (qoi.exponential() if client is None else client.value)
+        rules = [place.topic for place in self._places]
+        self._diagnostics = Diagnostics([topic.value or value for topic in rules])
+
+        def record(one: Record) -> None:
+            self._diagnostics(one)
+            if log is not None:
+                log(one)
+
         self.queue = PolicyQueue(
-            policy, capacity, value=client.value, topics=client.topics, window=window or 1, log=log
+            policy or ("afr" if len(rules) == 1 else "learned-scheduler"),
+            capacity,
+            value=value,
+            topics=rules,
+            window=window or 1,
+            log=record,
         )
         leaves: Leaves = "sent" if window is None else "acked"
         self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port), leaves)
-        self._streams = client.streams
-        self._numbers = {resolved(stream.topic.name): number for number, stream in enumerate(client.streams)}
+        self._depth = capacity
+        self._found = asyncio.Event()
         topic, self._odometry = ("", Odometry()) if odometry is None else followed(odometry)
-        self._odometry_topic = resolved(topic) if topic else None
-        self._began_s = time.monotonic()
+        self._odometry_topic = topic or None
         self._say = say
 
-    async def run(self) -> None:
-        """Relay until cancelled."""
-        with own_node(SENDER) as node:
-            names = [*self._numbers, *([] if self._odometry_topic is None else [self._odometry_topic])]
+    async def run(self, node: Any = None) -> None:
+        """Relay until cancelled, with a node of its own unless one is given."""
+        if node is None:
+            with own_node(SENDER) as own:
+                await self.run(own)
+        else:
+            self._odometry_topic = self._odometry_topic and node.resolve_topic_name(self._odometry_topic)
+            for place in self._places:
+                place.resolve(node)
             async with spinning(node):
-                found = partial(self._subscribe, node)
-                await until_one_ends(self.sender.run(), look(node, names, found, RECEIVER, self._say))
+                looking = look(node, partial(self._names, node), partial(self._subscribe, node), RECEIVER, self._say)
+                await until_one_ends(self.sender.run(), looking, self._tell(node))
+
+    async def _tell(self, node: Any) -> None:
+        """Publish each topic's numbers, from the first topic on."""
+        await self._found.wait()
+        publish = publisher(node, self._say)
+        while True:
+            await asyncio.sleep(TELL_S)
+            numbers = zip(self._places, self._diagnostics.tell(), strict=True)
+            faults = self.sender.faults
+            fault = (
+                "" if self.sender.connected.is_set() else f"not connected: {faults[-1] if faults else 'no answer yet'}"
+            )
+            publish({place.name: told for place, told in numbers if place.name is not None}, fault)
+
+    def _names(self, node: Any) -> list[str]:
+        """Names of the topics to look for; topics that a pattern fits take one of its places."""
+        if any(place.name is None for place in self._places):
+            published = [name for name, _ in node.get_topic_names_and_types()]
+            for place in self._places:
+                place.find(published, [one.name for one in self._places])
+        names = [place.name for place in self._places if place.name is not None]
+        return names if self._odometry_topic is None else [*names, self._odometry_topic]
 
     def _subscribe(self, node: Any, topic: Published) -> list[Any]:
-        subscribe = partial(node.create_subscription, topic.message_class, topic.name)
         made = []
         self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
-        number = self._numbers.get(topic.name)
+        number = next((k for k, place in enumerate(self._places) if place.name == topic.name), None)
         if number is not None:
-            stream, head = self._streams[number], topic.head()
+            place, head = self._places[number], topic.head()
 
             def put(message: bytes) -> None:
-                x = self._odometry.x if stream.moves else (time.monotonic() - self._began_s) * stream.unit_hz
-                self.queue.put(head + message, len(head) + len(message), x, number)
+                moved = None if self._odometry_topic is None else self._odometry.x
+                self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
 
-            made.append(subscribe(put, topic.qos, raw=True))
+            deep = replace(topic, depth=max(self._depth, topic.depth)).qos
+            kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
+            made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
+            self._found.set()
         if topic.name == self._odometry_topic:
-            made.append(subscribe(self._odometry.take, topic.qos))
+            made.append(node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos))
         return made
 
 
 async def receive(
-    port: int, host: str = "127.0.0.1", transport: str = "tcp", say: Callable[[str], None] = lambda text: None
+    port: int,
+    host: str = "127.0.0.1",
+    transport: str = "tcp",
+    say: Callable[[str], None] = lambda text: None,
+    ros_args: Sequence[str] = (),
 ) -> None:
     """Run the other end: republish messages with their publishers' quality of service, until cancelled.
 
-    Messages of a type that is not installed here are reported once and dropped.
+    Messages whose package is not installed here are republished as they came. What ROS 2 can't publish is reported once
+    and dropped.
     """
-    with own_node(RECEIVER) as node:
+    with own_node(RECEIVER, ros_args) as node:
         publishers: dict[Published, Any] = {}
 
         async def republish(message: Received) -> None:
             topic, body = parse(message.body)
             if topic not in publishers:
                 try:
-                    publishers[topic] = node.create_publisher(topic.message_class, topic.name, topic.qos)
+                    kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
+                    publishers[topic] = node.create_publisher(kind, topic.name, topic.qos, **options)
                     say(f"{topic.name}: {topic.type}")
                 except BufgymError as error:
                     publishers[topic] = None

@@ -6,7 +6,7 @@ The AFR paper's own program is a changed roscpp, and leaves an interface to choo
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +19,8 @@ from bufgym.traces.formats.text import write_text
 from bufgym_live.robot.c.header import SUPPORTED, header
 
 _SOURCE: Final = Path(__file__).with_name("source")
+SHARED: Final = {name: _SOURCE / name for name in ("log.h", "motion.h", "policy.cpp", "policy.h")}
+"""Files without ROS 1."""
 _CAPACITY: Final = 64  # ``MOST`` of policy.h
 
 _QUEUE: Final = """
@@ -38,18 +40,22 @@ def find(text: str) -> list[Policy]:
     return [policies.load(name) if name.endswith(".safetensors") else policies.get(name) for name in names]
 
 
-def write(folder: str | Path, chosen: Sequence[Policy]) -> Path:
+def write(folder: str | Path, chosen: Sequence[Policy], files: Mapping[str, Path] | None = None) -> Path:
     """Write the library's source with these policies to a folder: C++, CMakeLists.txt, package.xml.
+
+    ``files`` are those of another package by their names in the folder, in place of this library's.
 
     Raises:
         BufgymError: a policy has no C, or the folder cannot be written.
     """
     folder = Path(folder)
+    files = {file.name: file for file in _SOURCE.iterdir()} if files is None else files
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for name in files:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BufgymError(f"{folder}: {error.strerror or error}") from None
-    texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(_SOURCE.iterdir())}
+    texts = {name: file.read_text(encoding="utf-8") for name, file in sorted(files.items())}
     texts["package.xml"] = texts["package.xml"].replace("@VERSION@", __version__)
     queues, table = "", ""
     for policy in chosen:

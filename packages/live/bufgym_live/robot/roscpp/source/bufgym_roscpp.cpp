@@ -20,8 +20,12 @@
 #include <sys/socket.h>
 
 #include <boost/bind/bind.hpp>
+#include <nav_msgs/Odometry.h>
+#include <ros/callback_queue.h>
 #include <ros/connection.h>
+#include <ros/node_handle.h>
 #include <ros/publication.h>
+#include <ros/spinner.h>
 #include <ros/transport/transport_tcp.h>
 #define private public  // the functions below are members of the class and use its members
 #include <ros/transport_subscriber_link.h>
@@ -51,10 +55,34 @@ const bufgym::Settings &settings()
   return *all;
 }
 
+// x by a topic, subscribed on a queue and a thread of its own: the node need not spin.
+struct Odometry
+{
+  bufgym::Motion motion;
+  ros::CallbackQueue callbacks;
+  ros::Subscriber subscriber;
+  ros::AsyncSpinner spinner{1, &callbacks};
+
+  explicit Odometry(const std::string &topic)
+  {
+    ros::NodeHandle node;
+    node.setCallbackQueue(&callbacks);
+    subscriber = node.subscribe(topic, 100, &Odometry::take, this);
+    spinner.start();
+  }
+
+  void take(const nav_msgs::Odometry::ConstPtr &message)
+  {
+    const auto &p = message->pose.pose.position;
+    const auto &o = message->pose.pose.orientation;
+    motion.take(message->header.frame_id, message->header.stamp.toSec(), {p.x, p.y, p.z}, {o.x, o.y, o.z, o.w});
+  }
+};
+
 bufgym::Motion *motion()
 {
-  static bufgym::Motion *all = settings().odometry.empty() ? nullptr : new bufgym::Motion(settings().odometry);
-  return all;
+  static auto *all = settings().odometry.empty() ? nullptr : new Odometry(settings().odometry);
+  return all ? &all->motion : nullptr;
 }
 
 int64_t now_us()

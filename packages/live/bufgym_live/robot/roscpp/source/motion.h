@@ -1,14 +1,10 @@
 // x: how far the scene has moved on, in fields of view, summed from a robot's odometry (bufgym_live/robot/odometry.py).
 #ifndef BUFGYM_ROSCPP_MOTION_H
 #define BUFGYM_ROSCPP_MOTION_H
+#include <algorithm>
 #include <cmath>
 #include <mutex>
 #include <string>
-
-#include <nav_msgs/Odometry.h>
-#include <ros/callback_queue.h>
-#include <ros/node_handle.h>
-#include <ros/spinner.h>
 
 namespace bufgym
 {
@@ -17,35 +13,23 @@ class Motion
 public:
   static constexpr double FIELD_OF_VIEW = 60.0 * M_PI / 180.0, SCENE_M = 2.0, RATE_HZ = 30.0;
 
-  // Subscribe on a queue and a thread of its own: the node need not spin.
-  explicit Motion(const std::string &topic) : spinner_(1, &callbacks_)
-  {
-    ros::NodeHandle node;
-    node.setCallbackQueue(&callbacks_);
-    subscriber_ = node.subscribe(topic, 100, &Motion::take, this);
-    spinner_.start();
-  }
-
   double x()
   {
     std::lock_guard<std::mutex> lock(mutex_);
     return x_;
   }
 
-private:
-  void take(const nav_msgs::Odometry::ConstPtr &message)
+  // Take a pose: stamp, place, and turn as a quaternion x, y, z, w.
+  void take(const std::string &frame, double time_s, const double (&place)[3], const double (&turned)[4])
   {
-    const auto &p = message->pose.pose.position;
-    const auto &o = message->pose.pose.orientation;
-    double turn[4] = {o.x, o.y, o.z, o.w}, place[3] = {p.x, p.y, p.z};
+    double turn[4] = {turned[0], turned[1], turned[2], turned[3]};
     const double norm = std::sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2] + turn[3] * turn[3]);
     if (!(norm > 0.9 && norm < 1.1 && std::isfinite(place[0] + place[1] + place[2])))
       return;  // some drivers send zeros at first
     for (double &part : turn)
       part /= norm;
-    const double time_s = message->header.stamp.toSec();
     std::lock_guard<std::mutex> lock(mutex_);
-    if (message->header.frame_id != frame_ && known_)
+    if (frame != frame_ && known_)
       return;  // poses of one frame count, the first one's
     if (known_ && time_s >= time_s_)
     {
@@ -65,20 +49,18 @@ private:
       // By the half-angle's tangent: an arc cosine would lose small angles.
       x_ += 4 * std::atan2(std::sqrt(apart), std::sqrt(along)) / FIELD_OF_VIEW + std::sqrt(moved) / SCENE_M;
     }
-    frame_ = message->header.frame_id;
+    frame_ = frame;
     time_s_ = time_s;
     std::copy(turn, turn + 4, turn_);
     std::copy(place, place + 3, place_);
     known_ = true;
   }
 
+private:
   std::mutex mutex_;
   bool known_ = false;
   std::string frame_;
   double x_ = 0, time_s_ = 0, turn_[4], place_[3];
-  ros::CallbackQueue callbacks_;
-  ros::Subscriber subscriber_;
-  ros::AsyncSpinner spinner_;
 };
 }
 #endif

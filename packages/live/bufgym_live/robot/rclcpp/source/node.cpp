@@ -1,0 +1,334 @@
+// bufgym::SenderNode: a component with a lifecycle, which sends topics of any type. Each topic has a queue under a
+// policy and a connection of its own to `bufgym ros2 receive`.
+#include <fnmatch.h>
+
+#include <algorithm>
+#include <chrono>
+#include <functional>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include <diagnostic_msgs/msg/diagnostic_array.hpp>
+#include <lifecycle_msgs/msg/state.hpp>
+#include <nav_msgs/msg/odometry.hpp>
+#include <rclcpp/create_generic_subscription.hpp>
+#include <rclcpp/rclcpp.hpp>
+#include <rclcpp_components/register_node_macro.hpp>
+#include <rclcpp_lifecycle/lifecycle_node.hpp>
+
+#include "motion.h"
+#include "sender.h"
+
+namespace bufgym
+{
+using namespace std::chrono_literals;
+using rclcpp_lifecycle::node_interfaces::LifecycleNodeInterface;
+
+// Patterns leave these out, which every node has or which are this node's own.
+const std::vector<std::string> NOT_BY_PATTERN = {
+    "/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics"};
+const char *const RECEIVER = "bufgym_receive";  // in its node's name: its topics are never sent on, so two pairs make no circle
+const int64_t LONGEST_NS = INT64_C(1) << 62;
+
+class SenderNode : public rclcpp_lifecycle::LifecycleNode
+{
+public:
+  using CallbackReturn = LifecycleNodeInterface::CallbackReturn;
+
+  explicit SenderNode(const rclcpp::NodeOptions &options) : LifecycleNode("bufgym_sender", options)
+  {
+    declare(
+        "topics", std::vector<std::string>{},
+        "Topics to send, also patterns with * and ?; relative names stand in the namespace");
+    declare("host", std::string("127.0.0.1"), "Where bufgym ros2 receive listens; may change at any time");
+    declare("port", 7410, "Its port; may change at any time", 1, 65535);
+    declare("policy", std::string("learned"), "Which message goes when a queue is full: " + known());
+    declare("value", std::string(), "V, one for all nodes of the process: exponential:BASE or saturating:DISTANCE");
+    declare("capacity", 15, "L, messages of each queue; also the depth of the subscription", 1, MOST);
+    declare(
+        "odometry", std::string(), "Topic of nav_msgs/Odometry from which x is summed; without it x counts messages");
+    declare("log", std::string(), "Folder for a log of each queue, which bufgym live replay reads");
+    declare("autostart", true, "Whether the node configures and activates itself");
+    changes_ = add_on_set_parameters_callback(std::bind(&SenderNode::change, this, std::placeholders::_1));
+    if (get_parameter("autostart").as_bool())
+      start_ = create_wall_timer(0s, [this] {
+        start_->cancel();
+        configure();
+        activate();
+      });
+  }
+
+  CallbackReturn on_configure(const rclcpp_lifecycle::State &) override
+  {
+    const std::string odometry = get_parameter("odometry").as_string();
+    std::string value = get_parameter("value").as_string();
+    if (value.empty())
+      value = odometry.empty() ? "exponential:0.618" : "exponential:0.36787944117144233";
+    policy_ = find(get_parameter("policy").as_string());
+    if (!policy_ || !set_value(value))
+    {
+      RCLCPP_ERROR(
+          get_logger(), "policy must be one of %s; V = %s must be exponential:BASE or saturating:DISTANCE",
+          known().c_str(), value.c_str());
+      return CallbackReturn::FAILURE;
+    }
+    capacity_ = int(get_parameter("capacity").as_int());
+    diagnostics_ = create_publisher<diagnostic_msgs::msg::DiagnosticArray>("/diagnostics", 10);
+    return CallbackReturn::SUCCESS;
+  }
+
+  CallbackReturn on_activate(const rclcpp_lifecycle::State &state) override
+  {
+    const std::string odometry = get_parameter("odometry").as_string();
+    if (!odometry.empty())
+    {
+      motion_ = std::make_unique<Motion>();
+      odometry_ = create_subscription<nav_msgs::msg::Odometry>(
+          odometry, rclcpp::SensorDataQoS().keep_last(100), [this](nav_msgs::msg::Odometry::ConstSharedPtr message) {
+            const auto &p = message->pose.pose.position;
+            const auto &o = message->pose.pose.orientation;
+            const double time_s = rclcpp::Time(message->header.stamp).seconds();
+            motion_->take(message->header.frame_id, time_s, {p.x, p.y, p.z}, {o.x, o.y, o.z, o.w});
+          });
+    }
+    look_ = create_wall_timer(200ms, [this] { look(); });
+    tell_ = create_wall_timer(1s, [this] { tell(); });
+    return LifecycleNode::on_activate(state);
+  }
+
+  CallbackReturn on_deactivate(const rclcpp_lifecycle::State &state) override
+  {
+    stop();
+    return LifecycleNode::on_deactivate(state);
+  }
+
+  CallbackReturn on_cleanup(const rclcpp_lifecycle::State &) override
+  {
+    diagnostics_.reset();
+    return CallbackReturn::SUCCESS;
+  }
+
+  CallbackReturn on_shutdown(const rclcpp_lifecycle::State &) override
+  {
+    stop();
+    diagnostics_.reset();
+    return CallbackReturn::SUCCESS;
+  }
+
+private:
+  struct Sending
+  {
+    Published topic;
+    std::unique_ptr<Sender> sender;
+    rclcpp::GenericSubscription::SharedPtr subscription;
+  };
+
+  template <class Default>
+  void declare(const std::string &name, const Default &at, const std::string &about, int64_t from = 0, int64_t to = 0)
+  {
+    rcl_interfaces::msg::ParameterDescriptor descriptor;
+    descriptor.description = about;
+    if (to)
+    {
+      descriptor.integer_range.resize(1);
+      descriptor.integer_range[0].from_value = from;
+      descriptor.integer_range[0].to_value = to;
+      descriptor.integer_range[0].step = 1;
+    }
+    declare_parameter(name, at, descriptor);
+  }
+
+  Address address() { return {get_parameter("host").as_string(), int(get_parameter("port").as_int())}; }
+
+  // host and port move the connections. The others shape queues, so the node must not be configured.
+  rcl_interfaces::msg::SetParametersResult change(const std::vector<rclcpp::Parameter> &parameters)
+  {
+    rcl_interfaces::msg::SetParametersResult result;
+    result.successful = true;
+    Address to = address();
+    bool moves = false;
+    for (const rclcpp::Parameter &one : parameters)
+    {
+      const std::string &name = one.get_name();
+      if (name == "host")
+        to.host = one.as_string();
+      else if (name == "port")
+        to.port = int(one.as_int());
+      moves |= name == "host" || name == "port";
+      const bool shapes = name == "topics" || name == "policy" || name == "value" || name == "capacity" ||
+                          name == "odometry" || name == "log";
+      if (shapes && get_current_state().id() != lifecycle_msgs::msg::State::PRIMARY_STATE_UNCONFIGURED)
+      {
+        result.successful = false;
+        result.reason = name + ": deactivate and clean up the node first";
+      }
+      else if (name == "policy" && !find(one.as_string()))
+      {
+        result.successful = false;
+        result.reason = "policy " + one.as_string() + ": must be one of " + known();
+      }
+    }
+    if (result.successful && moves)
+      for (auto &[topic, sending] : sendings_)
+        sending.sender->move(to);
+    return result;
+  }
+
+  // The wanted topics that somebody publishes, with their types.
+  std::map<std::string, std::string> wanted()
+  {
+    const auto all = get_topic_names_and_types();
+    std::map<std::string, std::string> found;
+    for (const std::string &name : get_parameter("topics").as_string_array())
+    {
+      if (name.empty())
+        continue;
+      const bool pattern = name.find_first_of("*?[") != std::string::npos;
+      const std::string space = get_namespace(), full = space == "/" ? "/" + name : space + "/" + name;
+      const std::string resolved = !pattern         ? get_node_topics_interface()->resolve_topic_name(name)
+                                   : name[0] == '/' ? name
+                                                    : full;
+      for (const auto &[topic, types] : all)
+      {
+        const bool left_out = pattern && std::count(NOT_BY_PATTERN.begin(), NOT_BY_PATTERN.end(), topic);
+        if (!left_out && (pattern ? !fnmatch(resolved.c_str(), topic.c_str(), 0) : topic == resolved))
+          found[topic] = types.front();
+      }
+    }
+    return found;
+  }
+
+  // The topic as its publishers offer it: the weakest promise of any, so that one subscription gets them all.
+  bool published(const std::string &name, const std::string &type, Published &topic)
+  {
+    topic.name = name;
+    topic.type = type;
+    topic.transient_local = topic.manual = true;
+    topic.depth = 0;
+    bool any = false;
+    for (const rclcpp::TopicEndpointInfo &one : get_publishers_info_by_topic(name))
+    {
+      if (one.node_name().find(RECEIVER) != std::string::npos)
+        continue;
+      const rclcpp::QoS &qos = one.qos_profile();
+      any = true;
+      topic.reliable &= qos.reliability() == rclcpp::ReliabilityPolicy::Reliable;
+      topic.transient_local &= qos.durability() == rclcpp::DurabilityPolicy::TransientLocal;
+      topic.manual &= qos.liveliness() == rclcpp::LivelinessPolicy::ManualByTopic;
+      topic.depth = std::max(topic.depth, uint16_t(std::min<size_t>(qos.depth(), UINT16_MAX)));
+      topic.deadline_ns = std::max(topic.deadline_ns, qos.deadline().nanoseconds());
+      topic.lifespan_ns = std::max(topic.lifespan_ns, qos.lifespan().nanoseconds());
+      topic.lease_ns = std::max(topic.lease_ns, qos.liveliness_lease_duration().nanoseconds());
+    }
+    for (int64_t *ns : {&topic.deadline_ns, &topic.lifespan_ns, &topic.lease_ns})
+      *ns = *ns < LONGEST_NS ? *ns : 0;
+    topic.depth = topic.depth ? topic.depth : 10;  // DDS does not announce it
+    return any;
+  }
+
+  void look()
+  {
+    for (const auto &[name, type] : wanted())
+    {
+      Published topic;
+      const auto known = sendings_.find(name);
+      if (!published(name, type, topic) || (known != sendings_.end() && head(known->second.topic) == head(topic)))
+        continue;
+      try
+      {
+        subscribe(topic);
+      }
+      catch (const std::exception &error)
+      {
+        RCLCPP_ERROR_THROTTLE(get_logger(), *get_clock(), 10000, "%s: left out: %s", name.c_str(), error.what());
+      }
+    }
+  }
+
+  void subscribe(const Published &topic)
+  {
+    rclcpp::QoS qos{rclcpp::KeepLast(std::max<size_t>(size_t(capacity_), topic.depth))};
+    qos.reliability(topic.reliable ? rclcpp::ReliabilityPolicy::Reliable : rclcpp::ReliabilityPolicy::BestEffort);
+    qos.durability(
+        topic.transient_local ? rclcpp::DurabilityPolicy::TransientLocal : rclcpp::DurabilityPolicy::Volatile);
+    qos.liveliness(topic.manual ? rclcpp::LivelinessPolicy::ManualByTopic : rclcpp::LivelinessPolicy::Automatic);
+    if (topic.deadline_ns)
+      qos.deadline(rclcpp::Duration(std::chrono::nanoseconds(topic.deadline_ns)));
+    if (topic.lease_ns)
+      qos.liveliness_lease_duration(rclcpp::Duration(std::chrono::nanoseconds(topic.lease_ns)));
+    rclcpp::SubscriptionOptions options;
+    options.qos_overriding_options = rclcpp::QosOverridingOptions::with_default_policies();
+    sendings_.erase(topic.name);  // its publishers came back with another type or quality of service
+    Sending sending;
+    sending.topic = topic;
+    sending.sender = std::make_unique<Sender>(address(), topic, *policy_, capacity_, get_parameter("log").as_string());
+    Sender *sender = sending.sender.get();
+    sending.subscription = rclcpp::create_generic_subscription(
+        get_node_topics_interface(), topic.name, topic.type, qos,
+        [this, sender](std::shared_ptr<const rclcpp::SerializedMessage> message) {
+          const auto &data = message->get_rcl_serialized_message();
+          if (motion_)
+            sender->put(data.buffer, data.buffer_length, motion_->x());
+          else
+            sender->put(data.buffer, data.buffer_length);
+        },
+        options);
+    sendings_[topic.name] = std::move(sending);
+    RCLCPP_INFO(
+        get_logger(), "%s: %s, %s", topic.name.c_str(), topic.type.c_str(),
+        topic.reliable ? "reliable" : "best effort");
+  }
+
+  void tell()
+  {
+    diagnostic_msgs::msg::DiagnosticArray all;
+    all.header.stamp = now();
+    for (auto &[name, sending] : sendings_)
+    {
+      const Numbers n = sending.sender->numbers();
+      diagnostic_msgs::msg::DiagnosticStatus status;
+      status.name = std::string(get_fully_qualified_name()) + ": " + name;
+      status.hardware_id = "bufgym";
+      status.level = n.connected ? status.OK : status.WARN;
+      status.message = n.connected ? "connected" : "not connected: " + n.fault;
+      const std::pair<const char *, double> told[] = {
+          {"arrived per s", n.arrived_hz}, {"left per s", n.left_hz}, {"left Mbit/s", n.left_mbps},
+          {"arrived", double(n.arrived)},  {"left", double(n.left)},  {"dropped", double(n.dropped)},
+          {"queued", double(n.queued)},    {"oldest s", n.oldest_s},  {"QoI", n.qoi}};
+      for (const auto &[key, number] : told)
+      {
+        diagnostic_msgs::msg::KeyValue pair;
+        pair.key = key;
+        pair.value = std::to_string(number);
+        status.values.push_back(pair);
+      }
+      all.status.push_back(status);
+    }
+    diagnostics_->publish(all);
+  }
+
+  void stop()
+  {
+    look_.reset();
+    tell_.reset();
+    odometry_.reset();
+    for (auto &[name, sending] : sendings_)
+      sending.subscription.reset();
+    sendings_.clear();
+    motion_.reset();
+  }
+
+  const Policy *policy_ = nullptr;
+  int capacity_ = 0;
+  std::unique_ptr<Motion> motion_;
+  std::map<std::string, Sending> sendings_;
+  rclcpp::Subscription<nav_msgs::msg::Odometry>::SharedPtr odometry_;
+  rclcpp_lifecycle::LifecyclePublisher<diagnostic_msgs::msg::DiagnosticArray>::SharedPtr diagnostics_;
+  rclcpp::TimerBase::SharedPtr start_, look_, tell_;
+  rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr changes_;
+};
+}
+
+RCLCPP_COMPONENTS_REGISTER_NODE(bufgym::SenderNode)
