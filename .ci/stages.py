@@ -68,7 +68,7 @@ def pytest(
     *arguments: str,
     compiled: bool = True,
     environment: dict[str, str] | None = None,
-    limit_s: float = 10 * MINUTE,
+    limit_s: float = 20 * MINUTE,
 ) -> Stage:
     """A stage of tests, on two workers of one thread each: more only make them wait for one another."""
     report = folder / f"{name.replace(' ', '-')}.xml"

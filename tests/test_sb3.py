@@ -234,7 +234,7 @@ def test_an_agent_whose_prior_is_the_rule_begins_there() -> None:
     model = untrained(MaskablePPO, SlotPolicy, env, 6, policy_kwargs={"width": 8, "prior": 1e4})
     rule = repr(reached(policies.get("gap-price")))
     assert repr(reached(as_policy(model, "ruled"))) == repr(reached_in_env(model, "dict", "rule")) == rule
-    refuse("prior = 10000: what the rule chooses is not observed", untrained, MaskablePPO, SlotPolicy, None, 0, **_PRIOR)
+    refuse("prior = 10000: what the rule chooses is not observed", untrained, MaskablePPO, SlotPolicy, **_PRIOR)
 
 
 _PRIOR: dict[str, Any] = {"policy_kwargs": {"prior": 1e4}}
