@@ -11,7 +11,8 @@ from typing import Annotated
 from cyclopts import App
 
 from agents.runs import prepare
-from agents.settings import ALGORITHMS, FLAT, PPO, Evolve, Hindsight, Settings, SlotEnvironment
+from agents.settings import ALGORITHMS, FLAT, PPO, Evolve, Hindsight, Settings
+from agents.tasks import SlotEnvironment
 from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked

@@ -13,7 +13,8 @@ import numpy as np
 
 from agents.evaluation import Agent, play
 from agents.mixed_env import Cell
-from agents.settings import Environment, Settings
+from agents.settings import Settings
+from agents.tasks import Environment
 from bufgym import scenario as scenarios
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, percentile_interval, times_drawn
 from bufgym.benchmark.rows import Row

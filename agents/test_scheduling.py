@@ -16,7 +16,8 @@ import train
 from agents.cma_es import Evolution, Search
 from agents.objectives import topics
 from agents.runs import MODEL, prepare
-from agents.settings import Evolve, Suites
+from agents.settings import Evolve
+from agents.tasks import Suites
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.topics import Topic

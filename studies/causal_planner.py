@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.held_out import FIRST_SEED, split_scenario
-from agents.settings import Environment
+from agents.tasks import Environment
 from bufgym import policies
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
 from bufgym.benchmark.score import scores

@@ -15,7 +15,8 @@ from train_cases import DropOldest
 from agents import mixed_env, runs
 from agents.dqn import INVALID, SlotDQN, valid_actions
 from agents.evaluation import EvaluationSet, SlotModel, sweep_for
-from agents.settings import DQN, Evolve, Suites
+from agents.settings import DQN, Evolve
+from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark.run import run as rows_of
 from bufgym.ground import files

@@ -18,7 +18,8 @@ from agents.families import Family, Run, run_of
 from agents.mixed_env import Cell
 from agents.objectives import suites
 from agents.runs import MODEL
-from agents.settings import Cluster, Evolve, Suites
+from agents.settings import Cluster, Evolve
+from agents.tasks import Suites
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength, integer, law

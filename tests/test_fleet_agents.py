@@ -11,7 +11,8 @@ import train_cases  # noqa: F401  (it skips without the extra)
 import train
 from agents.learner import learner_of
 from agents.objectives import fleet
-from agents.settings import PPO, Evolve, Suites
+from agents.settings import PPO, Evolve
+from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run

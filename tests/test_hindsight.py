@@ -11,7 +11,8 @@ from agents.held_out import split_scenario
 from agents.hindsight import HindsightLearner, Lesson, Lessons, Rows, School, padded
 from agents.hindsight_network import CONTEXT, SLOT, Student, mean_regret
 from agents.mixed_env import Cell
-from agents.settings import Environment, Hindsight, Suites
+from agents.settings import Hindsight
+from agents.tasks import Environment, Suites
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.expert import clairvoyant

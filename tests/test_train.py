@@ -194,7 +194,7 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     agent = f"agent ({SUITE[algo].algo})"
     standings = {standing["policy"]: standing for standing in results["standings"]}
-    assert set(standings) == {*registry.names(for_topics=False), agent} and not standings[agent]["apart"]
+    assert set(standings) == {*registry.names(for_topics=False), agent} and not standings[agent]["unranked_because"]
     assert {cell["exact"] for cell in results["cells"]} == {True}
     assert results["held_out"] == {"suite": "interruption-v1", "split": "test", "episodes": 60}
     # The columns of the benchmark, and the training seed: none for a fixed policy.

@@ -15,7 +15,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.objectives.objective import Objective
-from agents.settings import Settings, Suites
+from agents.settings import Settings
+from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.benchmark.sweep import Sweep

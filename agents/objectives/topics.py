@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agents.objectives.objective import Objective
-from agents.settings import Suites
+from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
 from bufgym.ground import files

@@ -1,0 +1,99 @@
+"""What a training run learns on: one environment, or whole suites; each with its options of ``train.py``."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from bufgym.cli.options import Capacities, Count, Positive, checked
+from bufgym.ground.errors import BufgymError
+from bufgym.scenario import Uplink, suites
+from bufgym.scenario.uplink import RGBD_BYTES
+
+Kind = Literal["environment", "queue", "topics", "fleet"]
+"""The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
+
+_KINDS: dict[str, Kind] = {"topics": "topics", "fleet": "fleet"}
+TestSeeds = Annotated[int, checked(int, lambda number: 0 <= number <= 1000, "a whole number from 0 to 1000")]
+Names = Annotated[tuple[str, ...], checked(lambda text: tuple(text.split(",")), all, "names such as lte-v1,outage-v1")]
+
+
+@dataclass(frozen=True)
+class Environment:
+    """One environment to train in."""
+
+    kind: ClassVar[Kind] = "environment"
+    env: Literal["bufgym/Uplink-v0", "bufgym/Interruption-v0"] = "bufgym/Uplink-v0"
+    """Gymnasium id."""
+    capacity: Count = 8
+    """L, messages."""
+    size_bytes: Count = RGBD_BYTES
+    """Mean message size (uplink only)."""
+    duration_s: Positive = Uplink.duration_s
+    """Length of an episode (uplink only)."""
+    episodes: Count = 200
+    """Held-out episodes in the evaluation."""
+
+    def __post_init__(self) -> None:
+        if "Uplink" not in self.env and (self.size_bytes, self.duration_s) != (RGBD_BYTES, Uplink.duration_s):
+            raise BufgymError(f"{self.env}: its messages have no size and its episodes no length to set")
+
+    @property
+    def slots(self) -> int:
+        """Slots that an agent observes."""
+        return self.capacity
+
+
+@dataclass(frozen=True)
+class SlotEnvironment(Environment):
+    """One environment, for an agent that chooses among slots."""
+
+    decide_at: Literal["arrival", "overflow"] = "arrival"
+    """When the agent is asked: at every arrival, or only when the buffer is full."""
+
+
+@dataclass(frozen=True)
+class FullBuffer(SlotEnvironment):
+    """The same, where the agent is asked only when the buffer is full, unless it is told otherwise."""
+
+    decide_at: Literal["arrival", "overflow"] = "overflow"
+    """When the agent is asked: at every arrival, or only when the buffer is full."""
+
+
+@dataclass(frozen=True)
+class Suites:
+    """Suites to train on instead of an environment."""
+
+    suite: Names = ()
+    """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
+    validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
+    them at once. A suite of many topics (topics-v1) makes a scheduler, one of a fleet (fleet-v1) an agent
+    that all its robots share."""
+    data: str | None = None
+    """Folder of recordings, for suites that need one."""
+    capacities: Capacities = ()
+    """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
+    test_seeds: TestSeeds = 0
+    """Test episodes on each trace of a suite; 0: as many as the suite says."""
+
+    def __post_init__(self) -> None:
+        if not self.suite and any(vars(self).values()):
+            raise BufgymError("--data, --capacities and --test-seeds are of a suite, which --suite names")
+        if len(self.suite) > 1 and {"topics", "fleet"} & {suites.get(name).kind for name in self.suite}:
+            raise BufgymError(
+                f"suite {','.join(self.suite)}: an agent for topics or a fleet learns from one suite alone"
+            )
+        for name in self.suite:
+            suites.get(name).settings("validation", self.data)  # raises here if recordings are missing
+
+    @property
+    def kind(self) -> Kind:
+        """The task of its suites."""
+        return _KINDS.get(suites.get(self.suite[0]).kind, "queue")
+
+    def capacities_of(self, suite: str) -> tuple[int, ...]:
+        """L to train for and to test at: the given ones, or the suite's."""
+        return self.capacities or suites.get(suite).capacities
+
+    @property
+    def slots(self) -> int:
+        """Slots that one agent of all suites observes."""
+        return max(L for suite in self.suite for L in self.capacities_of(suite))
