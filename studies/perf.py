@@ -30,6 +30,7 @@ import numpy as np
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.cli.options import Count
+from bufgym.envs import SenderVectorEnv, expert
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import write_text
 from bufgym.ground.kernel import JIT
@@ -44,6 +45,8 @@ TOPICS = "bufgym/Topics-v0"
 POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")
 NATIVE = "vector_entry_point"
 SEED = 1
+LABELLED = 64
+"""Environments side by side whose decisions the clairvoyant labels."""
 FELL, BEFORE = 0.15, 5  # A ratio fell if it is lower by more than this share than the median of so many runs before
 
 
@@ -149,7 +152,7 @@ class _Meter:
 def measure(sizes: Sizes | None = None) -> list[Measurement]:
     """Speed of the yardstick, the batches, the single environments and of rollouts."""
     meter = _Meter(sizes or Sizes())
-    return [meter.yardstick, *_batches(meter), *_singles(meter), *_rollouts(meter)]
+    return [meter.yardstick, *_batches(meter), *_singles(meter), *_rollouts(meter), _labels(meter)]
 
 
 def _batches(meter: _Meter) -> Iterator[Measurement]:
@@ -192,6 +195,24 @@ def _rollouts(meter: _Meter) -> Iterator[Measurement]:
         load()
         run()  # compiled, or loaded from disk, before the clock starts
         yield meter.figure(f"rollout, {name}", told, arrivals, "arrivals", load, run)
+
+
+def _labels(meter: _Meter) -> Measurement:
+    """Decisions of the rule gap-price, each with the regrets of all actions, as ``train.py hindsight`` needs them."""
+    n, steps = LABELLED, meter.sizes.single_steps // 20
+    envs = SenderVectorEnv(n, capacity=8, autoreset_mode="SameStep", info="none")
+    rule, clairvoyant = expert.policy(envs, "gap-price"), expert.clairvoyant(envs)
+
+    def label() -> None:
+        for _ in range(steps):
+            clairvoyant.regrets()
+            envs.step(rule.actions())
+
+    reset = partial(envs.reset, seed=SEED)
+    reset()
+    label()  # compiled, or loaded from disk, before the clock starts
+    told = f"decisions a second of gap-price with clairvoyant.regrets(), n = {n}, L = 8, loading episodes in the time"
+    return meter.figure("labels of the clairvoyant", told, n * steps, "labels", reset, label)
 
 
 def report(figures: Sequence[Measurement], repeats: int) -> str:

@@ -15,14 +15,14 @@ from bufgym.ground.kernel import named
 from bufgym.sim.rollout import python_arrival, python_view
 from studies import perf, yardstick
 
-TINY = perf.Sizes(3, (2, 1), 24, 10, 1, 1)
+TINY = perf.Sizes(3, (2, 1), 24, 20, 1, 1)
 
 
 def test_every_figure_is_a_number_with_its_ratio_and_definition(tmp_path: Path) -> None:
     figures = perf.measure(TINY)
     assert all(math.isfinite(figure.value) and figure.value > 0 and figure.definition for figure in figures)
     assert all(figure.ratio and math.isfinite(figure.ratio) for figure in figures)
-    assert figures[0].name == "yardstick" and len({figure.name for figure in figures}) == len(figures) == 19
+    assert figures[0].name == "yardstick" and len({figure.name for figure in figures}) == len(figures) == 20
     text = perf.report(figures, TINY.repeats)
     assert all(figure.name in text and figure.definition in text for figure in figures)
     perf.write_json(figures, TINY, tmp_path / "perf.json")
