@@ -173,8 +173,8 @@ TINY = Hindsight(
 @pytest.mark.parametrize("task", ["environment", "suite"])
 def test_training_keeps_an_agent_and_goes_on(task: str, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     """The kept file is a policy of the benchmark; a resumed run adds to the curve and to the steps."""
-    monkeypatch.setattr("agents.objectives.guided.PARTS", 1)
-    monkeypatch.setattr("agents.objectives.guided.EPISODES", 4)
+    monkeypatch.setattr("agents.objectives.environment.PARTS", 1)
+    monkeypatch.setattr("agents.objectives.environment.EPISODES", 4)
     settings = TINY
     if task == "suite":
         on = Suites(("interruption-v1",), capacities=(3, 5))

@@ -1,15 +1,15 @@
-"""Objectives of CMA-ES, one module per kind of task: one environment, one queue, topics, a fleet."""
+"""What a run of any learner is measured by, a module for each kind of task: one environment, one queue, topics, a fleet."""
 
 from __future__ import annotations
 
+from agents.objectives.environment import EnvironmentObjective
 from agents.objectives.fleet import FleetObjective
-from agents.objectives.guided import GuidedObjective
 from agents.objectives.objective import Objective
 from agents.objectives.suites import SuitesObjective
 from agents.objectives.topics import TopicsObjective
 
 OBJECTIVES: dict[str, type[Objective]] = {
-    "environment": GuidedObjective,
+    "environment": EnvironmentObjective,
     "queue": SuitesObjective,
     "topics": TopicsObjective,
     "fleet": FleetObjective,

@@ -30,7 +30,7 @@ from bufgym.sim.state import (
 
 @kernel
 def next_event(batch: Batch, shares: Shares | None, c: int) -> int:
-    """Move cell ``c`` on to its next DEPARTURE, DECISION, DEQUEUE, SEND or END (see the package's text).
+    """Move cell ``c`` on to its next DEPARTURE, DECISION, DEQUEUE, SEND or END (see ``bufgym/sim/__init__.py``).
 
     The event is about sender ``sender_of(shares, c)``. While its arrival waits, the DECISION is due again.
     """

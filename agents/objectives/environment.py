@@ -43,7 +43,7 @@ class Played:
         return float(qoi_of(policy, self._senders, self.episodes).mean())
 
 
-class GuidedObjective(Objective):
+class EnvironmentObjective(Objective):
     """The environment of a run."""
 
     name = "guided"
