@@ -1,4 +1,4 @@
-"""What a run of any learner is measured by, a module for each kind of task: one environment, one queue, topics, a fleet."""
+"""What a run of any learner is measured by: a module for one environment, for one queue, topics and a fleet."""
 
 from __future__ import annotations
 
