@@ -1,7 +1,7 @@
 """How far PPO comes on ``Uplink-v0`` with the defaults of stable-baselines3: the curve of docs/guide/trainers.md.
 
 python -m studies.sb3_defaults --settings default --seeds 0 1 2 3 4 --steps 100000
-python -m studies.sb3_defaults --seeds --figure docs/figures/sb3-defaults.svg
+python -m studies.sb3_defaults --figure docs/figures/sb3-defaults.svg
 
 The score is that of the most likely actions on fixed episodes that training does not draw, 0 for Drop Oldest and 1 for
 the clairvoyant. Each evaluation is a line of the file of curves at once, so that a run cut short keeps what it had.
@@ -17,6 +17,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,23 +25,28 @@ from stable_baselines3.common.callbacks import BaseCallback
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.tasks import QueueTask
+from bufgym.ground.errors import unknown
 from bufgym.oracle import BASELINE, normalised_score
 from bufgym.sb3 import make_vec_env
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
-from studies.page import command
+from studies.page import command, table
 
 ENV, CAPACITY, RULES = "bufgym/Uplink-v0", 8, ("afr", "target-gap", "gap-price")
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
+    "scaled": {"reward_scale": "episode"},
     "compact": {"fields": "compact"},
     "rule": {"fields": "rule"},
-    "plausible": {"mask": "plausible", "mask_in_observation": True},
     "8 rows": {"n_envs": 8},
+    "8 rows, rule": {"n_envs": 8, "fields": "rule"},
+    "8 rows, losses": {"n_envs": 8, "fields": ["occupied", "loss", "relative_loss", "occupancy"]},
+    "8 rows, guided": {"n_envs": 8, "actions": "guided", "fields": "guided"},
 }
 """Name -> arguments of ``make_vec_env``; those of PPO are never changed."""
 FIRST_SEED = 2_000_000_000  # of the episodes for evaluation
+ROLLOUT = 16_384  # most steps between two updates of any settings
 LINE = ("settings", "seed", "steps", "score")
 
 
@@ -116,6 +122,39 @@ def train(settings: str, seed: int, steps: int, curve: Curve) -> None:
     envs.close()
 
 
+def read(curves: Path) -> dict[str, dict[int, list[tuple[int, float]]]]:
+    """Settings -> seed -> (steps, score) in the order of the file."""
+    found: dict[str, dict[int, list[tuple[int, float]]]] = {}
+    with curves.open(newline="", encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            curve = found.setdefault(line["settings"], {}).setdefault(int(line["seed"]), [])
+            curve.append((int(line["steps"]), float(line["score"])))
+    return found
+
+
+def summary(curves: Path, steps: int) -> list[str]:
+    """A table: each seed's score at the last evaluation within so many steps and one rollout, and their median."""
+    rows = []
+    for settings, of_seed in read(curves).items():
+        scores = [[score for at, score in curve if at <= steps + ROLLOUT][-1] for curve in of_seed.values()]
+        rows.append((settings, f"{np.median(scores):.2f}", ", ".join(f"{score:.2f}" for score in scores)))
+    return table(("settings", f"median after {steps:,} steps", "seeds"), rows)
+
+
+def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
+    """A line for each seed, a colour for each of the settings, and the rules as levels."""
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = figure.add_subplot(xlabel="steps", ylabel="score")
+    for k, (settings, of_seed) in enumerate(read(curves).items()):
+        for n, curve in enumerate(of_seed.values()):
+            axes.plot(*zip(*curve, strict=True), color=f"C{k}", alpha=0.7, label=settings if n == 0 else None)
+    for name, score in rules.items():
+        axes.axhline(score, color="black", linewidth=0.8, linestyle=":")
+        axes.annotate(name, (1, score), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
+    axes.legend(loc="lower right", frameon=False)
+    figure.savefig(out)
+
+
 def page(
     settings: Sequence[str] = ("default",),
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
@@ -123,12 +162,20 @@ def page(
     every: int = 10_000,
     episodes: int = 40,
     curves: Path = Path("runs/sb3_defaults.csv"),
+    figure: Path | None = None,
 ) -> None:
-    """Train and write the curves."""
+    """Train, or with ``figure`` draw the curves and print their table."""
     fixed = Episodes(episodes)
-    print({name: round(fixed.of_rule(name), 3) for name in RULES}, flush=True)
+    rules = {name: fixed.of_rule(name) for name in RULES}
+    print(", ".join(f"{name} {score:.3f}" for name, score in rules.items()), flush=True)
+    if figure is not None:
+        draw_curves(curves, rules, figure)
+        print(*summary(curves, steps), sep="\n")
+        return
     curves.parent.mkdir(exist_ok=True)
     for name in settings:
+        if name not in SETTINGS:
+            raise unknown("settings", name, SETTINGS)
         for seed in seeds:
             train(name, seed, steps, Curve(fixed, name, seed, every, curves))
 
