@@ -11,6 +11,7 @@ from typing import Any
 
 import bufgym
 from bufgym import scenario
+from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
 from bufgym.scenario import FleetScenario
 from bufgym_papers.environments import MAPPING
@@ -175,6 +176,8 @@ def _fields(topics: bool) -> str:
 def _returns(id: str) -> str:
     with RETURNS.open(newline="", encoding="utf-8") as file:
         rows = [(f"`{row['rule']}`", row["return"], row["steps"]) for row in csv.DictReader(file) if row["id"] == id]
+    if not rows:
+        raise BufgymError(f"{id}: has no returns in {RETURNS.name}; run python -m website.returns")
     return table(("rule", "return", "steps"), rows)
 
 

@@ -95,6 +95,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
+    _spec: EnvSpec | None = None
 
     def __init__(self, scenario: str | Scenario = "lte", capacity: int = Options.capacity, **arguments: Any) -> None:
         self.rows = Rows(1, *read_arguments(scenario, capacity=capacity, **arguments))
