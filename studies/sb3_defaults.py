@@ -1,7 +1,7 @@
 """How far PPO comes on ``Uplink-v0`` with the defaults of stable-baselines3: the curve of docs/guide/trainers.md.
 
 python -m studies.sb3_defaults --settings default --seeds 0 1 2 3 4 --steps 100000
-python -m studies.sb3_defaults --figure docs/figures/sb3-defaults.svg
+python -m studies.sb3_defaults --curves studies/sb3_defaults.csv --figure docs/figures/sb3-defaults.svg
 
 The score is that of the most likely actions on fixed episodes that training does not draw, 0 for Drop Oldest and 1 for
 the clairvoyant. Each evaluation is a line of the file of curves at once, so that a run cut short keeps what it had.
@@ -37,11 +37,9 @@ ENV, CAPACITY, RULES = "bufgym/Uplink-v0", 8, ("afr", "target-gap", "gap-price")
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
     "scaled": {"reward_scale": "episode"},
-    "compact": {"fields": "compact"},
     "rule": {"fields": "rule"},
     "8 rows": {"n_envs": 8},
     "8 rows, rule": {"n_envs": 8, "fields": "rule"},
-    "8 rows, losses": {"n_envs": 8, "fields": ["occupied", "loss", "relative_loss", "occupancy"]},
     "8 rows, guided": {"n_envs": 8, "actions": "guided", "fields": "guided"},
 }
 """Name -> arguments of ``make_vec_env``; those of PPO are never changed."""
