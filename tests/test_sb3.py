@@ -44,13 +44,6 @@ L = 3
 
 
 @pytest.mark.parametrize("id", bufgym.ENVIRONMENTS)
-def test_the_checker_of_stable_baselines3_has_nothing_to_say(id: str) -> None:
-    for form in ("dict", "flat", "slots"):
-        env = gym.make(id, observation=form, **SMALL[id]).unwrapped
-        check_env(env, warn=form != "slots")  # a warning is an error here; slots are for networks of one's own
-
-
-@pytest.mark.parametrize("id", bufgym.ENVIRONMENTS)
 def test_rows_are_those_of_the_native_batch_and_their_ends_are_told(id: str) -> None:
     """tests/envs shows that the native batch's rows are single environments."""
     n, rng = 3, np.random.default_rng(0)

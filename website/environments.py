@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import inspect
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import bufgym
 from bufgym import scenario
+from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
 from bufgym.scenario import FleetScenario
 from bufgym_papers.environments import MAPPING
@@ -16,6 +19,8 @@ from website.films import FILMS
 from website.markdown import code, parameters, table
 
 FLEET = "bufgym_fleet_v0"
+RETURNS = Path(__file__).with_name("returns.csv")
+"""Rules' returns, written by ``python -m website.returns``."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,11 @@ SCENARIOS = bufgym.ENVIRONMENTS | {"bufgym/Mapping-v0": MAPPING}
 
 TOPICS = """\
 Many topics share one uplink: decide at every arrival what to drop, and at every free socket what to send next."""
+
+
+RETURN = """\
+Mean return with `reward_scale="episode"`, the `ep_rew_mean` that a learner's curve is compared with, and steps of an
+episode: 100 episodes with the default arguments, by `python -m website.returns`."""
 
 
 def made() -> dict[str, str]:
@@ -104,6 +114,7 @@ def page(id: str) -> str:
     lines += ["Every field lies in [0, 1]. r is a reference: the field is 0.5 where the quantity is as large as r."]
     lines += [_fields(topics)]
     lines += ["## Reward", code(parts["Reward"]), _rewards(topics)]
+    lines += ["### Returns of rules", RETURN, _returns(id)]
     lines += ["## Episode end", code(parts["Episode end"])]
     lines += ["## Arguments", code(parts["Arguments"])]
     lines += [
@@ -160,6 +171,14 @@ def _fields(topics: bool) -> str:
     fields = FIELDS + TOPIC_FIELDS if topics else FIELDS
     rows = [(f"`{f.name}`", f.per, f.group, f.unit, code(f.meaning)) for f in fields]
     return table(("field", "per", "takes", "unit", "meaning"), rows)
+
+
+def _returns(id: str) -> str:
+    with RETURNS.open(newline="", encoding="utf-8") as file:
+        rows = [(f"`{row['rule']}`", row["return"], row["steps"]) for row in csv.DictReader(file) if row["id"] == id]
+    if not rows:
+        raise BufgymError(f"{id}: has no returns in {RETURNS.name}; run python -m website.returns")
+    return table(("rule", "return", "steps"), rows)
 
 
 def _rewards(topics: bool) -> str:

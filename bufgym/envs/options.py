@@ -9,7 +9,7 @@ import numpy as np
 from bufgym import scenario as scenarios
 from bufgym.envs.observation import MaskKeys
 from bufgym.ground.errors import BufgymError, UnknownArgumentError, unknown
-from bufgym.model.checks import whole
+from bufgym.model.checks import above_0, whole
 from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
 
@@ -46,6 +46,7 @@ class Options:
     max_bytes: int | None = None
     decide_at: str = "arrival"
     reward: str | Mapping[str, float] = "retained"
+    reward_scale: float | str | None = None
     actions: str = "slots"
     mask: str = "valid"
     fields: str | Sequence[str] | None = None
@@ -102,6 +103,17 @@ class Options:
             rule = f"must be True, False, two names of keys or one of {', '.join(map(repr, MASK_KEYS))}"
             raise BufgymError(f"mask_in_observation = {asked!r}: {rule}")
         return MaskKeys(keys[0], keys[1], self.mask_dtype)
+
+    def reward_factor(self, scenario: Any) -> float:
+        """Factor on the reward: a number as given, or for "episode" the ``reward_scale`` of the scenario's class."""
+        if (given := self.reward_scale) is None:
+            return 1.0
+        if isinstance(given, str) and given == "episode":
+            given = getattr(getattr(scenario, "uplink", scenario), "reward_scale", None)  # a fleet's is its uplink's
+            if given is None:
+                raise BufgymError("reward_scale = 'episode': this scenario has no `reward_scale`; give a number")
+        above_0("reward_scale", given, ", 'episode' or None")
+        return float(given)
 
     def check_without_own_queue(self, what: str) -> None:
         """Refuse options for one queue on a link of its own where the sender has ``what`` instead."""

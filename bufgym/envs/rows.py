@@ -123,6 +123,8 @@ class Rows:
 
         self.weights, own_terms = reward_weights(options.reward, several_topics)
         self.terms = terms_for(several_topics) + own_terms
+        scaled = len(self.terms) - len(own_terms) if options.reward_scale == "episode" else None
+        self.weights[:scaled] *= options.reward_factor(scenario)
         self._term_names = [term.name for term in self.terms]
         self.rewarded = np.zeros((n, len(self.terms)))
         self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
@@ -152,6 +154,16 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.senders)
+
+    @property
+    def unreached_steps(self) -> int:
+        """A number of steps that no episode reaches.
+
+        Each arrival asks, and asks again after an eviction if B is limited. With several topics a free socket asks for
+        each message sent, and after a hold at most at each arrival and ack.
+        """
+        asks = 1 + (self.options.max_bytes is not None) + 3 * bool(self.scenario.topics)
+        return asks * self.scenario.max_messages + 1
 
     def new_output(self) -> StepOutput:
         """Make zeroed arrays for the results of a step."""

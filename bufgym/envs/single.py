@@ -1,9 +1,11 @@
 """``gymnasium.Env``: one sender."""
 
+from dataclasses import replace
 from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation
@@ -55,6 +57,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``max_bytes``: B, bytes, by default without limit.
     - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
     - ``reward``: a term's name, or weights by name; terms of your own take part only if named.
+    - ``reward_scale``: factor on the reward, by default none. "episode" is the constant ``reward_scale`` of the
+      scenario's class, which brings a rule's return in a default episode between 1 and 10; weights of your own terms
+      stay as they are. ``info["reward_terms"]`` is not scaled.
     - ``actions``: "slots", as above, or "guided" (one queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule
       gap-price for this decision, by the table ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is
       no mask, and no invalid action.
@@ -90,6 +95,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}
+    _spec: EnvSpec | None = None
 
     def __init__(self, scenario: str | Scenario = "lte", capacity: int = Options.capacity, **arguments: Any) -> None:
         self.rows = Rows(1, *read_arguments(scenario, capacity=capacity, **arguments))
@@ -98,6 +104,18 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self.action_space = self.rows.action_space
         self._action = np.zeros(1, np.int64)
         self.rows.output.terminated[0] = True  # kept with the other arrays, so a snapshot of them has it
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's. ``max_episode_steps`` is a number that no episode reaches with these arguments.
+
+        Wrappers such as ``TimeAwareObservation`` read it. A registered one would cut episodes that arguments lengthen.
+        """
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec and replace(spec, max_episode_steps=self.rows.unreached_steps)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

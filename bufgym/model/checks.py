@@ -18,10 +18,10 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
-def above_0(name: str, number: Any) -> None:
-    """Check that ``number`` is finite and > 0."""
+def above_0(name: str, number: Any, others: str = "") -> None:
+    """Check that ``number`` is finite and > 0; the message appends ``others``, values that are checked elsewhere."""
     if not (is_number(number) and 0 < number <= sys.float_info.max):
-        raise BufgymError(f"{name} = {number!r}: must be a number > 0")
+        raise BufgymError(f"{name} = {number!r}: must be a number > 0{others}")
 
 
 def between(name: str, number: Any, low: float, high: float, unit: str = "") -> None:

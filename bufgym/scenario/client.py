@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,9 @@ class Client:
     """Law of the sizes of all streams that move, such as cameras, in place of their own; equal for their own."""
     value: Value = field(default_factory=lambda: qoi.exponential(0.618))
     """V of topics that have none of their own."""
+
+    reward_scale: ClassVar[float] = 0.0005
+    """Factor on rewards that brings a default episode's return between 1 and 10."""
 
     def __post_init__(self) -> None:
         as_tuple(self, "streams", Stream, "a bufgym.scenario.Stream")

@@ -1,4 +1,4 @@
-"""Fleet environments: PettingZoo's own checks, and that they are the rows and rollouts that are tested elsewhere."""
+"""Fleet environments: that they are the rows and rollouts that are tested elsewhere."""
 
 import sys
 from typing import Any
@@ -20,43 +20,11 @@ from bufgym.traces import Trace
 
 pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
 
-from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
-from pettingzoo.utils.conversions import parallel_to_aec
-
-from bufgym.envs import FleetEnv, parallel_env
+from bufgym.envs import FleetEnv
 
 L = 4
 SMALL: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 600_000}
 PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
-
-
-@pytest.mark.parametrize(("robots", "mask_in_observation"), [(1, False), (3, True)])
-def test_pettingzoo_has_nothing_to_say(robots, mask_in_observation, capsys):
-    def make():
-        return parallel_env(robots=robots, mask_in_observation=mask_in_observation, **SMALL)
-
-    parallel_api_test(make(), num_cycles=70)  # an episode has 60 ticks; a warning is an error here
-    parallel_seed_test(make, num_cycles=20)
-    assert "Passed" in capsys.readouterr().out
-
-
-# Remarks that are no rules: on observations that are dicts, and on zeros, which a robot sees at the end.
-@pytest.mark.filterwarnings("ignore:Observation")
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"mask_in_observation": True},
-        {"mask_in_observation": "pettingzoo", "observation": "flat"},
-        {"observation": "flat"},
-        {"info": "none"},
-    ],
-)
-def test_pettingzoo_has_nothing_to_say_of_it_turn_by_turn(options):
-    def make():
-        return parallel_to_aec(parallel_env(robots=3, **SMALL, **options))
-
-    api_test(make(), num_cycles=70)
-    seed_test(make, num_cycles=20)
 
 
 def test_one_robot_is_the_single_environment():

@@ -8,11 +8,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from env_cases import DYING, FADING, SMALL, same
+from env_cases import DYING, FADING, same
 from gymnasium.utils.env_checker import check_env
 from refusal_cases import refused
 
-import bufgym
 from bufgym.envs import SenderEnv
 from bufgym.envs.observation import Handed, ObservationForm
 from bufgym.ground.kernel import named
@@ -55,12 +54,6 @@ def seen(env: SenderEnv) -> tuple[Buffer, Any]:
     """The Buffer and the newcomer as a policy of plain Python gets them."""
     batch = named(env.rows.senders.batch)
     return python_view(batch, 0), batch.arrivals[0, batch.senders[0].next]
-
-
-@pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
-@pytest.mark.parametrize("observation", ["dict", "flat", "slots"])
-def test_gymnasium_finds_nothing_to_complain_about(env_id: str, observation: str) -> None:
-    check_env(gym.make(env_id, observation=observation, **SMALL[env_id]).unwrapped)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

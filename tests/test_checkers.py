@@ -1,0 +1,90 @@
+"""The checkers of four libraries have nothing to say of any environment, in any form; a warning is an error here."""
+
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from gymnasium.utils import env_checker
+
+import bufgym
+
+SMALL: dict[str, dict[str, Any]] = {
+    "bufgym/Interruption-v0": {"t_max": 20},
+    "bufgym/Uplink-v0": {"duration_s": 1.0, "size_bytes": 1_000_000},
+    "bufgym/Suite-v0": {"suite": "interruption-v1"},
+    "bufgym/Topics-v0": {"duration_s": 0.1},
+    "bufgym/Mapping-v0": {},
+}
+"""Arguments that make episodes of every environment short."""
+ROBOTS = {"capacity": 4, "duration_s": 2.0, "size_bytes": 600_000}  # an episode of a fleet has 60 ticks
+FORMS = [
+    {"observation": form, "mask_in_observation": mask, "mask_dtype": dtype}
+    for form in ("dict", "flat", "slots")
+    for mask, dtype in ((False, "int8"), (True, "int8"), (True, "bool"), ("pettingzoo", "int8"))
+]
+IDS = sorted(id for id in gym.registry if id.startswith("bufgym/"))
+
+every_id = pytest.mark.parametrize("id", IDS)
+every_form = pytest.mark.parametrize("form", FORMS, ids=str)
+# PettingZoo's tests sample by the mask that they observe, which Gymnasium wants int8.
+every_int8_form = pytest.mark.parametrize("form", [form for form in FORMS if form["mask_dtype"] == "int8"], ids=str)
+
+
+def made(id: str, **options: Any) -> gym.Env[Any, Any]:
+    """One of the environments, with short episodes."""
+    if id not in bufgym.ENVIRONMENTS:
+        pytest.importorskip("cv2", reason="the extra [perception] is not installed")
+    return gym.make(id, capacity=3, **SMALL[id], **options)
+
+
+@every_id
+@every_form
+def test_gymnasium(id: str, form: dict[str, Any]) -> None:
+    env_checker.check_env(made(id, **form).unwrapped)
+
+
+# That library has no network for two dimensions or nested dicts; all else it checks.
+@pytest.mark.filterwarnings("ignore:Your observation .*slots.* has an unconventional shape:UserWarning")
+@pytest.mark.filterwarnings("ignore:Nested observation spaces are not supported:UserWarning")
+@every_id
+@every_form
+def test_stable_baselines3(id: str, form: dict[str, Any]) -> None:
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra [train] is not installed")
+    checker.check_env(made(id, **form).unwrapped)
+
+
+@every_id
+@every_form
+def test_torchrl(id: str, form: dict[str, Any]) -> None:
+    envs = pytest.importorskip("torchrl.envs", reason="torchrl is not installed")
+    envs.check_env_specs(envs.GymWrapper(made(id, **form)))
+
+
+@pytest.mark.parametrize("robots", [1, 3])
+@every_int8_form
+def test_pettingzoo(robots: int, form: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    zoo = pytest.importorskip("pettingzoo.test", reason="the extra [fleet] is not installed")
+    from bufgym.envs import parallel_env
+
+    def make() -> Any:
+        return parallel_env(robots=robots, **ROBOTS, **form)
+
+    zoo.parallel_api_test(make(), num_cycles=70)
+    zoo.parallel_seed_test(make, num_cycles=20)
+    assert "Passed" in capsys.readouterr().out
+
+
+# Remarks that are no rules: on observations that are dicts, and on zeros, which a robot sees at the end.
+@pytest.mark.filterwarnings("ignore:Observation")
+@every_int8_form
+def test_pettingzoo_turn_by_turn(form: dict[str, Any]) -> None:
+    zoo = pytest.importorskip("pettingzoo.test", reason="the extra [fleet] is not installed")
+    from pettingzoo.utils import parallel_to_aec
+
+    from bufgym.envs import parallel_env
+
+    def make() -> Any:
+        return parallel_to_aec(parallel_env(robots=3, **ROBOTS, **form))
+
+    zoo.api_test(make(), num_cycles=70)
+    zoo.seed_test(make, num_cycles=20)
