@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from loop_cases import beside, compiled
 from relay_cases import Corner, relay, settings, until, wait, within
+from websockets.asyncio import client
 
 from bufgym.model.topics import Topic
 from bufgym_live.relay import backoff
@@ -47,10 +48,12 @@ def shut(accepted: Any, how: str) -> None:
 async def test_a_client_outlives_any_end_of_its_connection(
     how: str, corner: Corner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At each of its sends, pings and receipts in turn its connection ends. It comes back, and sends what it has to."""
-    for name, time_s in (("wire.PING_S", 0.05), ("wire.PONG_S", 1.0), ("session.CLOSE_S", 0.05)):
-        monkeypatch.setattr(f"bufgym_live.relay.{name}", time_s * (how == "silence") or 60.0)
+    """At each of its sends, pings and receipts in turn its connection ends. It comes back, and sends what it has to.
+
+    A connection that will fall silent is 500 times less patient than others.
+    """
     topic, came, commands, connect = corner.topic("camera"), set[int](), list[bytes](), Session._connect
+    dial = client.connect
     async with corner.client() as viewer:
         for id, name in (("a", "camera"), ("b", "command")):
             await viewer.subscribe(f"^{corner.topic(name)}$", id)
@@ -76,6 +79,11 @@ async def test_a_client_outlives_any_end_of_its_connection(
 
             return call
 
+        def dialled(*words: Any, **named: Any) -> Any:
+            if how == "silence" and moments < n:
+                named |= {name: named[name] / 500 for name in ("ping_interval", "ping_timeout", "close_timeout")}
+            return dial(*words, **named)
+
         async def opened(self: Session) -> Any:
             connection = await connect(self)
             for name in ("send", "ping", "recv"):
@@ -83,6 +91,7 @@ async def test_a_client_outlives_any_end_of_its_connection(
             return connection
 
         monkeypatch.setattr(Session, "_connect", opened)
+        monkeypatch.setattr(client, "connect", dialled)
         async with beside(watch()) as watching:
             while moments >= n:
                 n, moments = n + 1, 0
