@@ -19,11 +19,11 @@ from pathlib import Path
 from urllib.parse import SplitResult
 
 import numpy as np
-from studies.relay_load import CONFIG, beside, served
 
 from bufgym_live.relay import address
 from bufgym_live.relay.session import Session
 from bufgym_live.robot.sockets import free_port
+from studies.relay_load import CONFIG, beside, served
 
 LOCAL = contextvars.ContextVar("LOCAL", default="127.0.0.1")
 """Address that a client connects from."""

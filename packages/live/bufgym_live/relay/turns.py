@@ -29,7 +29,7 @@ class Turns:
 
     @types.coroutine
     def of(self, who: str, begin: Callable[[], Coroutine[Any, Any, Any]]) -> Generator[Any, Any, Any]:
-        """Do the work that ``begin`` returns, which is not called if this is cancelled first; note each of its turns."""
+        """Do the work that ``begin`` returns, unless this is cancelled before; note each of its turns."""
         work = begin()
         resume: Callable[[Any], Any] = work.send
         value: Any = None

@@ -133,9 +133,9 @@ def test_a_quota_counts_what_its_connections_have() -> None:
 # Frames byte by byte, and what is none.
 
 names = st.text(st.characters(exclude_categories=("C", "Z")), max_size=60)
-whole = st.integers(0, 2**53)
+whole, stamps = st.integers(0, 2**53), st.integers(-(2**53), 2**53)
 messages = st.builds(
-    Message, names.map("/{}".format), st.binary(max_size=50), st.just("raw"), names, names, whole, whole, st.booleans()
+    Message, names.map("/{}".format), st.binary(max_size=50), st.just("raw"), names, names, whole, stamps, st.booleans()
 )
 
 
