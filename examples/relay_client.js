@@ -8,8 +8,7 @@ const [url, name, topic, data] = process.argv.slice(2);
 const who = {version: 1, form: "json", name, session: crypto.randomUUID()};
 const commands = topic ? [{topic, data: JSON.parse(data)}] : [];  // the first is on its way
 let live = null, mostMs = FIRST_MS;                 // the WebSocket once it is welcome; longest delay until the next try
-let acked = 0;                                      // highest number of ours that the relay holds
-let received = 0;                                   // highest number of a no_drop message that came
+let acked = 0, received = 0;                        // highest number of ours that the relay holds, and that came
 
 function connect() {
   const socket = new WebSocket(`${url}/relay`, ["bufgym.relay.v1"]);
@@ -24,8 +23,8 @@ function connect() {
     isOver = said.what === "hello" && FOR_GOOD.includes(said.code);
     hear[said.op]?.(said);
   };
-  socket.onclose = () => {
-    live = null;
+  socket.onclose = socket.onerror = () => {         // in Node a connection that fails has no close
+    socket.onclose = socket.onerror = live = null;
     if (performance.now() - sinceMs >= HELD_MS) mostMs = FIRST_MS;
     if (!isOver) setTimeout(connect, Math.random() * Math.min(mostMs, mayWaitMs));
     mostMs = Math.min(2 * mostMs, MOST_MS);
