@@ -7,7 +7,7 @@ Robots and viewers are spread over the relays. Each robot sends pictures of 20 k
 robots, one at each relay. An operator at each relay sends commands to robots of all relays, two a second. Every ten
 seconds one relay of the last two is killed, and starts again at once; another stands in for it meanwhile. The first
 relay lives on, so that its memory can be watched. Every minute NATS is stopped (SIGSTOP) for ``--stall`` seconds. Needs
-nats-server. Prints a line for each promise, PASS or FAIL; the exit status is 1 if one fails.
+nats-server. Prints a line for each promise, PASS or FAIL.
 """
 
 import argparse
@@ -157,8 +157,8 @@ class Soak:
                         one.kill()
                     await one.wait()
 
-    def report(self) -> bool:
-        """Print what was promised and what came; return whether all was kept."""
+    def report(self) -> None:
+        """Print what was promised, and whether it was kept."""
         lost, twice = sum(one not in self.came for one in self.acked), sum(n - 1 for n in self.came.values())
         silent, growth_mb = max(self.gaps_s), max(self.memory_mb) - self.memory_mb[0]
         print(f"{len(self.down_s)} kills, a relay down for {max(self.down_s, default=0.0):.1f} s at most")
@@ -171,10 +171,9 @@ class Soak:
         }
         for line, holds in lines.items():
             print("PASS" if holds else "FAIL", line)
-        return all(lines.values())
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--robots", type=int, default=60)
@@ -184,8 +183,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         soak = Soak(Path(folder), options.robots, options.viewers, options.stall)
         asyncio.run(soak.run(options.minutes))
-    return int(not soak.report())
+    soak.report()
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()
