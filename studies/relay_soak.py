@@ -139,8 +139,9 @@ class Soak:
 
     async def run(self, minutes: float) -> None:
         async with nats_server(self.nats_port, self.folder / "nats") as nats:
-            self.relays = [await self.started(k) for k in range(RELAYS)]
             try:
+                for k in range(RELAYS):
+                    self.relays.append(await self.started(k))
                 moving = [self.drive(k) for k in range(self.robots)] + [self.watch(k) for k in range(len(self.gaps_s))]
                 async with relay_load.beside(*moving):
                     await asyncio.sleep(SETTLES_S)
