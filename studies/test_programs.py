@@ -14,14 +14,15 @@ SHORT = {
     "studies.relay_load load": "--robots 2 --viewers 1 --seconds 1 --slow --flood",
     "studies.relay_load idle": "--connections 20",
     "studies.relay_load page": "--robots 2 --seconds 1",
-    "studies.relay_mesh": "--robots 3 --viewers 3 --seconds 3",
     "studies.relay_others": "--robots 2 --viewers 1 --seconds 1",
+    "studies.relay_return": "--clients 2 --kills 1 --away 1",
+    "studies.relay_soak": "--robots 3 --viewers 3 --minutes 0.05",
     "studies.hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms evolve",
 }
 """Program and verb -> the options that make it short."""
 NEEDS = {
     "studies.relay_load page": "chromium",
-    "studies.relay_mesh": "nats-server",
+    "studies.relay_soak": "nats-server",
     "studies.relay_others": "mosquitto",
 }
 ELSEWHERE = {

@@ -7,7 +7,7 @@ from typing import Final
 
 FIRST_S: Final = 0.2
 MOST_S: Final = 8.0  # For a client that is refused, or whose connections do not hold
-AWAY_S: Final = 1.5  # For a relay that cannot be reached, which costs it nothing: clients are back this soon
+AWAY_S: Final = 1.0  # For a relay that cannot be reached, which costs it nothing: clients are back this soon
 HELD_S: Final = 5.0  # Time after which a connection has held
 
 

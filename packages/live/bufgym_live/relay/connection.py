@@ -58,7 +58,7 @@ class Connection:
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
         greeted()
-        writer = asyncio.create_task(hub.turns.of(caller.identity.key, self._outbox.run()))
+        writer = asyncio.create_task(hub.turns.of(caller.identity.key, self._outbox.run))
         left_s = min(caller.identity.until_s - time.time(), 2**20)
         expiry = asyncio.get_running_loop().call_later(left_s, self.end, "the token has expired")
         try:
@@ -190,7 +190,7 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"
             one = kind(caller, admitted, session, quota)
-            await hub.turns.of(caller.identity.key, one.run(greeted))
+            await hub.turns.of(caller.identity.key, partial(one.run, greeted))
     except BufgymError as error:
         caller.refuse(stage, error)
         await caller.close(stage)

@@ -28,8 +28,9 @@ class Turns:
         return long
 
     @types.coroutine
-    def of(self, who: str, work: Coroutine[Any, Any, Any]) -> Generator[Any, Any, Any]:
-        """Do ``work``, and note each of its turns."""
+    def of(self, who: str, begin: Callable[[], Coroutine[Any, Any, Any]]) -> Generator[Any, Any, Any]:
+        """Do the work that ``begin`` returns, unless this is cancelled before; note each of its turns."""
+        work = begin()
         resume: Callable[[Any], Any] = work.send
         value: Any = None
         while True:

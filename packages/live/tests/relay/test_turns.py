@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) 
 
 
 async def test_a_task_is_the_same_under_the_watch() -> None:
-    """It gets what it waits for, and the errors that are thrown into it; it returns and raises."""
+    """It gets what it waits for, and the errors that are thrown into it; it returns and raises, or never begins."""
 
     async def works(error: Exception | None) -> str:
         if error is not None:
@@ -45,9 +46,9 @@ async def test_a_task_is_the_same_under_the_watch() -> None:
         return "done"
 
     watch = turns.Turns()
-    assert await watch.of("a", works(None)) == "done"
+    assert await watch.of("a", partial(works, None)) == "done"
     with pytest.raises(ValueError, match="no"):
-        await watch.of("a", works(ValueError("no")))
+        await watch.of("a", partial(works, ValueError("no")))
 
     async def forever() -> None:
         try:
@@ -56,8 +57,10 @@ async def test_a_task_is_the_same_under_the_watch() -> None:
             ended.append(True)
 
     ended = list[bool]()
-    async with beside(watch.of("a", forever())):
+    async with beside(watch.of("a", forever)):
         await asyncio.sleep(0)
+    async with beside(watch.of("a", forever)):
+        pass
     assert ended == [True]
 
 

@@ -2,7 +2,7 @@
 
 import {decode, fromJson} from "./messages.js";
 
-const FIRST_MS = 250, MOST_MS = 8000, HELD_MS = 5000;  // as in backoff.py
+const FIRST_MS = 200, AWAY_MS = 1000, MOST_MS = 8000, HELD_MS = 5000;  // as in backoff.py
 
 // Whether a whole topic matches; true for a pattern that only the relay's engine knows: the relay will say.
 function matches(pattern, topic) {
@@ -39,7 +39,9 @@ export class Relay {
     address.hash = address.search = "";
     this.socket = new WebSocket(address, ["bufgym.relay.v1"]);
     this.socket.binaryType = "arraybuffer";
+    let isAway = true;
     this.socket.onopen = () => {
+      isAway = false;
       // Without a session: it ends with the connection. A command that it leaves goes again, and says the same twice.
       this.received = 0;
       this.say("hello", {version: 1, name: this.name, form: "binary", ...(this.token ? {token: this.token} : {})});
@@ -49,7 +51,7 @@ export class Relay {
       if (this.welcome && performance.now() - this.since >= HELD_MS) this.mostMs = FIRST_MS;
       this.welcome = null;
       this.on.state("not connected", false);
-      if (!this.refused) setTimeout(() => this.connect(), this.mostMs * Math.random());
+      if (!this.refused) setTimeout(() => this.connect(), Math.min(this.mostMs, isAway ? AWAY_MS : MOST_MS) * Math.random());
       this.mostMs = Math.min(2 * this.mostMs, MOST_MS);
     };
   }

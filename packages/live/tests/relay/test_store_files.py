@@ -1,0 +1,41 @@
+"""The store's file over a backup and an upgrade, by the commands that the guide names."""
+
+import shutil
+import sqlite3
+import subprocess
+from pathlib import Path
+
+import pytest
+from relay_cases import client, relay, settings
+
+from bufgym_live.relay.store import FILE
+
+BEFORE = Path(__file__).with_name("held_d36707ca.sql")
+COMMAND = "/robots/a/command"
+
+
+@pytest.mark.skipif(shutil.which("sqlite3") is None, reason="no sqlite3 here")
+async def test_an_earlier_releases_store_is_backed_up_restored_and_opened(tmp_path: Path) -> None:
+    """Command 1 of 3 was acked. 2 and 3 arrive, and 4 follows. While a relay has the file, no other may read it."""
+    held, copy = tmp_path / FILE, tmp_path / "copy.sqlite"
+
+    def sqlite(order: str) -> str:
+        done = subprocess.run(["sqlite3", str(held), f"{order} {copy}"], capture_output=True, text=True, check=False)
+        return done.stderr
+
+    database = sqlite3.connect(held)
+    database.executescript(BEFORE.read_text(encoding="utf-8"))
+    database.close()
+    assert sqlite(".backup") == ""
+    held.unlink()
+    assert sqlite(".restore") == ""
+    async with (
+        relay(settings(folder=tmp_path)) as server,
+        client(server.port, session="operator", acked=3) as operator,
+        client(server.port, session="robot", received=1) as robot,
+    ):
+        assert operator.welcome["received"] == 3 and "locked" in sqlite(".backup")
+        await robot.came(2, 3)
+        await robot.subscribe(f"^{COMMAND}$", durable=True)
+        await operator.acked(COMMAND, 4)
+        await robot.came(4)
