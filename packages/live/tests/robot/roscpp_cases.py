@@ -47,10 +47,11 @@ def publishers(master: Any, topic: str) -> list[str]:
     return [node for name, nodes in published if name == f"/{topic}" for node in nodes]
 
 
-def subscriber(master: Any, topic: str) -> socket.socket:
-    """A connection on which the topic's messages come, only as fast as they are read."""
-    [name] = publishers(master, topic)
-    with xmlrpc.client.ServerProxy(master.lookupNode("/test", name)[2]) as talker:
+def subscriber(master: Any, topic: str, node: str = "") -> socket.socket:
+    """A connection on which the topic's messages come, only as fast as they are read; from the one node if unnamed."""
+    if not node:
+        [node] = publishers(master, topic)
+    with xmlrpc.client.ServerProxy(master.lookupNode("/test", node)[2]) as talker:
         _, host, port = talker.requestTopic("/test", f"/{topic}", [["TCPROS"]])[2]  # type: ignore[index,misc]
     connection = socket.create_connection((str(host), int(str(port))), timeout=5)
     fields = (f"callerid=/{port}", f"topic=/{topic}", "type=*", "md5sum=*", "tcp_nodelay=1")
@@ -69,7 +70,8 @@ def exactly(connection: socket.socket, count: int) -> bytes:
     data = bytearray()
     while len(data) < count:
         more = connection.recv(min(count - len(data), 2**16))
-        assert more, "the talker closed the connection"
+        if not more:
+            raise EOFError
         data += more
     return bytes(data)
 
@@ -78,7 +80,7 @@ def seqs(connection: socket.socket, most: int, pause_s: float = 0.0, patience_s:
     """The numbers of the images that come, with a pause before each, until there are so many or no more come."""
     came: list[int] = []
     connection.settimeout(patience_s)
-    with connection, contextlib.suppress(TimeoutError):
+    with connection, contextlib.suppress(TimeoutError, EOFError):
         while len(came) < most:
             time.sleep(pause_s)
             image = block(connection)
