@@ -10,7 +10,7 @@ import xmlrpc.client
 from pathlib import Path
 from typing import Any
 
-from bufgym_live.robot import roscpp
+from bufgym_live.robot import read_log, replay, roscpp
 
 
 def missing() -> str:
@@ -30,6 +30,14 @@ def build(folder: Path, policies: str, kind: str = "Debug") -> Path:
     talker = Path(__file__).with_name("roscpp_talker.cpp")
     run("g++", "-std=c++14", talker, "-o", folder / "talker", *flags, "-lpthread")
     return folder / "libbufgym_roscpp.so"
+
+
+def gone(file: Path) -> list[int]:
+    """Numbers of the messages that left the socket, by a log in which the simulator decides the same."""
+    records = read_log(file)
+    again, left = replay(records), [record["seq"] for record in records if record["event"] == "gone"]
+    assert again.differences == () and again.outcome.delivered == len(left)
+    return left
 
 
 def run(*words: Any) -> str:
