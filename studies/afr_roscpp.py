@@ -139,7 +139,7 @@ class Reproduction(Figure):
         wanted = {(0.0, "afr"): 1.08, (0.0, "learned"): 1.11, (50.0, "afr"): 1.15, (50.0, "learned"): 1.15}
         asked = [bool(ratios[case] >= least) for case, least in wanted.items() if np.isfinite(ratios.get(case, np.nan))]
         facts["more"] = all(asked) if len(asked) == len(wanted) else None
-        facts["ratios"] = ", ".join(f"{name} {ratio:.2f} at {rtt_ms:g} ms" for (rtt_ms, name), ratio in ratios.items())
+        facts["ratios"] = ", ".join(f"{name} {ratio:.3f} at {rtt_ms:g} ms" for (rtt_ms, name), ratio in ratios.items())
         return facts
 
     def draw(self, rows: FigureRows, figure: Any) -> None:

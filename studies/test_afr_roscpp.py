@@ -30,7 +30,7 @@ def test_the_claims_by_hand() -> None:
     held = {"more": True, "gaps": True, "same": True, "soon": True}
     found = study.claims(FigureRows(ROWS))
     assert {claim: found[claim] for claim in held} == held
-    assert found["ratios"] == "afr 1.08 at 0 ms, learned 1.11 at 0 ms, afr 1.15 at 50 ms, learned 1.30 at 50 ms"
+    assert found["ratios"] == "afr 1.080 at 0 ms, learned 1.110 at 0 ms, afr 1.150 at 50 ms, learned 1.300 at 50 ms"
     beyond = {"more": {"qoi": 107.0}, "gaps": {"longest_gap": 18}, "same": {"differ": 1}, "soon": {"decision_us": 10.1}}
     for claim, worse in beyond.items():
         found = study.claims(FigureRows([*ROWS[:1], {**ROWS[1], **worse}, *ROWS[2:]]))
