@@ -85,11 +85,11 @@ def exactly(connection: socket.socket, count: int) -> bytes:
 
 
 def seqs(connection: socket.socket, most: int, pause_s: float = 0.0, patience_s: float = 5.0) -> list[int]:
-    """The numbers of the images that come, with a pause before each, until there are so many or no more come."""
+    """The numbers of the images that come, with a pause before each, until the last of so many or no more come."""
     came: list[int] = []
     connection.settimeout(patience_s)
     with connection, contextlib.suppress(TimeoutError, EOFError):
-        while len(came) < most:
+        while not came or came[-1] < most - 1:
             time.sleep(pause_s)
             image = block(connection)
             came.append(int(image[16 : 16 + struct.unpack_from("<I", image, 12)[0]]))

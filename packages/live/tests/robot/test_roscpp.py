@@ -114,9 +114,9 @@ def test_each_of_two_subscribers_has_its_queue(built: Path, nodes: Nodes, tmp_pa
     log = tmp_path / "log"
     talker = nodes.talker("pair", 5, 40, 400_000, 20, 2, **preload(built, log, BUFGYM_POLICY="drop-oldest"))
     fast, slow = nodes.subscriber("pair"), nodes.subscriber("pair")
-    as_they_come = seqs(fast, 40, patience_s=1.0)
+    as_they_come = seqs(fast, 40)
     has_published(talker)
-    late = seqs(slow, 40, patience_s=1.0)
+    late = seqs(slow, 40)
     assert sorted([as_they_come, late]) == sorted(gone(file) for file in logs(log))
     assert len(late) < len(as_they_come) and late[-5:] == [35, 36, 37, 38, 39]
 
@@ -181,7 +181,7 @@ def test_small_and_unbounded_topics_are_left_alone(built: Path, nodes: Nodes, tm
     subscribers = [nodes.subscriber(topic) for topic in topics]
     for talker in (bounded, unbounded):
         has_published(talker)
-    for came in (seqs(one, 60, patience_s=1.0) for one in subscribers):
+    for came in (seqs(one, 60) for one in subscribers):
         assert len(came) < 60 and came[-5:] == [55, 56, 57, 58, 59]
     assert seqs(everything, 60) == list(range(60))
     with rosout:
