@@ -34,7 +34,6 @@ ELSEWHERE = {
     "studies.on_task": "studies/test_on_task.py",
     "studies.peers": "needs the other packages",
     "studies.perf": "studies/test_perf.py",
-    "studies.roscpp": "packages/live/tests/robot/test_roscpp.py",
     "studies.round_trips": "packages/live/tests/robot/test_round_trip.py",
     "studies.scheduling": "agents/test_scheduling.py",
     "studies.shipped": "studies/test_shipped.py",

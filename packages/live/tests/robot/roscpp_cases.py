@@ -10,7 +10,7 @@ import xmlrpc.client
 from pathlib import Path
 from typing import Any
 
-from bufgym_live.robot import roscpp
+from bufgym_live.robot import read_log, replay, roscpp
 
 
 def missing() -> str:
@@ -32,6 +32,14 @@ def build(folder: Path, policies: str, kind: str = "Debug") -> Path:
     return folder / "libbufgym_roscpp.so"
 
 
+def gone(file: Path) -> list[int]:
+    """Numbers of the messages that left the socket, by a log in which the simulator decides the same."""
+    records = read_log(file)
+    again, left = replay(records), [record["seq"] for record in records if record["event"] == "gone"]
+    assert again.differences == () and again.outcome.delivered == len(left)
+    return left
+
+
 def run(*words: Any) -> str:
     done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr + done.stdout
@@ -47,10 +55,11 @@ def publishers(master: Any, topic: str) -> list[str]:
     return [node for name, nodes in published if name == f"/{topic}" for node in nodes]
 
 
-def subscriber(master: Any, topic: str) -> socket.socket:
-    """A connection on which the topic's messages come, only as fast as they are read."""
-    [name] = publishers(master, topic)
-    with xmlrpc.client.ServerProxy(master.lookupNode("/test", name)[2]) as talker:
+def subscriber(master: Any, topic: str, node: str = "") -> socket.socket:
+    """A connection on which the topic's messages come, only as fast as they are read; from the one node if unnamed."""
+    if not node:
+        [node] = publishers(master, topic)
+    with xmlrpc.client.ServerProxy(master.lookupNode("/test", node)[2]) as talker:
         _, host, port = talker.requestTopic("/test", f"/{topic}", [["TCPROS"]])[2]  # type: ignore[index,misc]
     connection = socket.create_connection((str(host), int(str(port))), timeout=5)
     fields = (f"callerid=/{port}", f"topic=/{topic}", "type=*", "md5sum=*", "tcp_nodelay=1")
@@ -69,17 +78,18 @@ def exactly(connection: socket.socket, count: int) -> bytes:
     data = bytearray()
     while len(data) < count:
         more = connection.recv(min(count - len(data), 2**16))
-        assert more, "the talker closed the connection"
+        if not more:
+            raise EOFError
         data += more
     return bytes(data)
 
 
 def seqs(connection: socket.socket, most: int, pause_s: float = 0.0, patience_s: float = 5.0) -> list[int]:
-    """The numbers of the images that come, with a pause before each, until there are so many or no more come."""
+    """The numbers of the images that come, with a pause before each, until the last of so many or no more come."""
     came: list[int] = []
     connection.settimeout(patience_s)
-    with connection, contextlib.suppress(TimeoutError):
-        while len(came) < most:
+    with connection, contextlib.suppress(TimeoutError, EOFError):
+        while not came or came[-1] < most - 1:
             time.sleep(pause_s)
             image = block(connection)
             came.append(int(image[16 : 16 + struct.unpack_from("<I", image, 12)[0]]))

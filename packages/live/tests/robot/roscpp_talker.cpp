@@ -1,6 +1,10 @@
-// talker TOPIC QUEUE_SIZE MESSAGES BYTES HZ [latched | moves]: publishes images; their frame_id is their number.
+// talker TOPIC[,TOPIC...] QUEUE_SIZE MESSAGES BYTES HZ [SUBSCRIBERS [moves]]: publishes images on all topics; their
+// frame_id is their number. It waits for so many subscribers of each topic (1); with 0 the topics are latched.
+#include <algorithm>
 #include <cstdlib>
+#include <sstream>
 #include <string>
+#include <vector>
 
 #include <nav_msgs/Odometry.h>
 #include <ros/ros.h>
@@ -10,17 +14,23 @@ int main(int argc, char **argv)
 {
   ros::init(argc, argv, "talker", ros::init_options::AnonymousName);
   ros::NodeHandle node;
-  const std::string mode = argc > 6 ? argv[6] : "";
-  const int count = std::atoi(argv[3]);
-  ros::Publisher images = node.advertise<sensor_msgs::CompressedImage>(argv[1], std::atoi(argv[2]), mode == "latched");
+  const int count = std::atoi(argv[3]), subscribers = argc > 6 ? std::atoi(argv[6]) : 1;
+  const bool moves = argc > 7, latched = subscribers == 0;
+  std::vector<ros::Publisher> images;
+  std::istringstream topics(argv[1]);
+  for (std::string topic; std::getline(topics, topic, ',');)
+    images.push_back(node.advertise<sensor_msgs::CompressedImage>(topic, std::atoi(argv[2]), latched));
   ros::Publisher odometry = node.advertise<nav_msgs::Odometry>("odom", 10);
-  while (ros::ok() && mode != "latched" && images.getNumSubscribers() == 0)
+  const auto have = [&images](int wanted) {
+    return std::all_of(images.begin(), images.end(),
+                       [wanted](const ros::Publisher &one) { return int(one.getNumSubscribers()) >= wanted; });
+  };
+  while (ros::ok() && !have(subscribers))
     ros::WallDuration(0.02).sleep();
-  ros::WallDuration(0.5).sleep();
   ros::WallRate rate(std::atof(argv[5]));
   for (int k = 0; ros::ok() && k < count; k++)
   {
-    if (mode == "moves")
+    if (moves)
     {
       nav_msgs::Odometry moved;
       moved.header.stamp = ros::Time(1000 + k / 20.0);
@@ -32,10 +42,12 @@ int main(int argc, char **argv)
     sensor_msgs::CompressedImage image;
     image.header.frame_id = std::to_string(k);
     image.data.resize(std::atoi(argv[4]));
-    images.publish(image);
+    for (ros::Publisher &one : images)
+      one.publish(image);
     ros::spinOnce();
     rate.sleep();
   }
-  while (ros::ok() && (images.getNumSubscribers() > 0 || mode == "latched"))  // until they have what they want
+  ROS_WARN("published");  // a warning is not buffered
+  while (ros::ok() && (have(1) || latched))  // until they have what they want
     ros::WallDuration(0.05).sleep();
 }

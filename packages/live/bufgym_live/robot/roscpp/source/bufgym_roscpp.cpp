@@ -85,13 +85,6 @@ bufgym::Motion *motion()
   return all ? &all->motion : nullptr;
 }
 
-int64_t now_us()
-{
-  timespec t;
-  clock_gettime(CLOCK_MONOTONIC, &t);
-  return t.tv_sec * INT64_C(1000000) + t.tv_nsec / 1000;
-}
-
 // What a subscriber's link has besides roscpp's own members; roscpp's poll thread alone uses it.
 struct State
 {
@@ -102,7 +95,7 @@ struct State
   int64_t first_us = 0, last_us = 0;  // when it began, and its last event
   int64_t arrived = 0, dequeued_bytes = 0, carried = 0, seq = -1, in_socket = 0;
 
-  int64_t stamp() { return last_us = std::max(last_us + 1, now_us() - first_us); }
+  int64_t stamp() { return last_us = std::max(last_us + 1, bufgym::now_us() - first_us); }
 };
 
 std::unordered_map<void *, std::unique_ptr<State>> &states()
@@ -156,7 +149,7 @@ void begin(State &state, ros::TransportSubscriberLink *link, int capacity)
   state.socket = tcp->*pointer(Socket());
   if (!settings().local && is_local(state.socket))
     return;
-  state.first_us = now_us();
+  state.first_us = bufgym::now_us();
   state.queue = policy->make(0, capacity);
   if (!settings().log.empty())
     state.log.open(settings().log, topic, *policy, capacity);

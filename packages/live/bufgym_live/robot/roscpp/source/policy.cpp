@@ -2,9 +2,17 @@
 
 #include <cmath>
 #include <cstdlib>
+#include <ctime>
 
 namespace bufgym
 {
+int64_t now_us()
+{
+  timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return t.tv_sec * INT64_C(1000000) + t.tv_nsec / 1000;
+}
+
 const Policy *find(const std::string &name)
 {
   for (const Policy *policy = policies; policy->name; policy++)

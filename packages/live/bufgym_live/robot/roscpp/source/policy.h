@@ -9,6 +9,8 @@ namespace bufgym
 {
 const int MOST = 64;  // a larger queue_size stays roscpp's own queue
 
+int64_t now_us();  // by the monotonic clock
+
 // Times are in us of one clock, and must not fall.
 struct Queue
 {
