@@ -1,8 +1,8 @@
 """Teleoperation: a robot moves only as long as messages of the person who drives it come in time.
 
-Messages on ``/robots/NAME/drive`` are JSON, ``{"linear": 0.3, "angular": -0.2, "for_ms": 400}``: m/s ahead, rad/s to the
-left, and the message's deadline. It holds for so long from its stamp on, by the sender's clock as the promptest of the
-sender's messages shows it. So what waited on a stalled link moves nothing, and a robot whose link is cut stops.
+Messages on ``/robots/NAME/drive`` are JSON, ``{"linear": 0.3, "angular": -0.2, "for_ms": 400}``: m/s ahead, rad/s to
+the left, and the message's deadline. It holds for so long from its stamp on, by the sender's clock as the promptest of
+the sender's messages shows it. So what waited on a stalled link moves nothing, and a robot whose link is cut stops.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ def _read(message: wire.Message) -> tuple[Velocity, float]:
 
 
 class Drive:
-    """Dead man's rule: ``move`` is called with each velocity in turn, and at the deadline of the last with ``STILL``."""
+    """Dead man's rule: ``move`` is called with each velocity in turn, and with ``STILL`` at the last one's deadline."""
 
     def __init__(
         self, move: Callable[[Velocity], Awaitable[None]], clock: Callable[[], float] = time.monotonic

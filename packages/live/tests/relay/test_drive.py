@@ -53,7 +53,7 @@ def test_a_velocity_ends_at_its_deadline() -> None:
 
 
 def test_what_waited_on_a_link_moves_nothing() -> None:
-    """A link stalls for 2 s. Messages from before its end come too late, in a burst; the first in time moves it again."""
+    """A link stalls for 2 s. What was said meanwhile comes too late, in a burst; the first in time moves it again."""
     clock = Clock()
     drive = Drive(nowhere, clock)
     drive.take(said(7.0))

@@ -2,8 +2,11 @@
 
 import io
 import itertools
+import json
 import struct
+import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,11 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
 from made_up_robot import jpeg  # noqa: E402
 from page_cases import CLOUD, Fleet, cloud, drawn, health  # noqa: E402
 from PIL import Image  # noqa: E402
+from relay_cases import settings  # noqa: E402
 from test_page import SEES, until  # noqa: E402
+
+from bufgym_live.relay.audit import Audit  # noqa: E402
+from bufgym_live.relay.store import Store  # noqa: E402
 
 pytestmark = compiled
 RED = jpeg(np.full((120, 160, 3), (220, 30, 30), np.uint8))
@@ -247,6 +254,79 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
     assert page.is_disabled("#stop") and page.is_hidden("#goal")
     small = "[...document.querySelectorAll('button')].filter(one => one.offsetHeight && one.offsetHeight < 44).length"
     assert page.viewport_size["width"] > 1000 or page.evaluate(small) == 0
+
+
+def test_driving_by_hand(opened: tuple[Any, Fleet]) -> None:
+    """Messages come while the pad or a key is held, each with a deadline. Letting go, or leaving the page, sends zeros."""
+    page, fleet = opened
+    fleet.robots["one"] = {"location": PLACE}, ()
+    fleet.driven.clear()
+    until(page, f"{text('#facts')} !== ''")
+    assert page.is_hidden("#drive")
+    fleet.robots["one"] = {"location": PLACE, "commands": ["drive"]}, ()
+    page.click("#drive")
+    page.evaluate("document.querySelector('#map').scrollIntoView()")
+
+    def driven(holds: Callable[[list[Any]], bool]) -> list[Any]:
+        """The messages since the last call, once it holds of them."""
+        for _ in range(1_500):
+            if fleet.driven and holds(fleet.driven):
+                said = list(fleet.driven)
+                fleet.driven.clear()
+                return said
+            page.wait_for_timeout(20)
+        pytest.fail(f"at last {fleet.driven}")
+
+    still = {"linear": 0, "angular": 0, "for_ms": 0}
+    box = page.locator("#pad").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"])
+    page.mouse.down()
+    (ahead, *_) = driven(lambda said: len(said) >= 3)
+    assert ahead["linear"] == pytest.approx(0.2, abs=0.01) and ahead["angular"] == pytest.approx(0, abs=0.01)
+    assert ahead["for_ms"] == 400
+    page.mouse.up()
+    driven(lambda said: said[-1] == still)
+    page.select_option("#speed-most", "0.5")
+    for leaves in ("dispatchEvent(new Event('blur'))", "document.querySelector('#pad').blur()"):
+        page.focus("#pad")
+        page.keyboard.down("ArrowUp")
+        page.keyboard.down("a")
+        driven(lambda said: said[-1] == {"linear": 0.5, "angular": 1, "for_ms": 400})
+        page.evaluate(leaves)
+        driven(lambda said: said[-1] == still)
+        page.keyboard.up("a")
+        page.keyboard.up("ArrowUp")
+    fleet.robots["one"] = {"location": PLACE}, ()
+    until(page, "document.querySelector('#drive').hidden && document.querySelector('#driving').hidden")
+    assert fleet.driven == []
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_robots_that_are_away_are_listed_until_they_are_removed(
+    running: tuple[Any, Fleet], width: int, tmp_path: Path
+) -> None:
+    """They stand under those that are here, with their last place. On a phone 60 of them are a list that scrolls."""
+    said, long_us = json.dumps({"text": "charges", "location": PLACE}), time.time_ns() // 1000 - 3 * 3600 * 10**6
+    rows = [(name, long_us, said) for name in ("g\u043e\u043ed", *(f"old-{k}" for k in range(60)))]
+    kept = settings(folder=tmp_path)
+    store = Store(kept, Audit(None, kept.audit), lambda _: None, time.monotonic)
+    store.keep_robots(rows, 100)
+    store.close()
+    with Fleet(folder=tmp_path) as fleet, shows(running[0], f"http://127.0.0.1:{fleet.port}/", width=width) as page:
+        fleet.robots["zebra"] = {"location": PLACE}, ()
+        until(page, f"{text('#count')} === '1, 61 away'", f"{text('#name')} === 'zebra'")
+        names = text(".called")
+        assert page.evaluate(names).startswith("zebra,") and page.is_hidden("#remove")
+        assert page.evaluate(text(".mark:not([hidden])")) == "unusual letters"
+        assert page.evaluate("document.querySelector('#robots').offsetHeight <= 800")
+        page.fill("#search", "old-59")
+        page.click(".card:not([hidden])")
+        assert page.evaluate(text(".card:not([hidden]) .seen")) == "last seen 3 h ago at 0.0, 0.0 m"
+        page.click("#remove")
+        until(page, f"!{names}.includes('old-59')", f"{text('#name')} === 'zebra'")
+        page.reload()
+        until(page, f"{text('#count')} === '1, 60 away'")
+        assert "old-59" not in page.evaluate(names)
 
 
 def test_an_absent_relay_covers_the_page(running: tuple[Any, Fleet]) -> None:
