@@ -1,5 +1,6 @@
 """The page over made-up robots that send each type of message: troubles, layers, cameras, commands."""
 
+import base64
 import io
 import itertools
 import json
@@ -20,9 +21,11 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
 from made_up_robot import jpeg  # noqa: E402
 from page_cases import CLOUD, Fleet, cloud, drawn, health  # noqa: E402
 from PIL import Image  # noqa: E402
+from pose_cases import ESTIMATE, POSE  # noqa: E402
 from relay_cases import settings  # noqa: E402
 from test_page import SEES, until  # noqa: E402
 
+from bufgym_live.relay import ros_messages  # noqa: E402
 from bufgym_live.relay.audit import Audit  # noqa: E402
 from bufgym_live.relay.store import Store  # noqa: E402
 
@@ -256,8 +259,27 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
     assert page.viewport_size["width"] > 1000 or page.evaluate(small) == 0
 
 
+def test_what_the_page_writes_is_ros(opened: tuple[Any, Fleet]) -> None:
+    """A goal, a pose and a stop in CDR; a robot of ROS 1 gets the same in its own encoding."""
+    write = """async isEstimate => {
+      const {stamped, still} = await import("./cdr_write.js");
+      return isEstimate === null ? still() : stamped(isEstimate, {x: 1.5, y: -2, yaw: Math.PI / 2, frame: "map"});
+    }"""
+    for kind, type in ((False, POSE), (True, ESTIMATE), (None, "geometry_msgs/msg/Twist")):
+        payload = base64.b64decode(opened[0].evaluate(write, kind))
+        old = ros_messages.as_ros1(payload, type)
+        for read in (ros_messages.read(payload, type), ros_messages.read(old, type, "ros1")):
+            if kind is None:
+                assert (read.linear.x, read.linear.y, read.angular.z) == (0, 0, 0)
+                continue
+            pose = read.pose.pose if kind else read.pose
+            said = ros_messages.planar(pose.position, pose.orientation)
+            assert (read.header.frame_id, said) == ("map", {"x": 1.5, "y": -2.0, "yaw": round(np.pi / 2, 4)})
+            assert not kind or read.pose.covariance[[0, 7, 35]].tolist() == [0.25, 0.25, 0.0685]
+
+
 def test_driving_by_hand(opened: tuple[Any, Fleet]) -> None:
-    """Messages come while the pad or a key is held, each with a deadline. Letting go, or leaving the page, sends zeros."""
+    """Messages come while the pad or a key is held, each with a deadline. Letting go, or leaving it, sends zeros."""
     page, fleet = opened
     fleet.robots["one"] = {"location": PLACE}, ()
     fleet.driven.clear()
