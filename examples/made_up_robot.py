@@ -258,7 +258,7 @@ class MadeUp:
         return {"battery": round(max(0.0, charge), 3), "ok": True, "text": text, "commands": commands}
 
     async def on_command(self, command: Any) -> None:
-        """Obey ``stop`` (stand still), ``goal`` (drive straight to x, y), ``cancel`` (go on round the table) or ``drive``."""
+        """Obey ``stop``, ``goal`` (drive straight to x, y), ``cancel`` (go on round the table) or ``drive``."""
         self._move()
         self._driven = (0.0, 0.0)
         match command:
