@@ -301,7 +301,7 @@ def test_driving_by_hand(opened: tuple[Any, Fleet]) -> None:
 
     still = {"linear": 0, "angular": 0, "for_ms": 0}
     box = page.locator("#pad").bounding_box()
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"])
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 3)
     page.mouse.down()
     (ahead, *_) = driven(lambda said: len(said) >= 3)
     assert ahead["linear"] == pytest.approx(0.2, abs=0.01) and ahead["angular"] == pytest.approx(0, abs=0.01)

@@ -28,7 +28,10 @@ export class Hand {
       const {name} = asks.robot();
       relay.command(`/robots/${name}/last`, null).then(() => asks.removed(name), error => notices.refused(name, `remove: ${error.message}`, asks.nowMs()));
     };
-    $("stop").onclick = () => this.send("stop");
+    $("stop").onclick = () => {
+      this.drive.release();
+      this.send("stop");
+    };
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
     addEventListener("keydown", event => { if (event.key === "Escape") this.take(null); });
