@@ -3,11 +3,8 @@
 import base64
 import io
 import itertools
-import json
 import struct
-import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,12 +19,9 @@ from made_up_robot import jpeg  # noqa: E402
 from page_cases import CLOUD, Fleet, cloud, drawn, health  # noqa: E402
 from PIL import Image  # noqa: E402
 from pose_cases import ESTIMATE, POSE  # noqa: E402
-from relay_cases import settings  # noqa: E402
 from test_page import SEES, until  # noqa: E402
 
 from bufgym_live.relay import ros_messages  # noqa: E402
-from bufgym_live.relay.audit import Audit  # noqa: E402
-from bufgym_live.relay.store import Store  # noqa: E402
 
 pytestmark = compiled
 RED = jpeg(np.full((120, 160, 3), (220, 30, 30), np.uint8))
@@ -321,34 +315,6 @@ def test_driving_by_hand(opened: tuple[Any, Fleet]) -> None:
     fleet.robots["one"] = {"location": PLACE}, ()
     until(page, "document.querySelector('#drive').hidden && document.querySelector('#driving').hidden")
     assert fleet.driven == []
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-def test_robots_that_are_away_are_listed_until_they_are_removed(
-    running: tuple[Any, Fleet], width: int, tmp_path: Path
-) -> None:
-    """They stand under those that are here, with their last place. On a phone 60 of them are a list that scrolls."""
-    said, long_us = json.dumps({"text": "charges", "location": PLACE}), time.time_ns() // 1000 - 3 * 3600 * 10**6
-    rows = [(name, long_us, said) for name in ("g\u043e\u043ed", *(f"old-{k}" for k in range(60)))]
-    kept = settings(folder=tmp_path)
-    store = Store(kept, Audit(None, kept.audit), lambda _: None, time.monotonic)
-    store.keep_robots(rows, 100)
-    store.close()
-    with Fleet(folder=tmp_path) as fleet, shows(running[0], f"http://127.0.0.1:{fleet.port}/", width=width) as page:
-        fleet.robots["zebra"] = {"location": PLACE}, ()
-        until(page, f"{text('#count')} === '1, 61 away'", f"{text('#name')} === 'zebra'")
-        names = text(".called")
-        assert page.evaluate(names).startswith("zebra,") and page.is_hidden("#remove")
-        assert page.evaluate(text(".mark:not([hidden])")) == "unusual letters"
-        assert page.evaluate("document.querySelector('#robots').offsetHeight <= 800")
-        page.fill("#search", "old-59")
-        page.click(".card:not([hidden])")
-        assert page.evaluate(text(".card:not([hidden]) .seen")) == "last seen 3 h ago at 0.0, 0.0 m"
-        page.click("#remove")
-        until(page, f"!{names}.includes('old-59')", f"{text('#name')} === 'zebra'")
-        page.reload()
-        until(page, f"{text('#count')} === '1, 60 away'")
-        assert "old-59" not in page.evaluate(names)
 
 
 def test_an_absent_relay_covers_the_page(running: tuple[Any, Fleet]) -> None:
