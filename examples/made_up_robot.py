@@ -197,6 +197,8 @@ class MadeUp:
         """How long it has been on its loop; it does not count while it stands or drives elsewhere."""
         self._at, self._stands = pose_at(number, 0.0), False
         self._goal: Pose | None = None
+        self._driven = (0.0, 0.0)
+        """Velocity at which a person drives it: m/s ahead, rad/s to the left."""
 
     async def run(self, robot: Robot) -> None:
         makers = {"odom": self._odometry, "scan": self._scan, "camera": self._camera}
@@ -234,6 +236,11 @@ class MadeUp:
         target = self._goal or pose_at(self.number, self._loop_s + passed_s)
         dx, dy = target.x - self._at.x, target.y - self._at.y
         gap, step = math.hypot(dx, dy), SPEED_M_S * passed_s
+        if any(self._driven):
+            ahead_m, yaw = self._driven[0] * passed_s, self._at.yaw + self._driven[1] * passed_s
+            place = self._at.x + ahead_m * math.cos(yaw), self._at.y + ahead_m * math.sin(yaw)
+            x, y = (max(-half, min(half, one)) for one, half in zip(place, HALF_M, strict=True))
+            self._at = Pose(x, y, yaw)
         if self._stands:
             return self._at
         if self._goal is None and gap <= 2 * step + 0.2:
@@ -247,12 +254,13 @@ class MadeUp:
     def status(self) -> dict[str, Any]:
         charge = 1 - 0.13 * (self.number % 5) - self._now()[0] / _DRAIN_S
         text = "stands" if self._stands else "drives to its goal" if self._goal else "drives round"
-        commands = ["stop", "goal", "cancel"]
+        commands = ["stop", "goal", "cancel", "drive"]
         return {"battery": round(max(0.0, charge), 3), "ok": True, "text": text, "commands": commands}
 
     async def on_command(self, command: Any) -> None:
-        """Obey ``stop`` (stand still), ``goal`` (drive straight to x, y) or ``cancel`` (go on round the table)."""
+        """Obey ``stop``, ``goal`` (drive straight to x, y), ``cancel`` (go on round the table) or ``drive``."""
         self._move()
+        self._driven = (0.0, 0.0)
         match command:
             case {"command": "stop"}:
                 self._stands = True
@@ -267,8 +275,10 @@ class MadeUp:
                 if not (abs(x) <= HALF_M[0] and abs(y) <= HALF_M[1]):
                     raise BufgymError(f"goal {x}, {y}: must be in the room, {HALF_M} m from its middle")
                 self._stands, self._goal = False, Pose(x, y, yaw)
+            case {"command": "drive", "linear": float() as linear, "angular": float() as angular}:
+                self._stands, self._goal, self._driven = True, None, (linear, angular)
             case _:
-                raise BufgymError(f"command {command!r}: must be stop, goal or cancel")
+                raise BufgymError(f"command {command!r}: must be stop, goal, cancel or drive")
 
 
 if __name__ == "__main__":

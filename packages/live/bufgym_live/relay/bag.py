@@ -70,4 +70,5 @@ class BagSource:
         return {"recording": Path(self._bag.path).name}
 
     async def on_command(self, command: Any) -> None:
-        """Ignore the command, because a recording cannot change."""
+        """Refuse the command, because a recording cannot change."""
+        raise BufgymError(f"command {str(command)[:60]}: this robot is a recording, which takes none")

@@ -18,6 +18,7 @@ from bufgym_live.relay.outbox import Outbox
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
+from bufgym_live.relay.roster import is_last
 from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
@@ -112,6 +113,9 @@ class Connection:
         try:
             no_drop, now_s = hub.is_no_drop(message.topic), hub.clock()
             new = protocol.check(message, self.session, self.permissions, self._quota, no_drop, now_s)
+            hub.drivers.note(message.topic, self.session.name, address=who.address, email=who.email)
+            if is_last(message.topic):
+                hub.audit("removed", topic=message.topic, session=self.session.name, **who.as_json())
             stamp_us = message.stamp_us or time.time_ns() // 1000
             message = message._replace(sender=self._admitted.name, stamp_us=stamp_us)
             if not message.no_drop:

@@ -15,9 +15,11 @@ from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
+from bufgym_live.relay.drive import Drivers
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quotas
 from bufgym_live.relay.recorder import Recorder, Tape
+from bufgym_live.relay.roster import GONE, Roster, is_last
 from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.store import Settled, Store, StoredSession
 from bufgym_live.relay.subscriber import Subscription
@@ -98,7 +100,9 @@ class Hub:
         disk = Disk("recordings", self.audit)
         recorder = Recorder.of(config, disk)
         self.tape = None if recorder is None else Tape(recorder, disk)
-        self.own: list[Tape | Window] = [] if self.tape is None else [self.tape]
+        self.drivers = Drivers(self.audit, clock)
+        self.roster = Roster(self.store, lambda message: self.publish(None, message), clock)
+        self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
         self.replaying = asyncio.Lock()  # whose turn it is to read a recording
         self.turns = Turns()
@@ -110,6 +114,8 @@ class Hub:
         self._latched: dict[str, Outgoing] = {}
         self._latched_bytes = 0
         self.peers: Peers | None = None  # the other relays, if it shares topics with any
+        for message in self.roster.away():
+            self._latch(Outgoing(message))
 
     def take_over(self, identity: str, name: str) -> None:
         """End the connection of this session, if it has one, and free its place for the next."""
@@ -165,7 +171,7 @@ class Hub:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
         frame = Outgoing(message)
-        if _any_whole(self.config.latched, message.topic):
+        if is_last(message.topic) or _any_whole(self.config.latched, message.topic):
             self._latch(frame)
         for member, subscription in self._route(message.topic):
             if member is not sender:
@@ -174,8 +180,11 @@ class Hub:
     def _latch(self, frame: Outgoing) -> None:
         """Keep it in place of its topic's last message."""
         before = self._latched.pop(frame.message.topic, None)
+        self._latched_bytes -= before.size_bytes if before else 0
+        if is_last(frame.message.topic) and frame.message.payload == GONE:
+            return
         self._latched[frame.message.topic] = frame
-        self._latched_bytes += frame.size_bytes - (before.size_bytes if before else 0)
+        self._latched_bytes += frame.size_bytes
         while self._latched_bytes > MAX_LATCHED_BYTES:
             self._latched_bytes -= self._latched.pop(next(iter(self._latched))).size_bytes
 
@@ -282,11 +291,14 @@ class Hub:
         self.audit.flush()
         if self.tape is not None:
             self.tape.tick()
+        self.roster.tick()
+        self.drivers.tick()
         self.quotas.tidy()
         self.store.forget_expired()
 
     def close(self) -> None:
         """Finish the files."""
+        self.drivers.tick(quiet_s=0.0)
         for each in self.own:
             with self.spared(type(each).__name__):
                 each.close()

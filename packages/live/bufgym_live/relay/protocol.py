@@ -15,6 +15,7 @@ from bufgym_live.relay import wire
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Config, Rule
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quota
+from bufgym_live.relay.roster import GONE, is_last
 from bufgym_live.relay.rules import Identity, Permissions
 from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription
@@ -119,6 +120,8 @@ def check(
     if message.no_drop != no_drop:
         raise RefusedError("wrong", f"topic {topic}: is {'not ' if message.no_drop else ''}no_drop here")
     check_json(message)
+    if is_last(topic) and (message.encoding != "json" or message.payload != GONE):
+        raise RefusedError("wrong", f"topic {topic}: only null may be published here, which removes the robot")
     if message.no_drop and message.seq != received + 1:
         raise RefusedError("out_of_order", f"seq = {message.seq}: must be {received + 1}")
     return True

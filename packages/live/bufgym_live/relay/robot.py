@@ -3,7 +3,8 @@
 A robot's topics lie under ``/robots/NAME/``. Besides its source's topics it publishes ``queue`` five times a second and
 ``status`` once a second, with battery, location, network, queue and the list of topics. The command ``{"command":
 "policy", "policy": "afr"}`` on its topic ``command`` changes its queue's policy. Its status answers the latest command
-by the command's ``id``, with the reason ``why`` if it was refused.
+by the command's ``id``, with the reason ``why`` if it was refused. Messages on its topic ``drive`` move it as
+``bufgym_live.relay.drive`` says.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from bufgym.policies.registry import Policy, get
 from bufgym.scenario import Stream
 from bufgym_live.relay import wire
 from bufgym_live.relay.client import RobotClient
+from bufgym_live.relay.drive import TOPIC, Drive, Velocity
 from bufgym_live.relay.monitor import Monitor
 from bufgym_live.relay.place import Place
 from bufgym_live.robot.tasks import until_one_ends
@@ -48,7 +50,11 @@ class Source(Protocol):
         """Return ``battery``, ``location``, ``ok``, ``text`` and the like, as far as they are known."""
 
     async def on_command(self, command: Any) -> None:
-        """Take a command that is not the robot's own, or raise a BufgymError that says why not."""
+        """Take a command that is not the robot's own, or raise a BufgymError that says why not.
+
+        A source that takes ``{"command": "drive", "linear": m/s, "angular": rad/s}`` lists ``drive`` in ``commands`` of
+        its status. Zeros follow as soon as the person who drives is silent for too long.
+        """
 
 
 class Robot:
@@ -87,6 +93,8 @@ class Robot:
         settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
         self.client = RobotClient(url, name, **settings)
         self.client.subscribe(f"^{self.topic('command')}$", self._command)
+        self._drive = Drive(self._move)
+        self.client.subscribe(f"^{self.topic(TOPIC)}$", self._driven)
 
     def topic(self, name: str) -> str:
         """Put the robot's prefix before a topic's name."""
@@ -122,6 +130,7 @@ class Robot:
             "publishes": self._kinds,
             "policies": self._policies,
             "answer": self._answer,
+            "driver": self._drive.driver,
             **self.source.status(),
         }
 
@@ -136,7 +145,7 @@ class Robot:
 
         own = [(STATUS_S, status), (STATUS_S, self.client.ping), (QUEUE_S, queue)]
         every = [self._every(period_s, work) for period_s, work in own]
-        await until_one_ends(self.source.run(self), self.client.run(), *every)
+        await until_one_ends(self._drive.run(), self.source.run(self), self.client.run(), *every)
 
     async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         await self.client.connected.wait()
@@ -146,6 +155,18 @@ class Robot:
             await work()
             next_s = max(next_s + period_s, loop.time())
             await asyncio.sleep(next_s - loop.time())
+
+    def _driven(self, message: wire.Message) -> None:
+        try:
+            self._drive.take(message)
+        except BufgymError as error:
+            self.client.note(str(error))
+
+    async def _move(self, velocity: Velocity) -> None:
+        try:
+            await self.source.on_command({"command": "drive", **velocity._asdict()})
+        except BufgymError as error:
+            self.client.note(str(error))
 
     async def _command(self, message: wire.Message) -> None:
         try:

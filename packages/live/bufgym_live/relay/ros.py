@@ -5,6 +5,7 @@ the robot was told to receive that topic.
 """
 
 import asyncio
+import struct
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
@@ -17,6 +18,8 @@ from bufgym_live.robot.ros2.names import Published
 from bufgym_live.robot.ros2.relay import look, matched, own_node, spinning
 
 NODE: Final = "bufgym_robot"
+TWIST: Final = Published("/cmd_vel", "geometry_msgs/msg/Twist")
+"""Topic on which a person drives the robot, if it is one of those that it receives."""
 Outlet = Callable[[bytes], None]
 """Publishes a message in CDR here."""
 
@@ -33,6 +36,9 @@ class _RosSource:
         self.streams = tuple(streams)
         self._names = {resolved(stream.topic.name): stream.topic.name for stream in streams}
         self._receive = tuple(map(resolved, receive))
+        self._outlets: dict[Published, Outlet] = {}
+        self._advertise: Callable[[Published], Awaitable[Outlet]] | None = None
+        self._advertising = asyncio.Lock()
 
     def _wanted(self, robot: Robot) -> list[str]:
         """Its topics, and the one that is named as the robot's odometry, which need not be one of them."""
@@ -49,29 +55,39 @@ class _RosSource:
     def _listen(self, robot: Robot, advertise: Callable[[Published], Awaitable[Outlet]]) -> None:
         """Publish messages for the topics that this robot receives; note messages that fail."""
         before = robot.topic("to")
-        outlets: dict[Published, Outlet] = {}
+        self._advertise = advertise
 
         async def take(message: wire.Message) -> None:
             name = message.topic.removeprefix(before)
             if name not in self._receive or message.encoding != "cdr":
                 return
             try:
-                topic = Published(name, message.type)
-                if topic not in outlets:
-                    outlets[topic] = await advertise(topic)
-                outlets[topic](bytes(message.payload))
+                await self._publish(Published(name, message.type), bytes(message.payload))
             except Exception as error:  # messages are untrusted, and ROS has its own error types
                 robot.client.note(f"{message.topic}: not published: {error}")
 
         if self._receive:
             robot.client.subscribe(f"^{before}/", take)
 
+    async def _publish(self, topic: Published, payload: bytes) -> None:
+        """Publish a message in CDR here."""
+        async with self._advertising:
+            if topic not in self._outlets:
+                if self._advertise is None:
+                    raise BufgymError(f"topic {topic.name}: not published: ROS is not there yet")
+                self._outlets[topic] = await self._advertise(topic)
+        self._outlets[topic](payload)
+
     def status(self) -> dict[str, Any]:
-        """Return the topics that others may publish on, below ``to``."""
-        return {"receives": self._receive}
+        """Return the topics that others may publish on, below ``to``, and whether one of them drives it."""
+        return {"receives": self._receive, "commands": ["drive"] if TWIST.name in self._receive else []}
 
     async def on_command(self, command: Any) -> None:
-        """Refuse the command, because ROS takes commands on topics."""
+        """Publish a velocity as a Twist; refuse other commands, because ROS takes them on topics."""
+        match command:
+            case {"command": "drive", "linear": linear, "angular": angular} if TWIST.name in self._receive:
+                await self._publish(TWIST, b"\0\1\0\0" + struct.pack("<6d", linear, 0, 0, 0, 0, angular))
+                return
         raise BufgymError(f"command {command!r}: this robot takes commands on topics of ROS: {self._receive}")
 
 

@@ -31,6 +31,7 @@ CREATE TABLE IF NOT EXISTS message (
     waiting INTEGER, lost INTEGER);
 CREATE TABLE IF NOT EXISTS delivery (
     session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS robot (name TEXT PRIMARY KEY, seen_us INTEGER, said TEXT) WITHOUT ROWID;
 """
 _COLUMNS: Final = "id, name, address, email, temporary, received, numbered"
 
@@ -248,6 +249,23 @@ class Store:
     def _expire(self, session: StoredSession) -> None:
         self._audit("forgotten", session=session.name, held=session.held, **session.identity.as_json())
         self.forget(session)
+
+    def robots(self) -> list[tuple[str, int, str]]:
+        """Read the robots that were here: name, time of the last status in us since 1970, what it said as JSON."""
+        return self._db.execute("SELECT name, seen_us, said FROM robot").fetchall()
+
+    def keep_robots(self, rows: Sequence[tuple[str, int, str]], most: int) -> None:
+        """Keep these for later, as ``robots`` returns them, and of all only the ``most`` that were here last."""
+        if rows:
+            with self._bearable(), self._transaction():
+                self._db.executemany("INSERT OR REPLACE INTO robot VALUES (?, ?, ?)", rows)
+                last = "SELECT name FROM robot ORDER BY seen_us DESC LIMIT ?"
+                self._db.execute(f"DELETE FROM robot WHERE name NOT IN ({last})", (most,))
+
+    def forget_robot(self, name: str) -> None:
+        """Remove a robot that was here."""
+        with self._bearable(), self._transaction():
+            self._db.execute("DELETE FROM robot WHERE name = ?", (name,))
 
     @property
     def there(self) -> bool:

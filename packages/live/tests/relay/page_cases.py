@@ -84,9 +84,12 @@ def health(level: int, says: str) -> Topics:
 class Fleet:
     """A relay with made-up robots, in a thread; each publishes its status and topics some times a second."""
 
-    def __init__(self) -> None:
+    def __init__(self, **changed: Any) -> None:
+        """``changed`` are settings of the relay."""
+        self.settings = settings(**{"rules": (ALL,), "limits": Limits(hello_s=60), **changed})
         self.robots: dict[str, tuple[dict[str, Any], Topics]] = {}
         self.came: list[Any] = []
+        self.driven: list[Any] = []
         self.port, self.over, self.ready = 0, threading.Event(), threading.Event()
         self.thread = threading.Thread(target=lambda: asyncio.run(self.run()))
 
@@ -101,19 +104,20 @@ class Fleet:
         assert not self.thread.is_alive(), "waited 60 s for a relay's end"
 
     async def run(self) -> None:
-        async with (
-            relay(settings(rules=(ALL,), limits=Limits(hello_s=60))) as server,
-            client(server.port, name="fleet") as one,
-        ):
+        async with relay(self.settings) as server, client(server.port, name="fleet") as one:
             self.port = server.port
             self.ready.set()
-            await one.subscribe("^/robots/[^/]+/command$")
+            await one.subscribe("^/robots/[^/]+/(command|drive)$")
             while not self.over.is_set():
                 for name, (status, topics) in list(self.robots.items()):
                     await self.publish(one, name, status, topics)
                 for said in await one.rest():
+                    command = json.loads(bytes(said.payload))
+                    if said.topic.endswith("/drive"):
+                        self.driven.append(command)
+                        continue
                     await one.say("ack", seq=said.seq)
-                    self.came.append(command := json.loads(bytes(said.payload)))
+                    self.came.append(command)
                     answer = {"id": command["id"], "why": "too far" if command.get("x", 0) > 1 else ""}
                     self.robots[said.topic.split("/")[2]][0]["answer"] = answer
                 await asyncio.sleep(0.1)

@@ -1,6 +1,7 @@
 """A robot of ROS at a relay, for test_robot.py: prints what came each way. Needs rospy and rosmaster, or rclpy.
 
-node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer; viewer --/robots/r/to/speech--> node
+node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer
+viewer --/robots/r/to/speech, goal_pose, initialpose, cmd_vel and /robots/r/drive--> node
 """
 
 import asyncio
@@ -12,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from loop_cases import beside
-from relay_cases import relay, settings, until, wait
+from pose_cases import ESTIMATE, POSE, message
+from relay_cases import client, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay.session import Session
@@ -28,7 +30,15 @@ def cdr(text: str) -> bytes:
     return b"\0\1\0\0" + (len(text) + 1).to_bytes(4, "little") + text.encode() + b"\0"
 
 
-def node_1(folder: str, hear: Any) -> list[Any]:
+def heard_kinds() -> dict[str, Any]:
+    """Types of the topics that the node hears, as its version of ROS has them."""
+    from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+    from std_msgs.msg import String
+
+    return {"speech": String, "goal_pose": PoseStamped, "initialpose": PoseWithCovarianceStamped, "cmd_vel": Twist}
+
+
+def node_1(folder: str, hear: dict[str, Any]) -> list[Any]:
     """A node of ROS 1 with its master: its publishers of texts and of poses."""
     from rosmaster.master import Master
 
@@ -41,11 +51,12 @@ def node_1(folder: str, hear: Any) -> list[Any]:
     from std_msgs.msg import String
 
     rospy.init_node("node", disable_signals=True, disable_rosout=True)
-    rospy.Subscriber("speech", String, hear)
+    for topic, kind in heard_kinds().items():
+        rospy.Subscriber(topic, kind, hear[topic])
     return [rospy.Publisher(topic, kind, queue_size=9) for topic, kind in (("chatter", String), ("odom", Odometry))]
 
 
-def node_2(folder: str, hear: Any) -> list[Any]:
+def node_2(folder: str, hear: dict[str, Any]) -> list[Any]:
     """The same of ROS 2, in a domain of its own: two may run at a time."""
     os.environ["ROS_DOMAIN_ID"] = str(20 + os.getpid() % 80)
     import rclpy
@@ -54,7 +65,8 @@ def node_2(folder: str, hear: Any) -> list[Any]:
 
     rclpy.init(args=[])
     node = rclpy.create_node("node")
-    node.create_subscription(String, "speech", hear, 9)
+    for topic, kind in heard_kinds().items():
+        node.create_subscription(kind, topic, hear[topic], 9)
     threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
     return [node.create_publisher(kind, topic, 9) for topic, kind in (("chatter", String), ("odom", Odometry))]
 
@@ -64,7 +76,19 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
     config.write_text(CONFIG)
     came, location, sent, heard = list[Message](), list[Any](), list[str](), list[str]()
     make = {"1": node_1, "2": node_2}[version]
-    texts, poses = make(str(folder), lambda text: heard.append(text.data))
+    places, moves = dict[str, Any](), list[list[float]]()
+
+    def move(twist: Any) -> None:
+        now = [twist.linear.x, twist.angular.z]
+        moves.extend([now] if moves[-1:] != [now] else [])
+
+    hear = {
+        "speech": lambda text: heard.append(text.data),
+        "goal_pose": lambda said: places.update(goal=[said.header.frame_id, said.pose.position.x]),
+        "initialpose": lambda said: places.update(pose=[said.header.frame_id, said.pose.pose.position.x]),
+        "cmd_vel": move,
+    }
+    texts, poses = make(str(folder), hear)
 
     async def publish() -> None:
         from nav_msgs.msg import Odometry
@@ -91,7 +115,8 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
     async with relay(settings(no_drop=("/robots/[^/]+/(command|to/.*)",))) as server:
         url = f"ws://127.0.0.1:{server.port}"
         words = ["relay", "robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
-        words += ["--odom", "odom", "--receive", "speech", "--policies", "drop-oldest"]
+        words += ["--odom", "odom", "--policies", "drop-oldest"]
+        words += [word for topic in hear for word in ("--receive", topic)]
         robot = await asyncio.create_subprocess_exec(sys.executable, "-m", "bufgym", *words, stdout=sys.stderr)
         viewer = Session(url, "viewer", say=lambda text: print(text, file=sys.stderr))
         viewer.subscribe("^/robots/r/chatter$", came.append)
@@ -106,6 +131,17 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
                 for text in COMMANDS:
                     await command("/robots/r/to/speech", cdr(text), TEXT)
                 await until("what was said", lambda: len(heard) >= len(COMMANDS))
+                await command("/robots/r/to/goal_pose", message(POSE, 0, 1.5, "map"), POSE)
+                await command("/robots/r/to/initialpose", message(ESTIMATE, 0, -2.0, "map"), ESTIMATE)
+                await command("/robots/r/to/cmd_vel", b"\0\1\0\0" + bytes(48), "geometry_msgs/msg/Twist")
+                await until("goal, pose and stop", lambda: len(places) == 2 and moves)
+                async with client(server.port, name="ann") as ann:
+                    velocity = json.dumps({"linear": 0.3, "angular": -0.2, "for_ms": 1000}).encode()
+                    while len(moves) < 2:
+                        await ann.put("/robots/r/drive", velocity, encoding="json")
+                        await asyncio.sleep(0.1)
+                    await server.close()
+                await until("it stands", lambda: len(moves) == 3)
                 assert robot.returncode is None
         finally:
             robot.terminate()
@@ -115,6 +151,8 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
         "kinds": sorted({(message.encoding, message.type) for message in came}),
         "heard": heard,
         "location": next(filter(None, location)),
+        **places,
+        "moves": moves,
     }
 
 

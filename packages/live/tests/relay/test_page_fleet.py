@@ -1,5 +1,6 @@
 """The page over made-up robots that send each type of message: troubles, layers, cameras, commands."""
 
+import base64
 import io
 import itertools
 import struct
@@ -17,7 +18,10 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
 from made_up_robot import jpeg  # noqa: E402
 from page_cases import CLOUD, Fleet, cloud, drawn, health  # noqa: E402
 from PIL import Image  # noqa: E402
+from pose_cases import ESTIMATE, POSE  # noqa: E402
 from test_page import SEES, until  # noqa: E402
+
+from bufgym_live.relay import ros_messages  # noqa: E402
 
 pytestmark = compiled
 RED = jpeg(np.full((120, 160, 3), (220, 30, 30), np.uint8))
@@ -247,6 +251,70 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
     assert page.is_disabled("#stop") and page.is_hidden("#goal")
     small = "[...document.querySelectorAll('button')].filter(one => one.offsetHeight && one.offsetHeight < 44).length"
     assert page.viewport_size["width"] > 1000 or page.evaluate(small) == 0
+
+
+def test_what_the_page_writes_is_ros(opened: tuple[Any, Fleet]) -> None:
+    """A goal, a pose and a stop in CDR; a robot of ROS 1 gets the same in its own encoding."""
+    write = """async isEstimate => {
+      const {stamped, still} = await import("./cdr_write.js");
+      return isEstimate === null ? still() : stamped(isEstimate, {x: 1.5, y: -2, yaw: Math.PI / 2, frame: "map"});
+    }"""
+    for kind, type in ((False, POSE), (True, ESTIMATE), (None, "geometry_msgs/msg/Twist")):
+        payload = base64.b64decode(opened[0].evaluate(write, kind))
+        old = ros_messages.as_ros1(payload, type)
+        for read in (ros_messages.read(payload, type), ros_messages.read(old, type, "ros1")):
+            if kind is None:
+                assert (read.linear.x, read.linear.y, read.angular.z) == (0, 0, 0)
+                continue
+            pose = read.pose.pose if kind else read.pose
+            said = ros_messages.planar(pose.position, pose.orientation)
+            assert (read.header.frame_id, said) == ("map", {"x": 1.5, "y": -2.0, "yaw": round(np.pi / 2, 4)})
+            assert not kind or read.pose.covariance[[0, 7, 35]].tolist() == [0.25, 0.25, 0.0685]
+
+
+def test_driving_by_hand(opened: tuple[Any, Fleet]) -> None:
+    """Messages come while the pad or a key is held, each with a deadline. Letting go, or leaving it, sends zeros."""
+    page, fleet = opened
+    fleet.robots["one"] = {"location": PLACE}, ()
+    fleet.driven.clear()
+    until(page, f"{text('#facts')} !== ''")
+    assert page.is_hidden("#drive")
+    fleet.robots["one"] = {"location": PLACE, "commands": ["drive"]}, ()
+    page.click("#drive")
+    page.evaluate("document.querySelector('#map').scrollIntoView()")
+
+    def driven(holds: Callable[[list[Any]], bool]) -> list[Any]:
+        """The messages since the last call, once it holds of them."""
+        for _ in range(1_500):
+            if fleet.driven and holds(fleet.driven):
+                said = list(fleet.driven)
+                fleet.driven.clear()
+                return said
+            page.wait_for_timeout(20)
+        pytest.fail(f"at last {fleet.driven}")
+
+    still = {"linear": 0, "angular": 0, "for_ms": 0}
+    box = page.locator("#pad").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 3)
+    page.mouse.down()
+    (ahead, *_) = driven(lambda said: len(said) >= 3)
+    assert ahead["linear"] == pytest.approx(0.2, abs=0.01) and ahead["angular"] == pytest.approx(0, abs=0.01)
+    assert ahead["for_ms"] == 400
+    page.mouse.up()
+    driven(lambda said: said[-1] == still)
+    page.select_option("#speed-most", "0.5")
+    for leaves in ("dispatchEvent(new Event('blur'))", "document.querySelector('#pad').blur()"):
+        page.focus("#pad")
+        page.keyboard.down("ArrowUp")
+        page.keyboard.down("a")
+        driven(lambda said: said[-1] == {"linear": 0.5, "angular": 1, "for_ms": 400})
+        page.evaluate(leaves)
+        driven(lambda said: said[-1] == still)
+        page.keyboard.up("a")
+        page.keyboard.up("ArrowUp")
+    fleet.robots["one"] = {"location": PLACE}, ()
+    until(page, "document.querySelector('#drive').hidden && document.querySelector('#driving').hidden")
+    assert fleet.driven == []
 
 
 def test_an_absent_relay_covers_the_page(running: tuple[Any, Fleet]) -> None:

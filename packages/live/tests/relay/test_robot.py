@@ -199,6 +199,8 @@ async def test_a_recording_is_a_robot(corner: Corner, tmp_path: Path) -> None:
 
     async def story(viewer: Session, came: Came) -> None:
         await until("the recording, twice", lambda: len(came["scan"]) >= 12 and came["status"] and came["notes"])
+        await wait("an ack", viewer.command(corner.command, {"command": "stop", "id": "1"}))
+        await until("its answer", lambda: json.loads(bytes(came["status"][-1].payload))["answer"])
 
     source = BagSource(recording(tmp_path / "drive.mcap"))
     assert [(stream.topic.name, stream.rate_hz) for stream in source.streams] == [("notes", 5.0), ("scan", 10.0)]
@@ -208,6 +210,7 @@ async def test_a_recording_is_a_robot(corner: Corner, tmp_path: Path) -> None:
     assert set(ranges) <= set(range(10)) and 1 <= len(falls) < len(ranges) / 2
     assert came["notes"][0].encoding == "json"
     assert json.loads(bytes(came["status"][0].payload))["recording"] == "drive.mcap"
+    assert json.loads(bytes(came["status"][-1].payload))["answer"]["why"].endswith("a recording, which takes none")
 
 
 def test_what_a_recording_lacks(tmp_path: Path) -> None:
@@ -226,8 +229,14 @@ SEEN = {
     "kinds": [["cdr", "std_msgs/msg/String"]],
     "heard": [str(k) for k in range(8)],
     "location": {"x": 3.0, "y": 0.0, "yaw": 0.0, "frame": "map"},
+    "goal": ["map", 1.5],
+    "pose": ["map", -2.0],
+    "moves": [[0.0, 0.0], [0.3, -0.2], [0.0, 0.0]],
 }
-"""Each command once and in order; nothing of what was broken, or meant for other topics."""
+"""Each command once and in order; nothing of what was broken, or meant for other topics.
+
+It moves as a stop says, as somebody drives it, and not any more once the link is cut.
+"""
 
 
 @pytest.mark.nightly

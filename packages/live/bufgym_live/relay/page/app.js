@@ -35,8 +35,15 @@ const fleet = new Fleet({
   added(one) {
     list.add(one);
     one.troubles = [];
+    if (one.name === chosen) show();
+  },
+  here(one) {
     if (chosen === null) replace(one.name, tab);
     if (chosen === null || one.name === chosen) show();
+  },
+  removed(name) {
+    list.remove(name);
+    if (name === chosen) location.hash = address(null);
   },
   status(one) {
     subscribe();
@@ -86,7 +93,7 @@ const player = new Player($, relay, {
   message: message => tried(message),
   begin() {
     forget();
-    for (const id of ["status", "poses", "health", "chosen"]) relay.unsubscribe(id);
+    for (const id of ["status", "last", "poses", "health", "chosen"]) relay.unsubscribe(id);
     setTimeout(sayState);
   },
   jump() {
@@ -99,10 +106,11 @@ const player = new Player($, relay, {
     sayState();
   },
 });
-const hand = new Hand($, relay, map, notices, {robot, isReplay, nowMs, frame: () => shown().frame});
+const hand = new Hand($, relay, map, notices, {robot, isReplay, nowMs, frame: () => shown().frame, removed: name => fleet.remove(name)});
 
 function begin() {
   relay.subscribe("status", "^/robots/[^/]+/status$");
+  relay.subscribe("last", "^/robots/[^/]+/last$");
   relay.subscribe("relay", "^/relay/status$");
   subscribe();
 }
@@ -137,10 +145,8 @@ function tried(message) {
 function show() {
   const before = chosen;
   ({name: chosen, tab} = route());
-  if (chosen === null && fleet.robots.size) {
-    [chosen] = fleet.robots.keys();
-    replace(chosen, tab);
-  }
+  const first = fleet.all().find(one => one.isHere);
+  if (chosen === null && first) replace(chosen = first.name, tab);
   const one = robot();
   document.body.dataset.tab = tab;
   document.title = chosen === null ? "bufgym relay: robots" : `${chosen}, ${tab}: bufgym relay`;
@@ -211,7 +217,7 @@ function sayRobots() {
 
 // A map has one frame: the chosen robot's. A place without a frame is shown on each.
 function shown() {
-  const all = fleet.all(), frame = robot()?.pose?.frame || all.find(one => one.pose?.frame)?.pose.frame;
+  const all = fleet.all().filter(one => one.isHere || one === robot()), frame = robot()?.pose?.frame || all.find(one => one.pose?.frame)?.pose.frame;
   const here = all.filter(one => !one.pose?.frame || one.pose.frame === frame), away = all.length - here.length;
   say($("frame"), [frame && `in ${frame}`, away && `${away} in other frames`].filter(Boolean).join(", "));
   return {here, frame};

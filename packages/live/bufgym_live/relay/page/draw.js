@@ -161,5 +161,6 @@ export function drawHistory(canvas, entries, nowMs) {
 }
 
 export const bits = rate => rate >= 1e6 ? `${(rate / 1e6).toFixed(1)} Mbit/s` : `${(rate / 1e3).toFixed(0)} kbit/s`;
-export const seconds = s => s == null ? "–" : s < 10 ? `${s.toFixed(1)} s` : s < 120 ? `${s.toFixed(0)} s` : `${(s / 60).toFixed(0)} min`;
+export const seconds = s => s == null ? "–" : s < 10 ? `${s.toFixed(1)} s` : s < 120 ? `${s.toFixed(0)} s` : s < 7200 ? `${(s / 60).toFixed(0)} min` :
+  s < 172_800 ? `${(s / 3600).toFixed(0)} h` : `${(s / 86_400).toFixed(0)} days`;
 export const percent = part => part == null ? "–" : `${Math.round(part * 100)} %`;

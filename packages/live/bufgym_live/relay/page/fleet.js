@@ -6,12 +6,13 @@ import {Place, within} from "./frames.js";
 import {charge, diagnostics, DRAWN, flag, json, kindOf, queue, scan, status} from "./messages.js";
 
 export const AWAY_MS = 5000, LOW = 0.25;
+const GONE_MS = 600_000;                            // who was not here for so long needs nobody now
 const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, POSES = 100, NEAR_MS = 20, GAP_MS = 400, PARTS = 500, LAYERS = 64, EARLY = 1000;
 const LATELY_MS = 10_000, MANY = 0.3;               // a robot that drops so many of its messages lately is in trouble
 const ROBOT = /^\/robots\/([^/]+)\/(.+)$/;
 
 export class Fleet {
-  // on: {nowMs(), drawn(robot), added(robot), status(robot), reframed(robot), scanned(robot, pose, scan), moved()}
+  // on: {nowMs(), drawn(robot), added(robot), here(robot), removed(name), status(robot), reframed(robot), scanned(robot, pose, scan), moved()}
   constructor(on) {
     this.on = on;
     this.robots = new Map();
@@ -33,16 +34,36 @@ export class Fleet {
 
   of(name) {
     if (!this.robots.has(name)) {
-      const robot = {name, colour: colourOf(name), place: new Place(name), kinds: Object.create(null), heardMs: 0};
+      const robot = {name, colour: colourOf(name), place: new Place(name), kinds: Object.create(null), heardMs: 0, isHere: false};
       this.robots.set(name, robot);
       this.blank(robot);
       this.on.added(robot);
-      for (const [topic, message] of this.early) if (ROBOT.exec(topic)[1] === name) {
-        this.early.delete(topic);
-        this.take(message, true);
-      }
     }
     return this.robots.get(name);
+  }
+
+  // A robot's first message to this page.
+  enter(robot) {
+    robot.isHere = true;
+    this.on.here(robot);
+    for (const [topic, message] of this.early) if (ROBOT.exec(topic)[1] === robot.name) {
+      this.early.delete(topic);
+      this.take(message, true);
+    }
+  }
+
+  remove(name) {
+    if (this.robots.delete(name)) this.on.removed(name);
+  }
+
+  // What the relay says of a robot that is away: its last status and when that was; null where somebody has removed it.
+  takeLast(name, said, seenMs) {
+    const known = this.robots.get(name);
+    if (said === null && (!known || known.away || !known.isHere)) return this.remove(name);
+    if (said === null || (known && known.heardMs >= seenMs)) return;
+    const robot = this.of(name);
+    robot.heardMs = Math.min(seenMs, this.on.nowMs());
+    if (!robot.isHere) this.takeStatus(robot, status(said), seenMs);
   }
 
   // As it was before its first message; what its topics are is known still.
@@ -56,12 +77,14 @@ export class Fleet {
   take(message, isLatched = false) {
     const [, name, topic] = ROBOT.exec(message.topic) ?? [];
     if (!name) return;
-    if (isLatched && !this.robots.has(name)) {
+    if (topic === "last") return this.takeLast(name, json(message), message.stampMs);
+    if (isLatched && !this.robots.get(name)?.isHere) {
       if (this.early.size < EARLY) this.early.set(message.topic, message);
       return;
     }
     const robot = this.of(name), nowMs = this.on.nowMs();
     if (!isLatched) robot.heardMs = nowMs;
+    if (!robot.isHere) this.enter(robot);
     // A robot's clock may be wrong; how late a message is shows beside the promptest of them.
     robot.skewMs = Math.min(robot.skewMs, nowMs - message.stampMs);
     const ms = message.stampMs + robot.skewMs;
@@ -161,6 +184,7 @@ function dropping(robot) {
 // What is wrong with a robot, the worst first: {kind, rank, level, text}; kinds are fault, silent, battery, dropping and warning.
 export function troubles(robot, nowMs) {
   const {status = {}} = robot, silentMs = nowMs - robot.heardMs, charged = battery(robot), part = dropping(robot), found = [];
+  if (!robot.isHere && silentMs > GONE_MS) return [];
   const say = (kind, rank, level, text) => found.push({kind, rank, level, text});
   const parts = [...robot.parts.values()].filter(part => part.level > 0).sort((one, other) => other.level % 3 - one.level % 3);
   if (status.estop || [...robot.estop.values()].includes(true)) say("emergency stop", 0, "error", "emergency stop");

@@ -2,6 +2,7 @@
 // robot takes it, and is done once the robot answers.
 
 import {say, tint} from "./draw.js";
+import {Drive} from "./drive.js";
 import {FAR_M, number} from "./cdr.js";
 import {stamped, still} from "./cdr_write.js";
 
@@ -10,10 +11,10 @@ const POSE = "geometry_msgs/msg/PoseStamped", ESTIMATE = "geometry_msgs/msg/Pose
 const TOPICS = {
   goal: {"goal_pose": POSE, "move_base_simple/goal": POSE}, pose: {"initialpose": ESTIMATE}, stop: {"cmd_vel": "geometry_msgs/msg/Twist"},
 };
-const KINDS = ["stop", "goal", "pose", "cancel"];
+const KINDS = ["stop", "goal", "pose", "cancel", "drive"];
 
 export class Hand {
-  // asks: {robot(), isReplay(), frame(), nowMs()}
+  // asks: {robot(), isReplay(), frame(), nowMs(), removed(name)}
   constructor($, relay, map, notices, asks) {
     this.$ = $;
     this.relay = relay;
@@ -22,7 +23,15 @@ export class Hand {
     this.asks = asks;
     this.sent = null;
     this.number = 0;
-    $("stop").onclick = () => this.send("stop");
+    this.drive = new Drive($, relay);
+    $("remove").onclick = () => {
+      const {name} = asks.robot();
+      relay.command(`/robots/${name}/last`, null).then(() => asks.removed(name), error => notices.refused(name, `remove: ${error.message}`, asks.nowMs()));
+    };
+    $("stop").onclick = () => {
+      this.drive.release();
+      this.send("stop");
+    };
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
     addEventListener("keydown", event => { if (event.key === "Escape") this.take(null); });
@@ -34,8 +43,8 @@ export class Hand {
 
   // How the robot takes a command of a kind: its topic, and a type if that is ROS's own; undefined if it does not, or the viewer may not.
   way(robot, kind) {
-    const {commands = [], receives = []} = robot.status ?? {}, own = `/robots/${robot.name}/command`, asked = kind === "policy" ? robot.status?.policies.length : commands.includes(kind);
-    if (asked && this.relay.mayCommand(own)) return {topic: own};
+    const {commands = [], receives = []} = robot.status ?? {}, own = `/robots/${robot.name}/${kind === "drive" ? "drive" : "command"}`, asked = kind === "policy" ? robot.status?.policies.length : commands.includes(kind);
+    if (asked && this.relay.mayCommand(own) && !(kind === "drive" && this.relay.holds(own))) return {topic: own};   // what is held comes late
     for (const [name, type] of Object.entries(TOPICS[kind] ?? {})) {
       const topic = `/robots/${robot.name}/to/${name}`;
       if (receives.some(one => one.replace(/^\//, "") === name) && this.relay.mayCommand(topic)) return {topic, type};
@@ -102,6 +111,8 @@ export class Hand {
     this.$("stop").disabled = !ways.stop;
     say(this.$("stop"), ways.stop ? `Stop ${robot.name}` : `${robot?.name ?? ""} takes no stop`);
     for (const kind of ["goal", "pose", "cancel"]) this.$(kind).hidden = !ways[kind];
+    this.drive.offer(ways.drive && !robot.away ? robot : null);
+    this.$("remove").hidden = isOff || !robot.away || !this.relay.mayCommand(`/robots/${robot.name}/last`);
     if (this.map.tool && !ways[this.map.tool.kind]) this.take(null);
     if (this.told === "aim") return;
     const {sent} = this;

@@ -30,6 +30,11 @@ export class List {
 
   colour(robot) { this.cards.get(robot.name)?.style.setProperty("--robot", tint(robot.colour)); }
 
+  remove(name) {
+    this.cards.get(name)?.remove();
+    this.cards.delete(name);
+  }
+
   clear() {
     this.element.replaceChildren();
     this.cards.clear();
@@ -38,30 +43,31 @@ export class List {
   // Their troubles are in ``robot.troubles``.
   update(robots, chosen, tab, nowMs) {
     for (const robot of robots) this.say(robot, chosen, tab, nowMs);
-    const rank = robot => robot.troubles[0]?.rank ?? 9;
+    const rank = robot => robot.troubles[0]?.rank ?? (robot.isHere ? 9 : 10);
     const sorted = [...robots].sort((one, other) => rank(one) - rank(other) || byName(one, other)), focused = /** @type {HTMLElement} */ (document.activeElement);
     sorted.forEach((robot, k) => {
       const card = this.cards.get(robot.name), there = this.element.children[k];
       if (there !== card) this.element.insertBefore(card, there ?? null);
     });
     if (focused !== document.activeElement && this.element.contains(focused)) focused.focus({preventScroll: true});
-    const bad = robots.filter(robot => rank(robot) < 3).length;
-    say(this.count, `${robots.length}${bad ? `, ${bad} need${bad === 1 ? "s" : ""} help` : ""}`);
+    const absent = robots.filter(robot => rank(robot) === 10).length, bad = robots.filter(robot => rank(robot) < 3).length;
+    say(this.count, `${robots.length - absent}${absent ? `, ${absent} away` : ""}${bad ? `, ${bad} need${bad === 1 ? "s" : ""} help` : ""}`);
     this.find();
   }
 
   say(robot, chosen, tab, nowMs) {
     const card = this.cards.get(robot.name), charged = battery(robot), [worst] = robot.troubles, silentMs = nowMs - robot.heardMs;
-    const level = worst?.level ?? (robot.status?.ok ? "ok" : ""), [says, seen, charge, bar] = [".says", ".seen", ".charge", ".bar"].map(name => card.querySelector(name));
+    const level = worst?.level ?? (robot.status?.ok && robot.isHere ? "ok" : ""), [says, seen, charge, bar] = [".says", ".seen", ".charge", ".bar"].map(name => card.querySelector(name));
     const text = worst && worst.kind !== "silent" ? worst.text : robot.status?.text || (robot.status?.ok ? "OK" : "");
     card.classList.toggle("away", robot.away);
+    card.classList.toggle("absent", !worst && !robot.isHere);
     card.dataset.level = level;
     if (card.hash !== address(robot.name, tab)) card.href = address(robot.name, tab);
     if (robot.name === chosen) card.setAttribute("aria-current", "true");
     else card.removeAttribute("aria-current");
     say(says, text);
     if (says.title !== text) says.title = text;
-    say(seen, robot.away ? `silent for ${seconds(silentMs / 1000)}` : bits(robot.queue?.rate_bps ?? 0));
+    say(seen, !robot.isHere ? `last seen ${seconds(silentMs / 1000)} ago${robot.pose ? ` at ${robot.pose.x.toFixed(1)}, ${robot.pose.y.toFixed(1)} m` : ""}` : robot.away ? `silent for ${seconds(silentMs / 1000)}` : bits(robot.queue?.rate_bps ?? 0));
     say(charge, charged == null ? "" : percent(charged));
     bar.hidden = charged == null;
     bar.classList.toggle("low", charged < LOW);

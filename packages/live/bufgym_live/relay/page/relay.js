@@ -81,10 +81,17 @@ export class Relay {
     if (this.subscriptions.delete(id) && this.welcome) this.say("unsubscribe", {id});
   }
 
+  holds(topic) { return (this.welcome?.no_drop ?? []).some(pattern => matches(pattern, topic)); }
+
+  // Say what is worth nothing later: not while the relay is away, and behind what still waits only if it must.
+  sayNow(topic, data, must) {
+    if (this.welcome && (must || this.socket.bufferedAmount === 0))
+      this.say("publish", {topic, data, encoding: "json", stamp_us: Math.round(1000 * (performance.timeOrigin + performance.now()))});
+  }
+
   // Done when the relay holds it, true; an error says why it does not. What it does not hold goes at once, false.
   command(topic, data, fields = {encoding: "json"}) {
-    const holds = (this.welcome?.no_drop ?? []).some(pattern => matches(pattern, topic));
-    if (this.welcome && !holds) {
+    if (this.welcome && !this.holds(topic)) {
       this.say("publish", {topic, data, ...fields});
       return Promise.resolve(false);
     }

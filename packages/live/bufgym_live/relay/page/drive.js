@@ -1,0 +1,99 @@
+// Driving by hand: a pad and keys, to be held. Each message has a deadline. So the robot stops where none comes in time, and where this page
+// is left.
+
+import {say} from "./draw.js";
+
+const PERIOD_MS = 100, FOR_MS = 400, TURN = 2;      // rad/s at the pad's edge for each m/s there
+const KEYS = {ArrowUp: [1, 0], w: [1, 0], ArrowDown: [-1, 0], s: [-1, 0], ArrowLeft: [0, 1], a: [0, 1], ArrowRight: [0, -1], d: [0, -1]};
+const within = value => Math.min(1, Math.max(-1, value));
+
+export class Drive {
+  constructor($, relay) {
+    this.$ = $;
+    this.relay = relay;
+    this.robot = null;                              // who may be driven
+    this.keys = new Set();
+    this.pointer = null;                            // [ahead, left] of the pad's middle, from -1 to 1
+    this.timer = 0;
+    const pad = this.pad = $("pad");
+    $("drive").onclick = () => this.open($("driving").hidden);
+    const aim = event => {
+      const {left, top, width, height} = pad.getBoundingClientRect();
+      this.pointer = [within(1 - 2 * (event.clientY - top) / height), within(1 - 2 * (event.clientX - left) / width)];
+      this.hold();
+    };
+    pad.onpointerdown = event => {
+      pad.setPointerCapture(event.pointerId);
+      pad.focus();
+      aim(event);
+    };
+    pad.onpointermove = event => { if (this.pointer) aim(event); };
+    pad.onpointerup = pad.onpointercancel = pad.onlostpointercapture = () => {
+      this.pointer = null;
+      this.hold();
+    };
+    pad.onkeydown = event => {
+      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+      if (event.key === "Escape") this.open(false);
+      if (!(key in KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      this.keys.add(key);
+      this.hold();
+    };
+    pad.onkeyup = event => {
+      this.keys.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key);
+      this.hold();
+    };
+    pad.onblur = () => this.release();
+    addEventListener("blur", () => this.release());
+    addEventListener("pagehide", () => this.release());
+    document.addEventListener("visibilitychange", () => { if (document.hidden) this.release(); });
+  }
+
+  get topic() { return `/robots/${this.robot.name}/drive`; }
+
+  // The robot that may be driven now, or null; another one ends it.
+  offer(robot) {
+    if (robot !== this.robot) {
+      this.open(false);
+      this.robot = robot;
+    }
+    this.$("drive").hidden = robot === null;
+    const driver = robot?.status?.driver ?? "";
+    say(this.$("driver"), driver && driver !== this.relay.name ? "somebody else drives it" : "hold, or arrows");
+  }
+
+  open(isOpen) {
+    this.release();
+    this.$("driving").hidden = !isOpen;
+    this.$("drive").setAttribute("aria-pressed", isOpen);
+    if (isOpen) this.pad.focus();
+  }
+
+  // What is held has changed.
+  hold() {
+    if (!this.pointer && !this.keys.size) return this.release();
+    if (!this.robot || this.timer) return;
+    this.timer = setInterval(() => this.send(), PERIOD_MS);
+    this.send();
+  }
+
+  send() {
+    const sum = [0, 0];
+    for (const [ahead, left] of this.pointer ? [this.pointer] : [...this.keys].map(key => KEYS[key])) {
+      sum[0] += ahead;
+      sum[1] += left;
+    }
+    const most = Number(this.$("speed-most").value), [ahead, left] = sum.map(within);
+    this.relay.sayNow(this.topic, {linear: most * ahead, angular: most * TURN * left, for_ms: FOR_MS}, false);
+  }
+
+  release() {
+    this.keys.clear();
+    this.pointer = null;
+    if (!this.timer) return;
+    clearInterval(this.timer);
+    this.timer = 0;
+    this.relay.sayNow(this.topic, {linear: 0, angular: 0, for_ms: 0}, true);
+  }
+}
