@@ -27,7 +27,7 @@ REPO = Path(__file__).resolve().parent.parent
 # It shares robots with the examples, and a relay's settings with the tests.
 sys.path[:0] = [*(str(REPO / name) for name in ("packages/live/tests", "packages/live/tests/relay", "examples"))]
 
-from loop_cases import beside
+from loop_cases import beside as beside
 from made_up_robot import ODOMETRY, SCAN, cast, jpeg, odometry, picture, pose_at, scan
 from relay_cases import client
 

@@ -20,7 +20,7 @@ from urllib.parse import SplitResult
 
 import numpy as np
 
-from bufgym_live.relay import address
+from bufgym_live.relay import address as addresses
 from bufgym_live.relay.session import Session
 from bufgym_live.robot.sockets import free_port
 from studies.relay_load import CONFIG, beside, served
@@ -29,13 +29,13 @@ LOCAL = contextvars.ContextVar("LOCAL", default="127.0.0.1")
 """Address that a client connects from."""
 
 
-async def reached(relay: SplitResult) -> socket.socket:
-    """``address.reached`` from ``LOCAL``."""
+async def reached(address: SplitResult) -> socket.socket:
+    """``bufgym_live.relay.address.reached`` from ``LOCAL``."""
     one = socket.socket()
     try:
         one.setblocking(False)
         one.bind((LOCAL.get(), 0))
-        await asyncio.get_running_loop().sock_connect(one, (relay.hostname, relay.port))
+        await asyncio.get_running_loop().sock_connect(one, (address.hostname, address.port))
     except BaseException:
         one.close()
         raise
@@ -49,7 +49,7 @@ async def back_s(session: Session, began_s: float) -> float:
 
 
 async def returns(clients: int, identities: int, kills: int, away_s: float) -> None:
-    sessions = []
+    sessions: list[Session] = []
     with tempfile.TemporaryDirectory() as folder:
         port = free_port("127.0.0.1")
         config = CONFIG.replace("port = 0", f'port = {port}\nfolder = "held"')
@@ -61,7 +61,7 @@ async def returns(clients: int, identities: int, kills: int, away_s: float) -> N
         for k in range(identities or clients):
             sessions.append(Session(f"ws://127.0.0.1:{port}", f"client-{k}"))
             sessions[k].subscribe(f"^/robots/{k}/command$", print, durable=True)
-        address.reached = reached
+        addresses.reached = reached
         relay, _ = await served(config, Path(folder))
         try:
             async with beside(*(keep(k) for k in range(len(sessions)))):
