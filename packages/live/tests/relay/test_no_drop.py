@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from loop_cases import beside
+from refusal_cases import refuse
 from relay_cases import Corner, client, nothing, process, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
@@ -191,6 +192,17 @@ async def test_sessions_beyond_the_limit_take_the_place_of_the_dead(tmp_path: Pa
                     assert new.welcome["op"] == "welcome" and more.welcome["code"] == "too_many"
         forgotten = [entry["session"] for entry in server.hub.audit.recent if entry["event"] == "forgotten"]
         assert forgotten == ["dead-0"] and ("127.0.0.1", "dead-1") in server.hub.store.sessions
+
+
+def test_all_at_an_address_share_its_sessions() -> None:
+    """One session for each of two identities behind one address; a third identity gets one at another address."""
+    config = settings(limits=Limits(sessions=1, identities=2))
+    store = Store(config, Audit(None, Rotation()), lambda settled: None, time.monotonic)
+    for email in "ab":
+        store.open("s", Identity("1.1.1.1", email), False, 0, 0)
+    refuse("must be at most 2 sessions", store.open, "s", Identity("1.1.1.1", "c"), False, 0, 0)
+    store.open("s", Identity("1.1.1.2", "c"), False, 0, 0)
+    store.close()
 
 
 async def test_the_same_session_takes_over(corner: Corner) -> None:
