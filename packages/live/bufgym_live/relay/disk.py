@@ -93,7 +93,7 @@ class Disk:
                 self("failed", part=self.part, why=fault)
 
     def tick(self) -> None:
-        """Log whether the disk stalls, and what was left out."""
+        """Log whether the disk stalls, and how much was left out."""
         stalls = self.stalls
         if stalls and not self._stalled:
             self._audit("disk_stalls", part=self.part)

@@ -90,7 +90,7 @@ class Held:
         self._by_id: dict[int | None, StoredSession] = {}
 
     def load(self) -> Iterator[StoredSession]:
-        """Read the sessions of the relay that ran before, but for those that ended with it."""
+        """Read the sessions of the relay that ran before, and forget all that ended with it."""
         ended, found = list[StoredSession](), dict[tuple[str, str], StoredSession]()
         for row in self._db.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id").fetchall():
             id, name, address, email, temporary, received, numbered = row
@@ -119,7 +119,7 @@ class Held:
             self.there = False
 
     def forget(self, session: StoredSession) -> bool:
-        """Forget a session and what is held for it; return whether that could be written."""
+        """Forget a session and its messages; return whether that could be written."""
         with self._bearable():
             if session.id is not None:
                 gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"

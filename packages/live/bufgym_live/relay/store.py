@@ -6,7 +6,7 @@ once however often it is sent again, and a killed relay resumes where it was. Sp
 room is refused to its sender; but a receiver that acks nothing loses its own oldest before others wait for it.
 
 The disk has a thread, which does everything in the order in which the event loop asks for it. While it stalls, sessions
-come and go, and what must be written waits.
+come and go, and commands wait.
 """
 
 import asyncio
