@@ -117,16 +117,18 @@ class Connection:
 
     async def _carry_out(self) -> None:
         """Carry out the orders that wait for the disk; one that has begun is done though the connection ends."""
-        hub, key = self._hub, self._caller.identity.key
         try:
             while True:
-                size_bytes, work = await self._orders.get()
-                doing = hub.holding.begin(hub.turns.of(key, work()))
-                doing.add_done_callback(lambda _, size_bytes=size_bytes: hub.store.release(size_bytes))
-                await asyncio.shield(doing)
+                await asyncio.shield(self._hub.holding.begin(self._one(*await self._orders.get())))
         except Exception:
             self._socket.transport.abort()
             raise
+
+    async def _one(self, size_bytes: int, work: Work) -> None:
+        try:
+            await self._hub.turns.of(self._caller.identity.key, work())
+        finally:
+            self._hub.store.release(size_bytes)
 
     async def _busy(self, topic: str, seq: int) -> None:
         await asyncio.sleep(BUSY_S)

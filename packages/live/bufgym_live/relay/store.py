@@ -45,7 +45,7 @@ class Store:
         return self._held.there
 
     @property
-    def bytes(self) -> int:
+    def held_bytes(self) -> int:
         """Bytes held in total."""
         return self._held.bytes
 

@@ -26,10 +26,10 @@ from bufgym.traces.formats import bags
 from bufgym_live.relay import audit, backoff, server
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.config import Rule
-from bufgym_live.relay.held import Held
 from bufgym_live.relay.hub import Hub
 from bufgym_live.relay.recorder import FOLDER
 from bufgym_live.relay.session import Session
+from bufgym_live.relay.store import Store
 from bufgym_live.robot.mcap_file import McapFile
 
 pytest.importorskip("mcap", reason="no mcap here: the extra relay")
@@ -65,13 +65,14 @@ class Fails:
 @contextlib.contextmanager
 def failing(fails: Fails) -> Iterator[None]:
     """Within the block the n-th of these fails."""
-    began, made, sent, clock = (Held.__init__, server.Accepted.connection_made, ServerConnection.send, Hub.__init__)
+    began, made, sent, clock = (Store.__init__, server.Accepted.connection_made, ServerConnection.send, Hub.__init__)
 
-    def store(self: Held, *words: Any, **named: Any) -> None:
+    def store(self: Store, *words: Any, **named: Any) -> None:
         began(self, *words, **named)
-        real, broken = self._db, sqlite3.OperationalError("disk I/O error")
-        self._db = Mock(wraps=real, execute=fails.wrapped("statement", real.execute, broken))
-        type(self._db).in_transaction = property(lambda _: real.in_transaction)
+        held, broken = self._held, sqlite3.OperationalError("disk I/O error")
+        real = held._db
+        held._db = Mock(wraps=real, execute=fails.wrapped("statement", real.execute, broken))
+        type(held._db).in_transaction = property(lambda _: real.in_transaction)
 
     def hub(self: Hub, *words: Any, **named: Any) -> None:
         clock(self, *words, **named)
@@ -91,7 +92,7 @@ def failing(fails: Fails) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         for kind, name, function in (
-            *((Held, "__init__", store), (Hub, "__init__", hub)),
+            *((Store, "__init__", store), (Hub, "__init__", hub)),
             *((server.Accepted, "connection_made", accepted), (ServerConnection, "send", send)),
             *((kind, name, fails.wrapped(f"{kind.__name__}.{name}", getattr(kind, name), FULL)) for kind, name in DISK),
         ):
