@@ -1,6 +1,6 @@
 """How fast relays are, and their page.
 
-python -m studies.relay_load load --robots 20 --viewers 5 --seconds 60 [--slow] [--flood]
+python -m studies.relay_load load --robots 20 --viewers 5 --seconds 60 [--slow] [--flood] [--replays 6]
 python -m studies.relay_load idle --connections 1000
 python -m studies.relay_load page --robots 20 --seconds 10   # frames that the page drops; needs Playwright, Chromium
 
@@ -48,6 +48,7 @@ all_connections = 10000
 sessions = 10000
 subscriptions = 10000
 """
+RECORDER = '[[rules]]\nrecorder = true\nreceive = true\ntopic = ".*"\n'
 
 
 async def served(config: str, folder: Path) -> tuple[asyncio.subprocess.Process, int]:
@@ -62,10 +63,11 @@ async def served(config: str, folder: Path) -> tuple[asyncio.subprocess.Process,
 
 
 @contextlib.asynccontextmanager
-async def relay() -> Any:
+async def relay(records: bool = False) -> Any:
     """The number of its process, and its port."""
     with tempfile.TemporaryDirectory() as folder:
-        one, port = await served(CONFIG, Path(folder))
+        config = f'folder = "{folder}/held"\n{CONFIG}{RECORDER}' if records else CONFIG
+        one, port = await served(config, Path(folder))
         try:
             yield one.pid, port
         finally:
@@ -146,7 +148,19 @@ async def flood(port: int) -> None:
             await one.put("/flood", json.dumps("x" * 100_000).encode(), encoding="json")
 
 
-async def load(robots: int, viewers: int, seconds: float, slow: bool, loud: bool) -> None:
+async def replay(port: int, k: int) -> None:
+    """Ask for the first 4 MiB of the recording, again and again."""
+    async with client(port, local="127.0.0.3", name=f"replay-{k}") as one:
+        await one.say("recordings")
+        while not (files := (await one.next())["files"]):
+            await asyncio.sleep(0.1)
+            await one.say("recordings")
+        while True:
+            await one.say("replay", id="r", file=files[-1]["name"], from_us=0, most_bytes=2**22)
+            await one.next()
+
+
+async def load(robots: int, viewers: int, seconds: float, slow: bool, loud: bool, replays: int | None) -> None:
     latency_us: list[list[int]] = [[] for _ in range(viewers)]
     memory_mb: list[float] = []
 
@@ -155,9 +169,10 @@ async def load(robots: int, viewers: int, seconds: float, slow: bool, loud: bool
             await asyncio.sleep(MEMORY_S)
             memory_mb.append(megabytes(pid))
 
-    async with relay() as (pid, port):
+    async with relay(records=replays is not None) as (pid, port):
         views = [view(port, slow and k == 0, latency_us[k]) for k in range(viewers)]
-        async with beside(*views, watch(), *([flood(port)] if loud else [])):
+        others = [replay(port, k) for k in range(replays or 0)] + ([flood(port)] if loud else [])
+        async with beside(*views, watch(), *others):
             await asyncio.sleep(5.0)  # until the policy is compiled
             began_s, began_cpu_s, before = time.monotonic(), cpu_s(pid), megabytes(pid)
             await asyncio.gather(*(publish(port, k, robots, seconds) for k in range(robots)))
@@ -242,6 +257,7 @@ def main() -> None:
     of["load"].add_argument("--viewers", type=int, default=3)
     of["load"].add_argument("--slow", action="store_true", help="the first viewer reads 100 kB/s")
     of["load"].add_argument("--flood", dest="loud", action="store_true", help="another client floods it with JSON")
+    of["load"].add_argument("--replays", type=int, help="the relay records all, and so many clients ask for replays")
     of["idle"].add_argument("--connections", type=int, default=1000)
     options = vars(parser.parse_args())
     asyncio.run(options.pop("work")(**options))

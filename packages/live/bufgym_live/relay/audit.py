@@ -1,4 +1,4 @@
-"""Audit log of connections and refusals: JSON lines in rotated files.
+"""Audit log of connections and refusals: JSON lines in rotated files, written in a thread of its own.
 
 A client that is refused the same thing a thousand times a second makes one line a second, with the count.
 """
@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from bufgym.ground.errors import printable
 from bufgym_live.relay.config import Rotation
+from bufgym_live.relay.disk import Disk
 
 FILE: Final = "audit.jsonl"
 _MOST_CHARACTERS: Final = 300  # length limit of a text from outside
@@ -49,28 +50,31 @@ class Audit:
     def __init__(self, folder: Path | None, rotation: Rotation) -> None:
         self.recent: deque[dict[str, Any]] = deque(maxlen=_RECENT)  # the last entries
         self.refusals: Counter[str] = Counter()  # code -> how often it was refused
-        self.lost = 0  # entries that the disk did not take; the next one that it takes follows their count
+        self._lost = 0  # entries that the disk did not take; the next one that it takes follows their count
         self._repeated: Counter[tuple[str, ...]] = Counter()
-        self._lines = None
+        self.disk = None if folder is None else Disk("audit log", self)
         if folder is not None:
             path = folder / FILE
             self._lines = _Lines(path, maxBytes=rotation.bytes, backupCount=rotation.files, encoding="utf-8")
 
     def __call__(self, event: str, **fields: Any) -> None:
-        """Write one entry."""
+        """Have one entry written."""
         entry = {"at": round(time.time(), 6), "event": event}
         entry |= {name: _short(value) for name, value in fields.items()}
         self.recent.append(entry)
         if event == "refused":
             self.refusals[str(fields.get("code", "other"))] += fields.get("times", 1)
-        if self._lines is not None:
-            gap = [{"at": entry["at"], "event": "lost", "entries": self.lost}] if self.lost else []
-            text = "".join(json.dumps(one, separators=(",", ":")) + "\n" for one in (*gap, entry))
-            try:
-                self._lines.write(text)
-                self.lost = 0
-            except OSError:
-                self.lost += 1
+        if self.disk is not None:
+            self.disk.soon(0, self._write, entry)
+
+    def _write(self, entry: dict[str, Any]) -> None:
+        gap = [{"at": entry["at"], "event": "lost", "entries": self._lost}] if self._lost else []
+        text = "".join(json.dumps(one, separators=(",", ":")) + "\n" for one in (*gap, entry))
+        try:
+            self._lines.write(text)
+            self._lost = 0
+        except OSError:
+            self._lost += 1
 
     @property
     def refused(self) -> int:
@@ -101,9 +105,8 @@ class Audit:
     def close(self) -> None:
         """Finish the file."""
         self.flush()
-        if self._lines is not None:
-            with suppress(OSError):
-                self._lines.close()
+        if self.disk is not None:
+            self.disk.close(self._lines.close)
 
 
 def _short(value: Any) -> Any:

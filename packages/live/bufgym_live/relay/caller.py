@@ -52,12 +52,13 @@ class Caller:
         return data
 
     async def pace(self, json_bytes: int) -> None:
-        """Wait until the identity's budget allows to parse so much JSON."""
-        budget, loop = self.hub.quotas.of(self.identity.key).json, asyncio.get_running_loop()
-        while not budget.take(json_bytes, loop.time()):
-            await asyncio.sleep(_PACE_S)
-            if self.socket.ended:
-                raise RefusedError("too_many", "the connection has ended")
+        """Wait until the budgets of the identity and of its address allow to parse so much JSON."""
+        loop = asyncio.get_running_loop()
+        for whose in (self.identity.key, f"@{self.identity.address}"):
+            while not self.hub.quotas.of(whose).json.take(json_bytes, loop.time()):
+                await asyncio.sleep(_PACE_S)
+                if self.socket.ended:
+                    raise RefusedError("too_many", "the connection has ended")
 
     def tell(self, op: str, **fields: Any) -> None:
         """Have this sent before any message."""

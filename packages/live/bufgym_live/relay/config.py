@@ -100,7 +100,8 @@ class Limits(Section, frozen=True):
     """Bytes that have come and are not a whole message yet, or not taken. Beyond, the connection ends that waits
     longest."""
     identities: Count = 4
-    """How many times the incoming bytes and the queues of one identity all identities of one address may have."""
+    """How many times the incoming bytes, queues, sessions and JSON (so replays, too) of one identity all identities of
+    one address may have."""
     all_connections: Count = 4_096
     """Connections of all identities together."""
     hello_s: Seconds = 5.0

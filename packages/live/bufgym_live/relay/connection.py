@@ -3,7 +3,7 @@
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from functools import partial
 from typing import Any, Final
 
@@ -13,17 +13,20 @@ from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import outbox, policies, protocol, replay, wire
 from bufgym_live.relay.admission import POLICY_VIOLATION
 from bufgym_live.relay.caller import Caller
+from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.hub import Outgoing
 from bufgym_live.relay.outbox import Outbox
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
-from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
+Work = Callable[[], Coroutine[Any, Any, None]]
 HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello
+_MOST_ORDERS: Final = 64  # orders of a client that wait for the disk; beyond, nothing more of it is read
+BUSY_S: Final = 1.0  # Time to a refusal because too much waits for the disk, so that clients do not try at once
 
 
 class Connection:
@@ -42,6 +45,8 @@ class Connection:
         self.wake, self.tell, self.sent = self._outbox.wake, caller.tell, 0
         caller.told = self._told
         self._ending: asyncio.Task[None] | None = None
+        self._orders: asyncio.Queue[tuple[int, Work]] = asyncio.Queue(_MOST_ORDERS)
+        self._ids_waiting: list[str] = []  # of subscriptions
 
     @staticmethod
     async def greet(caller: Caller) -> Admitted:
@@ -59,7 +64,8 @@ class Connection:
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
         greeted()
-        writer = asyncio.create_task(hub.turns.of(caller.identity.key, self._outbox.run))
+        works = self._outbox.run, self._carry_out
+        tasks = [asyncio.create_task(hub.turns.of(caller.identity.key, work)) for work in works]
         left_s = min(caller.identity.until_s - time.time(), 2**20)
         expiry = asyncio.get_running_loop().call_later(left_s, self.end, "the token has expired")
         try:
@@ -68,7 +74,10 @@ class Connection:
             pass
         finally:
             expiry.cancel()
-            writer.cancel()
+            for task in tasks:
+                task.cancel()
+            while not self._orders.empty():
+                hub.store.release(self._orders.get_nowait()[0])
             hub.leave(self)
             hub.audit("left", session=self.session.name, **caller.identity.as_json())
         if self._ending is not None:
@@ -81,11 +90,16 @@ class Connection:
                 case wire.Message() as message:
                     if message.encoding == "json":
                         await self._caller.pace(len(message.payload))
-                    await self._publish(message)
-                case {"op": "subscribe"} as said:
-                    await self._subscribe(said)
-                case {"op": "unsubscribe", "id": id}:
-                    self._hub.unsubscribe(self, id)
+                    if message.no_drop:
+                        await self._later(partial(self._publish, message), message)
+                    else:
+                        await self._publish(message)
+                case {"op": "subscribe" | "unsubscribe"} as said:
+                    if said.get("durable") or said["id"] in self._ids_waiting:
+                        self._ids_waiting.append(said["id"])
+                        await self._later(partial(self._change_late, said))
+                    else:
+                        await self._change(said)
                 case {"op": "ack", "seq": number}:
                     self._outbox.acked(number)
                     self._hub.store.acked(self.session, number)
@@ -94,6 +108,44 @@ class Connection:
                     self.tell("recordings", files=await asyncio.to_thread(replay.recordings, folder))
                 case said:
                     await self._replay(said)
+
+    async def _later(self, work: Work, message: wire.Message | None = None) -> None:
+        """Have this done after all else that waits for the disk, while the client is read on."""
+        size_bytes = 0 if message is None else len(message.payload)
+        if message is not None and not self._hub.store.reserve(size_bytes):
+            size_bytes, work = 0, partial(self._busy, message.topic, message.seq)
+        await self._orders.put((size_bytes, work))
+
+    async def _carry_out(self) -> None:
+        """Carry out the orders that wait for the disk; one that has begun is done though the connection ends."""
+        try:
+            while True:
+                await asyncio.shield(self._hub.holding.begin(self._one(*await self._orders.get())))
+        except Exception:
+            self._socket.transport.abort()
+            raise
+
+    async def _one(self, size_bytes: int, work: Work) -> None:
+        try:
+            await self._hub.turns.of(self._caller.identity.key, work)
+        finally:
+            self._hub.store.release(size_bytes)
+
+    async def _busy(self, topic: str, seq: int) -> None:
+        await asyncio.sleep(BUSY_S)
+        self._refused(RefusedError("busy", "too much waits for the disk"), topic, seq, no_drop=True)
+
+    async def _change(self, said: Mapping[str, Any]) -> None:
+        if said["op"] == "subscribe":
+            await self._subscribe(said)
+        else:
+            self._hub.unsubscribe(self, said["id"])
+
+    async def _change_late(self, said: Mapping[str, Any]) -> None:
+        try:
+            await self._change(said)
+        finally:
+            self._ids_waiting.remove(said["id"])
 
     async def _replay(self, said: Mapping[str, Any]) -> None:
         may = partial(self.permissions.allow, "receive")
@@ -109,9 +161,9 @@ class Connection:
 
     async def _publish(self, message: wire.Message) -> None:
         """Publish it, or say why not: of a no_drop message every time, of others now and then."""
-        hub, who = self._hub, self._caller.identity
+        hub = self._hub
         try:
-            no_drop, now_s = hub.is_no_drop(message.topic), hub.clock()
+            who, no_drop, now_s = self._caller.identity, hub.is_no_drop(message.topic), hub.clock()
             new = protocol.check(message, self.session, self.permissions, self._quota, no_drop, now_s)
             hub.drivers.note(message.topic, self.session.name, address=who.address, email=who.email)
             if is_last(message.topic):
@@ -123,22 +175,25 @@ class Connection:
             elif not new or await self._hold(message):
                 self.tell("ack", seq=message.seq)
         except RefusedError as refused:
-            about = {"code": refused.code, "topic": message.topic, "session": self.session.name}
-            first = hub.audit.repeated(what="publish", **about, address=who.address, email=who.email)
-            if message.no_drop or first:
-                self._caller.refuse("publish", refused, topic=message.topic, seq=message.seq)
+            self._refused(refused, message.topic, message.seq, message.no_drop)
+
+    def _refused(self, refused: RefusedError, topic: str, seq: int, no_drop: bool) -> None:
+        about = {"code": refused.code, "topic": topic, "session": self.session.name}
+        first = self._hub.audit.repeated(what="publish", **about, **self._caller.identity.as_json())
+        if no_drop or first:
+            self._caller.refuse("publish", refused, topic=topic, seq=seq)
 
     async def _hold(self, message: wire.Message) -> bool:
         """Hold a no_drop message; return whether it is held."""
         shared: bool | None = False
         if self._hub.peers is not None:
-            self._hub.make_room(self, message)  # what is refused here, the others must not have
+            await self._hub.make_room(self, message)  # what is refused here, the others must not have
             shared = await self._hub.peers.hold(self.session, message)
         if shared is None:
             self.end("NATS does not answer")  # the client connects again, and sends this again
             return False
         if message.seq > self.session.received:  # else it was taken meanwhile, over another connection
-            self._hub.hold(self, message, shared=shared)
+            await self._hub.hold(self, message, shared=shared)
         return True
 
     async def _subscribe(self, said: Mapping[str, Any]) -> None:
@@ -155,7 +210,7 @@ class Connection:
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
             who = self._caller.identity
             subscription.may_grow = partial(self._hub.quotas.may_have_queue, who.key, who.address)
-            self._hub.subscribe(self, subscription)
+            await self._hub.subscribe(self, subscription)
         except BufgymError as error:
             self._caller.refuse("subscribe", error, id=said["id"])
             return
@@ -189,6 +244,7 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
         except TimeoutError:
             raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
         numbers = admitted.received, admitted.acked
+        await hub.store.catch_up(caller.identity, admitted.session, admitted.acked, admitted.received)
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)

@@ -16,15 +16,17 @@ from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.drive import Drivers
+from bufgym_live.relay.held import Settled, StoredSession
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quotas
 from bufgym_live.relay.recorder import Recorder, Tape
 from bufgym_live.relay.roster import GONE, Roster, is_last
 from bufgym_live.relay.rules import Permissions
-from bufgym_live.relay.store import Settled, Store, StoredSession
+from bufgym_live.relay.store import Store
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.turns import Turns
 from bufgym_live.relay.wire import RefusedError
+from bufgym_live.robot.tasks import Tasks
 
 if TYPE_CHECKING:
     from bufgym_live.relay.foxglove import Window
@@ -100,6 +102,8 @@ class Hub:
         disk = Disk("recordings", self.audit)
         recorder = Recorder.of(config, disk)
         self.tape = None if recorder is None else Tape(recorder, disk)
+        self.disks = [one for one in (self.store.disk, disk, self.audit.disk) if one is not None]
+        self.holding = Tasks()  # orders that wait for the disk, also of connections that have ended
         self.drivers = Drivers(self.audit, clock)
         self.roster = Roster(self.store, lambda message: self.publish(None, message), clock)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
@@ -142,23 +146,23 @@ class Hub:
         self._dropped += sum(each.dropped for each in member.subscriptions.values())
         self._routes.clear()
 
-    def subscribe(self, member: Member, subscription: Subscription) -> None:
+    async def subscribe(self, member: Member, subscription: Subscription) -> None:
         """Add a subscription, with what is latched; it replaces one with the same id.
 
         Raises RefusedError: it is durable, and there are too many or the store cannot be written.
         """
-        self.unsubscribe(member, subscription.id, subscription.pattern.text if subscription.durable else None)
+        if subscription.durable:
+            await self.store.want(member.session, subscription.id, subscription.pattern.text)
+        self.unsubscribe(member, subscription.id, still_held=subscription.durable)
         member.subscriptions[subscription.id] = subscription
         for topic, frame in self._latched.items():
             if subscription.pattern.part(topic) and member.permissions.allow("receive", topic):
                 member.offer(subscription, frame)
 
-    def unsubscribe(self, member: Member, id: str, durable: str | None = None) -> None:
-        """Remove a subscription if there is one of this id; messages of the pattern ``durable`` are held all the same.
-
-        Raises RefusedError: they cannot be held.
-        """
-        self.store.want(member.session, id, durable)
+    def unsubscribe(self, member: Member, id: str, *, still_held: bool = False) -> None:
+        """Remove a subscription if there is one of this id; its messages may be held all the same."""
+        if not still_held:
+            self.store.want_no_more(member.session, id)
         old = member.subscriptions.pop(id, None)
         self._dropped += old.dropped if old else 0
         self._routes.clear()
@@ -219,12 +223,14 @@ class Hub:
                     route.append((member, wanted))
         return route
 
-    def make_room(self, sender: Member, message: wire.Message) -> None:
+    async def make_room(self, sender: Member, message: wire.Message) -> None:
         """Make room for a no_drop message's receivers here; raise RefusedError if that cannot be."""
         if receivers := self._holders(sender, message.topic):
-            self.store.make_room(len(wire.encode(message)), receivers)
+            await self.store.make_room(len(wire.encode(message)), receivers)
 
-    def hold(self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None) -> None:
+    async def hold(
+        self, sender: Member, message: wire.Message, *, shared: bool = False, taken: int | None = None
+    ) -> None:
         """Keep a no_drop message until its receivers have acked it.
 
         Args:
@@ -240,7 +246,8 @@ class Hub:
             raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it{other}")
         frame = wire.encode(message)
         number = message.seq if taken is None else taken
-        self.store.hold(sender.session, number, message.topic, frame, receivers)
+        if not await self.store.hold(sender.session, number, message.topic, frame, receivers):
+            return
         self._show(message)
         for session in receivers:
             if session in self.members:
@@ -257,7 +264,7 @@ class Hub:
             each
             for each in self.store.sessions.values()
             if each is not sender.session and each not in here
-            if any(pattern(text).part(topic) for text in each.durable.values())
+            if any(pattern(text).part(topic) for text in list(each.durable.values()))
             if Permissions(self.config.rules, each.identity).allow("receive", topic)
         ]
         return here + away
@@ -294,7 +301,15 @@ class Hub:
         self.roster.tick()
         self.drivers.tick()
         self.quotas.tidy()
-        self.store.forget_expired()
+        self.store.tick()
+        for disk in self.disks:
+            disk.tick()
+
+    @property
+    def ills(self) -> list[str]:
+        """What is wrong with the relay's files, as far as it knows."""
+        gone = [] if self.store.there else ["the store's file was deleted"]
+        return gone + [f"the disk stalls: {disk.part}" for disk in self.disks if disk.stalls]
 
     def close(self) -> None:
         """Finish the files."""
@@ -302,8 +317,8 @@ class Hub:
         for each in self.own:
             with self.spared(type(each).__name__):
                 each.close()
-        self.audit.close()
         self.store.close()
+        self.audit.close()
 
 
 @functools.lru_cache(MAX_ROUTES)

@@ -28,6 +28,7 @@ class Outbox:
         self._member, self._form = member, form
         self._sent_number = received
         self._in_flight: deque[int] = deque()
+        self._fetching: asyncio.Future[tuple[int, str, bytes]] | None = None
 
     def wake(self) -> None:
         """Look for something to send."""
@@ -59,7 +60,7 @@ class Outbox:
         """Send the next message; return whether there was one."""
         await self._caller.send_answers()
         member = self._member
-        if self._sent_number < member.session.numbered and await self._no_drop(member):
+        if await self._no_drop(member):
             return True
         subscriptions = list(member.subscriptions.values())
         made, now_s = await make_one(subscriptions, self._hub.making), self._hub.clock()
@@ -72,14 +73,19 @@ class Outbox:
         return True
 
     async def _no_drop(self, member: Member) -> bool:
-        """Send the next no_drop message, if the window has room and there is one."""
-        if len(self._in_flight) >= self._hub.config.store.window:
+        """Send the no_drop message that was fetched; have the next one fetched if the window has room for it."""
+        if self._fetching is None:
+            room = len(self._in_flight) < self._hub.config.store.window
+            if room and self._sent_number < member.session.numbered:
+                self._fetching = self._hub.store.next(member.session, self._sent_number)
+                self._fetching.add_done_callback(lambda _: self.wake())
             return False
-        waiting = self._hub.store.next(member.session, self._sent_number)
-        if waiting is None:
+        if not self._fetching.done():
             return False
-        self._sent_number, topic, frame = waiting
-        if member.permissions.allow("receive", topic):
+        (self._sent_number, topic, frame), self._fetching = self._fetching.result(), None
+        if not frame:
+            pass  # all up to this number have gone
+        elif member.permissions.allow("receive", topic):
             self._in_flight.append(self._sent_number)
             await self._send(Outgoing(wire.decode(frame, len(frame))._replace(seq=self._sent_number)))
         else:

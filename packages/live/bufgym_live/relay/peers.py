@@ -21,10 +21,10 @@ from bufgym_live.relay import policies, protocol, wire
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats
+from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.hub import CONNECTED, Hub, Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import NATS, Permissions
-from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription, make_one, next_lane
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
@@ -87,7 +87,7 @@ class Peers:
                 await bus.open(self._options, self._heard, self._known)
                 self._bus = bus
                 backoff.connected()
-                self._hub.subscribe(self, Subscription("all", pattern(""), policy, DEFAULT_CAPACITY))
+                await self._hub.subscribe(self, Subscription("all", pattern(""), policy, DEFAULT_CAPACITY))
                 self._becomes(CONNECTED)
                 if not tried.done():
                     tried.set_result(None)
@@ -206,7 +206,7 @@ class Peers:
         message = None if relay == self._settings.name else self._read(heard)
         if message is not None and self._hub.is_no_drop(message.topic) and number != self.session.received:
             try:
-                self._hub.hold(self, message, taken=number)
+                await self._hub.hold(self, message, taken=number)
             except wire.RefusedError as refused:
                 if refused.code != "no_receiver":
                     self._note(refused)

@@ -13,11 +13,11 @@ from bufgym.ground import strict_json
 from bufgym.model.checks import whole
 from bufgym_live.relay import wire
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Config, Rule
+from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.roster import GONE, is_last
 from bufgym_live.relay.rules import Identity, Permissions
-from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError, WireError
 

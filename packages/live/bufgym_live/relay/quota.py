@@ -28,12 +28,12 @@ class Bucket:
 
 
 class Quota:
-    """Use that one identity has made of its limits."""
+    """Use that one identity has made of its limits; or that so many ``identities`` of an address have made."""
 
-    def __init__(self, limits: Limits, idle_since_s: float) -> None:
+    def __init__(self, limits: Limits, idle_since_s: float, identities: int = 1) -> None:
         self.limits, self.idle_since_s = limits, idle_since_s
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
-        self.json = Bucket(limits.json_bytes_per_s)
+        self.json = Bucket(limits.json_bytes_per_s * identities)
         self.topics: defaultdict[str, dict[str, None]] = defaultdict(dict)
         """Session -> the topics that it publishes on, the oldest first."""
         self.connections: list[Mapping[str, Any]] = []  # the subscriptions of each of its connections, by id
@@ -94,7 +94,7 @@ class Quotas:
         if key not in self._quotas:
             if len(self._quotas) >= MAX_QUOTAS:
                 self.tidy(kept_s=0.0)
-            self._quotas[key] = Quota(self._limits, self._clock())
+            self._quotas[key] = Quota(self._limits, self._clock(), self._limits.identities if key[:1] == "@" else 1)
         return self._quotas[key]
 
     @contextmanager

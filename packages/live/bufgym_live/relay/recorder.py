@@ -113,19 +113,18 @@ class Tape:
     """A recorder in a thread of its own."""
 
     def __init__(self, recorder: Recorder, disk: Disk) -> None:
-        self._recorder, self._disk = recorder, disk
+        self._recorder, self.disk = recorder, disk
 
     def __call__(self, message: wire.Message) -> None:
         """Have a message written."""
         if self._recorder.wants(message.topic):
-            self._disk.soon(len(message.payload), self._recorder, message, time.time_ns())
+            self.disk.soon(len(message.payload), self._recorder, message, time.time_ns())
 
     def tick(self) -> None:
         """Have the file flushed."""
-        if self._disk.idle:
-            self._disk.soon(0, self._recorder.flush)
-        self._disk.tick()
+        if self.disk.idle:
+            self.disk.soon(0, self._recorder.flush)
 
     def close(self) -> None:
         """Finish the file, when all is written."""
-        self._disk.close(self._recorder.close)
+        self.disk.close(self._recorder.close)

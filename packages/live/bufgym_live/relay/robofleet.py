@@ -10,6 +10,7 @@ hello and no ack.
 import json
 import secrets
 import struct
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 from bufgym_live.relay import protocol, wire
@@ -106,8 +107,14 @@ class RobofleetConnection(Connection):
                 continue
             message = wire.Message(flat.topic, data, ROBOFLEET, flat.type)
             if self._hub.is_no_drop(flat.topic):
-                message = message._replace(no_drop=True, seq=self.session.received + 1)
-            await self._publish(message)
+                message = message._replace(no_drop=True)
+                await self._later(partial(self._publish, message), message)
+            else:
+                await self._publish(message)
+
+    async def _publish(self, message: wire.Message) -> None:
+        """Publish it; the client numbers no messages."""
+        await super()._publish(message._replace(seq=self.session.received + 1) if message.no_drop else message)
 
     async def _ordered(self, flat: Flat) -> None:
         """Subscribe or unsubscribe; as at Robofleet's server, a client with bytes pending is skipped."""

@@ -144,6 +144,7 @@ class Server:
             await self._server.wait_closed()
         if self.hub.peers is not None:
             await self.hub.peers.close()
+        await self.hub.holding.end()
         self.hub.close()
         if self._server is not None:
             await asyncio.wait([self._warming])  # after the files: a first compilation takes long
@@ -173,9 +174,8 @@ class Server:
         match request.path.partition("?")[0]:
             case "/healthz":
                 stuck = self._ticking is None or self._ticking.done()
-                if stuck or not self.hub.store.there:
-                    why = "stuck" if stuck else "the store's file was deleted"
-                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, f"{why}\n")
+                if ills := ["stuck"] * stuck + self.hub.ills:
+                    return pages.response(HTTPStatus.SERVICE_UNAVAILABLE, f"{', '.join(ills)}\n")
                 return pages.response(HTTPStatus.OK, "ok\n")
             case "/metrics":
                 return self._metrics(socket.address)

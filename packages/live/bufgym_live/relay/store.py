@@ -4,66 +4,21 @@ A session outlives its connections. The relay numbers the messages that it sends
 number received from it. Both are committed with the message itself, before anything is acked. So a message is taken
 once however often it is sent again, and a killed relay resumes where it was. Space is bounded. A message that has no
 room is refused to its sender; but a receiver that acks nothing loses its own oldest before others wait for it.
+
+The disk has a thread, which does everything in the order in which the event loop asks for it. While it stalls, sessions
+come and go, and commands wait.
 """
 
+import asyncio
 import math
-import os
-import sqlite3
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from collections.abc import Callable, Sequence
 
-from bufgym.ground.errors import BufgymError
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
+from bufgym_live.relay.disk import Disk
+from bufgym_live.relay.held import Held, Settled, StoredSession
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.wire import RefusedError
-
-FILE: Final = "held.sqlite"
-_SCHEMA: Final = """
-CREATE TABLE IF NOT EXISTS session (
-    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER);
-CREATE TABLE IF NOT EXISTS durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS message (
-    id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
-    waiting INTEGER, lost INTEGER);
-CREATE TABLE IF NOT EXISTS delivery (
-    session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS robot (name TEXT PRIMARY KEY, seen_us INTEGER, said TEXT) WITHOUT ROWID;
-"""
-_COLUMNS: Final = "id, name, address, email, temporary, received, numbered"
-
-
-@dataclass(eq=False)
-class StoredSession:
-    """A client's session as the relay keeps it, over all its connections."""
-
-    name: str
-    identity: Identity
-    temporary: bool  # whether the session ends with its connection
-    received: int = 0  # highest number of a no_drop message taken from it
-    numbered: int = 0  # highest number of a no_drop message for it
-    held: int = 0  # number of messages for it that are not acked
-    held_bytes: int = 0
-    durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
-    away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
-    id: int | None = None  # id in the store; None while there is nothing to remember
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Identity and name; the same name under another identity is another session."""
-        return self.identity.key, self.name
-
-
-class Settled(NamedTuple):
-    """A message that no receiver waits for any more."""
-
-    sender: StoredSession
-    seq: int
-    receivers: int
-    lost: int  # number of receivers whose sessions were forgotten before they acked it
 
 
 class Store:
@@ -76,172 +31,139 @@ class Store:
         self, config: Config, audit: Audit, tell: Callable[[Settled], None], clock: Callable[[], float]
     ) -> None:
         self.limits, self._quota = config.store, config.limits
-        self._audit, self._tell, self._clock = audit, tell, clock
-        path = ":memory:" if config.folder is None else str(config.folder / FILE)
-        try:
-            self._db = sqlite3.connect(path, timeout=0.5, isolation_level=None)
-            # A kill of the process loses nothing; a power failure may lose the last moments.
-            for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL", "synchronous = NORMAL"):
-                self._db.execute(f"PRAGMA {pragma}")
-            self._db.executescript(_SCHEMA)
-        except sqlite3.Error as error:
-            raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
-        self._file = None if config.folder is None else (path, os.stat(path).st_ino)
-        self.sessions: dict[tuple[str, str], StoredSession] = {}
-        self._by_id: dict[int | None, StoredSession] = {}
-        self._load()
+        self._audit, self._clock = audit, clock
+        self.disk = Disk("held messages", audit)
+        self._held = Held(config, self.disk, audit, tell)
+        self.sessions = {session.key: session for session in self._held.load()}
+        for session in self.sessions.values():
+            session.away_s = clock()
+        self._waiting_bytes = 0
 
-    def _load(self) -> None:
-        for row in self._db.execute(f"SELECT {_COLUMNS} FROM session").fetchall():
-            id, name, address, email, temporary, received, numbered = row
-            session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
-            session.away_s = self._clock()
-            session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
-            held = "SELECT count(*), coalesce(sum(length(frame)), 0) FROM delivery JOIN message ON id = message"
-            session.held, session.held_bytes = self._db.execute(f"{held} WHERE session = ?", (id,)).fetchone()
-            self.sessions[session.key] = self._by_id[id] = session
-        (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
-        for session in list(self.sessions.values()):
-            if session.temporary:  # left by a relay that was killed
-                self.forget(session)
+    @property
+    def there(self) -> bool:
+        """Whether the file was where a relay that starts anew looks for it, at the last tick or transaction."""
+        return self._held.there
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes held in total."""
+        return self._held.bytes
+
+    def reserve(self, size_bytes: int) -> bool:
+        """Count the bytes of a message that is to be held; return False if too many wait for the disk."""
+        if self._waiting_bytes and self._waiting_bytes + size_bytes > self.limits.bytes:
+            return False
+        self._waiting_bytes += size_bytes
+        return True
+
+    def release(self, size_bytes: int) -> None:
+        """Count them no more."""
+        self._waiting_bytes -= size_bytes
+
+    async def catch_up(self, identity: Identity, name: str, received: int, numbered: int) -> None:
+        """Give a session numbers that are at least its client's, which knows more than a store that went back."""
+        session = self.sessions.get((identity.key, name))
+        if session is not None and (received > session.received or numbered > session.numbered):
+            await self.disk.do(self._held.remember, session, received, numbered)
 
     def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> StoredSession:
         """Open the session of this name; a new session begins at the client's numbers.
 
-        If the identity has too many, the one goes that has been away for longest.
+        If the identity has too many, or all at its address together, the one goes that has been away for longest.
 
         Raises RefusedError: all of them are here.
         """
         session = self.sessions.get((identity.key, name))
         if session is None:
-            own = [one for (key, _), one in self.sessions.items() if key == identity.key]
-            if len(own) >= self._quota.sessions:
-                oldest = min(own, key=lambda one: one.away_s)
-                if oldest.away_s == math.inf:
-                    raise RefusedError("too_many", f"must be at most {self._quota.sessions} sessions")
-                self._expire(oldest)
+            others, most = self.sessions.values(), self._quota.sessions
+            self._free_place([one for one in others if one.identity.key == identity.key], most)
+            at_address = [one for one in others if one.identity.address == identity.address]
+            self._free_place(at_address, most * self._quota.identities)
             session = StoredSession(name, identity, temporary, acked, received)
             self.sessions[session.key] = session
-        session.identity, session.away_s = identity, math.inf
-        session.received, session.numbered = max(session.received, acked), max(session.numbered, received)
-        if session.id is not None:
-            with self._bearable():
-                self._save(session)
+        before, session.identity, session.away_s = session.identity, identity, math.inf
+        if session.kept and before.as_json() != identity.as_json():
+            self.disk.later(self._held.remember, session, 0, 0)
         return session
+
+    def _free_place(self, sessions: Sequence[StoredSession], most: int) -> None:
+        if len(sessions) >= most:
+            oldest = min(sessions, key=lambda one: one.away_s)
+            if oldest.away_s == math.inf:
+                raise RefusedError("too_many", f"must be at most {most} sessions")
+            self._expire(oldest)
 
     def left(self, session: StoredSession) -> None:
         """Note the end of a session's connection; forget messages that nobody will ask for."""
         session.away_s = self._clock()
-        if session.temporary or session.id is None:
+        if session.temporary or not session.kept:
             self.forget(session)
 
     def forget(self, session: StoredSession) -> None:
         """Forget a session; messages held for it are lost. A disk that cannot be written keeps it for later."""
-        with self._bearable():
-            if session.id is not None:
-                gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
-                self._settle(session, 0, 2**62, 1, *gone)
-                del self._by_id[session.id]
-                session.id = None
-            self.sessions.pop(session.key, None)
+        if self.sessions.get(session.key) is session:
+            del self.sessions[session.key]
+            if session.kept:
+                self.disk.later(self._forget, session)
 
-    def want(self, session: StoredSession, id: str, pattern: str | None) -> None:
-        """Hold matching messages while the session is away; the pattern None ends that.
+    def _forget(self, session: StoredSession) -> None:
+        if not self._held.forget(session):
+            self.disk.on_loop(self.sessions.setdefault, session.key, session)
+
+    async def want(self, session: StoredSession, id: str, pattern: str) -> None:
+        """Hold matching messages while the session is away.
 
         Raises RefusedError: too many, also of connections that have ended; or the disk cannot be written.
         """
-        if pattern is None:
-            if session.durable.pop(id, None) is not None:
-                with self._bearable(), self._transaction():
-                    self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
+        if session.durable.get(id) == pattern:
             return
         if id not in session.durable and len(session.durable) >= self._quota.subscriptions:
             raise RefusedError("too_many", f"must be at most {self._quota.subscriptions} durable subscriptions")
-        self._remember(session)
-        with self._transaction():
-            self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
-        session.durable[id] = pattern
+        session.kept = True
+        await self.disk.do(self._held.want, session, id, pattern)
 
-    def hold(
+    def want_no_more(self, session: StoredSession, id: str) -> None:
+        """End that."""
+        if session.durable.pop(id, None) is not None:
+            self.disk.later(self._held.want_no_more, session, id)
+
+    async def hold(
         self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
-    ) -> None:
-        """Store the sender's message number ``seq`` on disk for these receivers.
+    ) -> bool:
+        """Store the sender's message number ``seq`` on disk for these receivers; return whether it is new.
 
         Without receivers, whom other relays have, the number alone is taken.
 
         Raises RefusedError: there is no room; then its number is not used.
         """
-        if receivers:
-            self.make_room(len(frame), receivers)
         for session in (sender, *receivers):
-            self._remember(session)
-        with self._transaction():
-            if receivers:
-                row = sender.id, seq, topic, frame, len(receivers), len(receivers)
-                columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
-                message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
-            for receiver in receivers:
-                number = receiver.numbered + 1
-                self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
-                self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
-            self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
-        sender.received = seq
-        self.bytes += len(frame) if receivers else 0
-        for receiver in receivers:
-            receiver.numbered += 1
-            receiver.held += 1
-            receiver.held_bytes += len(frame)
+            session.kept = True
+        new: bool = await self.disk.do(self._held.hold, sender, seq, topic, frame, receivers)
+        return new
 
-    def make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> None:
-        """Let the oldest go: of a full session, and of the identity with the most bytes, so that others get theirs.
+    async def make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> None:
+        """Make room for a message; raise RefusedError if that cannot be."""
+        await self.disk.do(self._held.make_room, size_bytes, receivers)
 
-        Raises RefusedError: nobody but these has to wait; or the message is larger than the store.
-        """
-        full = [each for each in receivers if each.held >= self.limits.messages]
-        if len(full) == len(receivers):
-            raise RefusedError("store_full", f"session {full[0].name} has not acked {self.limits.messages} messages")
-        for each in full:
-            self._let_go(each)
-        while self.bytes + size_bytes > self.limits.bytes:
-            shares: Counter[str] = Counter()
-            for session in self.sessions.values():
-                shares[session.identity.key] += session.held_bytes
-            largest = max(self.sessions.values(), key=lambda one: (shares[one.identity.key], one.held_bytes))
-            alone = all(each.identity.key == largest.identity.key for each in receivers)
-            if alone or size_bytes > self.limits.bytes:
-                raise RefusedError("store_full", f"no room for {size_bytes} bytes beside {self.bytes}")
-            self._let_go(largest)
-
-    def _let_go(self, session: StoredSession) -> None:
-        (oldest,) = self._db.execute("SELECT min(number) FROM delivery WHERE session = ?", (session.id,)).fetchone()
-        self._audit.repeated(what="held", code="store_full", session=session.name, identity=session.identity.key)
-        self._settle(session, oldest, oldest, 1)
-
-    def next(self, session: StoredSession, after: int) -> tuple[int, str, bytes] | None:
-        """Find number, topic and frame of the session's next message, None without one."""
-        query = (
-            "SELECT number, topic, frame FROM delivery JOIN message ON message.id = delivery.message "
-            "WHERE session = ? AND number > ? ORDER BY number LIMIT 1"
-        )
-        found: tuple[int, str, bytes] | None = self._db.execute(query, (session.id, after)).fetchone()
-        return found
+    def next(self, session: StoredSession, after: int) -> asyncio.Future[tuple[int, str, bytes]]:
+        """Find number, topic and frame of the session's next message; with no frame, none is left up to the number."""
+        return self.disk.do(self._held.next, session, after)
 
     def acked(self, session: StoredSession, number: int) -> None:
-        """Note that the session has processed all messages up to this number.
-
-        If the disk cannot be written, a later ack does it.
-        """
-        if session.held > 0:
-            with self._bearable():
-                self._settle(session, 0, number, 0)
+        """Note that the session has processed all messages up to this number."""
+        session.acked = max(session.acked, number)
+        if session.held > 0 and not session.settling:
+            session.settling = True
+            self.disk.later(self._held.settle_acked, session)
 
     def denied(self, session: StoredSession, number: int) -> None:
         """Drop a message that no rule lets the session have any more."""
-        with self._bearable():
-            self._settle(session, number, number, 1)
+        self.disk.later(self._held.deny, session, number)
 
-    def forget_expired(self) -> None:
+    def tick(self) -> None:
         """Forget the sessions that have been away for too long, counted while the relay runs."""
+        if self.disk.idle:
+            self.disk.soon(0, self._held.look)
         for session in list(self.sessions.values()):
             if session.away_s < self._clock() - self.limits.keep_s:
                 self._expire(session)
@@ -251,94 +173,21 @@ class Store:
         self.forget(session)
 
     def robots(self) -> list[tuple[str, int, str]]:
-        """Read the robots that were here: name, time of the last status in us since 1970, what it said as JSON."""
-        return self._db.execute("SELECT name, seen_us, said FROM robot").fetchall()
+        """Read the robots that were here: name, time of the last status in us since 1970, what it said as JSON.
+
+        For the start alone, before the disk has its thread.
+        """
+        return self._held.robots()
 
     def keep_robots(self, rows: Sequence[tuple[str, int, str]], most: int) -> None:
         """Keep these for later, as ``robots`` returns them, and of all only the ``most`` that were here last."""
         if rows:
-            with self._bearable(), self._transaction():
-                self._db.executemany("INSERT OR REPLACE INTO robot VALUES (?, ?, ?)", rows)
-                last = "SELECT name FROM robot ORDER BY seen_us DESC LIMIT ?"
-                self._db.execute(f"DELETE FROM robot WHERE name NOT IN ({last})", (most,))
+            self.disk.soon(sum(len(said) for _, _, said in rows), self._held.keep_robots, rows, most)
 
     def forget_robot(self, name: str) -> None:
         """Remove a robot that was here."""
-        with self._bearable(), self._transaction():
-            self._db.execute("DELETE FROM robot WHERE name = ?", (name,))
-
-    @property
-    def there(self) -> bool:
-        """Whether the file is still where a relay that starts anew looks for it."""
-        with suppress(OSError):
-            return self._file is None or os.stat(self._file[0]).st_ino == self._file[1]
-        return False
+        self.disk.soon(0, self._held.forget_robot, name)
 
     def close(self) -> None:
-        """Close the file; everything is on disk already."""
-        self._db.close()
-
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        """Raises RefusedError: the disk cannot be written; then nothing has changed."""
-        if not self.there:
-            raise RefusedError("store_full", "the store cannot be written: its file was deleted")
-        try:
-            self._db.execute("BEGIN IMMEDIATE")
-            yield
-            self._db.execute("COMMIT")
-        except BaseException as error:
-            if self._db.in_transaction:
-                self._db.execute("ROLLBACK")
-            if isinstance(error, sqlite3.Error):
-                raise RefusedError("store_full", f"the store cannot be written: {error}") from None
-            raise
-
-    @contextmanager
-    def _bearable(self) -> Iterator[None]:
-        """Log that the store cannot be written, and go on."""
-        try:
-            yield
-        except RefusedError as refused:
-            self._audit.repeated(what="store", code=refused.code, why=str(refused))
-
-    def _settle(self, session: StoredSession, first: int, last: int, lost: int, *also: str) -> None:
-        """End deliveries to a session; ``also`` are statements about its id for the same transaction."""
-        settled, sizes, freed_bytes = [], [], 0
-        chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
-        with self._transaction():
-            rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
-            self._db.execute(f"DELETE {chosen}", (session.id, first, last))
-            for statement in also:
-                self._db.execute(statement, (session.id,))
-            for (id,) in rows:
-                (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
-                    "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
-                    "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
-                    (lost, id),
-                ).fetchone()
-                sizes.append(size_bytes)
-                if waiting == 0:
-                    self._db.execute("DELETE FROM message WHERE id = ?", (id,))
-                    freed_bytes += size_bytes
-                    if sender in self._by_id:
-                        settled.append(Settled(self._by_id[sender], seq, receivers, gone))
-        session.held -= len(sizes)
-        session.held_bytes -= sum(sizes)
-        self.bytes -= freed_bytes
-        for message in settled:
-            self._tell(message)
-
-    def _remember(self, session: StoredSession) -> None:
-        if session.id is None:
-            self._save(session)
-
-    def _save(self, session: StoredSession) -> None:
-        """Write the session; a new one gets its id in a transaction of its own, so that the id is never rolled back."""
-        who = session.identity
-        row = session.id, session.name, who.address, who.email, session.temporary, session.received, session.numbered
-        with self._transaction():
-            insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
-            id = self._db.execute(insert, row).lastrowid
-        session.id = id
-        self._by_id[id] = session
+        """Close the file, when all is written."""
+        self.disk.close(self._held.close)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import wire
 
-AGAIN = "out_of_order"  # Code with which a message behind a refused one is refused too; it is sent again
+AGAIN = ("out_of_order", "busy")
+"""Codes of refusals after which a message is sent again: it is behind a refused one, or the relay's disk stalls."""
 
 
 @dataclass
@@ -73,7 +74,7 @@ class Unanswered:
         if not self._sent:
             return
         pending = self._sent.popleft()
-        if code == AGAIN:
+        if code in AGAIN:
             self._again.append(pending)
         else:
             _settle(pending, BufgymError(f"topic {pending.message.topic}: refused: {code}: {why}"))

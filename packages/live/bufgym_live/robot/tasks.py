@@ -13,11 +13,12 @@ class Tasks:
     def __init__(self) -> None:
         self._running: set[asyncio.Task[None]] = set()
 
-    def begin(self, work: Coroutine[Any, Any, None], name: str = "") -> None:
+    def begin(self, work: Coroutine[Any, Any, None], name: str = "") -> asyncio.Task[None]:
         """Start ``work`` as a task and hold it, because the loop forgets a task without references."""
         task = asyncio.create_task(work, name=name)
         self._running.add(task)
         task.add_done_callback(self._running.discard)
+        return task
 
     def cancel(self, name: str) -> None:
         """Cancel the tasks of this name."""

@@ -69,9 +69,10 @@ def failing(fails: Fails) -> Iterator[None]:
 
     def store(self: Store, *words: Any, **named: Any) -> None:
         began(self, *words, **named)
-        real, broken = self._db, sqlite3.OperationalError("disk I/O error")
-        self._db = Mock(wraps=real, execute=fails.wrapped("statement", real.execute, broken))
-        type(self._db).in_transaction = property(lambda _: real.in_transaction)
+        held, broken = self._held, sqlite3.OperationalError("disk I/O error")
+        real = held._db
+        held._db = Mock(wraps=real, execute=fails.wrapped("statement", real.execute, broken))
+        type(held._db).in_transaction = property(lambda _: real.in_transaction)
 
     def hub(self: Hub, *words: Any, **named: Any) -> None:
         clock(self, *words, **named)

@@ -20,9 +20,10 @@ from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import backoff
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Limits, Rotation, Rule, StoreLimits
+from bufgym_live.relay.held import Settled
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.session import Session
-from bufgym_live.relay.store import Settled, Store
+from bufgym_live.relay.store import Store
 from bufgym_live.robot.sockets import free_port
 
 CONFIG = settings(store=StoreLimits(window=2, messages=4))
@@ -57,9 +58,8 @@ async def test_no_more_than_the_window_are_on_their_way(corner: Corner) -> None:
         await robot.came(1, 2)
         assert await nothing(operator, robot)
         await robot.say("ack", seq=2)
-        await robot.came(3)
+        await robot.came(3, 4)
         await robot.say("ack", seq=9)
-        await robot.came(4)
         assert "must be at most 4" in (await robot.next())["why"]
 
 
@@ -110,7 +110,7 @@ async def test_who_acks_nothing_blocks_nobody(corner: Corner) -> None:
         assert (first["session"], first["identity"], again["times"]) == ("hog", "127.0.0.9", 1)
 
 
-def test_the_identity_with_most_bytes_makes_room() -> None:
+async def test_the_identity_with_most_bytes_makes_room() -> None:
     """10 bytes of room: the hog's two sessions hold 3 and 4, the robot's one 3. So 2 more cost the hog its 4."""
     lost = list[Settled]()
     store = Store(settings(store=StoreLimits(bytes=10)), Audit(None, Rotation()), lost.append, time.monotonic)
@@ -119,17 +119,19 @@ def test_the_identity_with_most_bytes_makes_room() -> None:
         for name, address in (("s", "1.1.1.1"), ("r", "1.1.1.2"), ("a", "1.1.1.3"), ("b", "1.1.1.3"))
     )
     for seq, (size, receiver) in enumerate(((3, robot), (3, hogs[0]), (4, hogs[1])), start=1):
-        store.hold(sender, seq, "/a", bytes(size), [receiver])
+        await store.hold(sender, seq, "/a", bytes(size), [receiver])
     assert lost == []
-    store.hold(sender, 4, "/a", bytes(2), [robot])
+    await store.hold(sender, 4, "/a", bytes(2), [robot])
     assert lost == [Settled(sender, 3, 1, 1)]
-    assert [one.held_bytes for one in (robot, *hogs)] == [5, 3, 0] and store.bytes == 8
-    refuse("no room for 3 bytes beside 8", store.hold, sender, 5, "/a", bytes(3), [robot])  # now the robot has the most
-    refuse("no room for 11 bytes beside 8", store.hold, sender, 5, "/a", bytes(11), [robot, hogs[0]])
-    store.hold(sender, 5, "/a", bytes(4), [hogs[1]])  # costs the robot its 3
+    assert [one.held_bytes for one in (robot, *hogs)] == [5, 3, 0] and store.held_bytes == 8
+    for size, receivers in ((3, [robot]), (11, [robot, hogs[0]])):  # now the robot has the most
+        with pytest.raises(BufgymError, match=f"no room for {size} bytes beside 8"):
+            await store.hold(sender, 5, "/a", bytes(size), receivers)
+    await store.hold(sender, 5, "/a", bytes(4), [hogs[1]])  # costs the robot its 3
     with pytest.raises(BufgymError, match="no room for 9 bytes beside 2"):
-        store.hold(sender, 6, "/a", bytes(9), [robot])  # without the hog's 4 and 3 either, whose loss is told
+        await store.hold(sender, 6, "/a", bytes(9), [robot])  # without the hog's 4 and 3 either, whose loss is told
     assert [one.seq for one in lost] == [3, 1, 5, 2]
+    store.close()
 
 
 async def test_no_session_is_held_for_by_more_subscriptions_than_the_limit() -> None:
@@ -143,7 +145,7 @@ async def test_no_session_is_held_for_by_more_subscriptions_than_the_limit() -> 
             assert (await robot.subscribe("c", "c", durable=True))["op"] == "subscribed"
 
 
-def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot is kept for 100 s. Neither a year's jump of the system's clock nor a year off ends that, but 101 s do."""
     now_s = 10.0
 
@@ -153,19 +155,19 @@ def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatc
 
     store = opened()
     robot = store.open("robot", Identity("1.1.1.1"), False, 0, 0)
-    store.want(robot, "a", "command$")
+    await store.want(robot, "a", "command$")
     store.left(robot)
     year_s = time.time() + 366 * 86_400
     monkeypatch.setattr("time.time", lambda: year_s)
     now_s += 99
-    store.forget_expired()
+    store.tick()
     store.close()
     store, now_s = opened(), now_s + 99
     store.open("here", Identity("1.1.1.1"), False, 0, 0)
-    store.forget_expired()
+    store.tick()
     assert len(store.sessions) == 2
     now_s += 2
-    store.forget_expired()
+    store.tick()
     assert list(store.sessions) == [("1.1.1.1", "here")]
     store.close()
 
@@ -190,6 +192,17 @@ async def test_sessions_beyond_the_limit_take_the_place_of_the_dead(tmp_path: Pa
                     assert new.welcome["op"] == "welcome" and more.welcome["code"] == "too_many"
         forgotten = [entry["session"] for entry in server.hub.audit.recent if entry["event"] == "forgotten"]
         assert forgotten == ["dead-0"] and ("127.0.0.1", "dead-1") in server.hub.store.sessions
+
+
+def test_all_at_an_address_share_its_sessions() -> None:
+    """One session for each of two identities behind one address; a third identity gets one at another address."""
+    config = settings(limits=Limits(sessions=1, identities=2))
+    store = Store(config, Audit(None, Rotation()), lambda settled: None, time.monotonic)
+    for email in "ab":
+        store.open("s", Identity("1.1.1.1", email), False, 0, 0)
+    refuse("must be at most 2 sessions", store.open, "s", Identity("1.1.1.1", "c"), False, 0, 0)
+    store.open("s", Identity("1.1.1.2", "c"), False, 0, 0)
+    store.close()
 
 
 async def test_the_same_session_takes_over(corner: Corner) -> None:

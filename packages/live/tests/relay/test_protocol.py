@@ -16,11 +16,11 @@ from bufgym.policies import registry
 from bufgym_live.relay import backoff, protocol, wire
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.config import Config, Limits, Rule
+from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.patterns import for_client, pattern
 from bufgym_live.relay.quota import Quota, Quotas
 from bufgym_live.relay.rules import Identity, Permissions
 from bufgym_live.relay.session import Session
-from bufgym_live.relay.store import StoredSession
 from bufgym_live.relay.wire import Message, RefusedError, WireError
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from relay_cases import client, relay, settings
 
-from bufgym_live.relay.store import FILE
+from bufgym_live.relay.held import FILE
 
 BEFORE = Path(__file__).with_name("held_d36707ca.sql")
 COMMAND = "/robots/a/command"

@@ -1,0 +1,312 @@
+"""No_drop messages on disk and the sessions that they are held for, in SQLite.
+
+A message, its number to each receiver and the number of its sender are committed together.
+"""
+
+import math
+import os
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.relay.audit import Audit
+from bufgym_live.relay.config import Config
+from bufgym_live.relay.disk import Disk
+from bufgym_live.relay.rules import Identity
+from bufgym_live.relay.wire import RefusedError
+
+FILE: Final = "held.sqlite"
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS session (
+    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER);
+CREATE TABLE IF NOT EXISTS durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS message (
+    id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
+    waiting INTEGER, lost INTEGER);
+CREATE TABLE IF NOT EXISTS delivery (
+    session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS robot (name TEXT PRIMARY KEY, seen_us INTEGER, said TEXT) WITHOUT ROWID;
+"""
+_COLUMNS: Final = "id, name, address, email, temporary, received, numbered"
+
+
+@dataclass(eq=False)
+class StoredSession:
+    """A client's session as the relay keeps it, over all its connections."""
+
+    name: str
+    identity: Identity
+    temporary: bool  # whether the session ends with its connection
+    received: int = 0  # highest number of a no_drop message taken from it
+    numbered: int = 0  # highest number of a no_drop message for it
+    held: int = 0  # number of messages for it that are not acked
+    held_bytes: int = 0
+    durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
+    away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
+    kept: bool = False  # whether the store was asked to remember it
+    id: int | None = None  # id on disk, which only the disk's thread reads
+    acked: int = 0  # highest number that it has acked
+    settling: bool = False  # whether acks wait to be written
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Identity and name; the same name under another identity is another session."""
+        return self.identity.key, self.name
+
+
+class Settled(NamedTuple):
+    """A message that no receiver waits for any more."""
+
+    sender: StoredSession
+    seq: int
+    receivers: int
+    lost: int  # number of receivers whose sessions were forgotten before they acked it
+
+
+class Held:
+    """The file, or memory without a folder. After the start, all methods run in the thread of ``disk``.
+
+    ``tell`` is called in the event loop with each message as soon as it is settled.
+    """
+
+    def __init__(self, config: Config, disk: Disk, audit: Audit, tell: Callable[[Settled], None]) -> None:
+        self._limits, self._disk, self._audit, self._tell = config.store, disk, audit, tell
+        path = ":memory:" if config.folder is None else str(config.folder / FILE)
+        try:
+            self._db = sqlite3.connect(path, timeout=0.5, isolation_level=None, check_same_thread=False)
+            # A kill of the process loses nothing; a power failure may lose the last moments.
+            for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL", "synchronous = NORMAL"):
+                self._db.execute(f"PRAGMA {pragma}")
+            self._db.executescript(_SCHEMA)
+        except sqlite3.Error as error:
+            raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
+        self._file = None if config.folder is None else (path, os.stat(path).st_ino)
+        self.there = True
+        """Whether the file was where a relay that starts anew looks for it, when it was last looked for."""
+        self.bytes = 0
+        self._by_id: dict[int | None, StoredSession] = {}
+
+    def load(self) -> Iterator[StoredSession]:
+        """Read the sessions of the relay that ran before, and forget all that ended with it."""
+        ended, found = list[StoredSession](), dict[tuple[str, str], StoredSession]()
+        for row in self._db.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id").fetchall():
+            id, name, address, email, temporary, received, numbered = row
+            session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
+            session.kept = True
+            session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
+            held = "SELECT count(*), coalesce(sum(length(frame)), 0) FROM delivery JOIN message ON id = message"
+            session.held, session.held_bytes = self._db.execute(f"{held} WHERE session = ?", (id,)).fetchone()
+            self._by_id[id] = session
+            if temporary:  # left by a relay that was killed
+                ended.append(session)
+            elif before := found.pop(session.key, None):  # it could not be forgotten
+                ended.append(before)
+            if not temporary:
+                found[session.key] = session
+        (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
+        for session in ended:
+            self.forget(session)
+        yield from found.values()
+
+    def look(self) -> None:
+        """Look whether the file is still there."""
+        try:
+            self.there = self._file is None or os.stat(self._file[0]).st_ino == self._file[1]
+        except OSError:
+            self.there = False
+
+    def forget(self, session: StoredSession) -> bool:
+        """Forget a session and its messages; return whether that could be written."""
+        with self._bearable():
+            if session.id is not None:
+                gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
+                self._settle(session, 0, 2**62, 1, *gone)
+                del self._by_id[session.id]
+                session.id = None
+        return session.id is None
+
+    def remember(self, session: StoredSession, received: int, numbered: int) -> None:
+        """Write a session again, with numbers that are at least these."""
+        session.received, session.numbered = max(session.received, received), max(session.numbered, numbered)
+        if session.id is not None:
+            with self._bearable():
+                self._save(session)
+
+    def want(self, session: StoredSession, id: str, pattern: str) -> None:
+        """Note that matching messages are held while the session is away."""
+        if session.id is None:
+            self._save(session)
+        with self._transaction():
+            self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
+        session.durable[id] = pattern
+
+    def want_no_more(self, session: StoredSession, id: str) -> None:
+        """End that."""
+        with self._bearable(), self._transaction():
+            self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
+
+    def hold(
+        self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
+    ) -> bool:
+        """Write a message; return whether it is new, not taken meanwhile over another connection."""
+        if seq == sender.received:
+            return False
+        if receivers:
+            self.make_room(len(frame), receivers)
+        for session in (sender, *receivers):
+            if session.id is None:
+                self._save(session)
+        with self._transaction():
+            if receivers:
+                row = sender.id, seq, topic, frame, len(receivers), len(receivers)
+                columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
+                message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
+            for receiver in receivers:
+                number = receiver.numbered + 1
+                self._db.execute("INSERT INTO delivery VALUES (?, ?, ?)", (receiver.id, number, message))
+                self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
+            self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
+        sender.received = seq
+        self.bytes += len(frame) if receivers else 0
+        for receiver in receivers:
+            receiver.numbered += 1
+            receiver.held += 1
+            receiver.held_bytes += len(frame)
+        return True
+
+    def make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> None:
+        """Let the oldest go: of a full session, and of the identity with the most bytes, so that others get theirs.
+
+        Raises RefusedError: nobody but these has to wait; or the message is larger than the store.
+        """
+        full = [each for each in receivers if each.held >= self._limits.messages]
+        if len(full) == len(receivers):
+            raise RefusedError("store_full", f"session {full[0].name} has not acked {self._limits.messages} messages")
+        for each in full:
+            self._let_go(each)
+        while self.bytes + size_bytes > self._limits.bytes:
+            shares: Counter[str] = Counter()
+            for session in self._by_id.values():
+                shares[session.identity.key] += session.held_bytes
+            holders = list(self._by_id.values()) or receivers
+            largest = max(holders, key=lambda one: (shares[one.identity.key], one.held_bytes))
+            alone = all(each.identity.key == largest.identity.key for each in receivers)
+            if alone or size_bytes > self._limits.bytes:
+                raise RefusedError("store_full", f"no room for {size_bytes} bytes beside {self.bytes}")
+            self._let_go(largest)
+
+    def _let_go(self, session: StoredSession) -> None:
+        (oldest,) = self._db.execute("SELECT min(number) FROM delivery WHERE session = ?", (session.id,)).fetchone()
+        who = {"session": session.name, "identity": session.identity.key}
+        self._disk.on_loop(self._audit.repeated, what="held", code="store_full", **who)
+        self._settle(session, oldest, oldest, 1)
+
+    def next(self, session: StoredSession, after: int) -> tuple[int, str, bytes]:
+        """Find number, topic and frame of the session's next message; with no frame, none is left up to the number."""
+        query = (
+            "SELECT number, topic, frame FROM delivery JOIN message ON message.id = delivery.message "
+            "WHERE session = ? AND number > ? ORDER BY number LIMIT 1"
+        )
+        found: tuple[int, str, bytes] | None = self._db.execute(query, (session.id, after)).fetchone()
+        return found or (session.numbered, "", b"")
+
+    def settle_acked(self, session: StoredSession) -> None:
+        """End the deliveries that the session has acked; if that cannot be written, a later ack does it."""
+        session.settling = False
+        with self._bearable():
+            self._settle(session, 0, session.acked, 0)
+
+    def deny(self, session: StoredSession, number: int) -> None:
+        """Drop a message that no rule lets the session have any more."""
+        with self._bearable():
+            self._settle(session, number, number, 1)
+
+    def robots(self) -> list[tuple[str, int, str]]:
+        """Read the robots that were here, as ``Store.robots``; none if they cannot be read."""
+        try:
+            return self._db.execute("SELECT name, seen_us, said FROM robot").fetchall()
+        except sqlite3.Error as error:
+            self._audit.repeated(what="store", code="store_full", why=f"the robots cannot be read: {error}")
+            return []
+
+    def keep_robots(self, rows: Sequence[tuple[str, int, str]], most: int) -> None:
+        """Write these, and keep of all only the ``most`` that were here last."""
+        with self._bearable(), self._transaction():
+            self._db.executemany("INSERT OR REPLACE INTO robot VALUES (?, ?, ?)", rows)
+            last = "SELECT name FROM robot ORDER BY seen_us DESC LIMIT ?"
+            self._db.execute(f"DELETE FROM robot WHERE name NOT IN ({last})", (most,))
+
+    def forget_robot(self, name: str) -> None:
+        """Remove a robot."""
+        with self._bearable(), self._transaction():
+            self._db.execute("DELETE FROM robot WHERE name = ?", (name,))
+
+    def close(self) -> None:
+        """Close the file; everything is on disk already."""
+        self._db.close()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """Raises RefusedError: the disk cannot be written; then nothing has changed."""
+        self.look()
+        if not self.there:
+            raise RefusedError("store_full", "the store cannot be written: its file was deleted")
+        try:
+            self._db.execute("BEGIN IMMEDIATE")
+            yield
+            self._db.execute("COMMIT")
+        except BaseException as error:
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
+            if isinstance(error, sqlite3.Error):
+                raise RefusedError("store_full", f"the store cannot be written: {error}") from None
+            raise
+
+    @contextmanager
+    def _bearable(self) -> Iterator[None]:
+        """Log that the store cannot be written, and go on."""
+        try:
+            yield
+        except RefusedError as refused:
+            self._disk.on_loop(self._audit.repeated, what="store", code=refused.code, why=str(refused))
+
+    def _settle(self, session: StoredSession, first: int, last: int, lost: int, *also: str) -> None:
+        """End deliveries to a session; ``also`` are statements about its id for the same transaction."""
+        settled, sizes, freed_bytes = [], [], 0
+        chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
+        with self._transaction():
+            rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
+            self._db.execute(f"DELETE {chosen}", (session.id, first, last))
+            for statement in also:
+                self._db.execute(statement, (session.id,))
+            for (id,) in rows:
+                (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
+                    "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
+                    "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
+                    (lost, id),
+                ).fetchone()
+                sizes.append(size_bytes)
+                if waiting == 0:
+                    self._db.execute("DELETE FROM message WHERE id = ?", (id,))
+                    freed_bytes += size_bytes
+                    if sender in self._by_id:
+                        settled.append(Settled(self._by_id[sender], seq, receivers, gone))
+        session.held -= len(sizes)
+        session.held_bytes -= sum(sizes)
+        self.bytes -= freed_bytes
+        for message in settled:
+            self._disk.on_loop(self._tell, message)
+
+    def _save(self, session: StoredSession) -> None:
+        """Write the session; a new one gets its id in a transaction of its own, so that the id is never rolled back."""
+        who = session.identity
+        row = session.id, session.name, who.address, who.email, session.temporary, session.received, session.numbered
+        with self._transaction():
+            insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+            id = self._db.execute(insert, row).lastrowid
+        session.id = id
+        self._by_id[id] = session
