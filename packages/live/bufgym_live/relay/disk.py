@@ -105,7 +105,9 @@ class Disk:
             self._left_out = 0
 
     def close(self, work: Callable[[], Any]) -> None:
-        """Wait for the end of all, and of ``work`` after it."""
+        """Wait for the end of all, and of ``work`` after it; once is enough."""
+        if self._closed:
+            return
         self._closed = True
         self._thread.submit(self._bearably, work)
         self._thread.shutdown()
