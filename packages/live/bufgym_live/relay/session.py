@@ -214,6 +214,8 @@ class Session:
         from websockets.asyncio.client import connect
         from websockets.typing import Subprotocol
 
+        from bufgym_live.relay.client_connection import WatchedConnection  # not at start-up
+
         secure = self.address.scheme == "wss"
         return await connect(
             f"{self.address.scheme}://{self.address.netloc}{self.address.path.rstrip('/')}{wire.PATH}",
@@ -222,6 +224,7 @@ class Session:
             ssl=(self._tls or ssl.create_default_context()) if secure else None,
             server_hostname=self.address.hostname if secure else None,
             compression=None,
+            create_connection=WatchedConnection,
             ping_interval=wire.PING_S,
             ping_timeout=wire.PONG_S,
             close_timeout=CLOSE_S,
