@@ -7,10 +7,10 @@ from pathlib import Path
 
 REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
-    "bufgym": 27_500,
-    "tests": 18_210,
-    "packages/live/bufgym_live": 11_600,
-    "packages/live/tests": 7_990,
+    "bufgym": 27_550,
+    "tests": 18_380,
+    "packages/live/bufgym_live": 12_240,
+    "packages/live/tests": 8_780,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_160,
 }
