@@ -247,7 +247,7 @@ def test_a_robot_of_ros(version: str, request: pytest.FixtureRequest, tmp_path: 
     else:
         pytest.importorskip("rclpy", reason="needs rclpy (extra ros2)")
         where = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    places = [where.get("PYTHONPATH", ""), str(HERE), str(HERE.parent), str(HERE.parents[1])]
+    places = [where.get("PYTHONPATH", ""), *map(str, (HERE, HERE.parent, HERE.parents[1], HERE.parents[3] / "tests"))]
     where = {**where, "PYTHONPATH": os.pathsep.join(filter(None, places))}
     words = [sys.executable, str(HERE / "ros_session.py"), version, str(tmp_path)]
     done = subprocess.run(words, env=where, capture_output=True, text=True, check=False, timeout=300)
