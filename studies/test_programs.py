@@ -35,11 +35,13 @@ ELSEWHERE = {
     "studies.peers": "needs the other packages",
     "studies.perf": "studies/test_perf.py",
     "studies.round_trips": "packages/live/tests/robot/test_round_trip.py",
+    "studies.sb3_defaults": "studies/test_sb3_defaults.py",
     "studies.scheduling": "agents/test_scheduling.py",
     "studies.shipped": "studies/test_shipped.py",
     "studies.sizes": "needs a recording, and PyAV",
     "studies.tune": "studies/test_tune.py",
     "website.films": "website/test_gallery.py",
+    "website.returns": "it plays 100 episodes in each environment, and takes minutes",
     "website.row": "needs the folder of a suite's run",
     "website.shares": "needs the folder of a suite's run",
 }

@@ -17,7 +17,7 @@ from agents.callbacks import Curve, checkpoints
 from agents.evaluation import SlotModel
 from agents.held_out import FixedEpisodes
 from agents.learner import learner_of
-from agents.objectives import guided
+from agents.objectives import environment
 from agents.report import verdict
 from agents.settings import (
     DQN,
@@ -91,8 +91,8 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
 
 
 def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, capsys: Capsys) -> None:
-    monkeypatch.setattr(guided, "PARTS", 2)
-    monkeypatch.setattr(guided, "EPISODES", 2)
+    monkeypatch.setattr(environment, "PARTS", 2)
+    monkeypatch.setattr(environment, "EPISODES", 2)
     on = Environment(capacity=8, duration_s=3.0, episodes=3)
     evolve = Evolve(environment=on, **{**SHARED, "steps": 3_000, "validate_every": 3_000})
     train.main(evolve, train.others_of(evolve))
