@@ -15,6 +15,7 @@ import {Overview} from "./overview.js";
 import {Player} from "./player.js";
 import {Relay} from "./relay.js";
 import {address, replace, route, TABS} from "./route.js";
+import {SignIn} from "./sign_in.js";
 
 const TEXT_MS = 250, GRACE_MS = 2000;               // texts are said so often; so long may a connection be away before the page says so
 const USUAL_POSES = ["odom", "odometry", "localization", "tf", "tf_static"];   // asked for before a robot's status, which comes once a second, names its own
@@ -74,7 +75,7 @@ const relay = new Relay({
     sayState(text);
   },
   welcome() {
-    say($("you"), `you are ${relay.welcome.identity.email || relay.welcome.identity.address}`);
+    signIn.welcomed(relay.welcome.identity);
     hand.offerPolicies();
     hand.draw();
   },
@@ -84,11 +85,9 @@ const relay = new Relay({
     else if (said.op === "replayed") player.replay?.take(said);
     else if (said.op === "refused") notices.refused(/^\/robots\/([^/]+)/.exec(said.topic)?.[1] ?? chosen ?? "", `${said.what}: ${said.why}`, nowMs());
   },
-  unauthorized(why) {
-    $("why").textContent = why;
-    $("ask").showModal();
-  },
+  unauthorized(why, token) { signIn.refused(why, token); },
 });
+const signIn = new SignIn($, relay);
 const player = new Player($, relay, {
   message: message => tried(message),
   begin() {
@@ -235,7 +234,6 @@ function forget() {
 }
 
 $("fit").onclick = () => { map.follow = true; map.fitted = false; };
-$("ask").onclose = () => relay.authorize($("token").value);
 
 // --- drawing ---------------------------------------------------------------------------------------------------------
 
