@@ -89,6 +89,8 @@ class Fleet:
         self.hello: dict[str, Any] = {"name": "fleet"} if token is None else {"name": "fleet", "token": token}
         self.settings = settings(**{"rules": (ALL,), "limits": Limits(hello_s=60), **changed})
         self.robots: dict[str, tuple[dict[str, Any], Topics]] = {}
+        self.released: Topics = ()
+        """What a robot of Robofleet's publishes: whole topics, types and flatbuffers."""
         self.came: list[Any] = []
         self.driven: list[Any] = []
         self.port, self.over, self.ready = 0, threading.Event(), threading.Event()
@@ -112,6 +114,8 @@ class Fleet:
             while not self.over.is_set():
                 for name, (status, topics) in list(self.robots.items()):
                     await self.publish(one, name, status, topics)
+                for topic, type, payload in self.released:
+                    await one.put(topic, payload, type=type, encoding="robofleet")
                 for said in await one.rest():
                     command = json.loads(bytes(said.payload))
                     if said.topic.endswith("/drive"):
