@@ -135,6 +135,7 @@ def test_a_robot_of_robofleet_s_is_shown_like_ours(running: tuple[Any, Fleet], s
             ("#facts", "battery 50 %"),
         ):
             until(page, says.format(selector, text))
+        until(page, f"{at(0x8C96A3 if scheme == 'light' else 0x76818E)} !== 0")  # the walls that the laser saw
         for canvas, colours in (("#camera", 1), ("#scan", 3)):
             until(page, f"({SEES})(document.querySelector('{canvas}')) >= {colours}")
         page.focus("#map")

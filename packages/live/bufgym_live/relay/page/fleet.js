@@ -75,7 +75,7 @@ export class Fleet {
 
   // As it was before its first message; what its topics are is known still.
   blank(robot) {
-    Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0, estop: new Map(),
+    Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, unplaced: null, poseMs: 0, queueMs: 0, estop: new Map(),
       cameras: new Map(), layers: new Map(), parts: new Map()});
     robot.place.forget();
   }
@@ -142,14 +142,24 @@ export class Fleet {
     robot.poses.push({...at, ms});
     if (robot.poses.length > POSES) robot.poses.shift();
     if (!robot.trail.length || ms - robot.trail.at(-1).ms >= TRAIL_GAP_MS) robot.trail.push({x: at.x, y: at.y, ms});
+    this.placeScan(robot);
     this.on.moved();
   }
 
   takeScan(robot, scan, ms) {
     if (!this.on.drawn(robot)) return;
     Object.assign(robot, {scan, scanMs: ms, scanChanged: true});
-    const then = poseAt(robot, ms), {tree} = robot.place, mounted = tree.base && scan.frame && tree.between(scan.frame, tree.base);
-    if (then) this.on.scanned(robot, mounted ? within(then, mounted) : then, scan);
+    robot.unplaced = {scan, ms};
+    this.placeScan(robot);
+  }
+
+  // A scan lies where the robot was at its time; the pose of that time may come behind it.
+  placeScan(robot) {
+    const {scan, ms} = robot.unplaced ?? {}, then = scan && poseAt(robot, ms);
+    if (!then) return;
+    robot.unplaced = null;
+    const {tree} = robot.place, mounted = tree.base && scan.frame && tree.between(scan.frame, tree.base);
+    this.on.scanned(robot, mounted ? within(then, mounted) : then, scan);
   }
 
   // Only the latest picture is decoded.
