@@ -220,7 +220,7 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
     fleet.robots.clear()
     old = "document.querySelector('#cameras figure')"
     until(page, f"{old}.dataset.old.endsWith('s old') && {old}.style.getPropertyValue('--age') > 0.3")
-    until(page, f"{text('#facts')}.endsWith('ago')", f"{text('.seen')}.startsWith('silent for')")
+    until(page, f"{text('#facts')}.endsWith('ago')", f"{text('.card[aria-current] .seen')}.startsWith('silent for')")
 
 
 def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
