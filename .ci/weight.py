@@ -9,8 +9,8 @@ REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
     "bufgym": 27_550,
     "tests": 18_380,
-    "packages/live/bufgym_live": 12_240,
-    "packages/live/tests": 8_780,
+    "packages/live/bufgym_live": 12_280,
+    "packages/live/tests": 9_240,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_160,
 }

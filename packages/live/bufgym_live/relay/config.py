@@ -142,15 +142,47 @@ class Tokens(Section, frozen=True):
     issuer: Text
     audience: Text
     keys: Text
-    """The issuer's key set (JWKS), a URL or a file. It is read again when a token names an unknown key."""
+    """The issuer's key set (JWKS), a URL or a file. It is read again when a token names an unknown key or the file has
+    changed."""
     algorithms: tuple[str, ...] = ("RS256", "ES256", "EdDSA")
     leeway_s: Annotated[float, Meta(ge=0, le=1e6)] = 10.0
     """Allowed difference between clocks."""
+    client: str = ""
+    """The page's client id at the issuer, with which it signs people in; empty if it asks for a token. Identity tokens
+    have it as their audience, so it is one that the relay takes."""
+    scope: Text = "openid email"
+    """What the page asks the issuer for; many renew a token only with ``offline_access``."""
+    endpoints: tuple[str, ...] = ()
+    """Origins of the issuer's token endpoint, as ``https://tokens.example.org``, if it is not the issuer's own."""
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.algorithms) - set(ALGORITHMS))
         if unknown or not self.algorithms:
             raise BufgymError(f"tokens: algorithms = {list(self.algorithms)}: must be of {', '.join(ALGORITHMS)}")
+        urls = [("keys", self.keys)] if "://" in self.keys else []
+        if self.client:
+            urls += [("issuer", self.issuer), *(("endpoints", url) for url in self.endpoints)]
+        for name, url in urls:
+            if not _is_safe(url):
+                raise BufgymError(f"tokens: {name} = {url!r}: must be an https address")
+
+    @property
+    def origins(self) -> tuple[str, ...]:
+        """Servers from which the page fetches what it needs to sign in."""
+        urls = map(urlsplit, (self.issuer, *self.endpoints) if self.client else ())
+        return tuple(f"{url.scheme}://{url.netloc}" for url in urls)
+
+
+def _is_safe(url: str) -> bool:
+    """Whether nobody can listen on the way to this address; nor does it say more to a header that it stands in."""
+    try:
+        parts = urlsplit(url)
+        host = parts.hostname or ""
+        if parts.scheme == "http" and host != "localhost":
+            return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and host != "" and not set(parts.netloc) & set(" ;,'*@")
 
 
 class Nats(Section, frozen=True):

@@ -1,15 +1,14 @@
 """Proofs of identity: JSON web tokens checked against an issuer's keys, and clients' certificates."""
 
 import asyncio
-import ipaddress
 import json
 import ssl
 import time
 import urllib.request
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
-from urllib.parse import urlsplit
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
@@ -38,10 +37,9 @@ class Verifier:
         self._keys: Mapping[str | None, Any] = {}
         self._fetched_s = -1e9
         self._fetching = asyncio.Lock()
-        if "://" in tokens.keys:
-            url = urlsplit(tokens.keys)
-            if url.scheme != "https" and not (url.scheme == "http" and _is_loopback(url.hostname)):
-                raise BufgymError(f"tokens: keys = {tokens.keys!r}: must be an https address")
+        self._audiences = [name for name in (tokens.audience, tokens.client) if name]
+        self._file = None if "://" in tokens.keys else Path(tokens.keys)
+        self._state: tuple[int, ...] = ()
 
     async def email(self, token: str) -> tuple[str, float]:
         """Return the e-mail that the token proves and the token's end, s since 1970.
@@ -52,7 +50,7 @@ class Verifier:
             raise _unauthorized(f"token of {len(token)} characters: must be at most {MAX_TOKEN_CHARACTERS}")
         try:
             key = await self._key(self._jwt.get_unverified_header(token).get("kid"))
-            known = {"audience": self._tokens.audience, "issuer": self._tokens.issuer, "leeway": self._tokens.leeway_s}
+            known = {"audience": self._audiences, "issuer": self._tokens.issuer, "leeway": self._tokens.leeway_s}
             options = {"require": ["exp", "iss", "aud"]}
             claims = self._jwt.decode(token, key, list(self._tokens.algorithms), options, **known)
         except (self._jwt.PyJWTError, ValueError, TypeError, OverflowError, RecursionError) as error:
@@ -66,10 +64,10 @@ class Verifier:
 
     async def _key(self, kid: str | None) -> Any:
         async with self._fetching:
-            age_s = self._clock() - self._fetched_s
-            asked = age_s > KEYS_AGE_S or (kid not in self._keys and age_s > AGAIN_S)
+            state, age_s = self._state_of_file(), self._clock() - self._fetched_s
+            asked = state != self._state or age_s > KEYS_AGE_S or (kid not in self._keys and age_s > AGAIN_S)
             if asked:
-                self._fetched_s = self._clock()
+                self._state, self._fetched_s = state, self._clock()
                 try:
                     text = await asyncio.to_thread(self._text)
                     self._keys = {key.key_id: key for key in self._jwt.PyJWKSet.from_dict(json.loads(text)).keys}
@@ -83,19 +81,19 @@ class Verifier:
             raise RefusedError("unauthorized" if asked else "unavailable", f"token: unknown key {str(kid)[:60]!r}")
         return self._keys[kid]
 
+    def _state_of_file(self) -> tuple[int, ...]:
+        """Tell one state of the file of keys from another; empty for a URL, and where there is no file."""
+        try:
+            found = self._file and self._file.stat()
+        except OSError:
+            found = None
+        return (found.st_mtime_ns, found.st_size, found.st_ino) if found else ()
+
     def _text(self) -> str:
-        keys = self._tokens.keys
-        if "://" not in keys:
-            return read_utf8(keys, MAX_KEYS_BYTES)
-        with urllib.request.urlopen(keys, timeout=_FETCH_S) as answer:
+        if self._file is not None:
+            return read_utf8(self._file, MAX_KEYS_BYTES)
+        with urllib.request.urlopen(self._tokens.keys, timeout=_FETCH_S) as answer:
             return str(answer.read(MAX_KEYS_BYTES).decode())
-
-
-def _is_loopback(host: str | None) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host or "").is_loopback
-    except ValueError:
-        return False
 
 
 def server_context(tls: Tls) -> ssl.SSLContext:

@@ -5,7 +5,7 @@ import functools
 import gzip
 import hashlib
 import mimetypes
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import Final
@@ -14,20 +14,24 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 FOLDER: Final = Path(__file__).with_name("page")
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "form-action 'self'; connect-src 'self' ws: wss:; frame-ancestors 'none'; base-uri 'none'"
+)
 HEADERS: Final = {
     "Cache-Control": "no-cache",
     "Connection": "close",
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
-        "form-action 'self'; connect-src 'self' ws: wss:; frame-ancestors 'none'; base-uri 'none'"
-    ),
+    "Content-Security-Policy": POLICY,
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
 
 
-def answer(path: str, asked: Headers, folder: Path = FOLDER) -> Response:
-    """Answer a GET of this path; ``asked`` has the request's headers. Nothing is sent that the browser has already."""
+def answer(path: str, asked: Headers, folder: Path = FOLDER, origins: Sequence[str] = ()) -> Response:
+    """Answer a GET of this path; ``asked`` has the request's headers. Nothing is sent that the browser has already.
+
+    The page may fetch from these other ``origins``, too.
+    """
     name = path.partition("?")[0].removeprefix("/") or "index.html"
     files = {file.name: file for file in folder.iterdir() if file.is_file()} if folder.is_dir() else {}
     if name not in files:  # a name that was not listed is never opened: no "..", no absolute path
@@ -35,6 +39,7 @@ def answer(path: str, asked: Headers, folder: Path = FOLDER) -> Response:
     data, packed, tag = _read(files[name], files[name].stat().st_mtime_ns)
     kind = mimetypes.guess_type(name)[0] or "text/plain"
     more = {"ETag": tag, "Vary": "Accept-Encoding"}
+    more["Content-Security-Policy"] = POLICY.replace(" wss:", " ".join([" wss:", *origins]))
     if tag in asked.get("If-None-Match", ""):
         return response(HTTPStatus.NOT_MODIFIED, b"", kind, more)
     if "gzip" in asked.get("Accept-Encoding", "") and len(packed) < len(data):

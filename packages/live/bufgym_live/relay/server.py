@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 import signal
 import socket
@@ -179,7 +180,17 @@ class Server:
                 return pages.response(HTTPStatus.OK, "ok\n")
             case "/metrics":
                 return self._metrics(socket.address)
-        return pages.answer(request.path, request.headers)
+            case "/sign-in.json":
+                return pages.response(HTTPStatus.OK, self._sign_in(), "application/json")
+        tokens = self.config.tokens
+        return pages.answer(request.path, request.headers, origins=tokens.origins if tokens else ())
+
+    def _sign_in(self) -> str:
+        """What the page must know to sign somebody in; nothing if it asks for a token."""
+        tokens = self.config.tokens
+        if tokens is None or not tokens.client:
+            return "{}"
+        return json.dumps({"issuer": tokens.issuer, "client": tokens.client, "scope": tokens.scope})
 
     def _metrics(self, address: str) -> Response:
         if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):

@@ -84,10 +84,13 @@ def health(level: int, says: str) -> Topics:
 class Fleet:
     """A relay with made-up robots, in a thread; each publishes its status and topics some times a second."""
 
-    def __init__(self, **changed: Any) -> None:
-        """``changed`` are settings of the relay."""
+    def __init__(self, token: str | None = None, **changed: Any) -> None:
+        """``changed`` are settings of the relay; ``token`` is the robots'."""
+        self.hello: dict[str, Any] = {"name": "fleet"} if token is None else {"name": "fleet", "token": token}
         self.settings = settings(**{"rules": (ALL,), "limits": Limits(hello_s=60), **changed})
         self.robots: dict[str, tuple[dict[str, Any], Topics]] = {}
+        self.released: Topics = ()
+        """What a robot of Robofleet's publishes: whole topics, types and flatbuffers."""
         self.came: list[Any] = []
         self.driven: list[Any] = []
         self.port, self.over, self.ready = 0, threading.Event(), threading.Event()
@@ -104,13 +107,15 @@ class Fleet:
         assert not self.thread.is_alive(), "waited 60 s for a relay's end"
 
     async def run(self) -> None:
-        async with relay(self.settings) as server, client(server.port, name="fleet") as one:
+        async with relay(self.settings) as server, client(server.port, **self.hello) as one:
             self.port = server.port
             self.ready.set()
             await one.subscribe("^/robots/[^/]+/(command|drive)$")
             while not self.over.is_set():
                 for name, (status, topics) in list(self.robots.items()):
                     await self.publish(one, name, status, topics)
+                for topic, type, payload in self.released:
+                    await one.put(topic, payload, type=type, encoding="robofleet")
                 for said in await one.rest():
                     command = json.loads(bytes(said.payload))
                     if said.topic.endswith("/drive"):

@@ -2,58 +2,34 @@
 
 import datetime
 import ipaddress
-import json
 import ssl
 import threading
 import time
+from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
+from issuer_cases import Issuer
+from loop_cases import beside
+from msgspec.structs import replace
 from refusal_cases import refuse
-from relay_cases import client, relay, settings, wait
+from relay_cases import client, relay, settings, until, wait
 from websockets.exceptions import WebSocketException
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import identity
+from bufgym_live.relay.address import token
 from bufgym_live.relay.config import Rule, Tls, Tokens
+from bufgym_live.relay.session import Session
 
 jwt = pytest.importorskip("jwt")
 x509 = pytest.importorskip("cryptography.x509")
 from cryptography.hazmat.primitives import hashes, serialization  # noqa: E402
 from cryptography.hazmat.primitives.asymmetric import ec  # noqa: E402
 
-ISSUER = "https://issuer.test"
 ANNA = Rule(email="anna@x.org", send=True, receive=True)
-
-
-class Issuer:
-    """Signs tokens; its key set is a file."""
-
-    def __init__(self, folder: Path) -> None:
-        self.file = folder / "jwks.json"
-        self.keys: dict[str, Any] = {}
-        self.rotate("one")
-
-    def rotate(self, kid: str) -> None:
-        """From now on only this key."""
-        self.keys[kid] = ec.generate_private_key(ec.SECP256R1())
-        public = json.loads(jwt.algorithms.ECAlgorithm.to_jwk(self.keys[kid].public_key()))
-        self.file.write_text(json.dumps({"keys": [{**public, "kid": kid, "alg": "ES256", "use": "sig"}]}))
-        self.kid = kid
-
-    def token(self, kid: str = "", algorithm: str = "ES256", key: Any = None, **changed: Any) -> str:
-        kid = kid or self.kid
-        claims = {"iss": ISSUER, "aud": "fleet", "exp": time.time() + 60, "email": "anna@x.org"}
-        claims |= {"email_verified": True, **changed}
-        claims = {name: value for name, value in claims.items() if value is not None}
-        key = None if algorithm == "none" else key or self.keys[kid]
-        return str(jwt.encode(claims, key, algorithm, headers={"kid": kid}))
-
-    @property
-    def tokens(self) -> Tokens:
-        return Tokens(ISSUER, "fleet", str(self.file))
 
 
 @pytest.fixture
@@ -75,21 +51,33 @@ async def test_a_token_names_who_it_is(issuer: Issuer) -> None:
             assert anna.socket.close_reason == "the token has expired"
 
 
+async def test_a_client_reads_its_file_again(issuer: Issuer, tmp_path: Path) -> None:
+    """Its token ends, and so does the connection; it is let in again once the file has the next."""
+    file = tmp_path / "token"
+    file.write_text(issuer.token(exp=time.time() + 1))
+    async with relay(settings(rules=(ANNA,), tokens=replace(issuer.tokens, leeway_s=0.0))) as server:
+        one = Session(f"ws://127.0.0.1:{server.port}", "anna", token=partial(token, file))
+        async with beside(one.run()):
+            await wait("the first connection", one.ready.wait())
+            await until("a refusal", lambda: any("expired" in fault for fault in one.faults) and not one.ready.is_set())
+            file.write_text(issuer.token())
+            await wait("the second connection", one.ready.wait())
+
+
 async def test_keys_change(issuer: Issuer) -> None:
-    """The key set is read again for a key that it did not have, and after a while; a key that has gone is no good."""
+    """The key set is read again once its file has changed; a key that has gone is no good."""
     now_s = 1_000.0
     verifier = identity.Verifier(issuer.tokens, clock=lambda: now_s)
     old = issuer.token()
     assert (await verifier.email(old))[0] == "anna@x.org"
     issuer.rotate("two")
-    with pytest.raises(BufgymError, match="unknown key 'two'"):
-        await verifier.email(issuer.token())  # it was just read
-    now_s += 2 * identity.AGAIN_S
     assert (await verifier.email(issuer.token()))[0] == "anna@x.org"
     with pytest.raises(BufgymError, match="unknown key 'one'"):
         await verifier.email(old)
     issuer.file.write_text("{}")
-    assert (await verifier.email(issuer.token()))[0] == "anna@x.org"
+    with pytest.raises(BufgymError, match="the issuer's keys cannot be read"):
+        await verifier.email(issuer.token())
+    assert (await verifier.email(issuer.token()))[0] == "anna@x.org"  # half a file: the keys from before it
     now_s += 2 * identity.KEYS_AGE_S
     with pytest.raises(BufgymError, match="the issuer's keys cannot be read"):
         await verifier.email(issuer.token())
@@ -132,7 +120,7 @@ async def test_the_keys_come_over_http_no_more_often_than_they_may(issuer: Issue
 
     with HTTPServer(("127.0.0.1", 0), Keys) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        tokens = Tokens(ISSUER, "fleet", f"http://127.0.0.1:{server.server_port}/jwks.json")
+        tokens = Tokens(issuer.name, "fleet", f"http://127.0.0.1:{server.server_port}/jwks.json")
         verifier = identity.Verifier(tokens, clock=lambda: 0.0)
         for _ in range(5):
             assert await verifier.email(issuer.token())
@@ -142,7 +130,34 @@ async def test_the_keys_come_over_http_no_more_often_than_they_may(issuer: Issue
                 await verifier.email(issuer.token(f"forged {k}"))
         server.shutdown()
     assert asked == ["/jwks.json"]
-    refuse("must be an https address", identity.Verifier, Tokens(ISSUER, "fleet", "http://issuer.test/jwks.json"))
+
+
+def test_what_travels_in_the_open_is_refused() -> None:
+    """Keys that are not a file, and whatever the page fetches; at this machine nobody listens."""
+    safe, name = "https://issuer.test", "keys.json"
+    for url in (
+        "http://issuer.test/keys",
+        "http://10.0.0.1/keys",
+        "ftp://issuer.test",
+        "https://",
+        "https://a;b",
+        "//a",
+    ):
+        refuse("must be an https address", Tokens, safe, "fleet", name, client="page", endpoints=(url,))
+        refuse("issuer = .* must be an https address", Tokens, url, "fleet", name, client="page")
+        assert Tokens(url, "fleet", name).origins == ()  # the page signs nobody in
+    refuse("must be an https address", Tokens, safe, "fleet", "http://issuer.test/keys")
+    here = ("http://localhost:1/token", "http://[::1]:2", "http://127.0.0.1:3/a")
+    found = Tokens(f"{safe}/fleet", "fleet", name, client="page", endpoints=here).origins
+    assert found == (safe, "http://localhost:1", "http://[::1]:2", "http://127.0.0.1:3")
+
+
+async def test_a_page_s_token_has_its_client_as_audience(issuer: Issuer) -> None:
+    proof = issuer.token(aud="page")
+    with pytest.raises(BufgymError, match="token: Audience doesn't match"):
+        await identity.Verifier(issuer.tokens).email(proof)
+    verifier = identity.Verifier(replace(issuer.tokens, client="page"))
+    assert (await verifier.email(proof))[0] == (await verifier.email(issuer.token()))[0] == "anna@x.org"
 
 
 HERE = x509.IPAddress(ipaddress.ip_address("127.0.0.1"))

@@ -221,7 +221,8 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
     old = "document.querySelector('#cameras figure')"
     until(page, f"{old}.dataset.old.endsWith('s old') && {old}.style.getPropertyValue('--age') > 0.3")
     # Soon the relay says, too, that it is away.
-    until(page, f"{text('#facts')}.endsWith('ago')", f"/^(silent for|last seen) [0-9]/.test({text('.seen')})")
+    seen = text(".card[aria-current] .seen")
+    until(page, f"{text('#facts')}.endsWith('ago')", f"/^(silent for|last seen) [0-9]/.test({seen})")
 
 
 def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:

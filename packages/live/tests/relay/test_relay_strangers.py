@@ -11,9 +11,9 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
+from issuer_cases import Issuer
 from mutations import COUNT, SEED, mutated
 from relay_cases import Server, client, connect, relay, settings, stranger, until, wait, within
-from test_identity import Issuer
 from websockets.datastructures import Headers
 from websockets.exceptions import WebSocketException
 

@@ -7,9 +7,10 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from issuer_cases import Issuer
 from mutations import COUNT, SEED, mutated
 from relay_cases import Server, client, relay, settings, until, wait
-from test_identity import ANNA, Issuer
+from test_identity import ANNA
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 

@@ -3,7 +3,7 @@
 
 import {Cameras} from "./cameras.js";
 import {say, seconds, tint, whenColoursChange} from "./draw.js";
-import {AWAY_MS, Fleet, troubles} from "./fleet.js";
+import {AWAY_MS, Fleet, split, troubles} from "./fleet.js";
 import {Hand} from "./hand.js";
 import {Health} from "./health.js";
 import {Layers} from "./layers.js";
@@ -15,9 +15,11 @@ import {Overview} from "./overview.js";
 import {Player} from "./player.js";
 import {Relay} from "./relay.js";
 import {address, replace, route, TABS} from "./route.js";
+import {SignIn} from "./sign_in.js";
 
 const TEXT_MS = 250, GRACE_MS = 2000;               // texts are said so often; so long may a connection be away before the page says so
-const USUAL_POSES = ["odom", "odometry", "localization", "tf", "tf_static"];   // asked for before a robot's status, which comes once a second, names its own
+const ALL = "^/(robots|ut)/[^/]+/", RELEASED = ["velodyne_2dscan", "scan", "visualization", "image_compressed/main"];  // Robofleet's robots name no topics
+const USUAL_POSES = ["odom", "odometry/raw", "odometry", "localization", "tf", "tf_static"];   // asked for before a robot's status, which comes once a second, names its own
 
 /** @type {(id: string) => any} */
 const $ = id => document.getElementById(id);
@@ -74,7 +76,7 @@ const relay = new Relay({
     sayState(text);
   },
   welcome() {
-    say($("you"), `you are ${relay.welcome.identity.email || relay.welcome.identity.address}`);
+    signIn.welcomed(relay.welcome.identity);
     hand.offerPolicies();
     hand.draw();
   },
@@ -82,13 +84,11 @@ const relay = new Relay({
   said(said) {
     if (said.op === "recordings") player.list(said.files);
     else if (said.op === "replayed") player.replay?.take(said);
-    else if (said.op === "refused") notices.refused(/^\/robots\/([^/]+)/.exec(said.topic)?.[1] ?? chosen ?? "", `${said.what}: ${said.why}`, nowMs());
+    else if (said.op === "refused") notices.refused(split(String(said.topic ?? "")).name ?? chosen ?? "", `${said.what}: ${said.why}`, nowMs());
   },
-  unauthorized(why) {
-    $("why").textContent = why;
-    $("ask").showModal();
-  },
+  unauthorized(why, token) { signIn.refused(why, token); },
 });
+const signIn = new SignIn($, relay);
 const player = new Player($, relay, {
   message: message => tried(message),
   begin() {
@@ -109,7 +109,7 @@ const player = new Player($, relay, {
 const hand = new Hand($, relay, map, notices, {robot, isReplay, nowMs, frame: () => shown().frame, removed: name => fleet.remove(name)});
 
 function begin() {
-  relay.subscribe("status", "^/robots/[^/]+/status$");
+  relay.subscribe("status", `${ALL}status$`);
   relay.subscribe("last", "^/robots/[^/]+/last$");
   relay.subscribe("relay", "^/relay/status$");
   subscribe();
@@ -121,12 +121,12 @@ const layered = () => tab === "3d" ? [...DRAWN, "cloud"] : DRAWN;  // kinds
 function subscribe() {
   if (isReplay()) return;                           // what is drawn now comes from the file
   const of = topics => `(${[...new Set(topics)].sort().map(escaped).join("|")})$`;
-  relay.subscribe("poses", "^/robots/[^/]+/" + of([...USUAL_POSES, ...fleet.topics(["pose", "tf"])]));
-  relay.subscribe("health", "^/robots/[^/]+/" + of(["diagnostics", ...fleet.topics(HEALTH)]));
+  relay.subscribe("poses", ALL + of([...USUAL_POSES, ...fleet.topics(["pose", "tf"])]));
+  relay.subscribe("health", ALL + of(["diagnostics", ...fleet.topics(HEALTH)]));
   if (chosen === null) return;
   const own = kinds => robot() ? fleet.topics(kinds, [robot()]) : [];
   const pictures = own(["picture"]), topics = ["queue", ...own(["scan"]).slice(0, 1), ...own(layered()).filter(topic => layers.isOn(topic))];
-  relay.subscribe("chosen", `^/robots/${escaped(chosen)}/` + of([...topics, ...(tab === "cameras" ? pictures : pictures.slice(0, 1))]));
+  relay.subscribe("chosen", `^/${chosen.startsWith("ut/") ? "" : "robots/"}${escaped(chosen)}/` + of([...topics, ...(chosen.startsWith("ut/") ? RELEASED : []), ...(tab === "cameras" ? pictures : pictures.slice(0, 1))]));
 }
 
 // A message that is not what it says it is changes nothing.
@@ -235,7 +235,6 @@ function forget() {
 }
 
 $("fit").onclick = () => { map.follow = true; map.fitted = false; };
-$("ask").onclose = () => relay.authorize($("token").value);
 
 // --- drawing ---------------------------------------------------------------------------------------------------------
 

@@ -59,14 +59,14 @@ function changed(before, markers, ms) {
 // A layer of the map by a message of a kind that is drawn; ``before`` is what the topic's layer was. A cloud is read once it is drawn.
 export function layer(kind, message, ms, before) {
   if (kind === "cloud") return {kind, ms, message};
-  const cdr = new Cdr(message.payload);
-  if (kind === "markers") {
-    const markers = changed(before, message.type.endsWith("Array") ? cdr.list(marker, MOST_MARKERS) : [marker(cdr)], ms);
-    return {kind, ms, markers, spaces: [...new Set([...markers.values()].map(one => one.space))]};
-  }
   if (kind === "goal") {
     const at = pose(message);
     return {kind, ms, frame: at?.frame ?? "", places: at ? [at] : []};
+  }
+  const cdr = message.markers ? null : new Cdr(message.payload);
+  if (kind === "markers") {
+    const markers = changed(before, message.markers ?? (message.type.endsWith("Array") ? cdr.list(marker, MOST_MARKERS) : [marker(cdr)]), ms);
+    return {kind, ms, markers, spaces: [...new Set([...markers.values()].map(one => one.space))]};
   }
   return {kind, ms, ...{grid, path, poses}[kind](cdr)};
 }

@@ -2,6 +2,7 @@
 
 import {colourOf} from "./draw.js";
 import {layer} from "./drawings.js";
+import {unpacked} from "./flat.js";
 import {Place, within} from "./frames.js";
 import {charge, diagnostics, DRAWN, flag, json, kindOf, queue, scan, status} from "./messages.js";
 
@@ -9,7 +10,13 @@ export const AWAY_MS = 5000, LOW = 0.25;
 const GONE_MS = 600_000;                            // who was not here for so long needs nobody now
 const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, POSES = 100, NEAR_MS = 20, GAP_MS = 400, PARTS = 500, LAYERS = 64, EARLY = 1000;
 const LATELY_MS = 10_000, MANY = 0.3;               // a robot that drops so many of its messages lately is in trouble
-const ROBOT = /^\/robots\/([^/]+)\/(.+)$/;
+const ROBOT = /^\/(?:robots\/([^/]+)|(ut\/[^/]+))\/(.+)$/;  // ours, and Robofleet's
+
+// A robot's name and the topic below it; empty where a topic is no robot's.
+export function split(topic) {
+  const [, name, released, own] = ROBOT.exec(topic) ?? [];
+  return {name: name ?? released, topic: own};
+}
 
 export class Fleet {
   // on: {nowMs(), drawn(robot), added(robot), here(robot), removed(name), status(robot), reframed(robot), scanned(robot, pose, scan), moved()}
@@ -46,7 +53,7 @@ export class Fleet {
   enter(robot) {
     robot.isHere = true;
     this.on.here(robot);
-    for (const [topic, message] of this.early) if (ROBOT.exec(topic)[1] === robot.name) {
+    for (const [topic, message] of this.early) if (split(topic).name === robot.name) {
       this.early.delete(topic);
       this.take(message, true);
     }
@@ -68,15 +75,16 @@ export class Fleet {
 
   // As it was before its first message; what its topics are is known still.
   blank(robot) {
-    Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, poseMs: 0, queueMs: 0, estop: new Map(),
+    Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, unplaced: null, poseMs: 0, queueMs: 0, estop: new Map(),
       cameras: new Map(), layers: new Map(), parts: new Map()});
     robot.place.forget();
   }
 
   // A latched message may be as old as it likes: it does not say that its robot is there.
   take(message, isLatched = false) {
-    const [, name, topic] = ROBOT.exec(message.topic) ?? [];
-    if (!name) return;
+    const {name, topic} = split(message.topic);
+    if (name && message.encoding === "robofleet") message = unpacked(message);
+    if (!name || !message) return;
     if (topic === "last") return this.takeLast(name, json(message), message.stampMs);
     if (isLatched && !this.robots.get(name)?.isHere) {
       if (this.early.size < EARLY) this.early.set(message.topic, message);
@@ -90,7 +98,7 @@ export class Fleet {
     const ms = message.stampMs + robot.skewMs;
     if (topic === "status") return this.takeStatus(robot, status(json(message)), ms);
     if (topic === "queue") return this.takeQueue(robot, queue(json(message)), ms);
-    const kind = robot.kinds[topic] ??= kindOf(topic, message);
+    const kind = robot.kinds[topic] ??= message.kind ?? kindOf(topic, message);
     if (kind === "pose" || kind === "tf") this.takePose(robot, robot.place.take(topic, kind, message, ms), ms);
     else if (kind === "scan") this.takeScan(robot, scan(message), ms);
     else if (kind === "picture") this.takePicture(robot, topic, message, ms);
@@ -134,14 +142,24 @@ export class Fleet {
     robot.poses.push({...at, ms});
     if (robot.poses.length > POSES) robot.poses.shift();
     if (!robot.trail.length || ms - robot.trail.at(-1).ms >= TRAIL_GAP_MS) robot.trail.push({x: at.x, y: at.y, ms});
+    this.placeScan(robot);
     this.on.moved();
   }
 
   takeScan(robot, scan, ms) {
     if (!this.on.drawn(robot)) return;
     Object.assign(robot, {scan, scanMs: ms, scanChanged: true});
-    const then = poseAt(robot, ms), {tree} = robot.place, mounted = tree.base && scan.frame && tree.between(scan.frame, tree.base);
-    if (then) this.on.scanned(robot, mounted ? within(then, mounted) : then, scan);
+    robot.unplaced = {scan, ms};
+    this.placeScan(robot);
+  }
+
+  // A scan lies where the robot was at its time; the pose of that time may come behind it.
+  placeScan(robot) {
+    const {scan, ms} = robot.unplaced ?? {}, then = scan && poseAt(robot, ms);
+    if (!then) return;
+    robot.unplaced = null;
+    const {tree} = robot.place, mounted = tree.base && scan.frame && tree.between(scan.frame, tree.base);
+    this.on.scanned(robot, mounted ? within(then, mounted) : then, scan);
   }
 
   // Only the latest picture is decoded.

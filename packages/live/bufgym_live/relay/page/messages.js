@@ -78,6 +78,7 @@ export function pose(message) {
 
 // The transforms of a message of tf: the frame, the child in it, where that is and how it is turned.
 export function transforms(message) {
+  if (message.transforms) return message.transforms;
   const cdr = new Cdr(message.payload);
   return Array.from({length: Math.min(MOST_TRANSFORMS, cdr.uint())}, () => cdr.transform());
 }

@@ -14,7 +14,7 @@ function matches(pattern, topic) {
 }
 
 export class Relay {
-  // on: {state(text, isOn), welcome(), message(message), said(object), unauthorized(why)}
+  // on: {state(text, isOn), welcome(), message(message), said(object), unauthorized(why, token)}
   constructor(on) {
     this.on = on;
     this.welcome = null;
@@ -44,6 +44,7 @@ export class Relay {
       isAway = false;
       // Without a session: it ends with the connection. A command that it leaves goes again, and says the same twice.
       this.received = 0;
+      this.shown = this.token;
       this.say("hello", {version: 1, name: this.name, form: "binary", ...(this.token ? {token: this.token} : {})});
     };
     this.socket.onmessage = event => this.hear(event.data);
@@ -56,10 +57,12 @@ export class Relay {
     };
   }
 
-  authorize(token) {
+  // Connect with this token: now, or ``later``, when the relay ends the connection because the token before is over.
+  authorize(token, later = false) {
     this.keep(token);
     this.refused = false;
-    this.connect();
+    if (this.socket.readyState === WebSocket.CLOSED) this.connect();
+    else if (!later) this.socket.close();
   }
 
   keep(token) {
@@ -138,7 +141,7 @@ export class Relay {
   refuse(said) {
     if (said.what === "hello" && said.code === "unauthorized") {
       this.refused = true;
-      this.on.unauthorized(said.why);
+      this.on.unauthorized(said.why, this.shown);
     } else if (said.what === "hello") {
       return;                                       // it was too slow, or there are too many: it connects again
     } else if (said.what === "publish" && said.topic === this.commands[0]?.topic) {
