@@ -48,6 +48,10 @@ int main(int argc, char **argv)
     rate.sleep();
   }
   ROS_WARN("published");  // a warning is not buffered
-  while (ros::ok() && (have(1) || latched))  // until they have what they want
+  const auto any = [&images] {
+    return std::any_of(images.begin(), images.end(),
+                       [](const ros::Publisher &one) { return one.getNumSubscribers() > 0; });
+  };
+  while (ros::ok() && (any() || latched))  // until the last of them has what it wants
     ros::WallDuration(0.05).sleep();
 }
