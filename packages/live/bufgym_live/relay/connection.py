@@ -114,6 +114,8 @@ class Connection:
         size_bytes = 0 if message is None else len(message.payload)
         if message is not None and not self._hub.store.reserve(size_bytes):
             size_bytes, work = 0, partial(self._busy, message.topic, message.seq)
+        if message is not None:  # the client sends it again on its next connection, and must find the session there
+            self.session.kept = True
         await self._orders.put((size_bytes, work))
 
     async def _carry_out(self) -> None:

@@ -104,6 +104,7 @@ async def test_a_client_outlives_any_end_of_its_connection(
                 for accepted in ended:
                     accepted.transport.resume_reading()
                 await until("its end", lambda: len(corner.hub.members) == 1)
+            await until("the commands", lambda: len(commands) >= n)
             watching[0].cancel()
     assert n >= 8 and commands == [b"%d" % k for k in range(1, n + 1)]
 
