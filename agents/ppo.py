@@ -15,7 +15,6 @@ from torch import nn
 from agents.decisions import SlotLearner
 from agents.settings import PPO, ActorCritic
 from bufgym.ground.errors import BufgymError
-from bufgym.policies.weights import MAX_WIDTH
 from bufgym.sb3 import SlotPolicy, weights_of
 
 
@@ -36,8 +35,7 @@ class SlotPPO(SlotLearner[PPO]):
     def weights_of(self, model: Any) -> Any:
         """The slot network's weights if it is asked at every arrival, as a policy is, and needs no mask of torch."""
         settings = self.settings
-        scores_slots = settings.network == "slots" and not settings.unmasked and settings.width <= MAX_WIDTH
-        return weights_of(model) if scores_slots and settings.decide_at == "arrival" else None
+        return weights_of(model) if settings.scores_slots and settings.decide_at == "arrival" else None
 
 
 def network_of(settings: PPO) -> tuple[Any, dict[str, Any]]:

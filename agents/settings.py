@@ -205,17 +205,21 @@ class PPO(OnSlots, ActorCritic):
     """Logit of what the rule gap-price chooses, besides the network's; above 0 the agent sees what the rule knows."""
 
     @property
+    def scores_slots(self) -> bool:
+        """Whether a compiled policy can decide as it does: a slot network that is not too wide, with masks."""
+        return self.network == "slots" and not self.unmasked and self.width <= MAX_WIDTH
+
+    @property
     def fields(self) -> str | None:
         """What the rule knows, where the rule is the prior."""
         return "rule" if self.prior else None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.kind == "fleet" and (self.network != "slots" or self.unmasked or self.width > MAX_WIDTH):
+        if self.kind == "fleet" and not self.scores_slots:
             rule = f"scores slots with masks, by at most {MAX_WIDTH} hidden units a layer"
             raise BufgymError(f"suite {self.suites.suite[0]}: a fleet's agent {rule}")
-        alone = self.network != "slots" or self.unmasked or self.width > MAX_WIDTH or self.decide_at != "arrival"
-        if self.prior and (self.kind == "fleet" or alone):
+        if self.prior and (self.kind == "fleet" or not self.scores_slots or self.decide_at != "arrival"):
             raise BufgymError(
                 f"prior = {self.prior:g}: the rule is the prior of one queue's slot network with masks, of at most"
                 f" {MAX_WIDTH} hidden units a layer, which is asked at every arrival"
