@@ -13,7 +13,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 STAGES := $(BIN)/python .ci/stages.py
 
 .DEFAULT_GOAL := help
-.PHONY: help train check test nightly fuzz claims docs gallery tutorials dist install-matrix format clean
+.PHONY: help train check test nightly fuzz claims docs gallery tutorials dist install-matrix trainers format clean
 
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
@@ -29,6 +29,7 @@ help:
 	@echo "make tutorials    set up if needed, then run the tutorials and draw their pictures again"
 	@echo "make dist     set up if needed, then build and check wheel and sdist in dist/"
 	@echo "make install-matrix    install the wheel for each Python, with the newest and oldest dependencies"
+	@echo "make trainers  run docs/guide/trainers.md's programs, each in a fresh environment (LIBRARY=skrl for one)"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
 	@echo "make clean    remove caches and build products; keeps .venv and results"
 	@echo ""
@@ -79,6 +80,9 @@ dist: $(READY)
 # Every Python that is here, each with the newest dependencies and with the oldest that pyproject allows.
 install-matrix: dist
 	.ci/install-matrix
+
+trainers: $(READY)
+	.ci/trainers $(LIBRARY)
 
 format: $(READY)
 	$(BIN)/ruff format .

@@ -33,6 +33,8 @@ def interpreter(package: str) -> str | None:
 def test_every_library_of_the_table_has_a_program() -> None:
     listed = re.findall(r"^\| [^|]+ \| `(\w+)` \|", PAGE, re.MULTILINE)
     assert len(listed) > 2 and sorted(listed) == sorted(PROGRAMS)
+    [nightly] = re.findall(r"^ +library: \[(.*)\]$", (REPO / ".github/workflows/nightly.yml").read_text(), re.MULTILINE)
+    assert sorted(nightly.split(", ")) == sorted(PROGRAMS)
 
 
 @pytest.mark.parametrize(
