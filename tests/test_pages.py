@@ -170,7 +170,7 @@ BEFORE = {
     "docs/guide/real-sockets.md": """
         import types
         frame, odometry = b"frame", types.SimpleNamespace(x=0.0)
-        connection = types.SimpleNamespace(send_and_wait_for_ack=lambda message: queue.close())""",
+        connection = types.SimpleNamespace(sendall=lambda message: queue.close())""",
     "docs/guide/truth.md": """
         from bufgym import scenario
         from bufgym.model.qoi import exponential

@@ -49,7 +49,8 @@ INPUT_FIELDS = (
     declared("drain", "lg(bytes queued, long rate x 1 s)",
              lambda buffer: lg(float(buffer.backlog_bytes), buffer.long_rate_bytes_per_s)),
     declared("service", "2 service_ratio - 1", lambda buffer: 2 * buffer.service_ratio - 1, high=math.inf),
-    declared("in_flight", "2 in_flight / n_T - 1", lambda buffer: 2 * buffer.in_flight / buffer.window - 1),
+    declared("in_flight", "2 in_flight / n_T - 1", lambda buffer: 2 * buffer.in_flight / buffer.window - 1,
+             high=math.inf),
     declared("window", "1 - 2 / n_T", lambda buffer: 1 - 2 / buffer.window),
 )  # fmt: skip
 INPUTS = {field.name: field for field in INPUT_FIELDS}

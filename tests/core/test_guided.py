@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refusal_cases import refuse
 from test_price_dp import equal, queue
+from test_target_gap import V, episode
 
 from bufgym import policies
 from bufgym.policies import guided, price_dp, target_gap
@@ -136,3 +137,15 @@ def test_in_bursts_no_target_guides_the_outputs_and_the_plain_rule_stays(label, 
     episodes = [draw(part, seed) for seed, (_, part) in enumerate(by_trace(scenario))]
     learned, plain = (run(policies.get(name), episodes, L, scenario.value) for name in ("learned", "gap-price"))
     assert same(learned, plain)
+
+
+@pytest.mark.parametrize("L", [1, 2, 3])
+def test_on_a_steady_link_the_smallest_outputs_keep_the_rule_of_a_short_queue(L):
+    """One frame in ten leaves. Without the rule's own step for it all but the first that arrive are others."""
+
+    def on_arrival(buffer, arrival, memory):
+        guided.recall(buffer, arrival, memory, guided.BASE)
+        return guided.follow(buffer, arrival, memory, guided.BASE, np.full(len(OUTPUTS), 1e-12))
+
+    small = replace(GuidedWeights(ZERO).policy("small"), on_arrival=on_arrival, compile=False)
+    assert same(*(run(policy, [episode(1 / 10)], L, V) for policy in (small, policies.get("gap-price"))))
