@@ -77,7 +77,7 @@ class Connection:
             for task in tasks:
                 task.cancel()
             while not self._orders.empty():
-                hub.store.release(self._orders.get_nowait()[0])
+                self._release(self._orders.get_nowait()[0])
             hub.leave(self)
             hub.audit("left", session=self.session.name, **caller.identity.as_json())
         if self._ending is not None:
@@ -116,7 +116,12 @@ class Connection:
             size_bytes, work = 0, partial(self._busy, message.topic, message.seq)
         if message is not None:  # the client sends it again on its next connection, and must find the session there
             self.session.kept = True
+        self.session.orders += 1
         await self._orders.put((size_bytes, work))
+
+    def _release(self, size_bytes: int) -> None:
+        self.session.orders -= 1
+        self._hub.store.release(size_bytes)
 
     async def _carry_out(self) -> None:
         """Carry out the orders that wait for the disk; one that has begun is done though the connection ends."""
@@ -131,7 +136,7 @@ class Connection:
         try:
             await self._hub.turns.of(self._caller.identity.key, work)
         finally:
-            self._hub.store.release(size_bytes)
+            self._release(size_bytes)
 
     async def _busy(self, topic: str, seq: int) -> None:
         await asyncio.sleep(BUSY_S)
