@@ -95,11 +95,10 @@ class Connection:
                     else:
                         await self._publish(message)
                 case {"op": "subscribe" | "unsubscribe"} as said:
-                    if said.get("durable") or said["id"] in self._ids_waiting:
-                        self._ids_waiting.append(said["id"])
-                        await self._later(partial(self._change_late, said))
-                    else:
-                        await self._change(said)
+                    late = said.get("durable") or said["id"] in self._ids_waiting
+                    self._ids_waiting.append(said["id"])
+                    change = partial(self._change, said)
+                    await (self._later(change) if late else change())
                 case {"op": "ack", "seq": number}:
                     self._outbox.acked(number)
                     self._hub.store.acked(self.session, number)
@@ -143,14 +142,11 @@ class Connection:
         self._refused(RefusedError("busy", "too much waits for the disk"), topic, seq, no_drop=True)
 
     async def _change(self, said: Mapping[str, Any]) -> None:
-        if said["op"] == "subscribe":
-            await self._subscribe(said)
-        else:
-            self._hub.unsubscribe(self, said["id"])
-
-    async def _change_late(self, said: Mapping[str, Any]) -> None:
         try:
-            await self._change(said)
+            if said["op"] == "subscribe":
+                await self._subscribe(said)
+            else:
+                self._hub.unsubscribe(self, said["id"])
         finally:
             self._ids_waiting.remove(said["id"])
 
