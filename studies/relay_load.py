@@ -151,6 +151,7 @@ async def flood(port: int) -> None:
 async def replay(port: int, k: int) -> None:
     """Ask for the first 4 MiB of the recording, again and again."""
     async with client(port, local="127.0.0.3", name=f"replay-{k}") as one:
+        one.socket.protocol.max_message_size = None
         await one.say("recordings")
         while not (files := (await one.next())["files"]):
             await asyncio.sleep(0.1)

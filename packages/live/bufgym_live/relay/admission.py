@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import DATA_OPCODES, Frame
 from websockets.http11 import Request
-from websockets.protocol import Event
+from websockets.protocol import Event, State
 
 from bufgym_live.relay import turns, wire
 from bufgym_live.relay.config import Limits
@@ -139,7 +139,7 @@ class Accepted(ServerConnection):
         self._whole: deque[int] = deque()
         """Bytes of each whole message, the one that is being worked on first."""
         self._whole_bytes = self._part_bytes = 0
-        self._working = False
+        self._working = self._anew = False
         self.ended = False
         """Whether it has used too much, so that nothing more is read or done of it."""
 
@@ -179,7 +179,6 @@ class Accepted(ServerConnection):
 
     def data_received(self, data: bytes) -> None:
         began_s = turns.clock()
-        self._count(len(data))
         if not self.ended:
             super().data_received(data)
             self._count()
@@ -192,7 +191,7 @@ class Accepted(ServerConnection):
             if event.fin:
                 self._whole.append(self._part_bytes)
                 self._whole_bytes, self._part_bytes = self._whole_bytes + self._part_bytes, 0
-                self._count(anew=True)
+                self._anew = True
 
     async def recv(self, decode: bool | None = None) -> Any:
         """Receive the next message; the last one counts no more."""
@@ -204,8 +203,17 @@ class Accepted(ServerConnection):
         self._working = True
         return data
 
-    def _count(self, more_bytes: int = 0, anew: bool = False) -> None:
-        self._admission.incoming.count(self, 0 if self.ended else self._held_bytes + more_bytes, anew)
+    def _count(self) -> None:
+        anew, self._anew = self._anew, False
+        self._admission.incoming.count(self, 0 if self.ended else self._held_bytes, anew)
+
+    async def send_frame(self, frame: bytes) -> None:
+        """Send a whole frame, which was written for all its receivers."""
+        if self.protocol.state is not State.OPEN:
+            async with self.send_context():  # raises ConnectionClosed once the connection has ended
+                pass
+        self.transport.write(frame)
+        await self.drain()
 
     @property
     def _held_bytes(self) -> int:

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any, Final
 
 from websockets.exceptions import WebSocketException
@@ -18,6 +18,7 @@ from bufgym_live.relay.wire import RefusedError
 
 _FRAME_BYTES: Final = 500  # bytes of JSON whose parsing takes as long as all else that is done for a frame
 _PACE_S: Final = 0.05
+PIECE: Final = 2**16  # Characters of a frame; a longer answer goes in several, each of them once its client has room
 
 
 class Caller:
@@ -80,7 +81,8 @@ class Caller:
     async def send_answers(self) -> None:
         """Send all answers."""
         while self.answers:
-            await self.socket.send(self.answers.popleft())
+            text = self.answers.popleft()
+            await self.socket.send(text if len(text) <= PIECE else _pieces(text))
 
     async def close(self, why: str) -> None:
         """Send the last answers, and close."""
@@ -90,3 +92,10 @@ class Caller:
                 await self.socket.close(POLICY_VIOLATION, why)
         except (WebSocketException, TimeoutError):
             self.socket.transport.abort()
+
+
+async def _pieces(text: str) -> AsyncIterator[str]:
+    """Yield an answer bit by bit; all others have a turn between two pieces."""
+    for begin in range(0, len(text), PIECE):
+        yield text[begin : begin + PIECE]
+        await asyncio.sleep(0)

@@ -77,7 +77,7 @@ class Connection:
             for task in tasks:
                 task.cancel()
             while not self._orders.empty():
-                hub.store.release(self._orders.get_nowait()[0])
+                self._release(self._orders.get_nowait()[0])
             hub.leave(self)
             hub.audit("left", session=self.session.name, **caller.identity.as_json())
         if self._ending is not None:
@@ -95,11 +95,10 @@ class Connection:
                     else:
                         await self._publish(message)
                 case {"op": "subscribe" | "unsubscribe"} as said:
-                    if said.get("durable") or said["id"] in self._ids_waiting:
-                        self._ids_waiting.append(said["id"])
-                        await self._later(partial(self._change_late, said))
-                    else:
-                        await self._change(said)
+                    late = said.get("durable") or said["id"] in self._ids_waiting
+                    self._ids_waiting.append(said["id"])
+                    change = partial(self._change, said)
+                    await (self._later(change) if late else change())
                 case {"op": "ack", "seq": number}:
                     self._outbox.acked(number)
                     self._hub.store.acked(self.session, number)
@@ -116,7 +115,12 @@ class Connection:
             size_bytes, work = 0, partial(self._busy, message.topic, message.seq)
         if message is not None:  # the client sends it again on its next connection, and must find the session there
             self.session.kept = True
+        self.session.orders += 1
         await self._orders.put((size_bytes, work))
+
+    def _release(self, size_bytes: int) -> None:
+        self.session.orders -= 1
+        self._hub.store.release(size_bytes)
 
     async def _carry_out(self) -> None:
         """Carry out the orders that wait for the disk; one that has begun is done though the connection ends."""
@@ -131,21 +135,18 @@ class Connection:
         try:
             await self._hub.turns.of(self._caller.identity.key, work)
         finally:
-            self._hub.store.release(size_bytes)
+            self._release(size_bytes)
 
     async def _busy(self, topic: str, seq: int) -> None:
         await asyncio.sleep(BUSY_S)
         self._refused(RefusedError("busy", "too much waits for the disk"), topic, seq, no_drop=True)
 
     async def _change(self, said: Mapping[str, Any]) -> None:
-        if said["op"] == "subscribe":
-            await self._subscribe(said)
-        else:
-            self._hub.unsubscribe(self, said["id"])
-
-    async def _change_late(self, said: Mapping[str, Any]) -> None:
         try:
-            await self._change(said)
+            if said["op"] == "subscribe":
+                await self._subscribe(said)
+            else:
+                self._hub.unsubscribe(self, said["id"])
         finally:
             self._ids_waiting.remove(said["id"])
 

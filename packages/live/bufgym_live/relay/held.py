@@ -48,6 +48,7 @@ class StoredSession:
     durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
     away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
     kept: bool = False  # whether the store was asked to remember it
+    orders: int = 0  # number of its orders that wait for the disk
     id: int | None = None  # id on disk, which only the disk's thread reads
     acked: int = 0  # highest number that it has acked
     settling: bool = False  # whether acks wait to be written
@@ -56,6 +57,11 @@ class StoredSession:
     def key(self) -> tuple[str, str]:
         """Identity and name; the same name under another identity is another session."""
         return self.identity.key, self.name
+
+    @property
+    def unused_s(self) -> float:
+        """Time from which on it may be forgotten; infinity while it is here, or an order of it waits."""
+        return math.inf if self.orders else self.away_s
 
 
 class Settled(NamedTuple):

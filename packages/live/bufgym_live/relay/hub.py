@@ -8,8 +8,10 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from websockets.frames import Frame, Opcode
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
@@ -42,23 +44,22 @@ MAX_LATCHED_BYTES: Final = 2**26  # Limit on the last messages of latched topics
 
 @dataclass(eq=False)
 class Outgoing:
-    """An outgoing message; each of its forms is made once for all receivers."""
+    """An outgoing message; its WebSocket frame in each form is made once for all receivers."""
 
     message: wire.Message
+    _frames: dict[str, bytes] = field(init=False, default_factory=dict)
 
-    @functools.cached_property
-    def binary(self) -> bytes:
-        return wire.encode(self.message)
-
-    @functools.cached_property
-    def json(self) -> str:
-        return wire.to_json(self.message)
-
-    def form(self, name: str) -> bytes | str:
-        """Give the form that a client asked for."""
-        if name == ROBOFLEET:
-            return bytes(self.message.payload)
-        return self.json if name == "json" else self.binary
+    def frame(self, form: str) -> bytes:
+        """Give the whole frame in the form that a client asked for."""
+        if form not in self._frames:
+            if form == "json":
+                whole = Frame(Opcode.TEXT, wire.to_json(self.message).encode())
+            elif form == ROBOFLEET:
+                whole = Frame(Opcode.BINARY, bytes(self.message.payload))
+            else:
+                whole = Frame(Opcode.BINARY, wire.encode(self.message))
+            self._frames[form] = whole.serialize(mask=False)
+        return self._frames[form]
 
     @property
     def size_bytes(self) -> int:

@@ -58,9 +58,10 @@ class Outbox:
 
     async def one(self) -> bool:
         """Send the next message; return whether there was one."""
-        await self._caller.send_answers()
+        if self._caller.answers:
+            await self._caller.send_answers()
         member = self._member
-        if await self._no_drop(member):
+        if self._sent_number < member.session.numbered and await self._no_drop(member):
             return True
         subscriptions = list(member.subscriptions.values())
         made, now_s = await make_one(subscriptions, self._hub.making), self._hub.clock()
@@ -75,8 +76,7 @@ class Outbox:
     async def _no_drop(self, member: Member) -> bool:
         """Send the no_drop message that was fetched; have the next one fetched if the window has room for it."""
         if self._fetching is None:
-            room = len(self._in_flight) < self._hub.config.store.window
-            if room and self._sent_number < member.session.numbered:
+            if len(self._in_flight) < self._hub.config.store.window:
                 self._fetching = self._hub.store.next(member.session, self._sent_number)
                 self._fetching.add_done_callback(lambda _: self.wake())
             return False
@@ -93,5 +93,5 @@ class Outbox:
         return True
 
     async def _send(self, frame: Outgoing) -> None:
-        await self._socket.send(frame.form(self._form))
+        await self._socket.send_frame(frame.frame(self._form))
         self._member.sent += 1

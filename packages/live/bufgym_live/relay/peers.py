@@ -141,7 +141,7 @@ class Peers:
                     frame, put_us = item.message
                     headers = {"Relay": self._settings.name, "Put": str(put_us)}
                     try:
-                        await bus.publish(frame.message.topic, frame.binary, headers)
+                        await bus.publish(frame.message.topic, wire.encode(frame.message), headers)
                         self.sent += 1
                     except wire.RefusedError as refused:
                         self._note(refused)

@@ -134,10 +134,12 @@ class _Index:
             self._end = end
 
     def messages(self, from_us: int) -> Iterator[Message]:
-        """Yield the messages recorded from that time on."""
+        """Yield the messages from that time on, as far as the walk came."""
         if self._offsets:
             place = max(0, bisect.bisect_left(self._times, from_us) - 1)
-            for _, record, _ in self._records(self._offsets[place]):
+            for _, record, end in self._records(self._offsets[place]):
+                if end > self._end:
+                    return  # written since the walk, perhaps on a channel that it did not see
                 if isinstance(record, Message) and record.log_time // 1000 >= from_us:
                     yield record
 

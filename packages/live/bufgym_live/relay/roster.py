@@ -10,6 +10,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 from bufgym_live.relay import wire
@@ -26,6 +27,7 @@ _READ_BYTES: Final = 2**16  # of a status that is read
 _TOPIC: Final = re.compile("/robots/([^/]+)/(status|last)")
 
 
+@lru_cache(10 * MOST_ROBOTS)
 def is_last(topic: str) -> bool:
     """Whether it is the topic of a robot that was here."""
     found = _TOPIC.fullmatch(topic)

@@ -8,6 +8,7 @@ import json
 import logging
 import signal
 import socket
+import sys
 from collections.abc import Sequence
 from functools import partial
 from http import HTTPStatus
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from bufgym_live.relay.foxglove import Window
 
 TICK_S: Final = 1.0  # Time between two ticks, which publish the relay's state and forget what has expired
+SWITCH_S: Final = 5e-4  # Time for which a thread that computes, as for a replay, may keep the event loop waiting
 _QUIET: Final = logging.getLogger("bufgym.relay.websockets")
 """Silenced logger; clients' faults go to the audit log, not to tracebacks."""
 _QUIET.setLevel(logging.CRITICAL + 1)
@@ -213,6 +215,7 @@ class Server:
 
 async def serve_forever(config: Config, say: Any = print) -> None:
     """Run a relay until cancelled, or until the process gets SIGTERM."""
+    sys.setswitchinterval(SWITCH_S)
     server = Server(config)
     port = await server.start()
     scheme = "http" if config.tls is None else "https"

@@ -71,7 +71,7 @@ class Store:
 
         If the identity has too many, or all at its address together, the one goes that has been away for longest.
 
-        Raises RefusedError: all of them are here.
+        Raises RefusedError: all of them are here, or their orders wait for the disk.
         """
         session = self.sessions.get((identity.key, name))
         if session is None:
@@ -88,8 +88,8 @@ class Store:
 
     def _free_place(self, sessions: Sequence[StoredSession], most: int) -> None:
         if len(sessions) >= most:
-            oldest = min(sessions, key=lambda one: one.away_s)
-            if oldest.away_s == math.inf:
+            oldest = min(sessions, key=lambda one: one.unused_s)
+            if oldest.unused_s == math.inf:
                 raise RefusedError("too_many", f"must be at most {most} sessions")
             self._expire(oldest)
 
@@ -165,7 +165,7 @@ class Store:
         if self.disk.idle:
             self.disk.soon(0, self._held.look)
         for session in list(self.sessions.values()):
-            if session.away_s < self._clock() - self.limits.keep_s:
+            if session.unused_s < self._clock() - self.limits.keep_s:
                 self._expire(session)
 
     def _expire(self, session: StoredSession) -> None:

@@ -150,8 +150,15 @@ def test_a_recording_that_is_being_written_goes_on(tmp_path: Path) -> None:
     record, folder = recorder(tmp_path, [b"1", b"2"]), tmp_path / FOLDER
     record._file.file.flush()  # type: ignore[union-attr]
     name = recordings(folder)[0]["name"]
-    first = piece(folder, name, 0, 100, every)
-    record(Message("/robots/c", b"3"))
+
+    def meanwhile(topic: str) -> bool:
+        """Another topic comes while a piece is read."""
+        if topic == "/robots/a":
+            record(Message("/robots/c", b"3"))
+            record._file.file.flush()  # type: ignore[union-attr]
+        return True
+
+    first = piece(folder, name, 0, 100, meanwhile)
     record.close()
     second = piece(folder, name, first["last_us"] + 1, 100, every)
     assert len(first["messages"]) == 2 and [one["topic"] for one in second["messages"]] == ["/robots/c"]

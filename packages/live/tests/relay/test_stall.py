@@ -15,7 +15,7 @@ from relay_cases import client, nothing, relay, settings, stranger, until, wait
 
 from bufgym_live.relay import connection, disk
 from bufgym_live.relay.audit import FILE, _Lines
-from bufgym_live.relay.config import StoreLimits
+from bufgym_live.relay.config import Limits, StoreLimits
 from bufgym_live.relay.held import Held
 from bufgym_live.relay.server import Server
 from bufgym_live.relay.session import Session
@@ -137,3 +137,26 @@ async def test_too_much_waits_for_the_disk(
             async with client(server.port, session="o") as operator:
                 assert operator.welcome["received"] == 1
     assert sorted(came) == [b'"x', b"1"]
+
+
+async def test_a_session_whose_command_waits_keeps_its_place(tmp_path: Path, go: threading.Event) -> None:
+    """One session at most. A stranger is refused while the command waits; sent again, the command is taken once."""
+    config = settings(folder=tmp_path, limits=Limits(sessions=1))
+    async with relay(config) as server, client(server.port, local="127.0.0.2", session="a") as robot:
+        await robot.subscribe("command$", durable=True)
+        go.clear()
+        async with client(server.port, session="o") as operator:
+            await operator.command(1, COMMAND)
+            await operator.rest()
+        await until("its end", lambda: len(server.hub.members) == 1)
+        async with client(server.port, session="x") as stranger:
+            assert stranger.welcome["code"] == "too_many"
+        go.set()
+        await robot.came(1)
+        async with client(server.port, session="o") as operator:
+            assert operator.welcome["received"] == 1
+            await operator.acked(COMMAND, 1)
+            assert await nothing(operator, robot)
+        await until("its end", lambda: len(server.hub.members) == 1)
+        async with client(server.port, session="x") as stranger:
+            assert stranger.welcome["op"] == "welcome"

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import json
 import threading
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from loop_cases import beside
 from relay_cases import client, relay, settings, until
 
-from bufgym_live.relay import replay, turns
+from bufgym_live.relay import caller, replay, turns
 
 
 async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,3 +98,42 @@ async def test_recordings_are_read_one_at_a_time(tmp_path: Path, monkeypatch: py
                 0,
             )
         assert most == 1
+
+
+async def test_a_long_answer_is_written_as_its_reader_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 8 MB at most one piece waits in the relay. Others' messages go on, and the answer is whole in the end."""
+    text = json.dumps({"op": "replayed", "id": "r", "messages": [{"data": "x" * 1_000_000}] * 8})
+    monkeypatch.setattr(replay, "told", lambda *asked: text)
+    async with (
+        relay(settings(folder=tmp_path)) as server,
+        client(server.port, receive_buffer_bytes=65_536) as one,
+        client(server.port, local="127.0.0.2") as viewer,
+        client(server.port, local="127.0.0.3") as robot,
+    ):
+        one.socket.protocol.max_message_size = None
+        port = one.socket.local_address[1]
+        (accepted,) = [each for each in server._admission.open if each.remote_address[1] == port]
+        await viewer.subscribe("^/a$")
+        await one.say("replay", id="r", file="x", from_us=0, most_bytes=1)
+        await until("a piece that waits", accepted.transport.get_write_buffer_size)
+        for _ in range(3):
+            await robot.put("/a")
+            assert (await viewer.next()).topic == "/a"
+            assert accepted.transport.get_write_buffer_size() < caller.PIECE + 20
+        parts = [part async for part in one.socket.recv_streaming()]
+        assert "".join(parts) == text and max(map(len, parts)) == caller.PIECE
+
+
+async def test_others_have_a_turn_between_two_pieces() -> None:
+    had = 0
+
+    async def other() -> None:
+        nonlocal had
+        while True:
+            had += 1
+            await asyncio.sleep(0)
+
+    async with beside(other()):
+        async for _ in caller._pieces("x" * 10 * caller.PIECE):
+            before, had = had, 0
+    assert before == 1
