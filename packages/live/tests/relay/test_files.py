@@ -98,8 +98,7 @@ async def test_a_deleted_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             assert said["code"] == "store_full" and "its file was deleted" in said["why"]
             server.hub.tick()
             await robot.put("/robots/a/camera")
-            await robot.rest()
-        assert len(recordings(tmp_path / "relay" / FOLDER)) == 1
+            await until("a recording", lambda: len(recordings(tmp_path / "relay" / FOLDER)) == 1)
         async with stranger(server.port) as (reader, writer):
             writer.write(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             assert b"503" in await wait("an answer", reader.readline())
