@@ -10,7 +10,7 @@ LIMITS = {
     "bufgym": 27_550,
     "tests": 18_380,
     "packages/live/bufgym_live": 12_280,
-    "packages/live/tests": 9_250,
+    "packages/live/tests": 9_520,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_160,
 }

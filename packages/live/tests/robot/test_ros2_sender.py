@@ -5,9 +5,11 @@ import itertools
 import json
 import shutil
 import subprocess
+import sysconfig
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import pytest
@@ -24,7 +26,21 @@ from bufgym_live.robot.ros2.names import Published, parse
 from bufgym_live.robot.shaped import ShapedLink
 
 HEAD = Published("/camera", "sensor_msgs/msg/Image", False, False, 300, True, 5_000_000_000, 1, 2**40)
+POLICIES: Final = "afr,drop-oldest,learned"
 Process = asyncio.subprocess.Process
+HERE: Final = Path(__file__).parent
+MESSAGES: Final = Path(sysconfig.get_path("data"), "include")
+"""C++ of ROS 2's messages, from the wheels that rclpy needs."""
+DOUBLED: Final = (
+    *("rclcpp/rclcpp.hpp", "rclcpp/create_generic_subscription.hpp", "rclcpp/detail/qos_parameters.hpp"),
+    *("rclcpp_components/register_node_macro.hpp", "rclcpp_lifecycle/lifecycle_node.hpp"),
+)
+OFFERED: Final = (
+    "offer /robot/camera sensor_msgs/msg/Image camera best_effort 300",
+    "offer /scan_a sensor_msgs/msg/LaserScan scanner reliable 3",
+    "offer /scan_b sensor_msgs/msg/LaserScan bufgym_receive reliable 3",
+    "offer /tf tf2_msgs/msg/TFMessage robot reliable 100",
+)
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +50,30 @@ def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if shutil.which(needed) is None:
             pytest.skip(f"no {needed} here")
     folder = tmp_path_factory.mktemp("ros2")
-    source = rclcpp.write(folder / "source", roscpp.find("afr,drop-oldest,learned"))
+    source = rclcpp.write(folder / "source", roscpp.find(POLICIES))
     run("cmake", "-S", source, "-B", folder, "-DCMAKE_BUILD_TYPE=Debug", "-DCMAKE_DISABLE_FIND_PACKAGE_ament_cmake=ON")
     run("cmake", "--build", folder)
-    program, own = folder / "talker", Path(__file__).with_name("ros2_talker.cpp")
+    program, own = folder / "talker", HERE / "ros2_talker.cpp"
     run("g++", "-std=c++17", "-I", source, own, "-o", program, folder / "libbufgym_queue.a", "-lpthread")
     return program
+
+
+@pytest.fixture(scope="module", params=["", pytest.param("-fsanitize=address,undefined", marks=pytest.mark.nightly)])
+def node(request: pytest.FixtureRequest, talker: Path) -> Path:
+    """The node itself over a double of rclcpp, and what drives it; nightly with each access to memory checked."""
+    if not (MESSAGES / "nav_msgs").is_dir():
+        pytest.skip(f"no C++ of ROS 2's messages in {MESSAGES}")
+    folder, source = talker.parent / f"node{request.param}", talker.parent / "source"
+    for name in DOUBLED:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text('#include "rclcpp_lifecycle_double.hpp"\n')
+    flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-I", source, "-I", folder, "-I", HERE]
+    flags += [word for package in sorted(MESSAGES.iterdir()) for word in ("-isystem", package)]
+    queue = source.glob("[!n]*.cpp") if request.param else [talker.parent / "libbufgym_queue.a"]
+    checked = [request.param] if request.param else []
+    given = HERE / "ros2_node_session.cpp", source / "node.cpp", *queue
+    run("g++", *flags, *checked, *given, "-o", folder / "session", "-lpthread")
+    return folder / "session"
 
 
 @asynccontextmanager
@@ -62,6 +96,20 @@ async def told(process: Process, command: str | None = None) -> dict[str, float]
     assert process.stdout is not None
     line = await asyncio.wait_for(process.stdout.readline(), 60)
     return {} if line == b"put\n" else dict(json.loads(line))
+
+
+async def said(process: Process, command: str) -> Any:
+    """What the node's program answers."""
+    assert process.stdin is not None and process.stdout is not None
+    process.stdin.write(f"{command}\n".encode())
+    return json.loads(await asyncio.wait_for(process.stdout.readline(), 60))
+
+
+async def made(process: Process, *parameters: str) -> int:
+    """Make the node beside some publishers; its state: 1 unconfigured, 2 inactive, 3 active, 4 finalized."""
+    for offer in OFFERED:
+        await said(process, offer)
+    return int(await said(process, f"make /robot {' '.join(parameters)}"))
 
 
 @pytest.mark.parametrize("policy", ["afr", "learned"])
@@ -139,3 +187,80 @@ def test_the_package_is_one_of_ros_2(tmp_path: Path) -> None:
     given = {str(param.get("name")) for param in launch.iter("param")} - {"use_sim_time"}
     assert given and all(f'"{name}"' in node for name in given)
     refuse("policy codel: has no C", rclcpp.write, tmp_path, roscpp.find("codel"))
+
+
+async def test_the_nodes_life(node: Path, tmp_path: Path) -> None:
+    """200 messages of 40 kB at 200 Hz into a link of 8 Mbit/s; another receiver; a rest; its end."""
+    async with receiving() as (_, port, came), receiving() as (_, other, second):
+        link = ShapedLink(Link(Trace.constant(1e6, duration_s=1)), ("127.0.0.1", port))
+        try:
+            async with talking(node) as one:
+                own = f"port={await link.listen()}", "autostart=false", "capacity=5", f"log={tmp_path}"
+                depth = "qos_overrides./robot/camera.subscription.depth=7"
+                assert await made(one, "topics=[camera,/scan*]", depth, *own) == 1
+                assert [await said(one, to) for to in ("activate", "configure", "activate")] == [1, 2, 3]
+                camera, scan = ["/robot/camera", HEAD.type, 7, 0], ["/scan_a", "sensor_msgs/msg/LaserScan", 5, 1]
+                assert await said(one, "pass 0.2") == [[*camera, 1], [*scan, 1]]
+                assert await said(one, "publish /robot/camera 200 40000 200") == 200
+                for command in ("set policy afr", "set topics [/scan_a]", "set log /tmp"):
+                    name = command.split()[1]
+                    assert await said(one, command) == f"{name}: deactivate and clean up the node first"
+                for command, part in (("capacity 65", "range"), ("port 0", "range"), ("autostart true", "read-only")):
+                    assert part in await said(one, f"set {command}")
+                numbers = await told_of_camera(one, 200)
+                assert await said(one, f"set port {other}") == ""
+                assert await said(one, "publish /robot/camera 1 50 100") == 1
+                assert (await told_of_camera(one, 201))["left"] == numbers["left"] + 1
+                assert await said(one, "deactivate") == 2
+                assert await said(one, "pass 2") == [[*camera, 0], [*scan, 0]]
+                assert await said(one, "publish /robot/camera 3 50 100") == 3  # an executor still held it
+                assert await said(one, "activate") == 3
+                assert await said(one, "pass 0.2") == [[*camera, 0], [*scan, 0], [*camera, 1], [*scan, 1]]
+                assert await said(one, "publish /robot/camera 1 60 100") == 2
+                await until(lambda: second and len(second[-1].body) == len(came[0].body) - 40_000 + 60)
+                assert await said(one, "end") == 1
+        finally:
+            await link.close()
+    assert in_order(came) and 20 < len(came) < 120
+    assert parse(came[0].body)[0] == Published("/robot/camera", HEAD.type, False, False, 300)
+    left = gone(tmp_path / "robot_camera-0.jsonl")
+    assert left[: len(came)] == [one.seq for one in came] and left[-1] == 200
+    h = qoi.exponential().information(left[:-1])
+    counts = {"arrived": 200, "left": len(left) - 1, "dropped": 201 - len(left), "queued": 0, "oldest s": 0}
+    assert {**numbers, **counts, "message": "connected", "QoI": pytest.approx(h, abs=1e-5)} == numbers
+    assert [len(parse(message.body)[1]) for message in second[-2:]] == [50, 60]  # before them what was on its way
+
+
+async def told_of_camera(process: Process, arrived: int) -> dict[str, float]:
+    """What /diagnostics tells of the camera once all of its messages have left or are dropped."""
+    while True:
+        await said(process, "pass 1")
+        numbers = (await said(process, "diagnostics"))["/robot/bufgym_sender: /robot/camera"]
+        if numbers["left"] + numbers["dropped"] == arrived:
+            return dict(numbers)
+        await asyncio.sleep(0.02)
+
+
+async def test_a_node_that_starts_by_itself(node: Path, tmp_path: Path) -> None:
+    """x is the robot's motion in scenes of 2 m; what cannot be configured waits until it is set right."""
+    async with receiving() as (_, port, came):
+        async with talking(node) as one:
+            assert await made(one, "topics=[camera]", f"port={port}", "odometry=odom", "value=cubic:2") == 1
+            await said(one, "pass 0")
+            assert await said(one, "configure") == 1
+            assert await said(one, "set policy codel") == f"policy codel: must be one of {POLICIES.replace(',', ', ')}"
+            assert [await said(one, f"set {right}") for right in ("value saturating:4", "odometry o'", "port 1")] == [
+                ""
+            ] * 3
+            assert await said(one, "configure") == 1  # o' is no topic's name
+            assert [await said(one, f"set {right}") for right in ("odometry odom", f"port {port}")] == [""] * 2
+            assert [await said(one, to) for to in ("configure", "activate", "pass 0.2")][:2] == [2, 3]
+            for metres in (0, 3, 5):
+                await said(one, f"odometry /robot/odom {metres}")
+                await said(one, "publish /robot/camera 1 10 100")
+            await until(lambda: len(came) == 3)
+            assert [await said(one, to) for to in ("shutdown", "end")] == [4, 1]
+        async with talking(node) as one:
+            assert await made(one, "topics=[camera]", f"port={port}") == 1
+            assert len(await said(one, "pass 0.2")) == 1 and await said(one, "end") == 1
+    assert [message.x for message in came] == [0, 1.5, 2.5]

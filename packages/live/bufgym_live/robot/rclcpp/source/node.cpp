@@ -13,12 +13,15 @@
 #include <diagnostic_msgs/msg/diagnostic_array.hpp>
 #include <lifecycle_msgs/msg/state.hpp>
 #include <nav_msgs/msg/odometry.hpp>
+#include <rcl_interfaces/msg/parameter_descriptor.hpp>
+#include <rcl_interfaces/msg/set_parameters_result.hpp>
 #include <rclcpp/create_generic_subscription.hpp>
 #include <rclcpp/rclcpp.hpp>
 #include <rclcpp_components/register_node_macro.hpp>
 #include <rclcpp_lifecycle/lifecycle_node.hpp>
 
 #include "motion.h"
+#include "publishers.h"
 #include "sender.h"
 
 namespace bufgym
@@ -29,8 +32,6 @@ using rclcpp_lifecycle::node_interfaces::LifecycleNodeInterface;
 // Patterns leave these out, which every node has or which are this node's own.
 const std::vector<std::string> NOT_BY_PATTERN = {
     "/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics"};
-const char *const RECEIVER = "bufgym_receive";  // in its node's name: its topics are never sent on, so two pairs make no circle
-const int64_t LONGEST_NS = INT64_C(1) << 62;
 
 class SenderNode : public rclcpp_lifecycle::LifecycleNode
 {
@@ -55,10 +56,12 @@ public:
     if (get_parameter("autostart").as_bool())
       start_ = create_wall_timer(0s, [this] {
         start_->cancel();
-        configure();
-        activate();
+        if (configure().id() == lifecycle_msgs::msg::State::PRIMARY_STATE_INACTIVE)
+          activate();
       });
   }
+
+  ~SenderNode() override { stop(); }
 
   CallbackReturn on_configure(const rclcpp_lifecycle::State &) override
   {
@@ -74,6 +77,17 @@ public:
           known().c_str(), value.c_str());
       return CallbackReturn::FAILURE;
     }
+    try
+    {
+      wanted();
+      if (!odometry.empty())
+        get_node_topics_interface()->resolve_topic_name(odometry);
+    }
+    catch (const std::exception &error)
+    {
+      RCLCPP_ERROR(get_logger(), "topics and odometry must be names of topics: %s", error.what());
+      return CallbackReturn::FAILURE;
+    }
     capacity_ = int(get_parameter("capacity").as_int());
     diagnostics_ = create_publisher<diagnostic_msgs::msg::DiagnosticArray>("/diagnostics", 10);
     return CallbackReturn::SUCCESS;
@@ -84,13 +98,14 @@ public:
     const std::string odometry = get_parameter("odometry").as_string();
     if (!odometry.empty())
     {
-      motion_ = std::make_unique<Motion>();
+      motion_ = std::make_shared<Motion>();
       odometry_ = create_subscription<nav_msgs::msg::Odometry>(
-          odometry, rclcpp::SensorDataQoS().keep_last(100), [this](nav_msgs::msg::Odometry::ConstSharedPtr message) {
+          odometry, rclcpp::SensorDataQoS().keep_last(100),
+          [motion = motion_](nav_msgs::msg::Odometry::ConstSharedPtr message) {
             const auto &p = message->pose.pose.position;
             const auto &o = message->pose.pose.orientation;
             const double time_s = rclcpp::Time(message->header.stamp).seconds();
-            motion_->take(message->header.frame_id, time_s, {p.x, p.y, p.z}, {o.x, o.y, o.z, o.w});
+            motion->take(message->header.frame_id, time_s, {p.x, p.y, p.z}, {o.x, o.y, o.z, o.w});
           });
     }
     look_ = create_wall_timer(200ms, [this] { look(); });
@@ -121,7 +136,7 @@ private:
   struct Sending
   {
     Published topic;
-    std::unique_ptr<Sender> sender;
+    std::shared_ptr<Sender> sender;
     rclcpp::GenericSubscription::SharedPtr subscription;
   };
 
@@ -130,6 +145,7 @@ private:
   {
     rcl_interfaces::msg::ParameterDescriptor descriptor;
     descriptor.description = about;
+    descriptor.read_only = name == "autostart";
     if (to)
     {
       descriptor.integer_range.resize(1);
@@ -181,7 +197,8 @@ private:
   {
     const auto all = get_topic_names_and_types();
     std::map<std::string, std::string> found;
-    for (const std::string &name : get_parameter("topics").as_string_array())
+    const std::vector<std::string> names = get_parameter("topics").as_string_array();  // a reference into a temporary
+    for (const std::string &name : names)
     {
       if (name.empty())
         continue;
@@ -200,45 +217,27 @@ private:
     return found;
   }
 
-  // The topic as its publishers offer it: the weakest promise of any, so that one subscription gets them all.
-  bool published(const std::string &name, const std::string &type, Published &topic)
-  {
-    topic.name = name;
-    topic.type = type;
-    topic.transient_local = topic.manual = true;
-    topic.depth = 0;
-    bool any = false;
-    for (const rclcpp::TopicEndpointInfo &one : get_publishers_info_by_topic(name))
-    {
-      if (one.node_name().find(RECEIVER) != std::string::npos)
-        continue;
-      const rclcpp::QoS &qos = one.qos_profile();
-      any = true;
-      topic.reliable &= qos.reliability() == rclcpp::ReliabilityPolicy::Reliable;
-      topic.transient_local &= qos.durability() == rclcpp::DurabilityPolicy::TransientLocal;
-      topic.manual &= qos.liveliness() == rclcpp::LivelinessPolicy::ManualByTopic;
-      topic.depth = std::max(topic.depth, uint16_t(std::min<size_t>(qos.depth(), UINT16_MAX)));
-      topic.deadline_ns = std::max(topic.deadline_ns, qos.deadline().nanoseconds());
-      topic.lifespan_ns = std::max(topic.lifespan_ns, qos.lifespan().nanoseconds());
-      topic.lease_ns = std::max(topic.lease_ns, qos.liveliness_lease_duration().nanoseconds());
-    }
-    for (int64_t *ns : {&topic.deadline_ns, &topic.lifespan_ns, &topic.lease_ns})
-      *ns = *ns < LONGEST_NS ? *ns : 0;
-    topic.depth = topic.depth ? topic.depth : 10;  // DDS does not announce it
-    return any;
-  }
-
   void look()
   {
-    for (const auto &[name, type] : wanted())
+    std::map<std::string, std::string> found;
+    try
     {
-      Published topic;
-      const auto known = sendings_.find(name);
-      if (!published(name, type, topic) || (known != sendings_.end() && head(known->second.topic) == head(topic)))
-        continue;
+      found = wanted();
+    }
+    catch (const std::exception &error)  // a signal has ended the context under this callback
+    {
+      RCLCPP_ERROR_THROTTLE(get_logger(), *get_clock(), 10000, "topics: %s", error.what());
+    }
+    for (const auto &[name, type] : found)
+    {
       try
       {
-        subscribe(topic);
+        Published topic;
+        const auto known = sendings_.find(name);
+        if (!published(*this, name, type, topic))
+          continue;
+        if (known == sendings_.end() || head(known->second.topic) != head(topic))
+          subscribe(topic);
       }
       catch (const std::exception &error)
       {
@@ -249,32 +248,21 @@ private:
 
   void subscribe(const Published &topic)
   {
-    rclcpp::QoS qos{rclcpp::KeepLast(std::max<size_t>(size_t(capacity_), topic.depth))};
-    qos.reliability(topic.reliable ? rclcpp::ReliabilityPolicy::Reliable : rclcpp::ReliabilityPolicy::BestEffort);
-    qos.durability(
-        topic.transient_local ? rclcpp::DurabilityPolicy::TransientLocal : rclcpp::DurabilityPolicy::Volatile);
-    qos.liveliness(topic.manual ? rclcpp::LivelinessPolicy::ManualByTopic : rclcpp::LivelinessPolicy::Automatic);
-    if (topic.deadline_ns)
-      qos.deadline(rclcpp::Duration(std::chrono::nanoseconds(topic.deadline_ns)));
-    if (topic.lease_ns)
-      qos.liveliness_lease_duration(rclcpp::Duration(std::chrono::nanoseconds(topic.lease_ns)));
-    rclcpp::SubscriptionOptions options;
-    options.qos_overriding_options = rclcpp::QosOverridingOptions::with_default_policies();
+    const rclcpp::QoS qos = subscription_qos(*this, topic, capacity_);
     sendings_.erase(topic.name);  // its publishers came back with another type or quality of service
     Sending sending;
     sending.topic = topic;
-    sending.sender = std::make_unique<Sender>(address(), topic, *policy_, capacity_, get_parameter("log").as_string());
-    Sender *sender = sending.sender.get();
+    sending.sender = std::make_shared<Sender>(address(), topic, *policy_, capacity_, get_parameter("log").as_string());
+    // An executor may call it once more when the subscription is gone, and the node.
     sending.subscription = rclcpp::create_generic_subscription(
         get_node_topics_interface(), topic.name, topic.type, qos,
-        [this, sender](std::shared_ptr<const rclcpp::SerializedMessage> message) {
+        [sender = sending.sender, motion = motion_](std::shared_ptr<const rclcpp::SerializedMessage> message) {
           const auto &data = message->get_rcl_serialized_message();
-          if (motion_)
-            sender->put(data.buffer, data.buffer_length, motion_->x());
+          if (motion)
+            sender->put(data.buffer, data.buffer_length, motion->x());
           else
             sender->put(data.buffer, data.buffer_length);
-        },
-        options);
+        });
     sendings_[topic.name] = std::move(sending);
     RCLCPP_INFO(
         get_logger(), "%s: %s, %s", topic.name.c_str(), topic.type.c_str(),
@@ -311,18 +299,27 @@ private:
 
   void stop()
   {
-    look_.reset();
-    tell_.reset();
+    for (rclcpp::TimerBase::SharedPtr *timer : {&start_, &look_, &tell_})
+    {
+      if (*timer)
+        (*timer)->cancel();  // an executor that holds it does not call it
+      timer->reset();
+    }
     odometry_.reset();
     for (auto &[name, sending] : sendings_)
+    {
       sending.subscription.reset();
+      sending.sender->stop();
+    }
+    for (auto &[name, sending] : sendings_)
+      sending.sender->close(0);
     sendings_.clear();
     motion_.reset();
   }
 
   const Policy *policy_ = nullptr;
   int capacity_ = 0;
-  std::unique_ptr<Motion> motion_;
+  std::shared_ptr<Motion> motion_;
   std::map<std::string, Sending> sendings_;
   rclcpp::Subscription<nav_msgs::msg::Odometry>::SharedPtr odometry_;
   rclcpp_lifecycle::LifecyclePublisher<diagnostic_msgs::msg::DiagnosticArray>::SharedPtr diagnostics_;

@@ -133,6 +133,14 @@ Numbers Sender::numbers()
   return all;
 }
 
+void Sender::stop()
+{
+  std::lock_guard<std::mutex> lock(mutex_);
+  closing_ = stopped_ = true;
+  eventfd_write(wake_, 1);
+  changed_.notify_all();
+}
+
 void Sender::close(double drain_s)
 {
   std::unique_lock<std::mutex> lock(mutex_);
@@ -140,10 +148,8 @@ void Sender::close(double drain_s)
   eventfd_write(wake_, 1);
   changed_.notify_all();
   changed_.wait_for(lock, std::chrono::duration<double>(drain_s), [this] { return stopped_; });
-  stopped_ = true;
-  eventfd_write(wake_, 1);
-  changed_.notify_all();
   lock.unlock();
+  stop();
   if (thread_.joinable())
     thread_.join();
   if (wake_ >= 0)

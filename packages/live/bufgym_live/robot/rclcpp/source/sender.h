@@ -46,7 +46,9 @@ public:
   // Send to another receiver from now on.
   void move(const Address &to);
   Numbers numbers();
-  // Stop; queued messages still go for so long at most.
+  // Tell the thread to end, and do not wait for it.
+  void stop();
+  // Stop and wait; queued messages still go for so long at most.
   void close(double drain_s);
 
 private:

@@ -1,0 +1,151 @@
+"""The ament package bufgym_sender, built against rclcpp itself and run. It needs rclcpp's headers and libraries.
+
+They cannot be had where bufgym is made, so this file has not run there: test_ros2_sender.py has the node over a double.
+"""
+
+import asyncio
+import importlib.util
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Final
+
+import pytest
+from live_cases import in_order, receiving
+from loop_cases import until
+from roscpp_cases import gone, run
+
+from bufgym.model import qoi
+from bufgym.model.link import Link
+from bufgym.traces import Trace
+from bufgym_live.robot import rclcpp, read_log, roscpp
+from bufgym_live.robot.ros2.names import parse
+from bufgym_live.robot.shaped import ShapedLink
+
+pytestmark = pytest.mark.nightly
+PLACES: Final = (
+    *(os.environ[name] for name in ("BUFGYM_ROS2_PREFIX", "AMENT_PREFIX_PATH") if os.environ.get(name)),
+    *map(str, sorted(Path("/opt/ros").glob("*"))),
+)
+CAMERA: Final = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "camera.py"
+ROSCPP_QOI: Final = 140.7
+"""QoI of roscpp's queue under ``afr`` over the same fade (docs/guide/on-a-robot.md)."""
+PARAMETERS: Final = """\
+/robot/sender:
+  ros__parameters:
+    topics: [image]
+    host: 127.0.0.1
+    port: {port}
+    policy: afr
+    capacity: 15
+    log: {log}
+"""
+
+
+@pytest.fixture(scope="module")
+def where() -> dict[str, str]:
+    """The environment in which rclcpp is found."""
+    prefixes = [Path(prefix) for place in PLACES for prefix in place.split(os.pathsep)]
+    named = [str(prefix) for prefix in prefixes if (prefix / "share" / "rclcpp" / "cmake").is_dir()]
+    if not named or (importlib.util.find_spec("rclpy") is None and not shutil.which("ros2")):
+        looked = ", ".join(map(str, prefixes)) or "BUFGYM_ROS2_PREFIX, AMENT_PREFIX_PATH, /opt/ros"
+        pytest.skip(f"rclcpp, or a rclpy to publish with, was not found; looked in {looked}")
+    setup = Path(named[0], "setup.bash")
+    source = f"source {setup} && " if setup.exists() else ""
+    lines = run("bash", "-c", f"{source}env -0").split("\0")
+    given = dict(line.split("=", 1) for line in lines if "=" in line)
+    lists = {"AMENT_PREFIX_PATH": "", "CMAKE_PREFIX_PATH": "", "LD_LIBRARY_PATH": "/lib"}
+    paths = {name: [f"{prefix}{below}" for prefix in named] + [given.get(name, "")] for name, below in lists.items()}
+    joined = {name: os.pathsep.join(filter(None, all_paths)) for name, all_paths in paths.items()}
+    return {**given, **joined, "ROS_DOMAIN_ID": str(os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+@pytest.fixture(scope="module")
+def installed(where: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment with the package too; ``BUILT`` is its place."""
+    folder = tmp_path_factory.mktemp("ament")
+    source = rclcpp.write(folder / "source", roscpp.find("afr,learned"))
+    words = "-S", source, "-B", folder / "build", f"-DCMAKE_INSTALL_PREFIX={folder / 'install'}"
+    for step in (words, ("--build", folder / "build"), ("--install", folder / "build")):
+        done = subprocess.run(["cmake", *map(str, step)], env=where, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    built = str(folder / "install")
+    paths = {name: f"{built}{os.pathsep}{where[name]}" for name in ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH")}
+    return {**where, **paths, "LD_LIBRARY_PATH": f"{built}/lib:{where['LD_LIBRARY_PATH']}", "BUILT": built}
+
+
+@asynccontextmanager
+async def started(env: dict[str, str], *words: object) -> AsyncIterator[asyncio.subprocess.Process]:
+    """A process whose messages come on its output; what is left of it in the end is killed."""
+    given = {"env": env, "stdout": asyncio.subprocess.PIPE, "stderr": asyncio.subprocess.STDOUT}
+    process = await asyncio.create_subprocess_exec(*map(str, words), **given, start_new_session=True)  # type: ignore[arg-type]
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        await process.communicate()
+
+
+async def says(process: asyncio.subprocess.Process, part: str) -> None:
+    """Return once the process has said so."""
+    assert process.stdout is not None
+    while part not in (line := (await asyncio.wait_for(process.stdout.readline(), 60)).decode()):
+        assert line, f"it has ended and never said {part}"
+
+
+def camera(env: dict[str, str], frames: int) -> tuple[dict[str, str], str, Path, str, str]:
+    python = sys.executable if importlib.util.find_spec("rclpy") else "python3"
+    return {**env, "PYTHONWARNINGS": "ignore"}, python, CAMERA, "--frames", str(frames)
+
+
+def settled(log: Path, frames: int) -> bool:
+    """Whether all have arrived, and each has left or is dropped."""
+    events = [record["event"] for record in read_log(log)]
+    return events.count("put") == events.count("gone") + events.count("dropped") == frames
+
+
+async def test_over_the_fade_it_is_as_good_as_roscpp(installed: dict[str, str], tmp_path: Path) -> None:
+    """A parameter file, a namespace, a name and a remapping; 600 frames; SIGTERM ends it in order."""
+    fade, log = Trace.steps([(7.5, 3e6), (5, 0.25e6), (7.5, 3e6)]), tmp_path / "camera-0.jsonl"
+    async with receiving() as (_, port, came):
+        link = ShapedLink(Link(fade), ("127.0.0.1", port))
+        file = tmp_path / "sender.yaml"
+        file.write_text(PARAMETERS.format(port=await link.listen(), log=tmp_path))
+        ros = "--ros-args", "-r", "__ns:=/robot", "-r", "__node:=sender", "-r", "image:=/camera", "--params-file", file
+        program = Path(installed["BUILT"], "lib", "bufgym_sender", "sender")
+        try:
+            async with started(installed, program, *ros) as node, started(*camera(installed, 600)):
+                await says(node, "/camera: sensor_msgs/msg/CompressedImage")
+                link.begin()
+                await until(lambda: came and came[-1].seq >= 600 - 32)
+                await until(lambda: settled(log, 600))
+                await until(lambda: came[-1].seq == gone(log)[-1])
+                node.send_signal(signal.SIGTERM)
+                assert await asyncio.wait_for(node.wait(), 10) == 0
+        finally:
+            await link.close()
+    assert in_order(came) and parse(came[0].body)[0].type == "sensor_msgs/msg/CompressedImage"
+    assert gone(log) == [one.seq for one in came]
+    assert qoi.exponential().information([one.x for one in came]) > 0.99 * ROSCPP_QOI
+
+
+async def test_its_launch_file(installed: dict[str, str]) -> None:
+    """All that the file leaves at its defaults is good enough to start with."""
+    ros2 = shutil.which("ros2", path=installed.get("PATH"))
+    if ros2 is None:
+        pytest.skip("no ros2 launch here")
+    async with receiving() as (_, port, came):
+        given = "topics:=['/camera']", f"port:={port}", "namespace:=robot"
+        launch = started(installed, ros2, "launch", "bufgym_sender", "sender.launch.xml", *given)
+        async with launch as node, started(*camera(installed, 30)):
+            await says(node, "/camera: sensor_msgs/msg/CompressedImage")
+            await until(lambda: len(came) >= 10)
+            node.send_signal(signal.SIGINT)
+            await asyncio.wait_for(node.wait(), 20)
+    assert in_order(came)
