@@ -8,9 +8,9 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
     "bufgym": 27_550,
-    "tests": 18_380,
-    "packages/live/bufgym_live": 12_280,
-    "packages/live/tests": 9_520,
+    "tests": 18_410,
+    "packages/live/bufgym_live": 12_310,
+    "packages/live/tests": 9_640,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_160,
 }

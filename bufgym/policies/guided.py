@@ -241,7 +241,9 @@ def follow(buffer: Buffer, arrival: Arrival, memory: Memory, base: Numbers, outp
     if a == 0:
         if not changed:
             return target_gap.decide(buffer, arrival, rule, numbers)
-        head_goes = last_chance(buffer, arrival, rule, numbers) or target_gap.falls_behind(buffer, arrival, rule, numbers)
+        head_goes = last_chance(buffer, arrival, rule, numbers) or target_gap.falls_behind(
+            buffer, arrival, rule, numbers
+        )
         if head_goes and needless(buffer, arrival) < 0:
             return 0
     return price_dp.decide(buffer, arrival, rule, numbers, a)
