@@ -238,12 +238,39 @@ def rllib(budget: Budget) -> Trained:
     return Trained(act, settings)
 
 
+def skrl(budget: Budget) -> Trained:
+    """The defaults of its PPO on four environments, as in its examples; it knows no masks."""
+    from skrl.envs.wrappers.torch import wrap_env
+    from skrl.utils.runner.torch import Runner
+
+    layers = {"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "tanh"}
+    models = {
+        "separate": True,
+        "policy": {
+            "class": "CategoricalMixin",
+            "network": [layers],
+            "output": "ACTIONS",
+            "unnormalized_log_prob": True,
+        },
+        "value": {"class": "DeterministicMixin", "network": [layers], "output": "ONE"},
+    }
+    cfg = {"seed": 0, "models": models, "memory": {"class": "RandomMemory", "memory_size": -1}}
+    cfg["agent"] = {"class": "PPO", "rollouts": 16}  # its default, which the memory reads here
+    cfg["trainer"] = {"class": "SequentialTrainer", "timesteps": 10**9, "headless": True, "environment_info": "log"}
+    runner = Runner(wrap_env(make_batch(4, **FLAT)), cfg)
+    with budget:
+        runner.run("train")
+    policy = runner.agent.models["policy"]
+    return Trained(lambda seen: policy.compute({"observations": tensor(seen)}, role="policy")[0].argmax(-1), FLAT)
+
+
 LIBRARIES: dict[str, Callable[[Budget], Trained]] = {
     "cleanrl": cleanrl,
     "sbx": sbx,
     "torchrl": torchrl,
     "tianshou": tianshou,
     "rllib": rllib,
+    "skrl": skrl,
 }
 
 
