@@ -39,6 +39,7 @@ ELSEWHERE = {
     "studies.scheduling": "agents/test_scheduling.py",
     "studies.shipped": "studies/test_shipped.py",
     "studies.sizes": "needs a recording, and PyAV",
+    "studies.ten_minutes": "studies/test_ten_minutes.py, and it needs the other libraries",
     "studies.tune": "studies/test_tune.py",
     "website.films": "website/test_gallery.py",
     "website.returns": "it plays 100 episodes in each environment, and takes minutes",

@@ -1,12 +1,14 @@
 """The checkers of four libraries have nothing to say of any environment, in any form; a warning is an error here."""
 
+import pickle
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import pytest
 from gymnasium.utils import env_checker
 
-import bufgym
+import bufgym.envs
 
 SMALL: dict[str, dict[str, Any]] = {
     "bufgym/Interruption-v0": {"t_max": 20},
@@ -39,8 +41,11 @@ def made(id: str, **options: Any) -> gym.Env[Any, Any]:
 
 @every_id
 @every_form
-def test_gymnasium(id: str, form: dict[str, Any]) -> None:
-    env_checker.check_env(made(id, **form).unwrapped)
+def test_gymnasium_and_a_pickled_copy_is_equal(id: str, form: dict[str, Any]) -> None:
+    env = made(id, **form)
+    copied = pickle.loads(pickle.dumps(env))
+    env_checker.check_env(env.unwrapped)
+    assert env_checker.data_equivalence(env.reset(seed=1), copied.reset(seed=1))
 
 
 # That library has no network for two dimensions or nested dicts; all else it checks.
@@ -64,11 +69,7 @@ def test_torchrl(id: str, form: dict[str, Any]) -> None:
 @every_int8_form
 def test_pettingzoo(robots: int, form: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     zoo = pytest.importorskip("pettingzoo.test", reason="the extra [fleet] is not installed")
-    from bufgym.envs import parallel_env
-
-    def make() -> Any:
-        return parallel_env(robots=robots, **ROBOTS, **form)
-
+    make = partial(bufgym.envs.parallel_env, robots=robots, **ROBOTS, **form)
     zoo.parallel_api_test(make(), num_cycles=70)
     zoo.parallel_seed_test(make, num_cycles=20)
     assert "Passed" in capsys.readouterr().out
@@ -81,10 +82,8 @@ def test_pettingzoo_turn_by_turn(form: dict[str, Any]) -> None:
     zoo = pytest.importorskip("pettingzoo.test", reason="the extra [fleet] is not installed")
     from pettingzoo.utils import parallel_to_aec
 
-    from bufgym.envs import parallel_env
-
     def make() -> Any:
-        return parallel_to_aec(parallel_env(robots=3, **ROBOTS, **form))
+        return parallel_to_aec(bufgym.envs.parallel_env(robots=3, **ROBOTS, **form))
 
     zoo.api_test(make(), num_cycles=70)
     zoo.seed_test(make, num_cycles=20)

@@ -102,9 +102,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             seeds = [int(seeds) + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise BufgymError(f"seed: {len(seeds)} seeds for {self.num_envs} environments")
-        mask = np.asarray(options.get("reset_mask", self._every_row), np.bool_)
-        if mask.shape != (self.num_envs,):
-            raise BufgymError(f"options['reset_mask'] has shape {mask.shape}: must be ({self.num_envs},)")
+        mask = np.asarray(options.get("reset_mask", self._every_row))
+        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,):  # numbers of rows are no mask
+            raise BufgymError(f"options['reset_mask'] is {mask.dtype}{[*mask.shape]}: must be bool[{self.num_envs}]")
         if any(self.rows.senders.episodes[i] is None for i in np.flatnonzero(~mask)):
             raise gym.error.ResetNeeded("options['reset_mask'] leaves out rows that have no episode yet")
         self._renew_output(keep=True)

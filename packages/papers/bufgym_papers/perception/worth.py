@@ -80,9 +80,9 @@ def tracked_part(frames: NDArray[np.int64]) -> float:
     return float(reached[-1] - frames[0]) / (FRAMES - 1)
 
 
-def _rated_at_end(name: str, unit: str, prepare: Callable[[], object]) -> Callable[[Any], Any]:
+def _rated_at_end(name: str, unit: str, rate: Callable[[NDArray[np.int64]], float]) -> Callable[[Any], Any]:
     """Register a term of the frames that arrived, which are rated once an episode has ended."""
-    return reward_term(name, unit=unit, one_queue=True, at_end=True, prepare=prepare)
+    return reward_term(name, unit=unit, one_queue=True, at_end=True, prepare=functools.partial(rate, np.arange(2)))
 
 
 def _arrived(step: Any) -> NDArray[np.int64]:
@@ -93,19 +93,19 @@ def _arrived(step: Any) -> NDArray[np.int64]:
     return np.flatnonzero(np.asarray(step.log["transmitted_us"]) >= 0)
 
 
-@_rated_at_end("covered", "part of the scene", lambda: scene().coverage)
+@_rated_at_end("covered", "part of the scene", coverage_of)
 def covered(step: Any, memory: Memory) -> float:
     """at the end, the part of the scene that the frames which arrived have seen (`bufgym/Mapping-v0`)"""
     return coverage_of(_arrived(step))
 
 
-@_rated_at_end("followed", "part of a frame", lambda: scene().seen)
+@_rated_at_end("followed", "part of a frame", least_followed)
 def followed(step: Any, memory: Memory) -> float:
     """at the end, the least part of a frame that the one before it has seen: stands in for `tracked`"""
     return least_followed(_arrived(step))
 
 
-@_rated_at_end("tracked", "part of the recording", lambda: scene().track_of([0, 1]))
+@_rated_at_end("tracked", "part of the recording", tracked_part)
 def tracked(step: Any, memory: Memory) -> float:
     """at the end, how far tracking gets along the frames that arrived in `bufgym/Mapping-v0`; takes some seconds"""
     return tracked_part(_arrived(step))
