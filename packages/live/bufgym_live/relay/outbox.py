@@ -50,7 +50,7 @@ class Outbox:
                 self._awake.clear()
                 while await self.one():
                     pass
-        except WebSocketException:
+        except (WebSocketException, OSError):
             pass  # the reader sees it too
         except Exception:
             self._socket.transport.abort()
