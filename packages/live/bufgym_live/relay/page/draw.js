@@ -139,18 +139,14 @@ export function drawHistory(canvas, entries, nowMs) {
     drawing.fillRect(0, top, width, bottom - top);
     if (entries.length > 1) {
       drawing.beginPath();
-      drawing.moveTo(x(entries[0].ms), bottom);
       for (const entry of entries) drawing.lineTo(x(entry.ms), y(entry[lane.key]));
-      drawing.lineTo(x(entries.at(-1).ms), bottom);
-      drawing.globalAlpha = 0.3;
-      drawing.fillStyle = lane.tint;
-      drawing.fill();
-      drawing.globalAlpha = 1;
-      drawing.beginPath();
-      for (const entry of entries) drawing.lineTo(x(entry.ms), y(entry[lane.key]));
-      drawing.strokeStyle = lane.tint;
+      drawing.strokeStyle = drawing.fillStyle = lane.tint;
       drawing.lineWidth = 1.5;
       drawing.stroke();
+      for (const {ms} of [entries.at(-1), entries[0]]) drawing.lineTo(x(ms), bottom);
+      drawing.globalAlpha = 0.3;
+      drawing.fill();
+      drawing.globalAlpha = 1;
     }
     top = bottom;
   }
