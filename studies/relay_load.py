@@ -3,6 +3,8 @@
 python -m studies.relay_load load --robots 20 --viewers 5 --seconds 60 [--slow] [--flood] [--replays 6]
 python -m studies.relay_load idle --connections 1000
 python -m studies.relay_load page --robots 20 --seconds 10   # frames that the page drops; needs Playwright, Chromium
+python -m studies.relay_load page --robots 907 --rate-hz 0.5   # more than one process can send for ten times a second
+python -m studies.relay_load page --robots 1 --points 100000   # the 3-D tab, with so large a cloud in each turn
 
 A relay is the command ``bufgym relay serve``; all else shares another process. Robots send messages that are made
 beforehand. ``page --robots 0`` says what the machine drops of an empty page.
@@ -24,9 +26,11 @@ from typing import Any
 import numpy as np
 
 REPO = Path(__file__).resolve().parent.parent
-# It shares robots with the examples, and a relay's settings with the tests.
-sys.path[:0] = [*(str(REPO / name) for name in ("packages/live/tests", "packages/live/tests/relay", "examples"))]
+# It shares robots with the examples, and a relay's settings and clouds with the tests.
+SHARED = ("packages/live/tests", "packages/live/tests/relay", "tests", "examples")
+sys.path[:0] = [str(REPO / name) for name in SHARED]
 
+import page_cases
 from loop_cases import beside as beside
 from made_up_robot import ODOMETRY, SCAN, cast, jpeg, odometry, picture, pose_at, scan
 from relay_cases import client
@@ -189,61 +193,93 @@ async def load(robots: int, viewers: int, seconds: float, slow: bool, loud: bool
 
 POSES, SETTLES_S = 40, 6.0
 SENSES = {"odom": ("cdr", ODOMETRY), "scan": ("cdr", SCAN), "camera": ("jpeg", "")}
+CLICK = """new Promise(shown => {
+  const card = [...document.querySelectorAll(".card")].at(-1), began = performance.now();
+  card.click();
+  requestAnimationFrame(function look() {
+    const isShown = document.querySelector("#name").textContent === card.querySelector(".called").textContent;
+    requestAnimationFrame(isShown ? () => shown(performance.now() - began) : look);
+  });
+})"""
+"""Milliseconds from a click on the last card to the frame after the one that shows its robot."""
 CATEGORIES = ["devtools.timeline", "disabled-by-default-devtools.timeline.frame", "cc", "benchmark"]
 ANGLES = np.radians(np.arange(0, 360, 2.0))
 
 
-async def robot(port: int, number: int) -> None:
+def cloud(count: int) -> bytes:
+    """Points with brightness, laid out as Velodyne's driver does: 22 bytes each."""
+    names, formats = ["x", "y", "z", "intensity", "ring", "time"], ["<f4", "<f4", "<f4", "<f4", "<u2", "<f4"]
+    points = np.zeros(count, np.dtype(list(zip(names, formats, strict=True))))
+    for k, name in enumerate(names[:4]):
+        points[name] = np.random.default_rng(k).normal(0, 10, count)
+    return page_cases.cloud(points, "base_link")
+
+
+async def robot(port: int, number: int, rate_hz: float, points: int) -> None:
     """One that drives its first four seconds again and again, with its status and a queue that fills and empties."""
     name, drive = f"robot-{number}", [pose_at(number, k / RATE_HZ) for k in range(POSES)]
     places = [odometry(0, name, pose, 1.0) for pose in drive]
     scans = [scan(0, name, ANGLES, cast(pose, ANGLES)[0]) for pose in drive]
     senses = list(zip(places, scans, [jpeg(picture(drive[0]))] * POSES, strict=True))
     kinds = {topic: {"encoding": encoding, "type": type} for topic, (encoding, type) in SENSES.items()}
+    seen = cloud(points) if points and number == 0 else b""
+    if seen:
+        kinds["velodyne"] = {"encoding": "cdr", "type": page_cases.CLOUD}
     async with client(port, name=name) as one:
 
         async def say(topic: str, data: Any) -> None:
             await one.put(f"/robots/{name}/{topic}", json.dumps(data).encode(), encoding="json")
 
-        async for k in each(RATE_HZ, 10**9, number / 200):
+        async for k in each(rate_hz, 10**9, number / 200):
             for (topic, (encoding, type)), payload in zip(SENSES.items(), senses[k % POSES], strict=True):
                 await one.put(f"/robots/{name}/{topic}", payload, encoding=encoding, type=type)
             topics = {topic: {"put": k, "left": k, "dropped": 0, "age_s": 0.1, "qoi": 0.9} for topic in SENSES}
             queue = {"policy": "afr", "capacity": 16, "queued": k % 16, "waiting": [n % 3 for n in range(k % 16)]}
             queue |= {"put": 3 * k, "left": 2 * k, "dropped": k, "rate_bps": 5e5, "qoi": 0.9, "topics": topics}
+            if seen:
+                await one.put(f"/robots/{name}/velodyne", seen, encoding="cdr", type=page_cases.CLOUD)
             if k % 2 == 0:
                 await say("queue", queue)
-            if k % RATE_HZ == 0:
+            if k % max(1, round(rate_hz)) == 0:
                 await say("status", {"battery": 0.7, "queue": queue, "publishes": kinds, "policies": ["afr"]})
 
 
-async def traced(port: int, robots: int, seconds: float) -> Any:
-    """The events of Chromium's trace of the page."""
+async def traced(port: int, robots: int, seconds: float, points: int) -> Any:
+    """The events of Chromium's trace of the page. Says how long it takes to the first robot and to one clicked on."""
     from playwright.async_api import async_playwright
 
     words: dict[str, Any] = {"executable_path": shutil.which("chromium"), "args": ["--no-sandbox", "--disable-gpu"]}
     async with async_playwright() as play, await play.chromium.launch(**words) as browser:
         page = await browser.new_page(viewport={"width": 1360, "height": 800})
         began_s = time.monotonic()
-        await page.goto(f"http://127.0.0.1:{port}/")
+        await page.goto(f"http://127.0.0.1:{port}/" + ("#/robot/robot-0/3d" if points else ""))
         while robots and not await page.evaluate("document.querySelectorAll('.card').length"):
             await page.wait_for_timeout(10)
         print(f"first robot after {time.monotonic() - began_s:.2f} s" if robots else "no robots")
         await page.wait_for_timeout(1000 * SETTLES_S)
         await browser.start_tracing(page=page, categories=CATEGORIES)
         await page.wait_for_timeout(1000 * seconds)
-        return json.loads(await browser.stop_tracing())["traceEvents"]
+        events = json.loads(await browser.stop_tracing())["traceEvents"]
+        if robots > 1:
+            cards = await page.evaluate("document.querySelectorAll('.card').length")
+            print(f"{cards} robots in the list; a click shows its robot after {await page.evaluate(CLICK):.0f} ms")
+        if points:
+            print(await page.text_content("#space figcaption"))
+        return events
 
 
-async def page(robots: int, seconds: float) -> None:
-    async with relay() as (_, port), beside(*(robot(port, number) for number in range(robots))):
+async def page(robots: int, seconds: float, rate_hz: float, points: int) -> None:
+    async with relay() as (_, port), beside(*(robot(port, number, rate_hz, points) for number in range(robots))):
         await asyncio.sleep(5.0)  # until the policy is compiled
-        events = await traced(port, robots, seconds)
+        events = await traced(port, robots, seconds, points)
     begun, dropped = (sum(event["name"] == name for event in events) for name in ("BeginFrame", "DroppedFrame"))
-    print(f"{dropped} of {begun} frames dropped")
-    ours = [event.get("tdur", 0) / 1e3 for event in events if event["name"] == "FireAnimationFrame"]
-    median, late, longest = np.percentile(ours, [50, 99, 100])
-    print(f"drawing takes {median:.1f} ms of a processor (median; p99 {late:.1f}, longest {longest:.1f})")
+    print(f"{dropped} of {begun} frames dropped; load {os.getloadavg()[0]:.0f} on {os.cpu_count()} processors")
+    for name, what in (("FireAnimationFrame", "drawing"), ("FunctionCall", "each call of the page's script")):
+        ours = [event["tdur"] / 1e3 for event in events if event["name"] == name and "tdur" in event]
+        median, late, longest = np.percentile(ours or [0], [50, 99, 100])
+        print(
+            f"{what}: {median:.1f} ms of a processor (median; p99 {late:.1f}, longest {longest:.1f}), {len(ours)} times"
+        )
 
 
 def main() -> None:
@@ -255,6 +291,8 @@ def main() -> None:
     for verb in ("load", "page"):
         of[verb].add_argument("--robots", type=int, default=20)
         of[verb].add_argument("--seconds", type=float, default=10.0)
+    of["page"].add_argument("--rate-hz", type=float, default=RATE_HZ, help="how often each robot says all it says")
+    of["page"].add_argument("--points", type=int, default=0, help="of a cloud that the first robot sends each time")
     of["load"].add_argument("--viewers", type=int, default=3)
     of["load"].add_argument("--slow", action="store_true", help="the first viewer reads 100 kB/s")
     of["load"].add_argument("--flood", dest="loud", action="store_true", help="another client floods it with JSON")

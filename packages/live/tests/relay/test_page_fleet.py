@@ -16,7 +16,7 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
     pytest.importorskip(library, reason=f"no {library} here: the extra relay")
 
 from made_up_robot import jpeg  # noqa: E402
-from page_cases import CLOUD, Fleet, cloud, drawn, health  # noqa: E402
+from page_cases import CLOUD, Fleet, cdr, cloud, drawn, health  # noqa: E402
 from PIL import Image  # noqa: E402
 from pose_cases import ESTIMATE, POSE  # noqa: E402
 from test_page import SEES, until  # noqa: E402
@@ -25,6 +25,7 @@ from bufgym_live.relay import ros_messages  # noqa: E402
 
 pytestmark = compiled
 RED = jpeg(np.full((120, 160, 3), (220, 30, 30), np.uint8))
+PICTURE = "sensor_msgs/msg/CompressedImage"
 PLACE = {"x": 0, "y": 0, "yaw": 0, "frame": "map"}
 WIDTHS = [1400, pytest.param(390, marks=pytest.mark.nightly)]
 COUNT = """([red, green, blue]) => {
@@ -223,6 +224,22 @@ def test_cameras_and_what_is_old(opened: tuple[Any, Fleet]) -> None:
     # Soon the relay says, too, that it is away.
     seen = text(".card[aria-current] .seen")
     until(page, f"{text('#facts')}.endsWith('ago')", f"/^(silent for|last seen) [0-9]/.test({seen})")
+
+
+def test_video_that_cannot_be_shown_is_named(opened: tuple[Any, Fleet]) -> None:
+    """By its type or its name, and nobody asks for it; by the format that a picture says."""
+    page, fleet = opened
+    kinds = ("front/theora", "theora_image_transport/msg/Packet"), ("depth/compressedDepth", PICTURE)
+    said = {topic: {"type": type, "encoding": "cdr"} for topic, type in kinds}
+    fleet.robots["one"] = {"location": PLACE, "publishes": said}, ()
+    first = "front/theora: this page cannot show theora; send front/compressed"
+    until(page, f"{text('#first.blank figcaption')} === '{first}'")
+    page.click("#tabs a:has-text('Cameras')")
+    other = "depth/compressedDepth: this page cannot show compressedDepth; send depth/compressed"
+    until(page, f"{text('#cameras .blank figcaption')} === '{first},{other}'")
+    packet = cdr(PICTURE, format="h264", data=np.zeros(9, np.uint8))
+    fleet.robots["one"] = {"location": PLACE}, (("side", PICTURE, packet),)
+    until(page, f"{text('#cameras .blank figcaption')}.endsWith('side: this page cannot show h264')")
 
 
 def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:

@@ -266,7 +266,7 @@ function frame(clockMs) {
 function sayChosen(one) {
   overview.facts(one, nowMs());
   layers.list(one, fleet.topics(layered(), [one]));
-  cameras.say(one, fleet.topics(["picture"], [one]), nowMs());
+  cameras.say(one, fleet.topics(["picture", "video"], [one]), nowMs());
   if (tab === "overview") overview.say(one, nowMs());
   if (tab === "health") health.draw(one, nowMs());
   else if (tab === "3d") space?.say(one, nowMs());

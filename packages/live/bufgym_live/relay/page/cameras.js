@@ -1,7 +1,7 @@
 // A robot's cameras: one beside its laser, all side by side on a tab, and one as large as the screen.
 
 import {aged, context, say, seconds} from "./draw.js";
-import {picture} from "./pictures.js";
+import {picture, unseen} from "./pictures.js";
 
 // Decode the latest picture, one at a time for each camera.
 function decode(camera) {
@@ -23,9 +23,20 @@ function show(canvas, bitmap) {
 }
 
 function caption(camera, nowMs) {
+  if (!camera) return "no picture";
   while (camera.frames.length && camera.frames[0] < nowMs - 2000) camera.frames.shift();
   if (camera.fault) return `${camera.topic}: ${camera.fault}`;
   return camera.bitmap ? `${camera.topic}, ${(camera.frames.length / 2).toFixed(1)} a second, ${seconds((nowMs - camera.ms) / 1000)} old` : `${camera.topic}: no picture yet`;
+}
+
+// A figure that is pressed like a button.
+function press(figure, act) {
+  figure.setAttribute("role", "button");
+  Object.assign(figure, {tabIndex: 0, onclick: act, onkeydown: event => {
+    if (event.key !== "Enter" && event.key !== " ") return;
+    event.preventDefault();
+    act();
+  }});
 }
 
 export class Cameras {
@@ -35,13 +46,13 @@ export class Cameras {
     this.large = large;
     this.topic = null;
     this.figures = new Map();
-    first.onclick = () => this.enlarge([...this.robot?.cameras.keys() ?? []][0]);
+    press(first, () => this.enlarge([...this.robot?.cameras.keys() ?? []][0]));
     large.onclick = () => large.close();
     large.onclose = () => { this.topic = null; };
   }
 
   enlarge(topic) {
-    if (topic === undefined) return;
+    if (!this.robot.cameras.get(topic)?.bitmap) return;
     this.topic = topic;
     this.redraw = true;
     if (!this.large.open) this.large.showModal();
@@ -72,17 +83,15 @@ export class Cameras {
   // Some times a second.
   say(robot, topics, nowMs) {
     const said = (figure, camera) => {
+      figure.classList.toggle("blank", !camera?.bitmap && Boolean(camera?.fault));
       say(figure.querySelector("figcaption"), caption(camera, nowMs));
-      aged(figure, camera.bitmap ? nowMs - camera.ms : 0);
+      aged(figure, camera?.bitmap ? nowMs - camera.ms : 0);
     };
-    for (const topic of topics) said(this.figure(topic), robot.cameras.get(topic) ?? {topic, frames: []});
+    const isVideo = topic => robot.kinds[topic] === "video";
+    const of = topic => robot.cameras.get(topic) ?? {topic, frames: [], fault: isVideo(topic) && unseen(topic, robot.status?.publishes[topic]?.type)};
+    for (const topic of topics) said(this.figure(topic), of(topic));
     say(this.all.nextElementSibling, topics.length ? "" : "This robot has no camera.");
-    const [first] = robot.cameras.values();
-    if (first) said(this.first, first);
-    else {
-      say(this.first.querySelector("figcaption"), "no picture");
-      aged(this.first, 0);
-    }
+    said(this.first, [...robot.cameras.values()][0] ?? topics.filter(isVideo).map(of)[0]);
     if (this.topic !== null && robot.cameras.has(this.topic)) said(this.large, robot.cameras.get(this.topic));
   }
 
@@ -90,8 +99,7 @@ export class Cameras {
     if (!this.figures.has(topic)) {
       const figure = document.createElement("figure");
       figure.innerHTML = "<canvas></canvas><figcaption></figcaption>";
-      Object.assign(figure, {tabIndex: 0, onclick: () => this.enlarge(topic), onkeydown: event => { if (event.key === "Enter") this.enlarge(topic); }});
-      figure.setAttribute("role", "button");
+      press(figure, () => this.enlarge(topic));
       this.all.append(figure);
       this.figures.set(topic, figure);
       this.redraw = true;

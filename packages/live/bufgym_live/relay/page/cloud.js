@@ -12,23 +12,19 @@ const TYPES = {
 };
 const PACKED = ["rgb", "rgba"], BRIGHT = ["intensity", "intensities", "reflectivity", "i"];
 
-// From blue over green and yellow to red: 256 colours of three bytes.
-const PALETTE = Uint8Array.from({length: 768}, (_, k) => {
-  const part = Math.floor(k / 3) / 255, wave = centre => 255 * Math.min(1, Math.max(0.08, 1.5 - Math.abs(4 * part - centre)));
-  return wave([3, 2, 1][k % 3]);
+// Red, green, blue and 255 in the order of bytes that browsers have.
+const word = (red, green, blue) => 255 << 24 | blue << 16 | green << 8 | red;
+// From blue over green and yellow to red.
+const PALETTE = Uint32Array.from({length: 256}, (_, k) => {
+  const wave = centre => 255 * Math.min(1, Math.max(0.08, 1.5 - Math.abs(k / 63.75 - centre)));
+  return word(wave(3), wave(2), wave(1));
 });
 
 // The colours that values have between the 2nd and the 98th part of a hundred of them.
 function shaded(values, count, colours) {
-  const step = Math.max(1, Math.floor(count / SAMPLES)), sample = values.slice(0, count).filter((value, k) => k % step === 0 && Number.isFinite(value)).sort();
+  const step = Math.max(1, Math.floor(count / SAMPLES)), sample = Float64Array.from({length: Math.ceil(count / step)}, (_, k) => values[k * step]).filter(Number.isFinite).sort();
   const low = sample[Math.floor(sample.length * 0.02)] ?? 0, scale = 255 / (sample[Math.floor(sample.length * 0.98)] - low || 1);
-  for (let k = 0; k < count; k++) {
-    const at = 3 * Math.min(255, Math.max(0, Math.round((values[k] - low) * scale) || 0));
-    colours[4 * k] = PALETTE[at];
-    colours[4 * k + 1] = PALETTE[at + 1];
-    colours[4 * k + 2] = PALETTE[at + 2];
-    colours[4 * k + 3] = 255;
-  }
+  for (let k = 0; k < count; k++) colours[k] = PALETTE[Math.min(255, Math.max(0, Math.round((values[k] - low) * scale) || 0))];
 }
 
 // ``by`` names the field that gives the colours, "z" for the height; what has none is coloured by rgb, intensity or height, the first it has.
@@ -47,7 +43,7 @@ export function cloud(message, by = "") {
   };
   const [x, y, z] = ["x", "y", "z"].map(field), chosen = [by, ...PACKED, ...BRIGHT].find(name => fields.get(name)?.type) ?? "z";
   const isPacked = PACKED.includes(chosen), shade = field(chosen);
-  const places = new Float32Array(3 * width * height), colours = new Uint8Array(4 * width * height), values = new Float64Array(width * height);
+  const places = new Float32Array(3 * width * height), colours = new Uint32Array(width * height), values = new Float64Array(width * height);
   let count = 0;
   for (let line = 0; line < height; line++)
     for (let column = 0, at = line * row; column < width; column++, at += step) {
@@ -57,12 +53,12 @@ export function cloud(message, by = "") {
       places[3 * count + 1] = py;
       places[3 * count + 2] = pz;
       if (isPacked) {
-        const word = view.getUint32(at + shade.offset, little);
-        colours.set([word >> 16 & 255, word >> 8 & 255, word & 255, 255], 4 * count);
+        const packed = view.getUint32(at + shade.offset, little);
+        colours[count] = word(packed >> 16 & 255, packed >> 8 & 255, packed & 255);
       } else values[count] = shade.read(view, at + shade.offset, little);
       count++;
     }
   if (!isPacked) shaded(values, count, colours);
   const named = [...fields.keys()].filter(name => name !== "x" && name !== "y" && fields.get(name).type);
-  return {frame, fields: named, by: chosen, count, places: places.subarray(0, 3 * count), colours: colours.subarray(0, 4 * count)};
+  return {frame, fields: named, by: chosen, count, places: places.subarray(0, 3 * count), colours: new Uint8Array(colours.buffer, 0, 4 * count)};
 }

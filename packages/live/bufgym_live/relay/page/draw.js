@@ -42,9 +42,9 @@ export function colourOf(name) {
   return (hash % 360 + (Number(number.slice(-9)) || 0) * 137.5) % 360;
 }
 
-// What is old loses its colour: from ``part`` 0, fresh, to 1.
+// What is old loses its colour: from ``part`` 0, fresh, to 1. Each is dark or light enough to be 3 : 1 from what lies below.
 export const tint = (colour, part = 0, dark = matchMedia("(prefers-color-scheme: dark)").matches) =>
-  `hsl(${colour} ${(dark ? 70 : 68) * (1 - part)}% ${dark ? 64 - 14 * part : 42 + 14 * part}%)`;
+  `hsl(${colour} ${(dark ? 70 : 68) * (1 - part)}% ${dark ? 64 - 14 * part : 33 + 21 * part}%)`;
 export const faded = ageMs => Math.min(1, Math.max(0, (ageMs - FRESH_MS) / (GREY_MS - FRESH_MS)));
 
 // Let a figure lose colour with the age of what it shows, and say that age in large letters.
@@ -139,18 +139,14 @@ export function drawHistory(canvas, entries, nowMs) {
     drawing.fillRect(0, top, width, bottom - top);
     if (entries.length > 1) {
       drawing.beginPath();
-      drawing.moveTo(x(entries[0].ms), bottom);
       for (const entry of entries) drawing.lineTo(x(entry.ms), y(entry[lane.key]));
-      drawing.lineTo(x(entries.at(-1).ms), bottom);
-      drawing.globalAlpha = 0.3;
-      drawing.fillStyle = lane.tint;
-      drawing.fill();
-      drawing.globalAlpha = 1;
-      drawing.beginPath();
-      for (const entry of entries) drawing.lineTo(x(entry.ms), y(entry[lane.key]));
-      drawing.strokeStyle = lane.tint;
+      drawing.strokeStyle = drawing.fillStyle = lane.tint;
       drawing.lineWidth = 1.5;
       drawing.stroke();
+      for (const {ms} of [entries.at(-1), entries[0]]) drawing.lineTo(x(ms), bottom);
+      drawing.globalAlpha = 0.3;
+      drawing.fill();
+      drawing.globalAlpha = 1;
     }
     top = bottom;
   }
@@ -163,4 +159,5 @@ export function drawHistory(canvas, entries, nowMs) {
 export const bits = rate => rate >= 1e6 ? `${(rate / 1e6).toFixed(1)} Mbit/s` : `${(rate / 1e3).toFixed(0)} kbit/s`;
 export const seconds = s => s == null ? "–" : s < 10 ? `${s.toFixed(1)} s` : s < 120 ? `${s.toFixed(0)} s` : s < 7200 ? `${(s / 60).toFixed(0)} min` :
   s < 172_800 ? `${(s / 3600).toFixed(0)} h` : `${(s / 86_400).toFixed(0)} days`;
+export const clock = s => [...(s < 3600 ? [] : [Math.floor(s / 3600)]), Math.floor(s % 3600 / 60), Math.floor(s % 60)].map(part => String(part).padStart(2, "0")).join(":");
 export const percent = part => part == null ? "–" : `${Math.round(part * 100)} %`;

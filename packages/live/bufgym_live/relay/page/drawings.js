@@ -17,15 +17,8 @@ function grid(cdr) {
   return {frame, cellM, width, height, origin, cells: new Int8Array(cells)};
 }
 
-function path(cdr) {
-  const frame = cdr.header();
-  return {frame, places: cdr.list(() => { cdr.header(); return place(cdr.pose()); }).filter(Boolean)};
-}
-
-function poses(cdr) {
-  const frame = cdr.header();
-  return {frame, places: cdr.list(() => place(cdr.pose())).filter(Boolean)};
-}
+const places = read => cdr => ({frame: cdr.header(), places: cdr.list(() => place(read(cdr))).filter(Boolean)});
+const poses = places(cdr => cdr.pose()), path = places(cdr => { cdr.header(); return cdr.pose(); });
 
 const point = cdr => { const [x, y, z] = cdr.doubles(3).map(metres); return {x, y, z}; };
 const rgba = cdr => Array.from({length: 4}, () => Math.min(1, Math.max(0, number(cdr.float()) ?? 0)));

@@ -34,7 +34,6 @@ export class Drive {
     };
     pad.onkeydown = event => {
       const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-      if (event.key === "Escape") this.open(false);
       if (!(key in KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
       event.preventDefault();
       this.keys.add(key);

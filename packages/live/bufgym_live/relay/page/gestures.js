@@ -31,18 +31,23 @@ export function listen(map) {
     before = null;
     map.preview = null;
   });
+  wheelAndKeys(canvas, (dx, dy) => map.shift(dx, dy), (factor, at) => map.zoom(factor, at));
+  fingers(map);
+}
+
+// move(dx, dy, isShift) and zoom(factor, at), in pixels.
+export function wheelAndKeys(canvas, move, zoom) {
   canvas.addEventListener("wheel", event => {
     event.preventDefault();
-    map.zoom(Math.exp(-event.deltaY / 500), place(event));
+    zoom(Math.exp(-event.deltaY / 500), [event.offsetX, event.offsetY]);
   }, {passive: false});
   canvas.addEventListener("keydown", event => {
     const step = {ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1]}[event.key], factor = {"+": 1.25, "=": 1.25, "-": 0.8}[event.key];
-    if (step) map.shift(STEP_PX * step[0], STEP_PX * step[1]);
-    else if (factor) map.zoom(factor, [canvas.clientWidth / 2, canvas.clientHeight / 2]);
+    if (step) move(STEP_PX * step[0], STEP_PX * step[1], event.shiftKey);
+    else if (factor) zoom(factor, [canvas.clientWidth / 2, canvas.clientHeight / 2]);
     else return;
     event.preventDefault();
   });
-  fingers(map);
 }
 
 // Two fingers move the map and zoom it.

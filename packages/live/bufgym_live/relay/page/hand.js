@@ -34,11 +34,24 @@ export class Hand {
     };
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
-    addEventListener("keydown", event => { if (event.key === "Escape") this.take(null); });
+    addEventListener("keydown", event => {
+      if (event.key === "Escape") this.escape();
+      const isText = /** @type {Element} */ (event.target).matches("[type=search], [type=password], select");
+      if (event.key.toLowerCase() === "x" && !isText && !event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey) $("stop").click();
+    });
     $("policy").onchange = () => {
       this.send("policy", {policy: $("policy").value});
       $("policy").blur();
     };
+  }
+
+  // What is open or in hand is so no more.
+  escape() {
+    this.take(null);
+    this.drive.open(false);
+    const box = this.$("layers-box"), summary = box.firstElementChild;
+    if (box.contains(document.activeElement)) summary.focus();
+    box.open = false;
   }
 
   // How the robot takes a command of a kind: its topic, and a type if that is ROS's own; undefined if it does not, or the viewer may not.

@@ -190,9 +190,8 @@ function shape(drawing, map, to, marker) {
       }
       break;
     }
-    case SHAPES.CUBES: at.forEach((one, k) => { drawing.fillStyle = own(k); box(one, sx, sy); }); break;
     case SHAPES.SPHERES: at.forEach((one, k) => { drawing.fillStyle = own(k); disc(one, sx, sy); }); break;
-    case SHAPES.POINTS: at.forEach((one, k) => { drawing.fillStyle = own(k); box(one, sx, sy); }); break;
+    case SHAPES.CUBES: case SHAPES.POINTS: at.forEach((one, k) => { drawing.fillStyle = own(k); box(one, sx, sy); }); break;
     case SHAPES.TEXT:
       drawing.font = "600 12px system-ui, sans-serif";
       drawing.textAlign = "center";

@@ -13,6 +13,11 @@ export class List {
     this.count = count;
     this.cards = new Map();
     search.oninput = () => this.find();
+    element.onkeydown = event => {
+      const shown = this.shown(), step = {ArrowDown: 1, ArrowUp: -1}[event.key], to = shown[shown.indexOf(document.activeElement) + step];
+      if (step) event.preventDefault();
+      to?.focus();
+    };
   }
 
   add(robot) {
@@ -77,5 +82,10 @@ export class List {
   find() {
     const wanted = this.search.value.trim().toLowerCase();
     for (const [name, card] of this.cards) card.hidden = !(name + " " + card.querySelector(".says").textContent).toLowerCase().includes(wanted);
+    // One of them is reached by Tab, the others from it by arrows.
+    const shown = this.shown(), first = shown.find(card => card === document.activeElement) ?? shown.find(card => card.ariaCurrent) ?? shown[0];
+    for (const card of shown) if (card.tabIndex !== (card === first ? 0 : -1)) card.tabIndex = card === first ? 0 : -1;
   }
+
+  shown() { return [...this.element.children].filter(card => !card.hidden); }
 }

@@ -202,6 +202,9 @@ export class Map2D {
     drawing.fillStyle = colour("soft");
     drawing.font = "11px system-ui, sans-serif";
     drawing.fillRect(12, height - 14, metres * scale, 2);
+    drawing.lineWidth = 3;
+    drawing.strokeStyle = colour("lane");
+    drawing.strokeText(`${metres} m`, 12, height - 20);
     drawing.fillText(`${metres} m`, 12, height - 20);
   }
 }

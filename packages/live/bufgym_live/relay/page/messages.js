@@ -39,11 +39,11 @@ const KINDS = {
   "nav_msgs/msg/Odometry": "pose", "geometry_msgs/msg/PoseStamped": "pose", "geometry_msgs/msg/PoseWithCovarianceStamped": "pose",
   "tf2_msgs/msg/TFMessage": "tf", "tf/msg/tfMessage": "tf",
   "sensor_msgs/msg/LaserScan": "scan", "sensor_msgs/msg/CompressedImage": "picture", "sensor_msgs/msg/Image": "picture",
-  "theora_image_transport/msg/Packet": "picture", "foxglove_msgs/msg/CompressedVideo": "picture", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "picture",
   "diagnostic_msgs/msg/DiagnosticArray": "diagnostics", "sensor_msgs/msg/BatteryState": "battery",
   "nav_msgs/msg/OccupancyGrid": "grid", "nav_msgs/msg/Path": "path", "geometry_msgs/msg/PoseArray": "poses",
   "visualization_msgs/msg/MarkerArray": "markers", "visualization_msgs/msg/Marker": "markers", "sensor_msgs/msg/PointCloud2": "cloud",
 };
+export const VIDEO = {"theora_image_transport/msg/Packet": "theora", "foxglove_msgs/msg/CompressedVideo": "video", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "h264"};
 export const DRAWN = ["grid", "path", "poses", "goal", "markers"], HEALTH = ["diagnostics", "estop", "battery"];   // kinds: of the map's layers, of what is wrong
 
 // Poses where a robot shall go, or that a person says; bag_poses.py has them too.
@@ -57,6 +57,7 @@ export function kindOf(name, {type, encoding}) {
   const kind = KINDS[type];
   if (encoding === "cdr" && kind === "pose" && type !== "nav_msgs/msg/Odometry" && GOAL.test(name.toLowerCase())) return "goal";
   if (encoding === "cdr" && type === "std_msgs/msg/Bool" && STOP.test(name.toLowerCase())) return "estop";
+  if (VIDEO[type] || name.endsWith("/compressedDepth")) return "video";
   if (kind && encoding === "cdr") return kind;
   if (encoding === "jpeg" || encoding === "png") return "picture";
   if (encoding === "json") return {odom: "pose", scan: "scan"}[name];

@@ -28,9 +28,7 @@ export class Notices {
   }
 
   clear() {
-    for (const [key, notice] of this.notices) if (notice.level === "error" && notice.overMs === null) this.seen.add(key);
-    this.notices.clear();
-    this.draw(Date.now());
+    for (const key of this.notices.keys()) this.dismiss(key);
   }
 
   dismiss(key) {

@@ -1,6 +1,6 @@
 // How the 3-D view is turned, moved and zoomed: by mouse, by wheel, by fingers, by keys.
 
-const STEP_PX = 40;
+import {wheelAndKeys} from "./gestures.js";
 
 // view: {turn(dx, dy), shift(dx, dy), zoom(factor)}, in pixels. One finger or the left button turns; two fingers or another button move.
 export function listen(canvas, view) {
@@ -27,15 +27,5 @@ export function listen(canvas, view) {
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, event => held.delete(event.pointerId));
   canvas.addEventListener("contextmenu", event => event.preventDefault());
-  canvas.addEventListener("wheel", event => {
-    event.preventDefault();
-    view.zoom(Math.exp(-event.deltaY / 500));
-  }, {passive: false});
-  canvas.addEventListener("keydown", event => {
-    const step = {ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1]}[event.key], factor = {"+": 1.25, "=": 1.25, "-": 0.8}[event.key];
-    if (step) view[event.shiftKey ? "shift" : "turn"](STEP_PX * step[0], STEP_PX * step[1]);
-    else if (factor) view.zoom(factor);
-    else return;
-    event.preventDefault();
-  });
+  wheelAndKeys(canvas, (dx, dy, isShift) => view[isShift ? "shift" : "turn"](dx, dy), factor => view.zoom(factor));
 }

@@ -1,10 +1,12 @@
 // Pictures: what they are is asked before anything is decoded, for 48 kB of PNG can be 1.6 GB of pixels.
 
 import {Cdr} from "./cdr.js";
+import {VIDEO} from "./messages.js";
 
 const MOST_PIXELS = 16_000_000;                     // two pictures of 4K
 
-const VIDEO = {"theora_image_transport/msg/Packet": "theora", "foxglove_msgs/msg/CompressedVideo": "video", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": "h264"};
+// Why a topic of kind "video" is not shown.
+export const unseen = (topic, type = "") => `this page cannot show ${VIDEO[type] ?? topic.split("/").at(-1)}; send ${topic.replace(/\/[^/]*$/, "")}/compressed`;
 
 // Width and height of a PNG or JPEG file, by its first bytes; undefined if it is neither.
 export function dimensions(bytes) {
@@ -27,13 +29,12 @@ function check(width, height) {
 // A canvas's picture; an error says in words why there is none.
 export async function picture(message) {
   let {payload, encoding} = message;
-  if (VIDEO[message.type]) throw new Error(`${VIDEO[message.type]} cannot be shown`);
   if (encoding === "cdr") {
     const cdr = new Cdr(payload);
     cdr.header();
     if (message.type === "sensor_msgs/msg/Image") return createImageBitmap(plain(cdr));
     const format = cdr.string();
-    if (/compressedDepth|h264|hevc|theora/i.test(format)) throw new Error(`${format} cannot be shown`);
+    if (/compressedDepth|h264|hevc|theora/i.test(format)) throw new Error(`this page cannot show ${format}`);
     payload = cdr.bytes(cdr.uint());
     encoding = format.includes("png") ? "png" : "jpeg";
   }
@@ -47,7 +48,7 @@ const ORDERS = {rgb8: [0, 1, 2, 3], bgr8: [2, 1, 0, 3], rgba8: [0, 1, 2, 4], bgr
 
 function plain(cdr) {
   const [height, width] = [cdr.uint(), cdr.uint()], order = cdr.string();
-  if (!ORDERS[order]) throw new Error(`${order} cannot be shown`);
+  if (!ORDERS[order]) throw new Error(`this page cannot show ${order}`);
   check(width, height);
   cdr.byte();                                       // whether it is big endian
   const step = cdr.uint(), data = cdr.bytes(cdr.uint()), [red, green, blue, bytes] = ORDERS[order];

@@ -1,7 +1,9 @@
 // Recordings: which there are, and one played with pause, seek and speed.
 
-import {seconds} from "./draw.js";
+import {clock} from "./draw.js";
 import {Replay} from "./replay.js";
+
+const STEPS_S = {ArrowLeft: -5, ArrowDown: -5, ArrowRight: 5, ArrowUp: 5, PageDown: -60, PageUp: 60};
 
 export class Player {
   // on: {message(message), begin(), jump(), end()}
@@ -10,6 +12,7 @@ export class Player {
     this.relay = relay;
     this.on = on;
     this.replay = null;
+    this.isDragged = false;                         // the slider: it shows where it would go
     $("recordings").onclick = () => relay.say("recordings", {});
     $("live").onclick = () => this.end();
     $("play").onclick = () => {
@@ -17,7 +20,21 @@ export class Player {
       $("play").textContent = this.replay.playing ? "Pause" : "Play";
     };
     $("speed").onchange = () => { this.replay.speed = Number($("speed").value); };
-    $("when").oninput = () => this.replay.seek(this.replay.firstMs + $("when").value / 1000 * (this.replay.lastMs - this.replay.firstMs));
+    $("back").onclick = () => this.step(-10);
+    $("ahead").onclick = () => this.step(10);
+    $("when").oninput = () => {
+      this.isDragged = true;
+      this.say();
+    };
+    $("when").onchange = () => {
+      this.isDragged = false;
+      this.seek(Number($("when").value));
+    };
+    $("when").onkeydown = event => {
+      if (!STEPS_S[event.key]) return;
+      event.preventDefault();
+      this.step(STEPS_S[event.key]);
+    };
   }
 
   get nowMs() { return this.replay.nowMs; }
@@ -47,10 +64,20 @@ export class Player {
     this.on.end();
   }
 
+  step(s) { this.seek((this.nowMs - this.replay.firstMs) / 1000 + s); }
+
+  // ``s`` counts from the recording's begin.
+  seek(s) {
+    const {firstMs, lastMs} = this.replay;
+    if (firstMs !== null) this.replay.seek(Math.min(lastMs, Math.max(firstMs, firstMs + 1000 * s)));
+    this.say();
+  }
+
   say() {
-    const {firstMs, lastMs, nowMs} = this.replay, {$} = this;
+    const {firstMs, lastMs, nowMs} = this.replay, when = this.$("when"), longS = (lastMs - firstMs) / 1000;
     if (firstMs === null) return;
-    if (document.activeElement !== $("when")) $("when").value = 1000 * (nowMs - firstMs) / Math.max(1, lastMs - firstMs);
-    $("clock").textContent = `${seconds((nowMs - firstMs) / 1000)} of ${seconds((lastMs - firstMs) / 1000)}`;
+    when.max = longS;
+    if (!this.isDragged) when.value = (nowMs - firstMs) / 1000;
+    when.ariaValueText = this.$("clock").textContent = `${clock(Number(when.value))} of ${clock(longS)}`;
   }
 }

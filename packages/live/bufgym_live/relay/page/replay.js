@@ -2,7 +2,7 @@
 
 import {fromJson} from "./messages.js";
 
-const AHEAD_MS = 3000, PIECE_BYTES = 1_000_000;
+const AHEAD_MS = 3000, BEFORE_MS = 2000, PIECE_BYTES = 1_000_000;
 
 export class Replay {
   constructor(relay, file, onMessage, onJump) {
@@ -21,7 +21,7 @@ export class Replay {
     this.id = "replay-" + ++this.number;            // answers to what was asked before are let pass
     this.messages = [];
     this.nowMs = ms;
-    this.nextUs = Math.round(ms * 1000);
+    this.nextUs = Math.round(Math.max(0, ms - BEFORE_MS) * 1000);  // what was said last holds, paused or not
     this.asking = false;
     this.frameMs = null;
     this.onJump();
@@ -45,9 +45,9 @@ export class Replay {
 
   // Once for each frame of the screen.
   frame(clockMs) {
-    const passed = this.frameMs === null ? 0 : clockMs - this.frameMs;
+    const passed = this.frameMs === null || !this.playing ? 0 : clockMs - this.frameMs;
     this.frameMs = clockMs;
-    if (this.firstMs === null || !this.playing) return;
+    if (this.firstMs === null) return;
     const known = this.nextUs === null ? this.lastMs : this.messages.at(-1)?.stampMs ?? this.nowMs;
     this.nowMs = Math.min(this.nowMs + passed * this.speed, Math.max(known, this.nowMs));
     let due = 0;
