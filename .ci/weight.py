@@ -10,7 +10,7 @@ LIMITS = {
     "bufgym": 27_550,
     "tests": 18_410,
     "packages/live/bufgym_live": 12_310,
-    "packages/live/tests": 9_640,
+    "packages/live/tests": 9_890,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_160,
 }
