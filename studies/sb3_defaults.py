@@ -13,13 +13,12 @@ import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 from stable_baselines3 import PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from bufgym import policies
@@ -48,6 +47,13 @@ ROLLOUT = 16_384  # most steps between two updates of any settings
 LINE = ("settings", "seed", "steps", "score")
 
 
+class Model(Protocol):
+    """What chooses actions for a batch of observations, as models of stable-baselines3 do."""
+
+    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
+        """Actions int64[n], and a state that nobody reads."""
+
+
 class Episodes:
     """Fixed episodes, and the scores of models and rules on them."""
 
@@ -57,7 +63,7 @@ class Episodes:
         self._best = math.fsum(QueueTask().best(episode, CAPACITY, self._scenario).qoi for episode in self._episodes)
         self._base = self._qoi_of_rule(BASELINE)
 
-    def of_model(self, model: BaseAlgorithm, settings: dict[str, Any]) -> float:
+    def of_model(self, model: Model, settings: dict[str, Any]) -> float:
         """The score of a model's most likely actions."""
         n = len(self._episodes)
         options = {name: value for name, value in settings.items() if name != "n_envs"} | {"info": "mask"}

@@ -11,6 +11,7 @@ The score is that of ``studies.sb3_defaults``, which needs the extras ``train`` 
 from __future__ import annotations
 
 import csv
+import importlib
 import os
 import signal
 import sys
@@ -109,8 +110,7 @@ def layers(*widths: int) -> torch.nn.Sequential:
 
 def cleanrl(budget: Budget) -> Trained:
     """examples/ppo.py with as many decisions as fit, because its learning rate falls to 0 over them."""
-    from examples import ppo
-
+    ppo: Any = importlib.import_module("examples.ppo")
     networks: list[Any] = []
 
     class Network(ppo.SlotNetwork):  # type: ignore[misc]
@@ -192,7 +192,8 @@ def tianshou(budget: Budget) -> Trained:
     from tianshou.utils.net.common import Net
 
     settings = FLAT | {"mask_in_observation": "tianshou"}
-    space, actions = make(**settings).observation_space, make(**settings).action_space
+    env: Any = make(**settings)
+    space, actions = env.observation_space, env.action_space
     net = Net(state_shape=space["obs"].shape, action_shape=actions.n, hidden_sizes=[128, 128, 128])
     policy = DiscreteQLearningPolicy(model=net, action_space=actions, observation_space=space, eps_training=0.1)
     optimizer = AdamOptimizerFactory(lr=1e-3)
