@@ -191,7 +191,7 @@ async def load(robots: int, viewers: int, seconds: float, slow: bool, loud: bool
         print(f"viewer {k}: {len(times_us)} of {of}, {median:.2f} ms, p99 {late:.2f}, longest {longest:.0f}")
 
 
-POSES, SETTLES_S = 40, 6.0
+DRIVE_S, SETTLES_S, COMING_HZ = 4, 6.0, 100  # so many robots come in a second
 SENSES = {"odom": ("cdr", ODOMETRY), "scan": ("cdr", SCAN), "camera": ("jpeg", "")}
 CLICK = """new Promise(shown => {
   const card = [...document.querySelectorAll(".card")].at(-1), began = performance.now();
@@ -218,10 +218,11 @@ def cloud(count: int) -> bytes:
 
 async def robot(port: int, number: int, rate_hz: float, points: int) -> None:
     """One that drives its first four seconds again and again, with its status and a queue that fills and empties."""
-    name, drive = f"robot-{number}", [pose_at(number, k / RATE_HZ) for k in range(POSES)]
+    await asyncio.sleep(number / COMING_HZ)
+    name, drive = f"robot-{number}", [pose_at(number, k / rate_hz) for k in range(max(1, round(DRIVE_S * rate_hz)))]
     places = [odometry(0, name, pose, 1.0) for pose in drive]
     scans = [scan(0, name, ANGLES, cast(pose, ANGLES)[0]) for pose in drive]
-    senses = list(zip(places, scans, [jpeg(picture(drive[0]))] * POSES, strict=True))
+    senses = list(zip(places, scans, [jpeg(picture(drive[0]))] * len(drive), strict=True))
     kinds = {topic: {"encoding": encoding, "type": type} for topic, (encoding, type) in SENSES.items()}
     seen = cloud(points) if points and number == 0 else b""
     if seen:
@@ -231,8 +232,8 @@ async def robot(port: int, number: int, rate_hz: float, points: int) -> None:
         async def say(topic: str, data: Any) -> None:
             await one.put(f"/robots/{name}/{topic}", json.dumps(data).encode(), encoding="json")
 
-        async for k in each(rate_hz, 10**9, number / 200):
-            for (topic, (encoding, type)), payload in zip(SENSES.items(), senses[k % POSES], strict=True):
+        async for k in each(rate_hz, 10**9):
+            for (topic, (encoding, type)), payload in zip(SENSES.items(), senses[k % len(drive)], strict=True):
                 await one.put(f"/robots/{name}/{topic}", payload, encoding=encoding, type=type)
             topics = {topic: {"put": k, "left": k, "dropped": 0, "age_s": 0.1, "qoi": 0.9} for topic in SENSES}
             queue = {"policy": "afr", "capacity": 16, "queued": k % 16, "waiting": [n % 3 for n in range(k % 16)]}
@@ -271,7 +272,7 @@ async def traced(port: int, robots: int, seconds: float, points: int) -> Any:
 
 async def page(robots: int, seconds: float, rate_hz: float, points: int) -> None:
     async with relay() as (_, port), beside(*(robot(port, number, rate_hz, points) for number in range(robots))):
-        await asyncio.sleep(5.0)  # until the policy is compiled
+        await asyncio.sleep(5.0 + robots / COMING_HZ)  # until the policy is compiled
         events = await traced(port, robots, seconds, points)
     begun, dropped = (sum(event["name"] == name for event in events) for name in ("BeginFrame", "DroppedFrame"))
     print(f"{dropped} of {begun} frames dropped; load {os.getloadavg()[0]:.0f} on {os.cpu_count()} processors")

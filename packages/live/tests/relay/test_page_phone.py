@@ -1,6 +1,7 @@
 """The page in a hand and by keys: fingers, targets, colours, cards, the order of Tab, the slider of a recording."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,52 +18,10 @@ from test_page import until  # noqa: E402
 from test_page_fleet import PLACE, text  # noqa: E402
 
 pytestmark = compiled
+OTHERS = [(390, "dark"), (320, "light"), (1400, "light"), (1400, "dark")]
 TABS = ("overview", "cameras", "3d", "health")
 PICTURE = jpeg(np.full((120, 160, 3), (60, 120, 90), np.uint8))
-SMALL = """[...document.querySelectorAll("a[href], button, select, summary, input, [role=button], [tabindex]")]
-  .filter(one => one.checkVisibility()).map(one => one.closest("label:has(input)") ?? one)
-  .map(one => [one.id || one.className || one.textContent, one.getBoundingClientRect()])
-  .filter(([, {width, height}]) => width < 44 || height < 44)
-  .map(([name, {width, height}]) => `${name} ${width} x ${height}`)"""
-"""Targets of less than 44 px."""
-WIDE = """[...document.querySelectorAll("body, main, header, footer, section, figure, .card, .numbers div, #tools")]
-  .filter(one => one.checkVisibility() && one.scrollWidth > one.clientWidth && one.clientWidth)
-  .map(one => `${one.id || one.className || one.tagName}: ${one.scrollWidth} in ${one.clientWidth}`)"""
-"""What runs out of its box."""
-FAINT = """(() => {
-  const canvas = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
-  const mixed = colours => {
-    canvas.clearRect(0, 0, 1, 1);
-    for (const colour of colours) { canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1); }
-    return canvas.getImageData(0, 0, 1, 1).data;
-  };
-  const part = value => value <= .04045 ? value / 12.92 : ((value + .055) / 1.055) ** 2.4;
-  const light = colours => {
-    const [red, green, blue] = [...mixed(colours)].map(value => part(value / 255));
-    return .2126 * red + .7152 * green + .0722 * blue + .05;
-  };
-  const ratio = (one, other) => Math.max(light(one) / light(other), light(other) / light(one));
-  const below = (one, layers = []) =>
-    one ? below(one.parentElement, [getComputedStyle(one).backgroundColor, ...layers]) : layers;
-  const found = [];
-  for (const one of document.querySelectorAll("body *")) {
-    if (!one.checkVisibility({opacityProperty: true}) || one.closest(":disabled, option")) continue;
-    const style = getComputedStyle(one), fill = below(one), around = below(one.parentElement);
-    const need = (what, has, least) => {
-      if (has < least) found.push(`${what} of ${one.id || one.className || one.tagName}: ${has.toFixed(2)}`);
-    };
-    const least = parseFloat(style.fontSize) >= (style.fontWeight >= 700 ? 18.66 : 24) ? 3 : 4.5;
-    const isText = [...one.childNodes].some(node => node.nodeType === Node.TEXT_NODE && node.data.trim());
-    if (isText || one.matches("input, select")) need("text", ratio(fill, [...fill, style.color]), least);
-    const faint = getComputedStyle(one, "::placeholder").color;
-    if (one.placeholder) need("placeholder", ratio(fill, [...fill, faint]), least);
-    if (one.matches("input[type=search], button, select"))
-      need("edge", Math.max(ratio(around, fill), ratio(around, [...around, style.borderTopColor])), 3);
-    if (one.matches(".dot")) need("dot", ratio(around, fill), 3);
-  }
-  return found;
-})()"""
-"""What has less contrast than WCAG 2.2 asks for, AA: 4.5, and 3 for large text and what shows a control."""
+LOOKS = (Path(__file__).parent / "page_looks.js").read_text()
 COUNTED = """import("./map.js").then(({Map2D}) => {
   const {zoom, shift} = Map2D.prototype;
   Object.assign(window, {zoomed: 1, across: 0, down: 0});
@@ -89,6 +48,16 @@ def running() -> Iterator[tuple[Any, Fleet]]:
         yield browser, fleet
 
 
+def looks(page: Any) -> tuple[Any, ...]:
+    """What has too little contrast, what runs out of its box, and on a phone what is too small to hit."""
+    kinds = ("faint", "wide", "small") if page.viewport_size["width"] < 1000 else ("faint", "wide")
+    return tuple(page.evaluate(f"{LOOKS}.{kind}()") for kind in kinds)
+
+
+def nightly(values: tuple[int, str]) -> Any:
+    return pytest.param(*values, marks=pytest.mark.nightly)
+
+
 def phone(browser: Any, port: int, width: int = 390, scheme: str = "light", fingers: bool = True) -> Any:
     """The page of robot "one" at this width."""
     size = {"width": width, "height": 844 if width < 1000 else 900}
@@ -98,8 +67,7 @@ def phone(browser: Any, port: int, width: int = 390, scheme: str = "light", fing
     return page
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 320, 1400])
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (320, "dark"), *map(nightly, OTHERS)])
 def test_all_can_be_read_and_hit(running: tuple[Any, Fleet], width: int, scheme: str) -> None:
     browser, fleet = running
     page = phone(browser, fleet.port, width, scheme, width < 1000)
@@ -110,8 +78,7 @@ def test_all_can_be_read_and_hit(running: tuple[Any, Fleet], width: int, scheme:
             until(page, f"{text('#cameras .blank figcaption')} !== ''")
         if tab in ("overview", "3d"):
             page.click("#drive" if tab == "overview" else "#layers-box summary")
-        found = page.evaluate(FAINT), page.evaluate(WIDE), page.evaluate(SMALL) if width < 1000 else []
-        assert found == ([], [], []), tab
+        assert not any(found := looks(page)), (tab, found)
     page.close()
 
 
@@ -218,7 +185,7 @@ def test_a_recording_of_half_an_hour_is_moved_to_the_second(running: tuple[Any, 
       player.say();
     })""")
     assert page.text_content("#clock") == "00:00 of 30:00"
-    assert (page.evaluate(FAINT), page.evaluate(WIDE), page.evaluate(SMALL)) == ([], [], [])
+    assert not any(looks(page))
     page.locator("#when").tap()
     minutes, _, rest = page.text_content("#clock").partition(":")
     assert minutes in ("14", "15") and rest.endswith(" of 30:00")

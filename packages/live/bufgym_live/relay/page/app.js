@@ -25,7 +25,7 @@ const USUAL_POSES = ["odom", "odometry/raw", "odometry", "localization", "tf", "
 const $ = id => document.getElementById(id);
 const escaped = text => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 
-let chosen = null, tab = TABS[0], textMs = -Infinity, texts = false, stale = false, space = null, onMs = null, awayMs = performance.now();
+let chosen = null, tab = TABS[0], textMs = -Infinity, texts = false, stale = false, wants = false, space = null, onMs = null, awayMs = performance.now();
 
 const nowMs = () => player.replay ? player.nowMs : Date.now();
 const isReplay = () => player.replay !== null;
@@ -48,7 +48,7 @@ const fleet = new Fleet({
     if (name === chosen) location.hash = address(null);
   },
   status(one) {
-    subscribe();
+    wants = true;
     if (one.name !== chosen) return;
     hand.answered(one);
     hand.offerPolicies();
@@ -119,6 +119,7 @@ const layered = () => tab === "3d" ? [...DRAWN, "cloud"] : DRAWN;  // kinds
 
 // Of all robots where they are and what is wrong, of the chosen one all that is drawn.
 function subscribe() {
+  wants = false;
   if (isReplay()) return;                           // what is drawn now comes from the file
   const of = topics => `(${[...new Set(topics)].sort().map(escaped).join("|")})$`;
   relay.subscribe("poses", ALL + of([...USUAL_POSES, ...fleet.topics(["pose", "tf"])]));
@@ -156,8 +157,7 @@ function show() {
   say($("name"), chosen ?? "");
   for (const link of $("tabs").children) {
     link.href = address(chosen, link.dataset.tab);
-    if (link.dataset.tab === tab) link.setAttribute("aria-current", "page");
-    else link.removeAttribute("aria-current");
+    link.ariaCurrent = link.dataset.tab === tab ? "page" : null;
   }
   for (const each of TABS) $("tab-" + each).hidden = each !== tab || one === undefined;
   if (chosen !== before) {
@@ -253,6 +253,7 @@ function frame(clockMs) {
   textMs = clockMs;
   texts = !texts;                                   // in turn: both in one frame are the longest of all
   if (!texts) {
+    if (wants) subscribe();
     if (one && tab === "overview") overview.drawHistory(one, nowMs());
     return;
   }

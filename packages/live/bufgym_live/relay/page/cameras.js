@@ -31,8 +31,7 @@ function caption(camera, nowMs) {
 
 // A figure that is pressed like a button.
 function press(figure, act) {
-  figure.setAttribute("role", "button");
-  Object.assign(figure, {tabIndex: 0, onclick: act, onkeydown: event => {
+  Object.assign(figure, {role: "button", tabIndex: 0, onclick: act, onkeydown: event => {
     if (event.key !== "Enter" && event.key !== " ") return;
     event.preventDefault();
     act();

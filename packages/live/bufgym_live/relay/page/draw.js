@@ -20,8 +20,9 @@ let colours = {};
 export function colour(name) {
   return colours[name] ??= getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
 }
+const night = matchMedia("(prefers-color-scheme: dark)");
 export function whenColoursChange(redraw) {
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { colours = {}; redraw(); });
+  night.addEventListener("change", () => { colours = {}; redraw(); });
 }
 
 // Red, green and blue, 0 to 255, of a colour of CSS.
@@ -43,7 +44,7 @@ export function colourOf(name) {
 }
 
 // What is old loses its colour: from ``part`` 0, fresh, to 1. Each is dark or light enough to be 3 : 1 from what lies below.
-export const tint = (colour, part = 0, dark = matchMedia("(prefers-color-scheme: dark)").matches) =>
+export const tint = (colour, part = 0, dark = night.matches) =>
   `hsl(${colour} ${(dark ? 70 : 68) * (1 - part)}% ${dark ? 64 - 14 * part : 33 + 21 * part}%)`;
 export const faded = ageMs => Math.min(1, Math.max(0, (ageMs - FRESH_MS) / (GREY_MS - FRESH_MS)));
 

@@ -4,7 +4,7 @@ import {bits, percent, say, seconds, tint} from "./draw.js";
 import {battery, LOW} from "./fleet.js";
 import {address} from "./route.js";
 
-const byName = (one, other) => one.name.localeCompare(other.name, undefined, {numeric: true});
+const names = new Intl.Collator(undefined, {numeric: true}), byName = (one, other) => names.compare(one.name, other.name);
 
 export class List {
   constructor(element, search, count) {
@@ -50,10 +50,13 @@ export class List {
     for (const robot of robots) this.say(robot, chosen, tab, nowMs);
     const rank = robot => robot.troubles[0]?.rank ?? (robot.isHere ? 9 : 10);
     const sorted = [...robots].sort((one, other) => rank(one) - rank(other) || byName(one, other)), focused = /** @type {HTMLElement} */ (document.activeElement);
-    sorted.forEach((robot, k) => {
-      const card = this.cards.get(robot.name), there = this.element.children[k];
-      if (there !== card) this.element.insertBefore(card, there ?? null);
-    });
+    let at = this.element.firstElementChild;
+    for (const {name} of sorted) {
+      const card = this.cards.get(name);
+      if (at?.nextElementSibling === card) this.element.append(at);  // one goes down, and not all others up
+      else if (at !== card) this.element.insertBefore(card, at);
+      at = card.nextElementSibling;
+    }
     if (focused !== document.activeElement && this.element.contains(focused)) focused.focus({preventScroll: true});
     const absent = robots.filter(robot => rank(robot) === 10).length, bad = robots.filter(robot => rank(robot) < 3).length;
     say(this.count, `${robots.length - absent}${absent ? `, ${absent} away` : ""}${bad ? `, ${bad} need${bad === 1 ? "s" : ""} help` : ""}`);
@@ -68,8 +71,7 @@ export class List {
     card.classList.toggle("absent", !worst && !robot.isHere);
     card.dataset.level = level;
     if (card.hash !== address(robot.name, tab)) card.href = address(robot.name, tab);
-    if (robot.name === chosen) card.setAttribute("aria-current", "true");
-    else card.removeAttribute("aria-current");
+    card.ariaCurrent = robot.name === chosen ? "true" : null;
     say(says, text);
     if (says.title !== text) says.title = text;
     say(seen, !robot.isHere ? `last seen ${seconds(silentMs / 1000)} ago${robot.pose ? ` at ${robot.pose.x.toFixed(1)}, ${robot.pose.y.toFixed(1)} m` : ""}` : robot.away ? `silent for ${seconds(silentMs / 1000)}` : bits(robot.queue?.rate_bps ?? 0));
