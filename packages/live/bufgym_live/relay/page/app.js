@@ -40,7 +40,7 @@ const fleet = new Fleet({
     if (one.name === chosen) show();
   },
   here(one) {
-    if (chosen === null) replace(one.name, tab);
+    if (route().name === null) replace(one.name, tab);  // the address may be newer than what is chosen
     if (chosen === null || one.name === chosen) show();
   },
   removed(name) {
