@@ -5,17 +5,17 @@ python -m studies.ten_minutes --library tianshou --minutes 10 --out runs/ten_min
 Each library has its own PPO, with its defaults or the numbers of its first example, on ``Uplink-v0`` with L = 8. Only
 Tianshou has its DQN, which knows masks. The minutes are processor time of the process and all those below it, so other
 work on the machine does not matter; imports and the score itself do not count. Training is cut wherever it is by then.
-The score is that of ``studies.sb3_defaults``, which needs the extras ``train`` and ``plot`` beside the library.
+The score is computed as in ``studies.sb3_defaults``, which needs the extras ``train`` and ``plot`` beside the library.
 """
 
 from __future__ import annotations
 
 import csv
-import importlib
 import os
 import signal
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -65,7 +65,7 @@ class Budget:
 
 
 def _processor_s() -> float:
-    """Seconds of this process and those below it, with those that have ended."""
+    """Seconds of this process and all below it, ended ones too."""
     root = psutil.Process()
     return sum(sum(process.cpu_times()[:4]) for process in (root, *root.children(recursive=True)))
 
@@ -110,7 +110,7 @@ def layers(*widths: int) -> torch.nn.Sequential:
 
 def cleanrl(budget: Budget) -> Trained:
     """examples/ppo.py with as many decisions as fit, because its learning rate falls to 0 over them."""
-    ppo: Any = importlib.import_module("examples.ppo")
+    ppo: Any = import_module("examples.ppo")
     networks: list[Any] = []
 
     class Network(ppo.SlotNetwork):  # type: ignore[misc]
@@ -265,6 +265,27 @@ def skrl(budget: Budget) -> Trained:
     return Trained(lambda seen: policy.compute({"observations": tensor(seen)}, role="policy")[0].argmax(-1), FLAT)
 
 
+def agilerl(budget: Budget) -> Trained:
+    """The defaults of its PPO on one native batch of eight, as on our page; it reads the mask of ``info``."""
+    from agilerl.algorithms import PPO
+    from agilerl.rollouts.on_policy import collect_rollouts
+
+    settings = FLAT | {"mask_in_observation": True}
+    envs = make_batch(8, **FLAT)
+    spaces = envs.single_observation_space, envs.single_action_space
+    agent = PPO(*spaces, num_envs=8, use_rollout_buffer=True, device="cpu")
+    agent.set_training_mode(True)
+    with budget:
+        while True:
+            collect_rollouts(agent, envs)
+            agent.learn()
+    net = agent.actor
+    return Trained(
+        lambda seen: best(net.head_net.wrapped(net.extract_features(tensor(seen["observation"]))), seen["action_mask"]),
+        settings,
+    )
+
+
 LIBRARIES: dict[str, Callable[[Budget], Trained]] = {
     "cleanrl": cleanrl,
     "sbx": sbx,
@@ -272,6 +293,7 @@ LIBRARIES: dict[str, Callable[[Budget], Trained]] = {
     "tianshou": tianshou,
     "rllib": rllib,
     "skrl": skrl,
+    "agilerl": agilerl,
 }
 
 
@@ -280,7 +302,7 @@ def page(library: str, minutes: float = 10.0, out: Path = Path("runs/ten_minutes
     if library not in LIBRARIES:
         raise unknown("library", library, LIBRARIES)
     fixed = Episodes(episodes)
-    trained = LIBRARIES[library](Budget(minutes))
+    trained: Any = LIBRARIES[library](Budget(minutes))
     score = fixed.of_model(trained, trained.settings)
     print(f"{library}: {score:.3f}")
     out.parent.mkdir(exist_ok=True)

@@ -192,8 +192,8 @@ def threading_run(work: Any) -> None:
 
 @pytest.mark.nightly
 def test_a_viewer_chooses_the_policy_and_plays_a_recording(browser: Any, port: int) -> None:
-    with shows(browser, f"http://127.0.0.1:{port}/") as page:
-        cards = "document.querySelectorAll('.card').length === 2"
+    with shows(browser, f"http://127.0.0.1:{port}/#/robot/robot-1") as page:
+        cards = "document.querySelectorAll('.card').length >= 2"
         until(page, f"{cards} && document.querySelector('#policy').value === 'drop-oldest'")
         page.select_option("#policy", "drop-newest")
         until(page, "document.querySelector('#told').textContent.endsWith('done')")
