@@ -65,7 +65,7 @@ class Fails:
 @contextlib.contextmanager
 def failing(fails: Fails) -> Iterator[None]:
     """Within the block the n-th of these fails."""
-    began, made, sent, clock = (Store.__init__, server.Accepted.connection_made, ServerConnection.send, Hub.__init__)
+    began, made, clock = Store.__init__, server.Accepted.connection_made, Hub.__init__
 
     def store(self: Store, *words: Any, **named: Any) -> None:
         began(self, *words, **named)
@@ -84,16 +84,21 @@ def failing(fails: Fails) -> Iterator[None]:
             transport.abort()  # the peer has gone already
         made(self, transport)
 
-    async def send(self: ServerConnection, *words: Any) -> None:
-        if fails.due("send"):
-            self.transport.abort()
-            raise ConnectionClosedError(None, None)
-        await sent(self, *words)
+    def send(real: Callable[..., Any]) -> Callable[..., Any]:
+        async def call(self: ServerConnection, *words: Any) -> None:
+            if fails.due("send"):
+                self.transport.abort()
+                raise ConnectionClosedError(None, None)
+            await real(self, *words)
+
+        return call
 
     with pytest.MonkeyPatch.context() as patch:
         for kind, name, function in (
             *((Store, "__init__", store), (Hub, "__init__", hub)),
-            *((server.Accepted, "connection_made", accepted), (ServerConnection, "send", send)),
+            (server.Accepted, "connection_made", accepted),
+            (server.Accepted, "send_frame", send(server.Accepted.send_frame)),
+            (ServerConnection, "send", send(ServerConnection.send)),
             *((kind, name, fails.wrapped(f"{kind.__name__}.{name}", getattr(kind, name), FULL)) for kind, name in DISK),
         ):
             patch.setattr(kind, name, function)

@@ -59,9 +59,11 @@ async def test_of_too_many_unfinished_messages_the_oldest_ends(data: bytes) -> N
     async with relay(settings(limits=LIMITS)) as server, contextlib.AsyncExitStack() as stack:
         viewer = await stack.enter_async_context(client(server.port, local="127.0.0.3"))
         await viewer.subscribe("^/a$", capacity=100, policy="drop-oldest")
-        other, _ = await begun(stack, server, data, local="127.0.0.2")
+        other, other_held = await begun(stack, server, data, local="127.0.0.2")
         mine = [await begun(stack, server, data) for _ in range(5)]
         assert max(server._admission.incoming.bytes.values()) <= 2 * 10**6
+        held = {one: one._held_bytes for one in server._admission.open if not one.ended}
+        assert sum(held.values()) - held[other_held] <= 2 * 10**6 and len(held) == 4
         for one, _ in mine[:3]:
             await wait("its end", one.socket.wait_closed())
             assert one.socket.close_code == 1008 and "2000000 bytes" in str(one.socket.close_reason)
