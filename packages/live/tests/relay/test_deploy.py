@@ -1,4 +1,4 @@
-"""A relay as a service: the unit and the containers need no root, and have the files and memory that the guide states."""
+"""A relay as a service: the unit and the containers need no root, and have the files and memory of the guide."""
 
 import shutil
 import subprocess
