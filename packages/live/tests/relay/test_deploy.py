@@ -1,4 +1,4 @@
-"""What runs a relay as a service says what the guide does: without root, with the files and memory that it needs."""
+"""A relay as a service: the unit and the containers need no root, and have the files and memory of the guide."""
 
 import shutil
 import subprocess
