@@ -129,7 +129,8 @@ async def test_a_command_that_is_refused_reaches_no_other_relay(relays: list[Ser
         for receiver in (one, viewer):
             await receiver.came(1, payload=large)
             await receiver.say("ack", seq=1)
-        await operator.rest()
+        assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 0}  # at its own relay
+        await until("both acks to be kept", lambda: a.hub.store.held_bytes == b.hub.store.held_bytes == 0)
         await operator.acked(command, 2)
         for receiver in (one, viewer):
             await receiver.came(2)
