@@ -211,7 +211,8 @@ def cloud(count: int) -> bytes:
     points = np.zeros(count, np.dtype(list(zip(names, formats, strict=True))))
     for k, name in enumerate(names[:4]):
         points[name] = np.random.default_rng(k).normal(0, 10, count)
-    return page_cases.cloud(points, "base_link")
+    message: bytes = page_cases.cloud(points, "base_link")
+    return message
 
 
 async def robot(port: int, number: int, rate_hz: float, points: int) -> None:
