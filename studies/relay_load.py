@@ -155,7 +155,6 @@ async def flood(port: int) -> None:
 async def replay(port: int, k: int) -> None:
     """Ask for the first 4 MiB of the recording, again and again."""
     async with client(port, local="127.0.0.3", name=f"replay-{k}") as one:
-        one.socket.protocol.max_message_size = None
         await one.say("recordings")
         while not (files := (await one.next())["files"]):
             await asyncio.sleep(0.1)
@@ -212,17 +211,22 @@ def cloud(count: int) -> bytes:
     points = np.zeros(count, np.dtype(list(zip(names, formats, strict=True))))
     for k, name in enumerate(names[:4]):
         points[name] = np.random.default_rng(k).normal(0, 10, count)
-    data: bytes = page_cases.cloud(points, "base_link")
-    return data
+    message: bytes = page_cases.cloud(points, "base_link")
+    return message
 
 
-async def robot(port: int, number: int, rate_hz: float, points: int) -> None:
+def driven(number: int, rate_hz: float) -> list[tuple[bytes, bytes, bytes]]:
+    """What a robot senses in its first four seconds, in the order of ``SENSES``."""
+    drive = [pose_at(number, k / rate_hz) for k in range(max(1, round(DRIVE_S * rate_hz)))]
+    places = [odometry(0, f"robot-{number}", pose, 1.0) for pose in drive]
+    scans = [scan(0, f"robot-{number}", ANGLES, cast(pose, ANGLES)[0]) for pose in drive]
+    return list(zip(places, scans, [jpeg(picture(drive[0]))] * len(drive), strict=True))
+
+
+async def robot(port: int, number: int, rate_hz: float, points: int, senses: list[tuple[bytes, bytes, bytes]]) -> None:
     """One that drives its first four seconds again and again, with its status and a queue that fills and empties."""
     await asyncio.sleep(number / COMING_HZ)
-    name, drive = f"robot-{number}", [pose_at(number, k / rate_hz) for k in range(max(1, round(DRIVE_S * rate_hz)))]
-    places = [odometry(0, name, pose, 1.0) for pose in drive]
-    scans = [scan(0, name, ANGLES, cast(pose, ANGLES)[0]) for pose in drive]
-    senses = list(zip(places, scans, [jpeg(picture(drive[0]))] * len(drive), strict=True))
+    name = f"robot-{number}"
     kinds = {topic: {"encoding": encoding, "type": type} for topic, (encoding, type) in SENSES.items()}
     seen = cloud(points) if points and number == 0 else b""
     if seen:
@@ -233,7 +237,7 @@ async def robot(port: int, number: int, rate_hz: float, points: int) -> None:
             await one.put(f"/robots/{name}/{topic}", json.dumps(data).encode(), encoding="json")
 
         async for k in each(rate_hz, 10**9):
-            for (topic, (encoding, type)), payload in zip(SENSES.items(), senses[k % len(drive)], strict=True):
+            for (topic, (encoding, type)), payload in zip(SENSES.items(), senses[k % len(senses)], strict=True):
                 await one.put(f"/robots/{name}/{topic}", payload, encoding=encoding, type=type)
             topics = {topic: {"put": k, "left": k, "dropped": 0, "age_s": 0.1, "qoi": 0.9} for topic in SENSES}
             queue = {"policy": "afr", "capacity": 16, "queued": k % 16, "waiting": [n % 3 for n in range(k % 16)]}
@@ -271,7 +275,8 @@ async def traced(port: int, robots: int, seconds: float, points: int) -> Any:
 
 
 async def page(robots: int, seconds: float, rate_hz: float, points: int) -> None:
-    async with relay() as (_, port), beside(*(robot(port, number, rate_hz, points) for number in range(robots))):
+    drives = [driven(number, rate_hz) for number in range(robots)]
+    async with relay() as (_, port), beside(*(robot(port, k, rate_hz, points, drives[k]) for k in range(robots))):
         await asyncio.sleep(5.0 + robots / COMING_HZ)  # until the policy is compiled
         events = await traced(port, robots, seconds, points)
     begun, dropped = (sum(event["name"] == name for event in events) for name in ("BeginFrame", "DroppedFrame"))

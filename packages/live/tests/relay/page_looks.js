@@ -9,7 +9,7 @@
     .map(([name, {width, height}]) => `${name} ${width} x ${height}`),
 
   // What runs out of its box.
-  wide: () => [...document.querySelectorAll("body, main, header, footer, section, figure, .card, .numbers div, #tools")]
+  wide: () => [...document.querySelectorAll("body, main, header, footer, section, figure, .card, .numbers div, #tools, #tabs a")]
     .filter(one => one.checkVisibility() && one.scrollWidth > one.clientWidth && one.clientWidth)
     .map(one => `${one.id || one.className || one.tagName}: ${one.scrollWidth} in ${one.clientWidth}`),
 

@@ -186,6 +186,14 @@ def test_a_recording_of_half_an_hour_is_moved_to_the_second(running: tuple[Any, 
     })""")
     assert page.text_content("#clock") == "00:00 of 30:00"
     assert not any(looks(page))
+    page.click("#layers-box summary")
+    above = page.evaluate("""(() => {
+      const [layers, ahead] = ["layers", "ahead"].map(id => document.getElementById(id).getBoundingClientRect());
+      scrollBy(0, layers.top - ahead.top);
+      return document.elementFromPoint(ahead.right - 5, ahead.top + ahead.height / 2).id;
+    })()""")
+    assert above == "ahead", "the map's layers go below the player"
+    page.keyboard.press("Escape")
     page.locator("#when").tap()
     minutes, _, rest = page.text_content("#clock").partition(":")
     assert minutes in ("14", "15") and rest.endswith(" of 30:00")
