@@ -1,7 +1,5 @@
 """Messages of a recording that a policy would have dropped, one by one and by topic."""
 
-from __future__ import annotations
-
 import csv
 import os
 from collections import Counter

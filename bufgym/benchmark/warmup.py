@@ -1,7 +1,5 @@
 """Parts that ``bufgym warmup`` compiles by running each once on a tiny input."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from typing import Any

@@ -37,7 +37,7 @@ from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.gaps import gap_left
 from bufgym.policies.price_dp import VARIANCE, remember_sizes, share
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.target_gap import SEEN_US, Numbers, bursty, last_chance, link_rate, needless, remember, target
+from bufgym.policies.target_gap import SEEN_US, Numbers, bursty, head_goes, link_rate, needless, remember, target
 from bufgym.policies.thinning import places, steady
 
 
@@ -241,10 +241,7 @@ def follow(buffer: Buffer, arrival: Arrival, memory: Memory, base: Numbers, outp
     if a == 0:
         if not changed:
             return target_gap.decide(buffer, arrival, rule, numbers)
-        head_goes = last_chance(buffer, arrival, rule, numbers) or target_gap.falls_behind(
-            buffer, arrival, rule, numbers
-        )
-        if head_goes and needless(buffer, arrival) < 0:
+        if needless(buffer, arrival) < 0 and head_goes(buffer, arrival, rule, numbers):
             return 0
     return price_dp.decide(buffer, arrival, rule, numbers, a)
 

@@ -230,12 +230,18 @@ def falls_behind(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numb
 
 
 @kernel
+def head_goes(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> bool:
+    """Whether the head of a short queue goes, whatever the gaps."""
+    return last_chance(buffer, arrival, memory, numbers) or falls_behind(buffer, arrival, memory, numbers)
+
+
+@kernel
 def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -> int:
     """The rule of the module's text, once ``remember`` has been called."""
     extra = needless(buffer, arrival)
     if extra >= 0:
         return extra
-    if last_chance(buffer, arrival, memory, numbers) or falls_behind(buffer, arrival, memory, numbers):
+    if head_goes(buffer, arrival, memory, numbers):
         return 0
     g = target(buffer, arrival, memory, numbers)
     if g > 0 and not steady(buffer):

@@ -1,7 +1,5 @@
 """Chart of one episode, message by message: the link's capacity above one lane per policy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any

@@ -64,8 +64,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     a = bufgym_share(q, &numbers);
     if (a <= 0.0 && !changed)
         return bufgym_follow_gap(q, arrival);
-    if (a <= 0.0 && bufgym_needless(q, arrival) < 0 &&
-        (bufgym_last_chance(q, arrival) || bufgym_falls_behind(q, arrival)))
+    if (a <= 0.0 && bufgym_needless(q, arrival) < 0 && bufgym_head_goes(q, arrival))
         return 0;
     return bufgym_priced(q, arrival, &numbers, a);
 }

@@ -115,6 +115,12 @@ static inline int bufgym_falls_behind(const struct bufgym_queue *q, const struct
         q, arrival, (arrival->x - q->dequeued_x) * bufgym_send_us(q, arrival) / elapsed_us);
 }
 
+/* Whether the head of a short queue goes, whatever the gaps. */
+static inline int bufgym_head_goes(const struct bufgym_queue *q, const struct bufgym_message *arrival)
+{
+    return bufgym_last_chance(q, arrival) || bufgym_falls_behind(q, arrival);
+}
+
 /* The decision that brings the gaps to g. */
 static inline int bufgym_approach(
     const struct bufgym_queue *q, const struct bufgym_message *arrival, double g)
@@ -138,7 +144,7 @@ static inline int bufgym_follow_gap(const struct bufgym_queue *q, const struct b
     int victim = bufgym_needless(q, arrival);
     if (victim >= 0)
         return victim;
-    if (bufgym_last_chance(q, arrival) || bufgym_falls_behind(q, arrival))
+    if (bufgym_head_goes(q, arrival))
         return 0;
     g = bufgym_target(q, arrival);
     if (g > 0.0 && !bufgym_steady(q))
