@@ -109,13 +109,14 @@ class Curve(BaseCallback):
     def write(self) -> None:
         """Append the model's score now."""
         score = self._episodes.of_model(self.model, SETTINGS[self._settings])
-        line = dict(zip(LINE, (self._settings, self._seed, self.num_timesteps, f"{score:.4f}"), strict=True))
-        begins = not self._out.exists()
-        with self._out.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, LINE)
-            if begins:
-                writer.writeheader()
-            writer.writerow(line)
+        append(self._out, LINE, (self._settings, self._seed, self.num_timesteps, f"{score:.4f}"))
+
+
+def append(out: Path, header: Sequence[str], line: Sequence[Any]) -> None:
+    """Append a line to a CSV file, which begins with its header."""
+    begins = not out.exists()
+    with out.open("a", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([header] * begins + [line])
 
 
 def train(settings: str, seed: int, steps: int, curve: Curve) -> None:

@@ -10,7 +10,6 @@ The score is computed as in ``studies.sb3_defaults``, which needs the extras ``t
 
 from __future__ import annotations
 
-import csv
 import os
 import signal
 import sys
@@ -31,7 +30,7 @@ import torch
 import bufgym  # noqa: F401  (registers the environments)
 from bufgym.ground.errors import unknown
 from studies.page import command
-from studies.sb3_defaults import CAPACITY, ENV, Episodes
+from studies.sb3_defaults import CAPACITY, ENV, Episodes, append
 
 FLAT: dict[str, Any] = {"observation": "flat"}
 BOOL = FLAT | {"mask_dtype": "bool"}
@@ -232,9 +231,8 @@ def rllib(budget: Budget) -> Trained:
     net = algorithm.get_module()
 
     def act(seen: Any) -> Any:
-        return net.forward_inference({"obs": {k: tensor(v) for k, v in seen.items()}})["action_dist_inputs"].argmax(
-            dim=-1
-        )
+        logits = net.forward_inference({"obs": {name: tensor(part) for name, part in seen.items()}})
+        return logits["action_dist_inputs"].argmax(dim=-1)
 
     return Trained(act, settings)
 
@@ -244,16 +242,16 @@ def skrl(budget: Budget) -> Trained:
     from skrl.envs.wrappers.torch import wrap_env
     from skrl.utils.runner.torch import Runner
 
-    layers = {"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "tanh"}
+    hidden = {"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "tanh"}
     models = {
         "separate": True,
         "policy": {
             "class": "CategoricalMixin",
-            "network": [layers],
+            "network": [hidden],
             "output": "ACTIONS",
             "unnormalized_log_prob": True,
         },
-        "value": {"class": "DeterministicMixin", "network": [layers], "output": "ONE"},
+        "value": {"class": "DeterministicMixin", "network": [hidden], "output": "ONE"},
     }
     cfg = {"seed": 0, "models": models, "memory": {"class": "RandomMemory", "memory_size": -1}}
     cfg["agent"] = {"class": "PPO", "rollouts": 16}  # its default, which the memory reads here
@@ -306,10 +304,7 @@ def page(library: str, minutes: float = 10.0, out: Path = Path("runs/ten_minutes
     score = fixed.of_model(trained, trained.settings)
     print(f"{library}: {score:.3f}")
     out.parent.mkdir(exist_ok=True)
-    begins = not out.exists()
-    with out.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerows([LINE] * begins + [(library, f"{minutes:g}", f"{score:.4f}")])
+    append(out, LINE, (library, f"{minutes:g}", f"{score:.4f}"))
 
 
 if __name__ == "__main__":
