@@ -34,8 +34,8 @@ class Incoming:
 
     def __init__(self, limits: Limits, clock: Callable[[], float]) -> None:
         self._limits, self._clock = limits, clock
-        self.bytes: Counter[str] = Counter()
-        """Identity, or address behind "@" -> bytes."""
+        self.bytes: dict[str, int] = {}
+        """Identity, or address behind "@" -> bytes, more than none."""
         self._waiting: dict[Accepted, tuple[float, int]] = {}
         """Connection -> when its last message was whole or its first byte came, s, and bytes; oldest first."""
 
@@ -51,13 +51,12 @@ class Incoming:
         if size_bytes:
             self._waiting[one] = since_s, size_bytes
         for who in one.shares:
-            self.bytes[who] += size_bytes - before
+            if now := self.bytes.pop(who, 0) + size_bytes - before:
+                self.bytes[who] = now
         for who, most in one.shares.items():
-            while self.bytes[who] > most:
+            while self.bytes.get(who, 0) > most:
                 oldest = next(each for each in self._waiting if who in each.shares)
                 oldest.fail("too_many", f"must be at most {most} bytes of messages that are not whole or not taken")
-            if not self.bytes[who]:
-                del self.bytes[who]
 
     def end_late(self) -> None:
         """End connections whose message has not become whole in the time that a pong may take behind it."""
