@@ -1,29 +1,34 @@
 """A camera of roscpp under policies, the node unchanged, over a link that fades: the AFR paper's program [wang2022afr].
 
 Frames of 230 kB come at 30 Hz for 20 s into a queue of 15, over 24 Mbit/s with 5 s of 2 Mbit/s in the middle, headers
-included, between two network namespaces (``bufgym_live.robot.tunnel``). "stock" is roscpp as it is. Each run under a
-policy is played again by the simulator from its log: ``differ`` counts decisions that are not the same. A decision is
-timed in the node.
+included, between two network namespaces. Without a round trip the link is the kernel's own (``examples/fade.py``, with
+tc's tbf), as on a robot whose own interface is the bottleneck. The kernel has no delay, so a round trip is
+``bufgym_live.robot.tunnel``'s. "stock" is roscpp as it is. Each run under a policy is played again by the simulator
+from its log: ``differ`` counts decisions that are not the same. A decision is timed in the node.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
+from bufgym.model import Link
 from bufgym_live.robot import read_log, replay, tunnel
 from bufgym_live.robot.programs import running
 from bufgym_papers.figures.figure import COLOURS, Figure, at_least_0, finish, legend_below, several
@@ -31,6 +36,8 @@ from bufgym_papers.figures.rows import FigureRows
 from studies.round_trips import CAPACITY, RATE_HZ, SIZE_BYTES, V, link
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "packages" / "live" / "tests" / "robot"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+import fade
 import roscpp_cases
 
 MBIT = 24  # Of Ethernet frames, as tc's tbf counts
@@ -47,12 +54,41 @@ def impossible() -> str:
 
 
 @dataclass(frozen=True)
+class KernelLink:
+    """What ``tunnel.Tunnel`` is, over a link of the kernel's."""
+
+    near: tunnel.End
+    far: tunnel.End
+
+    def carry(self, link: Link, words: Connection) -> None:
+        """Give the kernel each of the link's rates in its time, from the time on that comes as words."""
+        trace = link.trace
+        rates = np.diff(trace.cumulative_bytes) / np.diff(trace.time_us) * 1e6
+        began_s = words.recv()
+        for at_us, rate in zip(trace.time_us, rates, strict=False):
+            time.sleep(max(0.0, began_s + at_us / 1e6 - time.monotonic()))
+            fade.shaped(rate)
+        signal.pause()
+
+
+@contextmanager
+def kernel_link() -> Iterator[KernelLink]:
+    """Make one for a block."""
+    places = (Path("/run/netns/bufgym-robot"), Path("/run/netns/bufgym-base"))
+    with fade.namespaces(), places[0].open() as robot, places[1].open() as base:
+        fade.shaped(fade.FAST, "add")
+        near, far = (tunnel.End(*end) for end in zip(fade.ADDRESSES, (robot.fileno(), base.fileno()), strict=True))
+        yield KernelLink(near, far)
+
+
+@dataclass(frozen=True)
 class Reproduction(Figure):
-    """Runs of the camera; ``stock`` among the policies is roscpp without one."""
+    """Runs of the camera; ``stock`` among the policies is roscpp without one, which differs most from run to run."""
 
     round_trips_ms: Sequence[float] = (0.0, 50.0)
     policies: Sequence[str] = ("stock", "drop-oldest", "afr", "min-motion-gap", "learned")
     seconds: float = 20.0
+    stock_runs: int = 3
 
     RULES = {"round_trips_ms": several(at_least_0)}
 
@@ -63,7 +99,10 @@ class Reproduction(Figure):
             named = ",".join(name for name in self.policies if name != "stock") or "afr"
             built = roscpp_cases.build(Path(folder), named, "Release")
             return FigureRows(
-                self._row(built, policy, rtt_ms) for rtt_ms in self.round_trips_ms for policy in self.policies
+                self._row(built, policy, rtt_ms)
+                for rtt_ms in self.round_trips_ms
+                for policy in self.policies
+                for _ in range(self.stock_runs if policy == "stock" else 1)
             )
 
     def _row(self, built: Path, policy: str, rtt_ms: float) -> dict[str, Any]:
@@ -87,7 +126,7 @@ class Reproduction(Figure):
 
     def _frames(self, built: Path, policy: str, rtt_ms: float, log: Path) -> list[int]:
         """The frames that reach the far end."""
-        with tunnel.opened() as through, tempfile.TemporaryDirectory() as home:
+        with (tunnel.opened if rtt_ms else kernel_link)() as through, tempfile.TemporaryDirectory() as home:
             uri = f"http://{through.near.address}:11311"
             where = {**os.environ, "ROS_MASTER_URI": uri, "ROS_IP": through.near.address, "ROS_HOME": home}
             loaded = {"LD_PRELOAD": str(built), "BUFGYM_POLICY": policy, "BUFGYM_LOG": str(log)}
@@ -150,7 +189,8 @@ class Reproduction(Figure):
             for k, policy in enumerate(self.policies):
                 places = np.arange(len(self.round_trips_ms)) + 0.8 * (k / len(self.policies) - 0.5)
                 colour, label = COLOURS[LINES[k % len(LINES)]], LABELS.get(policy, policy)
-                axes.bar(places, rows.column(column, policy=policy), 0.15, color=colour, label=label)
+                heights = [rows.mean(column, rtt_ms=rtt_ms, policy=policy) for rtt_ms in self.round_trips_ms]
+                axes.bar(places, heights, 0.15, color=colour, label=label)
             axes.set_xticks(np.arange(len(self.round_trips_ms)), [f"{ms:g}" for ms in self.round_trips_ms])
             finish(axes, title, xlabel="round trip, ms")
         legend_below(figure, 5, axes)
