@@ -11,9 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.envs.options import GUIDED, RULE, Options
+from bufgym.envs.options import GUIDED, RULE, InvalidActionError, Options
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
-from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import kernel, stretch, table
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, GuidedWeights, follow, inputs, recall
 from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
@@ -95,9 +94,10 @@ class Guiding:
         shape = outputs.shape if name == "actions" else outputs.shape[1:]
         if numbers.dtype.kind not in "iuf" or numbers.shape != shape:
             known = ", ".join(output.name for output in OUTPUTS)
-            raise BufgymError(f"{name} is {numbers.dtype}{list(numbers.shape)}: must be float{list(shape)}: {known}")
+            shown = f"{numbers.dtype}{list(numbers.shape)}"
+            raise InvalidActionError(f"{name} is {shown}: must be float{list(shape)}: {known}")
         if not (np.abs(numbers) <= 1).all():  # False for NaN
             wrong = numbers[~(np.abs(numbers) <= 1)].flat[0]
-            raise BufgymError(f"{name}: {wrong} must lie in -1..1, as np.clip(..., -1, 1) makes it")
+            raise InvalidActionError(f"{name}: {wrong} must lie in -1..1, as np.clip(..., -1, 1) makes it")
         outputs[:] = numbers * SCALES
         return self._nothing

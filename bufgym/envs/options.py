@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from bufgym import scenario as scenarios
@@ -29,8 +30,11 @@ MASK_KEYS = {
 }
 """Library -> its keys of the observation and of the action mask in it."""
 
-
 _CHOICES = {"info": INFOS, "mask": MASKS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
+
+
+class InvalidActionError(BufgymError, gym.error.InvalidAction):
+    """An action outside of its space; also Gymnasium's ``InvalidAction``."""
 
 
 @dataclass(frozen=True, kw_only=True)

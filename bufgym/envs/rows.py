@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.guided import Guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
-from bufgym.envs.options import RULE, Options
+from bufgym.envs.options import RULE, InvalidActionError, Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.plausible import keep_plausible
@@ -280,7 +280,7 @@ class Rows:
         try:
             number = operator.index(action)
         except TypeError:
-            raise BufgymError(
+            raise InvalidActionError(
                 f"{name} = {action!r}: must be a whole number in 0..{self.capacity + 1} (L = {self.capacity})"
             ) from None
         if not 0 <= number < self.capacity + 2:
@@ -293,10 +293,10 @@ class Rows:
             return self._acts.take("actions", actions)
         numbers = np.asarray(actions)
         if numbers.dtype.kind not in "iu":
-            raise BufgymError(f"actions are {numbers.dtype}: must be whole numbers (int64)")
+            raise InvalidActionError(f"actions are {numbers.dtype}: must be whole numbers (int64)")
         numbers = np.ascontiguousarray(numbers, np.int64)
         if numbers.shape != (len(self),):
-            raise BufgymError(f"actions have shape {numbers.shape}: must be ({len(self)},)")
+            raise InvalidActionError(f"actions have shape {numbers.shape}: must be ({len(self)},)")
         unsigned = numbers.view(np.uint64)  # where negative ones are large
         if np.maximum.reduce(unsigned) >= self.capacity + 2:
             wrong = int(np.argmax(unsigned >= self.capacity + 2))
@@ -315,9 +315,9 @@ class Rows:
                 columns[name][i] = number
         return columns
 
-    def bad_action(self, name: str, action: Any) -> BufgymError:
+    def bad_action(self, name: str, action: Any) -> InvalidActionError:
         """Make the error for an action outside 0..L+1."""
-        return BufgymError(f"{name} = {action}: must lie in 0..{self.capacity + 1} (L = {self.capacity})")
+        return InvalidActionError(f"{name} = {action}: must lie in 0..{self.capacity + 1} (L = {self.capacity})")
 
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
         """The next episode of row ``i``'s streams, and the generator of its uniform draws."""

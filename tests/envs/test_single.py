@@ -223,7 +223,7 @@ def test_a_library_that_tries_an_argument_sees_pythons_own_error() -> None:
         SenderEnv(capacty=3)
 
 
-WHOLE = r"must be a whole number in 0\.\.5 \(L = 4\)"
+WHOLE, INVALID = r"must be a whole number in 0\.\.5 \(L = 4\)", gym.error.InvalidAction
 
 
 test_wrong_use_is_named = refused(
@@ -240,8 +240,8 @@ test_wrong_use_is_named = refused(
     (lambda: SenderEnv(mask_in_observation=("mask", "mask")), "two names of keys or one of 'rllib', 'tianshou'"),
     (lambda: SenderEnv(mask_in_observation=True, actions="guided"), "actions = 'guided' have no mask"),
     (lambda: SenderEnv(mask_dtype="float32"), "mask_dtype = 'float32': must be one of 'int8', 'bool'"),
-    *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}") for a in (1.7, np.array([1]), "1", None)),
-    (lambda: begun().step(6), r"action = 6: must lie in 0\.\.5"),
+    *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}", INVALID) for a in (1.7, np.array([1]), "1", None)),
+    (lambda: begun().step(6), r"action = 6: must lie in 0\.\.5", INVALID),
     (lambda: make("interruption").reset(options={"episode": Interruption(t_max=30).episode(30)}), "room for 27"),
 )
 

@@ -287,7 +287,7 @@ def test_autoreset_in_each_way_that_gymnasium_has(mode: Any) -> None:
     assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is SAME_STEP
 
 
-RESET = gym.error.ResetNeeded
+RESET, INVALID = gym.error.ResetNeeded, gym.error.InvalidAction
 
 
 test_wrong_use_is_named = refused(
@@ -306,6 +306,6 @@ test_wrong_use_is_named = refused(
     (lambda: begun().reset(options={"reset_mask": np.array([0, 2, 1])}), r"is int64\[3\]: must be bool\[3\]"),
     (lambda: begun().reset(options={"episodes": [None]}), "must be a list of 3, one a row"),
     (lambda: begun().step(np.array([0, 5, 6])), r"actions\[2\] = 6: must lie in 0\.\.5"),
-    (lambda: begun().step(np.array([0, 1.7, 2])), "actions are float64: must be whole numbers"),
+    (lambda: begun().step(np.array([0, 1.7, 2])), "actions are float64: must be whole numbers", INVALID),
     (lambda: begun().step(np.zeros(N + 1, np.int64)), "shape"),
 )
