@@ -9,6 +9,7 @@ import time
 import xmlrpc.client
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -155,7 +156,7 @@ def test_a_latched_message_larger_than_the_sockets_buffer(built: Path, nodes: No
 
 
 def test_x_is_the_robots_motion(built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """The talker goes 0.1 m before each message: 0.05 of a scene of 2 m."""
+    """The talker goes 0.1 m before each message: 0.05 of a scene of 2 m. After its end the master knows it no more."""
     log = tmp_path / "log"
     talker = nodes.talker("moving", 5, 60, 1000, 30, 1, "moves", **preload(built, log, BUFGYM_ODOMETRY="/odom"))
     assert len(seqs(nodes.subscriber("moving"), 60)) == 60
@@ -163,6 +164,7 @@ def test_x_is_the_robots_motion(built: Path, nodes: Nodes, tmp_path: Path) -> No
     records = read_log(logs(log)[0])
     x = [record["x"] for record in records if record["event"] == "put"]
     steps = [(b - a) / 0.05 for a, b in itertools.pairwise(x)]
+    assert "/odom" not in [topic for topic, _ in nodes.master.getSystemState("/test")[2][1]]
     assert x[-1] > 1.5 and all(step >= 0 and step == pytest.approx(round(step)) for step in steps)
     assert records[0]["v"]["numbers"] == [0, -1.0]
 
@@ -176,28 +178,69 @@ def test_small_and_unbounded_topics_are_left_alone(built: Path, nodes: Nodes, tm
     settings = preload(built, log, BUFGYM_TOPICS="/image=drop-oldest,/map=none")
     bounded = nodes.talker(",".join(topics), 5, 60, 200_000, 100, **settings)
     [node] = publishers(nodes.master, "image")
-    unbounded = nodes.talker("all", 0, 60, 200_000, 100, **settings)
-    rosout, everything = subscriber(nodes.master, "rosout", node), nodes.subscriber("all")
+    unbounded = [nodes.talker(f"all_{-size}", size, 60, 200_000, 100, **settings) for size in (0, -1)]
+    rosout, everything = subscriber(nodes.master, "rosout", node), [nodes.subscriber(f"all_{k}") for k in (0, 1)]
     subscribers = [nodes.subscriber(topic) for topic in topics]
-    for talker in (bounded, unbounded):
+    for talker in (bounded, *unbounded):
         has_published(talker)
     for came in (seqs(one, 60) for one in subscribers):
         assert len(came) < 60 and came[-5:] == [55, 56, 57, 58, 59]
-    assert seqs(everything, 60) == list(range(60))
+    assert [seqs(one, 60) for one in everything] == [list(range(60))] * 2
     with rosout:
         assert b"published" in block(rosout)
     [file] = logs(log)
     assert (file.name, read_log(file)[0]["policy"]) == ("image-0.jsonl", "drop-oldest")
 
 
-@pytest.mark.parametrize("settings", [{"BUFGYM_LOCAL": "0"}, {"BUFGYM_POLICY": "afrr"}], ids=str)
-def test_what_is_left_alone(settings: dict[str, str], built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """Subscribers on this machine, and all topics of a node with an unknown policy, which it says."""
-    topic = "_".join(settings.values())
-    talker = nodes.talker(f"left_{topic}", 5, 10, 1000, 100, **preload(built, tmp_path / "log", **settings))
-    assert seqs(nodes.subscriber(f"left_{topic}"), 10) == list(range(10))
-    assert ("unknown policy afrr" in ended(talker)) == (settings.get("BUFGYM_POLICY") == "afrr")
-    assert not logs(tmp_path / "log")
+def test_parameters_are_numbers_too(built: Path, nodes: Nodes, tmp_path: Path) -> None:
+    """roslaunch makes an int of "3". The log of an earlier run stays."""
+    for name, value in (("queue_size", 3), ("local", True), ("log", str(tmp_path))):
+        nodes.master.setParam("/test", f"/typed/bufgym_{name}", value)
+    (tmp_path / "typed-0.jsonl").touch()
+    settings = {"LD_PRELOAD": preload(built, tmp_path)["LD_PRELOAD"]}
+    talker = nodes.talker("typed", 5, 2, 1000, 100, "__name:=typed", **settings)
+    assert seqs(nodes.subscriber("typed"), 2) == [0, 1]
+    ended(talker)
+    assert [(file.name, read_log(file)[0]["capacity"]) for file in logs(tmp_path)[1:]] == [("typed-1.jsonl", 3)]
+
+
+def test_no_message_waits_for_the_master(built: Path, nodes: Nodes, tmp_path: Path) -> None:
+    """The master stands still. Another thread than the one that sends asks it for odometry.
+
+    That one holds a lock which roscpp takes second when it subscribes, so a node could stand still for ever.
+    """
+    words = {"TOPICS": "", "VALUE": "exponential:0.5", "QUEUE_SIZE": "5", "ODOMETRY": "/odom", "POLICY": "afr"}
+    settings = preload(built, tmp_path / "log", **{f"BUFGYM_{name}": word for name, word in words.items()})
+    talker = nodes.talker("alone", 5, 10, 1000, 100, **settings)
+    [node] = publishers(nodes.master, "alone")
+    found, pid = nodes.master.lookupNode("/test", node), nodes.master.getPid("/test")[2]
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        connection = subscriber(SimpleNamespace(lookupNode=lambda *_: found), "alone", node)
+        assert seqs(connection, 10) == list(range(10))
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    ended(talker)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"LOCAL": "0"}, ""),
+        ({"LOCAL": "yes"}, "BUFGYM_LOCAL = yes: must be 0 or 1"),
+        ({"POLICY": "afrr"}, "unknown policy afrr: roscpp's own queue stays"),
+        ({"QUEUE_SIZE": "65", "LOG": "/no/folder"}, "L = 65: must be 1 to 64|no log: /no/folder: No such file"),
+        ({"ODOMETRY": "my odom", "LOG": ""}, "not valid in Graph Resource Name [my odom]"),
+        ({"ODOMETRY": "/left", "LOG": ""}, "/left: must be a topic of nav_msgs/Odometry: x counts messages"),
+    ],
+)
+def test_what_is_left_alone(settings: dict[str, str], said: str, built: Path, nodes: Nodes, tmp_path: Path) -> None:
+    """Subscribers on this machine, and what a wrong setting is about, which is said."""
+    told = preload(built, tmp_path / "log", **{f"BUFGYM_{name}": word for name, word in settings.items()})
+    talker = nodes.talker("left", 5, 10, 1000, 100, **told)
+    assert seqs(nodes.subscriber("left"), 10) == list(range(10))
+    text = ended(talker)
+    assert all(words in text for words in said.split("|")) and not logs(tmp_path / "log")
 
 
 def test_a_policy_without_c_is_refused(tmp_path: Path) -> None:
