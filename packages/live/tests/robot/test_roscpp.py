@@ -192,9 +192,8 @@ def test_small_and_unbounded_topics_are_left_alone(built: Path, nodes: Nodes, tm
 
 def test_parameters_are_numbers_too(built: Path, nodes: Nodes, tmp_path: Path) -> None:
     """roslaunch makes an int of "3". The log of an earlier run stays."""
-    nodes.master.setParam(
-        "/test", "/typed", {"bufgym_queue_size": 3, "bufgym_local": True, "bufgym_log": f"{tmp_path}"}
-    )
+    typed = {"bufgym_queue_size": 3, "bufgym_local": True, "bufgym_log": str(tmp_path)}
+    nodes.master.setParam("/test", "/typed", typed)
     (tmp_path / "typed-0.jsonl").touch()
     talker = nodes.talker("typed", 5, 2, 1000, 100, "__name:=typed", LD_PRELOAD=preload(built, tmp_path)["LD_PRELOAD"])
     assert seqs(nodes.subscriber("typed"), 2) == [0, 1]
@@ -209,8 +208,7 @@ def test_no_message_waits_for_the_master(built: Path, nodes: Nodes, tmp_path: Pa
     found, pid = nodes.master.lookupNode("/test", "/alone"), nodes.master.getPid("/test")[2]
     os.kill(pid, signal.SIGSTOP)
     try:
-        connection = subscriber(SimpleNamespace(lookupNode=lambda *_: found), "alone", "/alone")
-        assert seqs(connection, 10) == list(range(10))
+        assert seqs(subscriber(SimpleNamespace(lookupNode=lambda *_: found), "alone", "/alone"), 10) == list(range(10))
     finally:
         os.kill(pid, signal.SIGCONT)
     ended(talker)
