@@ -3,13 +3,13 @@
 robot: /front/camera, /scan_left, /scan_right, /odd (of a package that is nowhere installed) -> base, renamed there
 """
 
-import importlib.util
 import json
 import os
 import time
 from collections.abc import Callable
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.serialization import serialize_message
@@ -28,16 +28,6 @@ CAREFUL = QoSProfile(
 )
 
 
-def diagnosed(robot: Side) -> list[Any]:
-    """Hear /diagnostics, where its messages are installed."""
-    heard: list[Any] = []
-    if importlib.util.find_spec("diagnostic_msgs"):
-        from diagnostic_msgs.msg import DiagnosticArray
-
-        robot.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
-    return heard
-
-
 def main() -> None:
     robot, base = Side(ROBOT, "robot"), Side(BASE, "base")
     publishers = {name: robot.node.create_publisher(String, name, 10) for name in ("/scan_left", "/scan_right")}
@@ -47,7 +37,8 @@ def main() -> None:
         base.hear(name, 10)
     odd: list[bytes] = []
     base.node.create_subscription(ODD, "/odd", odd.append, 10, raw=True)
-    told = diagnosed(robot)
+    told: list[Any] = []
+    robot.node.create_subscription(DiagnosticArray, "/diagnostics", told.append, 10)
     try:
         renamed = ("-r", "/front/camera:=/robot1/camera", "-r", "__node:=bufgym_receive_1")
         there = start(BASE, "receive", "--port", "0", "--ros-args", *renamed).rpartition(" ")[2]
@@ -71,9 +62,8 @@ def main() -> None:
                 base.spin()
 
         spin("a message of each topic", lambda: all(base.came.values()) and bool(odd), publish=True)
-        if importlib.util.find_spec("diagnostic_msgs"):
-            told.clear()
-            spin("diagnostics", lambda: bool(told))
+        told.clear()
+        spin("diagnostics", lambda: bool(told))
         [seen] = base.node.get_publishers_info_by_topic("/robot1/camera")
         qos = seen.qos_profile
         [asked] = robot.node.get_subscriptions_info_by_topic("/odd")

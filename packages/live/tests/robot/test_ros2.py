@@ -83,9 +83,8 @@ def test_the_relay_takes_ros_2s_own_words() -> None:
     assert seen["by"] == ["/bufgym_receive_1", "/robot/bufgym_send"]
     assert seen["qos"] == [[50, 60, 70], "MANUAL_BY_TOPIC"] and seen["reliability"] == "BEST_EFFORT"
     told = {name: (message, numbers) for name, message, numbers in seen["diagnostics"]}
-    if importlib.util.find_spec("diagnostic_msgs"):
-        topics = ("/front/camera", "/scan_left", "/scan_right", "/odd")
-        assert set(told) == {f"/robot/bufgym_send: {name}" for name in topics}
+    topics = ("/front/camera", "/scan_left", "/scan_right", "/odd")
+    assert set(told) == {f"/robot/bufgym_send: {name}" for name in topics}
     for message, numbers in told.values():
         assert message == "connected" and numbers["arrived"] == numbers["left"] >= 1
         assert numbers["QoI"] == pytest.approx(1 + 0.382 * (numbers["left"] - 1))
@@ -236,6 +235,9 @@ def test_the_command_names_what_is_wrong(
         ("send --ros-args -p capacity:=7", "no topics: name them in --config"),
         ("send --ros-args -p capacity:=many", "parameter capacity: "),
         ("send --ros-args -p topics:=[a] -p value:=linear", "linear"),
+        ("send --ros-args -p topics:=['a-b']", "topic 'a-b': failed to resolve name: topic name must not contain"),
+        ("send --ros-args -p topics:=[a] -p odometry:=a-b", "topic 'a-b': failed to resolve"),
+        ("send --ros-args -p topics:=[a] -p port:=65536", "127.0.0.1:65536: must be HOST:PORT"),
         ("send --ros-args -r a:=", "--ros-args -r a:=: "),
         ("receive --ros-args -r __node:=ear", "node 'ear': must have bufgym_receive in its name"),
     ],

@@ -9,6 +9,7 @@ import time
 import xmlrpc.client
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -33,10 +34,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def master(built: Path) -> Iterator[int]:
     """The port of a master, one for all tests: each has topics of its own."""
     port = free_port("127.0.0.1")
-    process = subprocess.Popen(["rosmaster", "--core", "-p", str(port)], stdout=subprocess.DEVNULL)
-    yield port
-    process.kill()
-    process.wait()
+    with subprocess.Popen(["rosmaster", "--core", "-p", str(port)], stdout=subprocess.DEVNULL) as process:
+        yield port
+        process.kill()
 
 
 class Nodes:
@@ -45,7 +45,7 @@ class Nodes:
     def __init__(self, built: Path, port: int, home: Path) -> None:
         self._built, uri = built, f"http://127.0.0.1:{port}"
         self._where = {**os.environ, "ROS_MASTER_URI": uri, "ROS_IP": "127.0.0.1", "ROS_HOME": str(home)}
-        self._started: list[subprocess.Popen[str]] = []
+        self.started: list[subprocess.Popen[str]] = []
         self.master: Any = xmlrpc.client.ServerProxy(uri)
 
     def talker(self, topics: str, *words: Any, **settings: str) -> "subprocess.Popen[str]":
@@ -53,7 +53,7 @@ class Nodes:
         pipe, environment = subprocess.PIPE, {**self._where, **settings}
         command = [str(self._built / "talker"), topics, *map(str, words)]
         process = subprocess.Popen(command, env=environment, stdout=pipe, stderr=subprocess.STDOUT, text=True)
-        self._started.append(process)
+        self.started.append(process)
         while not publishers(self.master, topics.split(",")[-1]):
             assert process.poll() is None
             time.sleep(0.05)
@@ -62,18 +62,15 @@ class Nodes:
     def subscriber(self, topic: str) -> socket.socket:
         return subscriber(self.master, topic)
 
-    def close(self) -> None:
-        self.master("close")()
-        for process in self._started:
-            process.kill()
-            process.communicate()
-
 
 @pytest.fixture
 def nodes(built: Path, master: int, tmp_path: Path) -> Iterator[Nodes]:
     made = Nodes(built, master, tmp_path)
     yield made
-    made.close()
+    made.master("close")()
+    for process in made.started:
+        process.kill()
+        process.communicate()
 
 
 def has_published(process: "subprocess.Popen[str]") -> None:
@@ -90,8 +87,10 @@ def ended(process: "subprocess.Popen[str]") -> str:
 
 
 def preload(built: Path, log: Path, **settings: str) -> dict[str, str]:
+    """Settings of a node: the library, a log, local subscribers too, and these."""
     log.mkdir(exist_ok=True)
-    return {"LD_PRELOAD": str(built / "libbufgym_roscpp.so"), "BUFGYM_LOG": str(log), "BUFGYM_LOCAL": "1", **settings}
+    told = {f"BUFGYM_{name}": word for name, word in {"LOG": str(log), "LOCAL": "1", **settings}.items()}
+    return {"LD_PRELOAD": str(built / "libbufgym_roscpp.so"), **told}
 
 
 def logs(folder: Path) -> list[Path]:
@@ -101,7 +100,7 @@ def logs(folder: Path) -> list[Path]:
 def test_every_decision_is_the_simulators(built: Path, nodes: Nodes, tmp_path: Path) -> None:
     """A subscriber that reads slowly: 150 messages of 400 kB into a queue of 5; the log says what became of each."""
     log = tmp_path / "log"
-    talker = nodes.talker("slow", 5, 150, 400_000, 100, **preload(built, log, BUFGYM_POLICY="afr"))
+    talker = nodes.talker("slow", 5, 150, 400_000, 100, **preload(built, log, POLICY="afr"))
     came = seqs(nodes.subscriber("slow"), 150, pause_s=0.02)
     ended(talker)
     [file] = logs(log)
@@ -112,7 +111,7 @@ def test_every_decision_is_the_simulators(built: Path, nodes: Nodes, tmp_path: P
 def test_each_of_two_subscribers_has_its_queue(built: Path, nodes: Nodes, tmp_path: Path) -> None:
     """One reads as they come, the other not before the last; 16 MB do not fit into the sockets between."""
     log = tmp_path / "log"
-    talker = nodes.talker("pair", 5, 40, 400_000, 20, 2, **preload(built, log, BUFGYM_POLICY="drop-oldest"))
+    talker = nodes.talker("pair", 5, 40, 400_000, 20, 2, **preload(built, log, POLICY="drop-oldest"))
     fast, slow = nodes.subscriber("pair"), nodes.subscriber("pair")
     as_they_come = seqs(fast, 40)
     has_published(talker)
@@ -155,14 +154,15 @@ def test_a_latched_message_larger_than_the_sockets_buffer(built: Path, nodes: No
 
 
 def test_x_is_the_robots_motion(built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """The talker goes 0.1 m before each message: 0.05 of a scene of 2 m."""
+    """The talker goes 0.1 m before each message: 0.05 of a scene of 2 m. After its end the master knows it no more."""
     log = tmp_path / "log"
-    talker = nodes.talker("moving", 5, 60, 1000, 30, 1, "moves", **preload(built, log, BUFGYM_ODOMETRY="/odom"))
+    talker = nodes.talker("moving", 5, 60, 1000, 30, 1, "moves", **preload(built, log, ODOMETRY="/odom"))
     assert len(seqs(nodes.subscriber("moving"), 60)) == 60
     ended(talker)
     records = read_log(logs(log)[0])
     x = [record["x"] for record in records if record["event"] == "put"]
     steps = [(b - a) / 0.05 for a, b in itertools.pairwise(x)]
+    assert "/odom" not in [topic for topic, _ in nodes.master.getSystemState("/test")[2][1]]
     assert x[-1] > 1.5 and all(step >= 0 and step == pytest.approx(round(step)) for step in steps)
     assert records[0]["v"]["numbers"] == [0, -1.0]
 
@@ -173,31 +173,63 @@ def test_small_and_unbounded_topics_are_left_alone(built: Path, nodes: Nodes, tm
     So the newest five arrive on a bounded topic, as under "drop-oldest", and all on one without bounds.
     """
     log, topics = tmp_path / "log", ["image", "map", "tf", "clock"]
-    settings = preload(built, log, BUFGYM_TOPICS="/image=drop-oldest,/map=none")
+    settings = preload(built, log, TOPICS="/image=drop-oldest,/map=none")
     bounded = nodes.talker(",".join(topics), 5, 60, 200_000, 100, **settings)
     [node] = publishers(nodes.master, "image")
-    unbounded = nodes.talker("all", 0, 60, 200_000, 100, **settings)
-    rosout, everything = subscriber(nodes.master, "rosout", node), nodes.subscriber("all")
+    unbounded = [nodes.talker(f"all_{-size}", size, 60, 200_000, 100, **settings) for size in (0, -1)]
+    rosout, everything = subscriber(nodes.master, "rosout", node), [nodes.subscriber(f"all_{k}") for k in (0, 1)]
     subscribers = [nodes.subscriber(topic) for topic in topics]
-    for talker in (bounded, unbounded):
+    for talker in (bounded, *unbounded):
         has_published(talker)
     for came in (seqs(one, 60) for one in subscribers):
         assert len(came) < 60 and came[-5:] == [55, 56, 57, 58, 59]
-    assert seqs(everything, 60) == list(range(60))
+    assert [seqs(one, 60) for one in everything] == [list(range(60))] * 2
     with rosout:
         assert b"published" in block(rosout)
     [file] = logs(log)
     assert (file.name, read_log(file)[0]["policy"]) == ("image-0.jsonl", "drop-oldest")
 
 
-@pytest.mark.parametrize("settings", [{"BUFGYM_LOCAL": "0"}, {"BUFGYM_POLICY": "afrr"}], ids=str)
-def test_what_is_left_alone(settings: dict[str, str], built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """Subscribers on this machine, and all topics of a node with an unknown policy, which it says."""
-    topic = "_".join(settings.values())
-    talker = nodes.talker(f"left_{topic}", 5, 10, 1000, 100, **preload(built, tmp_path / "log", **settings))
-    assert seqs(nodes.subscriber(f"left_{topic}"), 10) == list(range(10))
-    assert ("unknown policy afrr" in ended(talker)) == (settings.get("BUFGYM_POLICY") == "afrr")
-    assert not logs(tmp_path / "log")
+def test_parameters_are_numbers_too(built: Path, nodes: Nodes, tmp_path: Path) -> None:
+    """roslaunch makes an int of "3". The log of an earlier run stays."""
+    typed = {"bufgym_queue_size": 3, "bufgym_local": True, "bufgym_log": str(tmp_path)}
+    nodes.master.setParam("/test", "/typed", typed)
+    (tmp_path / "typed-0.jsonl").touch()
+    talker = nodes.talker("typed", 5, 2, 1000, 100, "__name:=typed", LD_PRELOAD=preload(built, tmp_path)["LD_PRELOAD"])
+    assert seqs(nodes.subscriber("typed"), 2) == [0, 1]
+    ended(talker)
+    assert [(file.name, read_log(file)[0]["capacity"]) for file in logs(tmp_path)[1:]] == [("typed-1.jsonl", 3)]
+
+
+def test_no_message_waits_for_the_master(built: Path, nodes: Nodes, tmp_path: Path) -> None:
+    """Who sends holds a lock that roscpp takes second when it subscribes: it must not ask for odometry itself."""
+    words = {"TOPICS": "", "VALUE": "exponential:0.5", "QUEUE_SIZE": "5", "ODOMETRY": "/odom", "POLICY": "afr"}
+    talker = nodes.talker("alone", 5, 10, 1000, 100, "__name:=alone", **preload(built, tmp_path / "log", **words))
+    found, pid = nodes.master.lookupNode("/test", "/alone"), nodes.master.getPid("/test")[2]
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        assert seqs(subscriber(SimpleNamespace(lookupNode=lambda *_: found), "alone", "/alone"), 10) == list(range(10))
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    ended(talker)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"LOCAL": "yes"}, "BUFGYM_LOCAL = yes: must be 0 or 1"),
+        ({"POLICY": "afrr"}, "unknown policy afrr: roscpp's own queue stays"),
+        ({"QUEUE_SIZE": "65", "LOG": "/no/folder"}, "L = 65: must be 1 to 64|no log: /no/folder: No such file"),
+        ({"ODOMETRY": "my odom", "LOG": ""}, "not valid in Graph Resource Name [my odom]"),
+        ({"ODOMETRY": "/left", "LOG": ""}, "/left: must be a topic of nav_msgs/Odometry: x counts messages"),
+    ],
+)
+def test_what_is_left_alone(settings: dict[str, str], said: str, built: Path, nodes: Nodes, tmp_path: Path) -> None:
+    """Subscribers on this machine, and what a wrong setting is about, which is said."""
+    talker = nodes.talker("left", 5, 10, 1000, 100, **preload(built, tmp_path / "log", **settings))
+    assert seqs(nodes.subscriber("left"), 10) == list(range(10))
+    text = ended(talker)
+    assert all(words in text for words in said.split("|")) and not logs(tmp_path / "log")
 
 
 def test_a_policy_without_c_is_refused(tmp_path: Path) -> None:

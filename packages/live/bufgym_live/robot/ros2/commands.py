@@ -65,8 +65,7 @@ async def send(
         told = _parameters(node, {"topics": [""], **options, "host": host, "port": port})
         robot = RosSender(
             client,
-            told["host"],
-            told["port"],
+            *address(f"{told['host']}:{told['port']}"),
             topics=[name for name in told["topics"] if name],
             policy=one_policy(told["policy"], policy_file) if told["policy"] else None,
             capacity=told["capacity"],

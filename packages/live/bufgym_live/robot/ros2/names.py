@@ -99,6 +99,14 @@ class Published:
         return _HEAD.pack(len(name), len(kind), flags, min(self.depth, 2**16 - 1), *times) + name + kind
 
 
+def resolved(node: Any, name: str) -> str:
+    """Apply the node's namespace and remappings; raises an error if ROS 2 has no such names."""
+    try:
+        return str(node.resolve_topic_name(name))
+    except Exception as error:  # rclpy's own, of several kinds
+        raise BufgymError(f"topic {name!r}: {str(error).partition(', at ')[0]}") from None
+
+
 def parse(body: bytes | memoryview) -> tuple[Published, bytes]:
     """Parse received bytes; return the topic and the serialized message.
 

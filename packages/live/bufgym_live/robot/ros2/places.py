@@ -8,6 +8,7 @@ from typing import Any, Final
 from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream
+from bufgym_live.robot.ros2.names import resolved
 
 MOST_BY_PATTERN: Final = 8
 """Topics that one pattern stands for at most."""
@@ -36,7 +37,7 @@ class Place:
     def resolve(self, node: Any) -> None:
         """Apply the node's namespace and remappings; ROS 2 remaps no patterns."""
         if not self.by_pattern:
-            self.name = node.resolve_topic_name(self.wanted)
+            self.name = resolved(node, self.wanted)
         elif not self.wanted.startswith("/"):
             self.wanted = f"{node.get_namespace().rstrip('/')}/{self.wanted}"
 

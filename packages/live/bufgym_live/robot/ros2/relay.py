@@ -9,7 +9,7 @@ way through a second pair with ``no_drop`` topics.
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -25,7 +25,7 @@ from bufgym_live.robot.log import Record
 from bufgym_live.robot.odometry import Odometry, followed
 from bufgym_live.robot.receiver import Received, Receiver
 from bufgym_live.robot.ros2.diagnostics import Diagnostics, publisher
-from bufgym_live.robot.ros2.names import Published, needs_rclpy, parse, published
+from bufgym_live.robot.ros2.names import Published, needs_rclpy, parse, published, resolved
 from bufgym_live.robot.ros2.places import places
 from bufgym_live.robot.sender import Leaves, Sender
 from bufgym_live.robot.tasks import until_one_ends
@@ -174,17 +174,14 @@ class RosSender:
         self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port), leaves)
         self._depth = capacity
         self._found = asyncio.Event()
-        topic, self._odometry = ("", Odometry()) if odometry is None else followed(odometry)
-        self._odometry_topic = topic or None
+        self._odometry_topic: str | None
+        self._odometry_topic, self._odometry = (None, Odometry()) if odometry is None else followed(odometry)
         self._say = say
 
     async def run(self, node: Any = None) -> None:
         """Relay until cancelled, with a node of its own unless one is given."""
-        if node is None:
-            with own_node(SENDER) as own:
-                await self.run(own)
-        else:
-            self._odometry_topic = self._odometry_topic and node.resolve_topic_name(self._odometry_topic)
+        with own_node(SENDER) if node is None else nullcontext(node) as node:
+            self._odometry_topic = self._odometry_topic and resolved(node, self._odometry_topic)
             for place in self._places:
                 place.resolve(node)
             async with spinning(node):
@@ -198,10 +195,8 @@ class RosSender:
         while True:
             await asyncio.sleep(TELL_S)
             numbers = zip(self._places, self._diagnostics.tell(), strict=True)
-            faults = self.sender.faults
-            fault = (
-                "" if self.sender.connected.is_set() else f"not connected: {faults[-1] if faults else 'no answer yet'}"
-            )
+            why = self.sender.faults[-1] if self.sender.faults else "no answer yet"
+            fault = "" if self.sender.connected.is_set() else f"not connected: {why}"
             publish({place.name: told for place, told in numbers if place.name is not None}, fault)
 
     def _names(self, node: Any) -> list[str]:

@@ -7,10 +7,12 @@
 // first has them. roscpp's class is the same from indigo to noetic (transport_subscriber_link.h of ros_comm at
 // indigo-devel, kinetic-devel, melodic-devel and noetic-devel); its Boost headers must be the robot's own.
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cstring>
 #include <deque>
 #include <memory>
+#include <thread>
 #include <unordered_map>
 
 #include <linux/sockios.h>
@@ -19,13 +21,13 @@
 #include <sys/ioctl.h>
 #include <sys/socket.h>
 
-#include <boost/bind/bind.hpp>
 #include <nav_msgs/Odometry.h>
 #include <ros/callback_queue.h>
 #include <ros/connection.h>
-#include <ros/node_handle.h>
+#include <ros/init.h>
 #include <ros/publication.h>
-#include <ros/spinner.h>
+#include <ros/subscribe_options.h>
+#include <ros/topic_manager.h>
 #include <ros/transport/transport_tcp.h>
 #define private public  // the functions below are members of the class and use its members
 #include <ros/transport_subscriber_link.h>
@@ -55,20 +57,34 @@ const bufgym::Settings &settings()
   return *all;
 }
 
-// x by a topic, subscribed on a queue and a thread of its own: the node need not spin.
+// x by a topic, on a queue and a thread of its own: the node need not spin. The thread also subscribes, because who asks
+// for x holds locks that roscpp takes the other way round when it subscribes. It has no NodeHandle and no spinner: the
+// node still ends with its own last handle, and old roscpp has one spinner in a process.
 struct Odometry
 {
   bufgym::Motion motion;
   ros::CallbackQueue callbacks;
-  ros::Subscriber subscriber;
-  ros::AsyncSpinner spinner{1, &callbacks};
+  std::atomic<bool> refused{false};  // then x counts messages
 
-  explicit Odometry(const std::string &topic)
+  explicit Odometry(const std::string &topic) { std::thread(&Odometry::run, this, topic).detach(); }
+
+  void run(const std::string &topic)
   {
-    ros::NodeHandle node;
-    node.setCallbackQueue(&callbacks);
-    subscriber = node.subscribe(topic, 100, &Odometry::take, this);
-    spinner.start();
+    ros::SubscribeOptions options;
+    options.init<nav_msgs::Odometry>(topic, 100, [this](const nav_msgs::Odometry::ConstPtr &message) { take(message); });
+    options.callback_queue = &callbacks;
+    try
+    {
+      refused = !ros::TopicManager::instance()->subscribe(options);
+    }
+    catch (const ros::Exception &error)  // the node itself has the topic with another type
+    {
+      refused = true;
+    }
+    if (refused)
+      ROS_ERROR("bufgym: %s: must be a topic of nav_msgs/Odometry: x counts messages", topic.c_str());
+    while (ros::ok() && !refused)
+      callbacks.callAvailable(ros::WallDuration(0.1));
   }
 
   void take(const nav_msgs::Odometry::ConstPtr &message)
@@ -82,7 +98,7 @@ struct Odometry
 bufgym::Motion *motion()
 {
   static auto *all = settings().odometry.empty() ? nullptr : new Odometry(settings().odometry);
-  return all ? &all->motion : nullptr;
+  return all && !all->refused ? &all->motion : nullptr;
 }
 
 // What a subscriber's link has besides roscpp's own members; roscpp's poll thread alone uses it.
@@ -216,9 +232,10 @@ void TransportSubscriberLink::enqueueMessage(const SerializedMessage &m, bool se
       if (!keeps(state, box, m.num_bytes, *connection_))
         return;
     }
-    else if (const int capacity = capacity_of(parent_))
+    else
     {
-      if ((int)box.size() >= capacity)
+      const int capacity = capacity_of(parent_);  // roscpp takes one below 1, as a queue_size of -1, for no bound
+      if (capacity > 0 && (int)box.size() >= capacity)
         box.pop_front();
     }
     box.push_back(m);
@@ -248,9 +265,8 @@ void TransportSubscriberLink::startMessageWrite(bool immediate_write)
       state.log.event("dequeued", state.last_us, state.seq);
     }
   }
-  connection_->write(
-      m.buf, m.num_bytes, boost::bind(&TransportSubscriberLink::onMessageWritten, this, boost::placeholders::_1),
-      immediate_write);
+  const auto written = [this](const ConnectionPtr &connection) { onMessageWritten(connection); };
+  connection_->write(m.buf, m.num_bytes, written, immediate_write);
 }
 
 void TransportSubscriberLink::onMessageWritten(const ConnectionPtr &)

@@ -1,6 +1,7 @@
 // A queue's log, a record a line, from which the simulator makes every decision again (bufgym live replay FILE).
 #ifndef BUFGYM_ROSCPP_LOG_H
 #define BUFGYM_ROSCPP_LOG_H
+#include <cerrno>
 #include <cinttypes>
 #include <cstdio>
 #include <string>
@@ -26,8 +27,10 @@ public:
     static int count = 0;
     for (char &c : topic)
       c = c == '/' ? '_' : c;
-    const std::string path = folder + "/" + topic.substr(1) + "-" + std::to_string(count++) + ".jsonl";
-    file_ = std::fopen(path.c_str(), "w");
+    std::string path;
+    do  // logs of other nodes and of earlier runs stay
+      path = folder + "/" + topic.substr(1) + "-" + std::to_string(count++) + ".jsonl";
+    while (!(file_ = std::fopen(path.c_str(), "wx")) && errno == EEXIST);
     if (!file_)
       return;
     std::setvbuf(file_, nullptr, _IOLBF, 1 << 16);

@@ -9,12 +9,18 @@
 //   BUFGYM_LOG         folder for a log of each queue, which `bufgym live replay` reads
 #ifndef BUFGYM_ROSCPP_SETTINGS_H
 #define BUFGYM_ROSCPP_SETTINGS_H
+#include <cerrno>
 #include <cstdlib>
+#include <cstring>
 #include <map>
 #include <sstream>
 #include <string>
 
+#include <unistd.h>
+
 #include <ros/console.h>
+#include <ros/exception.h>
+#include <ros/names.h>
 #include <ros/param.h>
 
 #include "policy.h"
@@ -50,10 +56,29 @@ struct Settings
       else
         topics[pair.substr(0, equals)] = named(pair.substr(equals + 1));
     }
-    capacity = std::atoi(text("QUEUE_SIZE", "0").c_str());
-    local = text("LOCAL", "0") == "1";
+    const std::string size = text("QUEUE_SIZE", ""), here = text("LOCAL", "0");
+    capacity = std::atoi(size.c_str());
+    if (!size.empty() && (size != std::to_string(capacity) || capacity < 1 || capacity > MOST))
+    {
+      ROS_ERROR("bufgym: L = %s: must be 1 to %d; it is the publisher's queue_size", size.c_str(), MOST);
+      capacity = 0;
+    }
+    local = here == "1" || here == "true";
+    if (!local && here != "0" && here != "false")
+      ROS_ERROR("bufgym: BUFGYM_LOCAL = %s: must be 0 or 1; it is 0", here.c_str());
     odometry = text("ODOMETRY", "");
+    try
+    {
+      odometry = odometry.empty() ? odometry : ros::names::resolve(odometry);
+    }
+    catch (const ros::Exception &error)
+    {
+      ROS_ERROR("bufgym: odometry: %s: x counts messages", error.what());
+      odometry.clear();
+    }
     log = text("LOG", "");
+    if (!log.empty() && access(log.c_str(), W_OK | X_OK))
+      ROS_ERROR("bufgym: no log: %s: %s", log.c_str(), std::strerror(errno));
     const std::string wanted = text("VALUE", odometry.empty() ? v.name : "exponential:0.36787944117144233");
     if (!set_value(wanted))
       ROS_ERROR("bufgym: V = %s: must be exponential:BASE or saturating:DISTANCE; it is %s", wanted.c_str(), v.name.c_str());
@@ -65,10 +90,12 @@ private:
     const char *word = std::getenv(("BUFGYM_" + name).c_str());
     if (word)
       return word;
-    std::string key = "~bufgym_", told;
+    std::string key = "~bufgym_";
     for (char c : name)
       key += c == '_' ? c : char(c + 32);
-    return ros::param::get(key, told) ? told : otherwise;
+    XmlRpc::XmlRpcValue told;  // roslaunch makes numbers of what looks like them
+    std::ostringstream written;
+    return ros::param::get(key, told) ? (written << told, written.str()) : otherwise;
   }
 
   static const Policy *named(const std::string &name)
