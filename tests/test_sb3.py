@@ -292,7 +292,7 @@ def test_an_agent_for_topics_is_a_scheduler(form: str, network: str) -> None:
 
 
 def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
-    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym/Uplink-v0", 2, **WORLD)
+    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym:bufgym/Uplink-v0", 2, **WORLD)
     with pytest.raises(BufgymError, match="policy ppo: trained for L = 3, not for L = 5; only a network that scores"):
         run(as_policy(untrained(PPO, "MultiInputPolicy")), [scenario.episode(20)], 5, scenario.value)
     pole = untrained(PPO, "MlpPolicy", env_util.make_vec_env("CartPole-v1", 2)).policy

@@ -63,7 +63,7 @@ def make_vec_env(
 
 def _has_native_batch(env_id: Any) -> bool:
     """Whether Gymnasium knows the id and a native batch of it that can reset in the same step."""
-    entry = gym.spec(env_id).vector_entry_point if isinstance(env_id, str) else None
+    entry = gym.spec(env_id.split(":")[-1]).vector_entry_point if isinstance(env_id, str) else None
     native = load_env_creator(entry) if isinstance(entry, str) else entry
     # Gymnasium's own native batches support NEXT_STEP only.
     return native is not None and "autoreset_mode" in inspect.signature(native).parameters
