@@ -63,6 +63,8 @@ def test_stable_baselines3(id: str, form: dict[str, Any]) -> None:
 def test_torchrl(id: str, form: dict[str, Any]) -> None:
     envs = pytest.importorskip("torchrl.envs", reason="torchrl is not installed")
     envs.check_env_specs(envs.GymWrapper(made(id, **form)))
+    batch = gym.make_vec(id, num_envs=2, capacity=3, **SMALL[id], **form, autoreset_mode="Disabled")
+    envs.check_env_specs(envs.GymWrapper(batch))
 
 
 @pytest.mark.parametrize("robots", [1, 3])

@@ -148,7 +148,13 @@ def test_a_monitor_file(tmp_path: Path) -> None:
 
 test_what_a_native_batch_cannot_do_is_an_error = refused(
     (lambda: make_vec_env("bufgym/Interruption-v0", num_envs=2), "stable-baselines3 calls it n_envs"),
-    (lambda: make_vec_env("CartPole-v1"), "has no native batch"),
+    (lambda: make_vec_env("bufgym/Uplink-v0", env_kwargs={"capacity": 8}), "'env_kwargs': settings go by", TypeError),
+    (
+        lambda: make_vec_env("bufgym/Uplink-v0", vec_env_cls=GymVecEnv),
+        "'vec_env_cls': stable_baselines3.*make_",
+        TypeError,
+    ),
+    *((lambda id=id: make_vec_env(id), "has no native batch") for id in ("CartPole-v1", Monitor)),
     (lambda: GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2)), "SAME_STEP"),
 )
 
@@ -286,7 +292,7 @@ def test_an_agent_for_topics_is_a_scheduler(form: str, network: str) -> None:
 
 
 def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
-    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym/Uplink-v0", 2, **WORLD)
+    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym:bufgym/Uplink-v0", 2, **WORLD)
     with pytest.raises(BufgymError, match="policy ppo: trained for L = 3, not for L = 5; only a network that scores"):
         run(as_policy(untrained(PPO, "MultiInputPolicy")), [scenario.episode(20)], 5, scenario.value)
     pole = untrained(PPO, "MlpPolicy", env_util.make_vec_env("CartPole-v1", 2)).policy

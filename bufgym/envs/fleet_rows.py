@@ -54,7 +54,7 @@ class FleetRows(Rows):
             if episode is None:
                 self.fleet.load(c, *self._next_episode(c * self.robots))
                 continue
-            if not episode.ticks_together:
+            if not getattr(episode, "ticks_together", True):
                 raise BufgymError("episode: in an environment the messages of all robots arrive at the same times")
             self.fleet.load(c, episode)
         return cells

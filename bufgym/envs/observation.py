@@ -88,9 +88,6 @@ class ObservationForm:
             raise BufgymError(f"observation = {form!r}: must be one of {', '.join(map(repr, FORMS))}")
         tables = {"slot": slot_fields, "context": context_fields}
         known = [field.name for field in (*slot_fields, *context_fields)]
-        if isinstance(chosen, str):
-            rule = "must be a list of names, 'compact', 'guided' or 'rule'"
-            raise BufgymError(f"fields = {chosen!r}: {rule}; known: {', '.join(known)}")
         own: dict[str, Field] = {}
         names = known if chosen is None else list(chosen)
         for k, name in enumerate(names):

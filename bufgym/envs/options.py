@@ -1,6 +1,6 @@
 """The options that every environment takes, as one checked record with all defaults."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -69,6 +69,10 @@ class Options:
                 raise BufgymError(f"{name} = {given!r}: must be one of {', '.join(map(repr, known))}")
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
+        names: Any = () if self.fields in (None, "compact", GUIDED, RULE) else self.fields
+        is_list = isinstance(names, Collection) and not isinstance(names, str)
+        if not (is_list and all(isinstance(name, str) for name in names)):
+            raise BufgymError(f"fields = {names!r}: must be a list of names, 'compact', 'guided' or 'rule'")
         if not isinstance(self.bound, bool | np.bool_):
             raise BufgymError(f"bound = {self.bound!r}: must be True or False")
         whole("num_threads", self.num_threads, 1)
@@ -103,7 +107,7 @@ class Options:
             beside = None if self.observation != "flat" else "observation"
             return MaskKeys(beside, "action_mask", self.mask_dtype) if asked else None
         keys = MASK_KEYS.get(asked) if isinstance(asked, str) else asked
-        if not isinstance(keys, Sequence) or len({*map(str, keys)}) != 2 or len(keys) != 2:
+        if not isinstance(keys, Sequence) or len({key for key in keys if isinstance(key, str)}) != 2 or len(keys) != 2:
             rule = f"must be True, False, two names of keys or one of {', '.join(map(repr, MASK_KEYS))}"
             raise BufgymError(f"mask_in_observation = {asked!r}: {rule}")
         return MaskKeys(keys[0], keys[1], self.mask_dtype)

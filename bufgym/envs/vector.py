@@ -52,8 +52,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         **arguments: Any,
     ) -> None:
         rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity=capacity, **arguments)
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise BufgymError(f"max_episode_steps = {max_episode_steps}: must be >= 1, or None for no limit")
+        if max_episode_steps is not None:
+            whole("max_episode_steps", max_episode_steps, 1)
         if rows.options.info == "steady":
             raise BufgymError("info = 'steady': is for recorders of a single environment; a batch has 'full'")
         modes = {text: mode for mode in AutoresetMode for text in (mode, mode.value, mode.name)}

@@ -20,11 +20,12 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
+from stable_baselines3.common import env_util
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, UnknownArgumentError
 
 
 def make_vec_env(
@@ -40,10 +41,12 @@ def make_vec_env(
             it.
         settings: of the environment.
     """
-    if "num_envs" in settings:
-        raise BufgymError(f"num_envs = {settings['num_envs']}: stable-baselines3 calls it n_envs")
+    instead = "stable_baselines3.common.env_util.make_vec_env has single environments"
+    named = {"num_envs": "stable-baselines3 calls it n_envs", "env_kwargs": "settings go by name, as in capacity=8"}
+    for name in settings.keys() & {*named, *inspect.signature(env_util.make_vec_env).parameters}:
+        ours = named.get(name, instead)
+        raise UnknownArgumentError(f"make_vec_env() got an unexpected keyword argument {name!r}: {ours}")
     if not _has_native_batch(env_id):
-        instead = "stable_baselines3.common.env_util.make_vec_env has single environments"
         raise BufgymError(f"env_id = {env_id!r}: has no native batch that resets in the same step; {instead}")
     options: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, **settings}
     envs: Any = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **options)
@@ -58,9 +61,9 @@ def make_vec_env(
     return batch
 
 
-def _has_native_batch(env_id: str) -> bool:
+def _has_native_batch(env_id: Any) -> bool:
     """Whether Gymnasium knows the id and a native batch of it that can reset in the same step."""
-    entry = gym.spec(env_id).vector_entry_point
+    entry = gym.spec(env_id.split(":")[-1]).vector_entry_point if isinstance(env_id, str) else None
     native = load_env_creator(entry) if isinstance(entry, str) else entry
     # Gymnasium's own native batches support NEXT_STEP only.
     return native is not None and "autoreset_mode" in inspect.signature(native).parameters

@@ -150,6 +150,7 @@ test_bad_input_is_told_apart = refused(
     (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),
     (lambda: begun().step({"robot_0": 0, "robot_1": L + 2}), r"actions\['robot_1'\] = 6: must lie in 0..5"),
     (lambda: begun().reset(options={"episode": apart()}), "arrive at the same times"),
+    (lambda: begun().reset(options={"episode": 3}), "3 is not a bufgym.scenario FleetEpisode"),
     (lambda: FleetVecEnv(0), "cells = 0"),
     (lambda: FleetVecEnv(2, 2).reset(options={"episodes": [None]}), "1 given for 2 cells"),
     (lambda: batch().reset(options={"reset_mask": np.arange(4) == 0}), "begin together"),

@@ -294,7 +294,7 @@ test_wrong_use_is_named = refused(
     (lambda: SenderVectorEnv(0), "num_envs = 0"),
     (lambda: SenderVectorEnv(autoreset_mode="Sometimes"), "autoreset_mode = 'Sometimes'"),
     (lambda: gym.make_vec("bufgym/Uplink-v0", 1, "sync", autoreset_mode="SameStep"), "SyncVectorEnv by vector_kwargs"),
-    (lambda: SenderVectorEnv(max_episode_steps=0), "max_episode_steps = 0"),
+    *((lambda n=n: SenderVectorEnv(max_episode_steps=n), "max_episode_steps = ") for n in (0, 1.5, "5")),
     (lambda: SenderVectorEnv(observation="vector"), "must be one of 'dict', 'flat', 'slots'"),
     (lambda: SenderVectorEnv(info="some"), "must be one of 'full', 'steady', 'mask', 'none'"),
     (lambda: SenderVectorEnv(info="steady"), "info = 'steady': is for recorders"),
