@@ -86,7 +86,7 @@ class Limits(Section, frozen=True):
     topics: Count = 1_024
     """Topics that it publishes on."""
     subscriptions: Count = 512
-    """Subscriptions at a time; and the durable ones that the relay keeps for one session."""
+    """Subscriptions at a time, and durable ones that the relay keeps. A long pattern counts as several."""
     queues: Count = 1_024
     """Queues of its subscriptions; beyond, topics of a subscription share. One of capacity 1,000 takes 0.1 MB."""
     sessions: Count = 256

@@ -16,6 +16,7 @@ from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.hub import Outgoing
 from bufgym_live.relay.outbox import Outbox
+from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
@@ -209,7 +210,7 @@ class Connection:
             policy = (
                 await asyncio.to_thread(policies.warm, name) if name in (*config.policies, *self.policies) else None
             )
-            self._quota.subscribe(said["id"], self.subscriptions)
+            self._quota.subscribe(said["id"], self.subscriptions, pattern(said["topic"]).cost)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
             who = self._caller.identity
             subscription.may_grow = partial(self._hub.quotas.may_have_queue, who.key, who.address)

@@ -72,9 +72,10 @@ class Quota:
         """Queues of its subscriptions, over all its connections."""
         return sum(one.queues for each in self.connections for one in each.values())
 
-    def subscribe(self, id: str, before: Mapping[str, Any]) -> None:
-        """Check that a connection with these subscriptions may have one of this id."""
-        if id not in before and sum(map(len, self.connections)) >= self.limits.subscriptions:
+    def subscribe(self, id: str, before: Mapping[str, Any], cost: int) -> None:
+        """Check that a connection with these subscriptions may have one of this id, which counts for ``cost``."""
+        others = (one for each in self.connections for one in each.values() if one is not before.get(id))
+        if sum(one.pattern.cost for one in others) + cost > self.limits.subscriptions:
             raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
 
 

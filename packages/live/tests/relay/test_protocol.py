@@ -3,6 +3,7 @@
 import contextlib
 import json
 import random
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -116,14 +117,18 @@ def test_a_subscription_that_is_refused() -> None:
 
 
 def test_a_quota_counts_what_its_connections_have() -> None:
-    """Two connections and three subscriptions at most; a connection that fails gives back what it had."""
-    quotas = Quotas(Limits(connections=2, subscriptions=3), lambda: 0.0)
-    with contextlib.suppress(ValueError), quotas.connection("a", {"x": 1, "y": 2}) as quota:
-        quota.subscribe("z", {})
-        with quotas.connection("a", {"z": 3}) as same, pytest.raises(RefusedError, match="at most 3 subscriptions"):
+    """Two connections and four subscriptions at most, of which a long pattern counts for two.
+
+    A connection that fails gives back what it had.
+    """
+    quotas, short = Quotas(Limits(connections=2, subscriptions=4), lambda: 0.0), pattern("^/a$")
+    x, y, z = (SimpleNamespace(pattern=pattern(text)) for text in ("^/x$", "^/y$", "/[^/]+/[^/]+/[^/]+/y"))
+    with contextlib.suppress(ValueError), quotas.connection("a", {"x": x, "y": y}) as quota:
+        quota.subscribe("z", {}, z.pattern.cost)
+        with quotas.connection("a", {"z": z}) as same, pytest.raises(RefusedError, match="at most 4 subscriptions"):
             assert same is quota
-            quota.subscribe("x", {"x": 1})  # it replaces one
-            quota.subscribe("w", {"z": 3})
+            quota.subscribe("x", {"x": x}, short.cost)  # it replaces one
+            quota.subscribe("w", {"z": z}, short.cost)
         with quotas.connection("a", {}), pytest.raises(RefusedError, match="at most 2 connections"):
             quotas.connection("a", {}).__enter__()
         raise ValueError

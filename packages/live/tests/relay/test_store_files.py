@@ -16,7 +16,10 @@ COMMAND = "/robots/a/command"
 
 @pytest.mark.skipif(shutil.which("sqlite3") is None, reason="no sqlite3 here")
 async def test_an_earlier_releases_store_is_backed_up_restored_and_opened(tmp_path: Path) -> None:
-    """Command 1 of 3 was acked. 2 and 3 arrive, and 4 follows. While a relay has the file, no other may read it."""
+    """Command 1 of 3 was acked. 2 and 3 arrive, and 4 follows, although one pattern is no longer taken.
+
+    While a relay has the file, no other may read it.
+    """
     held, copy = tmp_path / FILE, tmp_path / "copy.sqlite"
 
     def sqlite(order: str) -> str:
