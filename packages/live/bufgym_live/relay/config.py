@@ -93,6 +93,7 @@ class Limits(Section, frozen=True):
     """Sessions that the relay keeps, with the messages held for them."""
     connections: Count = 128
     messages_per_s: Count = 10_000
+    """Messages; and as many pings, pongs and pieces of messages."""
     bytes_per_s: Count = 10**8
     json_bytes_per_s: Count = 2**22
     """Bytes of JSON that it may have parsed; beyond, its frames wait. A text frame counts for 500 bytes more."""

@@ -33,6 +33,7 @@ class Quota:
     def __init__(self, limits: Limits, idle_since_s: float, identities: int = 1) -> None:
         self.limits, self.idle_since_s = limits, idle_since_s
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
+        self.frames = Bucket(limits.messages_per_s)  # that are no whole messages
         self.json = Bucket(limits.json_bytes_per_s * identities)
         self.topics: defaultdict[str, dict[str, None]] = defaultdict(dict)
         """Session -> the topics that it publishes on, the oldest first."""
