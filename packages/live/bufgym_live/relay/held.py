@@ -46,9 +46,7 @@ class StoredSession:
     numbered: int = 0  # highest number of a no_drop message for it
     held: int = 0  # number of messages for it that are not acked
     held_bytes: int = 0
-    durable: dict[str, Pattern] = field(
-        default_factory=dict
-    )  # id -> pattern of the messages held for it while it is away
+    durable: dict[str, Pattern] = field(default_factory=dict)  # id -> pattern of messages held for it while away
     away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
     kept: bool = False  # whether the store was asked to remember it
     orders: int = 0  # number of its orders that wait for the disk
