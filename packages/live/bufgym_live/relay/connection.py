@@ -1,6 +1,7 @@
 """One client's connection in its session: its checked requests. Its ``outbox`` sends to it."""
 
 import asyncio
+import itertools
 import secrets
 import time
 from collections.abc import Callable, Coroutine, Mapping
@@ -26,6 +27,7 @@ from bufgym_live.relay.wire import RefusedError
 
 Work = Callable[[], Coroutine[Any, Any, None]]
 HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello
+_MOST_IN_TURN: Final = 8  # frames of a client that are taken without a turn of all others
 _MOST_ORDERS: Final = 64  # orders of a client that wait for the disk; beyond, nothing more of it is read
 BUSY_S: Final = 1.0  # Time to a refusal because too much waits for the disk, so that clients do not try at once
 
@@ -86,7 +88,11 @@ class Connection:
 
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
-        while self._ending is None:
+        for heard in itertools.count(1):
+            if self._ending is not None:
+                break
+            if heard % _MOST_IN_TURN == 0:
+                await asyncio.sleep(0)
             match protocol.asked(await self._caller.heard(), self._hub.config.limits.message_bytes):
                 case wire.Message() as message:
                     if message.encoding == "json":
