@@ -9,8 +9,8 @@ REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
     "bufgym": 27_550,
     "tests": 18_410,
-    "packages/live/bufgym_live": 12_310,
-    "packages/live/tests": 9_890,
+    "packages/live/bufgym_live": 12_451,
+    "packages/live/tests": 10_020,
     "packages/papers/bufgym_papers": 5_250,
     "packages/papers/tests": 1_160,
 }

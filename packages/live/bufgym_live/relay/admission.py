@@ -27,6 +27,8 @@ from bufgym_live.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
 POLICY_VIOLATION: Final = 1008
 _CLOSE_S: Final = 1.0  # time for a client to answer that its connection is closed
 _FRAME_BYTES: Final = 256  # memory of a frame beside its bytes
+_SLICE_BYTES: Final = 4_096  # bytes that are read without a look at the clock; they may hold 680 frames
+_TURN_S: Final = 0.005  # time for which what has come is read; the rest waits for the next turn of the event loop
 
 
 class Incoming:
@@ -138,6 +140,7 @@ class Accepted(ServerConnection):
         self._whole: deque[int] = deque()
         """Bytes of each whole message, the one that is being worked on first."""
         self._whole_bytes = self._part_bytes = 0
+        self._unread = bytearray()
         self._working = self._anew = False
         self.ended = False
         """Whether it has used too much, so that nothing more is read or done of it."""
@@ -177,14 +180,37 @@ class Accepted(ServerConnection):
         self._count()
 
     def data_received(self, data: bytes) -> None:
+        under_way = bool(self._unread)
+        self._unread += b"" if self.ended else data
+        if not under_way:
+            self._read(_TURN_S)
+
+    def eof_received(self) -> None:
+        self._read(float("inf"))
+        super().eof_received()
+
+    def _read(self, most_s: float) -> None:
+        """Read what has come, for so long; the rest follows in further turns."""
         began_s = turns.clock()
-        if not self.ended:
+        while self._unread and not self.ended and turns.clock() - began_s < most_s:
+            data = bytes(self._unread[:_SLICE_BYTES])
+            del self._unread[:_SLICE_BYTES]
             super().data_received(data)
-            self._count()
+        self._count()
         self._admission.hub.turns.note(self.address, began_s)
+        if self._unread and not self.ended:
+            self.transport.pause_reading()
+            self.loop.call_soon(self._read, _TURN_S)
+        elif not self.recv_messages.paused:
+            self.transport.resume_reading()
 
     def process_event(self, event: Event) -> None:
         super().process_event(event)
+        if isinstance(event, Frame) and not (event.fin and event.opcode in DATA_OPCODES):
+            hub = self._admission.hub
+            if not hub.quotas.of(next(iter(self.shares))).frames.take(1, hub.clock()):
+                most = f"must be at most {hub.config.limits.messages_per_s} pings, pongs and pieces a second"
+                self.fail("too_fast", most)
         if isinstance(event, Frame) and event.opcode in DATA_OPCODES:
             self._part_bytes += len(event.data) + _FRAME_BYTES
             if event.fin:
@@ -216,7 +242,7 @@ class Accepted(ServerConnection):
 
     @property
     def _held_bytes(self) -> int:
-        return len(self.protocol.reader.buffer) + self._part_bytes + self._whole_bytes
+        return len(self._unread) + len(self.protocol.reader.buffer) + self._part_bytes + self._whole_bytes
 
     @property
     def is_partial(self) -> bool:
@@ -226,6 +252,7 @@ class Accepted(ServerConnection):
     def fail(self, code: str, why: str) -> None:
         """End it at once, with the bytes that wait."""
         self.ended = True
+        self._unread.clear()
         self.refused(code, why)
         self._count()
         self.protocol.fail(POLICY_VIOLATION, why)

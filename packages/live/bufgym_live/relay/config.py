@@ -86,13 +86,14 @@ class Limits(Section, frozen=True):
     topics: Count = 1_024
     """Topics that it publishes on."""
     subscriptions: Count = 512
-    """Subscriptions at a time; and the durable ones that the relay keeps for one session."""
+    """Subscriptions at a time, and durable ones that the relay keeps. A long pattern counts as several."""
     queues: Count = 1_024
     """Queues of its subscriptions; beyond, topics of a subscription share. One of capacity 1,000 takes 0.1 MB."""
     sessions: Count = 256
     """Sessions that the relay keeps, with the messages held for them."""
     connections: Count = 128
     messages_per_s: Count = 10_000
+    """Messages; and as many pings, pongs and pieces of messages."""
     bytes_per_s: Count = 10**8
     json_bytes_per_s: Count = 2**22
     """Bytes of JSON that it may have parsed; beyond, its frames wait. A text frame counts for 500 bytes more."""

@@ -1,6 +1,7 @@
 """One client's connection in its session: its checked requests. Its ``outbox`` sends to it."""
 
 import asyncio
+import itertools
 import secrets
 import time
 from collections.abc import Callable, Coroutine, Mapping
@@ -16,6 +17,7 @@ from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.hub import Outgoing
 from bufgym_live.relay.outbox import Outbox
+from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
@@ -25,6 +27,7 @@ from bufgym_live.relay.wire import RefusedError
 
 Work = Callable[[], Coroutine[Any, Any, None]]
 HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello
+_MOST_IN_TURN: Final = 8  # frames of a client that are taken without a turn of all others
 _MOST_ORDERS: Final = 64  # orders of a client that wait for the disk; beyond, nothing more of it is read
 BUSY_S: Final = 1.0  # Time to a refusal because too much waits for the disk, so that clients do not try at once
 
@@ -85,7 +88,11 @@ class Connection:
 
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
-        while self._ending is None:
+        for heard in itertools.count(1):
+            if self._ending is not None:
+                break
+            if heard % _MOST_IN_TURN == 0:
+                await asyncio.sleep(0)
             match protocol.asked(await self._caller.heard(), self._hub.config.limits.message_bytes):
                 case wire.Message() as message:
                     if message.encoding == "json":
@@ -209,7 +216,7 @@ class Connection:
             policy = (
                 await asyncio.to_thread(policies.warm, name) if name in (*config.policies, *self.policies) else None
             )
-            self._quota.subscribe(said["id"], self.subscriptions)
+            self._quota.subscribe(said["id"], self.subscriptions, pattern(said["topic"]).cost)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
             who = self._caller.identity
             subscription.may_grow = partial(self._hub.quotas.may_have_queue, who.key, who.address)

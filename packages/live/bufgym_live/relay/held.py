@@ -8,7 +8,7 @@ import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -16,6 +16,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
+from bufgym_live.relay.patterns import Pattern, pattern
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.wire import RefusedError
 
@@ -45,7 +46,7 @@ class StoredSession:
     numbered: int = 0  # highest number of a no_drop message for it
     held: int = 0  # number of messages for it that are not acked
     held_bytes: int = 0
-    durable: dict[str, str] = field(default_factory=dict)  # id -> pattern of the messages held for it while it is away
+    durable: dict[str, Pattern] = field(default_factory=dict)  # id -> pattern of messages held for it while away
     away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
     kept: bool = False  # whether the store was asked to remember it
     orders: int = 0  # number of its orders that wait for the disk
@@ -88,6 +89,7 @@ class Held:
             for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL", "synchronous = NORMAL"):
                 self._db.execute(f"PRAGMA {pragma}")
             self._db.executescript(_SCHEMA)
+            self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
         except sqlite3.Error as error:
             raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
         self._file = None if config.folder is None else (path, os.stat(path).st_ino)
@@ -103,7 +105,9 @@ class Held:
             id, name, address, email, temporary, received, numbered = row
             session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
             session.kept = True
-            session.durable = dict(self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)))
+            for one, text in self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)):
+                with suppress(BufgymError):  # an earlier release took more; its client is told when it subscribes again
+                    session.durable[one] = pattern(text)
             held = "SELECT count(*), coalesce(sum(length(frame)), 0) FROM delivery JOIN message ON id = message"
             session.held, session.held_bytes = self._db.execute(f"{held} WHERE session = ?", (id,)).fetchone()
             self._by_id[id] = session
@@ -142,12 +146,12 @@ class Held:
             with self._bearable():
                 self._save(session)
 
-    def want(self, session: StoredSession, id: str, pattern: str) -> None:
+    def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Note that matching messages are held while the session is away."""
         if session.id is None:
             self._save(session)
         with self._transaction():
-            self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern))
+            self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern.text))
         session.durable[id] = pattern
 
     def want_no_more(self, session: StoredSession, id: str) -> None:

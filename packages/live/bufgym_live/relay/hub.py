@@ -153,9 +153,10 @@ class Hub:
         Raises RefusedError: it is durable, and there are too many or the store cannot be written.
         """
         if subscription.durable:
-            await self.store.want(member.session, subscription.id, subscription.pattern.text)
+            await self.store.want(member.session, subscription.id, subscription.pattern)
         self.unsubscribe(member, subscription.id, still_held=subscription.durable)
         member.subscriptions[subscription.id] = subscription
+        self._routes.clear()
         for topic, frame in self._latched.items():
             if subscription.pattern.part(topic) and member.permissions.allow("receive", topic):
                 member.offer(subscription, frame)
@@ -165,8 +166,9 @@ class Hub:
         if not still_held:
             self.store.want_no_more(member.session, id)
         old = member.subscriptions.pop(id, None)
-        self._dropped += old.dropped if old else 0
-        self._routes.clear()
+        if old is not None:
+            self._dropped += old.dropped
+            self._routes.clear()
 
     def is_no_drop(self, topic: str) -> bool:
         """Whether the topic is lossless."""
@@ -265,7 +267,7 @@ class Hub:
             each
             for each in self.store.sessions.values()
             if each is not sender.session and each not in here
-            if any(pattern(text).part(topic) for text in list(each.durable.values()))
+            if any(wanted.part(topic) for wanted in list(each.durable.values()))
             if Permissions(self.config.rules, each.identity).allow("receive", topic)
         ]
         return here + away

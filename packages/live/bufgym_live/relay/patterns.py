@@ -14,6 +14,7 @@ from bufgym.ground.errors import BufgymError
 
 MAX_CHARACTERS: Final = 512
 MAX_MEMORY_BYTES: Final = 2**18  # Memory limit of one expression's automaton
+_STEPS: Final = 32  # Instructions of RE2 that count for one subscription; each may cost a step per character
 _KEPT: Final = 1024  # expressions kept compiled; viewers with the same expression share it
 _ESCAPE: Final = re.compile(r"\\.", re.DOTALL)
 _CLASS: Final = re.compile(r"\[\^?[^\]]+\]")
@@ -32,6 +33,11 @@ class Pattern(NamedTuple):
 
     text: str
     compiled: Any
+
+    @property
+    def cost(self) -> int:
+        """How many subscriptions it counts for, by the length of RE2's program."""
+        return 1 + int(self.compiled.programsize) // _STEPS
 
     def whole(self, topic: str) -> bool:
         """Whether it matches the whole topic, as rules do."""

@@ -33,6 +33,7 @@ class Quota:
     def __init__(self, limits: Limits, idle_since_s: float, identities: int = 1) -> None:
         self.limits, self.idle_since_s = limits, idle_since_s
         self.messages, self.bytes = Bucket(limits.messages_per_s), Bucket(limits.bytes_per_s)
+        self.frames = Bucket(limits.messages_per_s)  # that are no whole messages
         self.json = Bucket(limits.json_bytes_per_s * identities)
         self.topics: defaultdict[str, dict[str, None]] = defaultdict(dict)
         """Session -> the topics that it publishes on, the oldest first."""
@@ -72,9 +73,10 @@ class Quota:
         """Queues of its subscriptions, over all its connections."""
         return sum(one.queues for each in self.connections for one in each.values())
 
-    def subscribe(self, id: str, before: Mapping[str, Any]) -> None:
-        """Check that a connection with these subscriptions may have one of this id."""
-        if id not in before and sum(map(len, self.connections)) >= self.limits.subscriptions:
+    def subscribe(self, id: str, before: Mapping[str, Any], cost: int) -> None:
+        """Check that a connection with these subscriptions may have one of this id, which counts for ``cost``."""
+        others = (one for each in self.connections for one in each.values() if one is not before.get(id))
+        if sum(one.pattern.cost for one in others) + cost > self.limits.subscriptions:
             raise RefusedError("too_many", f"must be at most {self.limits.subscriptions} subscriptions")
 
 

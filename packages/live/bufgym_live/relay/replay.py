@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-from mcap.exceptions import EndOfFile
+from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 
@@ -32,9 +32,11 @@ _STEP_BYTES: Final = 2**18  # distance between two indexed places of a file
 
 def recordings(folder: Path | None) -> list[dict[str, Any]]:
     """List the files of a relay's recordings, the latest first."""
-    paths = [] if folder is None or not folder.is_dir() else folder.glob("*.mcap")
-    stats = [(path.name, path.stat()) for path in paths]
-    files = [{"name": name, "bytes": stat.st_size, "modified_us": stat.st_mtime_ns // 1000} for name, stat in stats]
+    files = list[dict[str, Any]]()
+    for path in [] if folder is None or not folder.is_dir() else folder.glob("*.mcap"):
+        with suppress(OSError):  # it has just been deleted
+            stat = path.stat()
+            files.append({"name": path.name, "bytes": stat.st_size, "modified_us": stat.st_mtime_ns // 1000})
     return sorted(files, key=lambda file: (file["modified_us"], file["name"]), reverse=True)
 
 
@@ -72,7 +74,10 @@ def piece(
 
 def told(id: str, *asked: Any) -> str:
     """Give the text frame with a ``piece``; written bit by bit, because others wait while JSON is written."""
-    part = piece(*asked)
+    try:
+        part = piece(*asked)
+    except (McapError, OSError, LookupError, UnicodeDecodeError) as error:
+        raise BufgymError(f"recording {asked[1]!r}: cannot be read: {type(error).__name__}: {error}") from None
     texts, breath = list[str](), _Breath()
     for message in part.pop("messages"):
         texts.append(json.dumps(message, separators=(",", ":"), allow_nan=False))

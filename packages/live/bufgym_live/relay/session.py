@@ -22,6 +22,7 @@ from urllib.parse import SplitResult
 
 from bufgym_live.relay import address, wire
 from bufgym_live.relay.backoff import Backoff
+from bufgym_live.relay.inbox import Inbox
 from bufgym_live.relay.patterns import for_client
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wire import RefusedError
@@ -86,6 +87,7 @@ class Session:
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
         self._no_drop: tuple[re.Pattern[str], ...] = ()
         self._unanswered = Unanswered()
+        self._inbox = Inbox()
         self._wanted = asyncio.Event()
         self._received = [0, 0]
         """Number of the last no_drop message received from home and from the relay that stands in."""
@@ -119,6 +121,7 @@ class Session:
         self.check_size(message)
         answered = self._unanswered.put(message)
         self._wanted.set()
+        self._inbox.look()
         await answered
 
     def subscribe(
@@ -190,9 +193,8 @@ class Session:
             self.ready.clear()
             self._confirmed.clear()
             connection, self._connection = self._connection, None
-            if connection is not None:
-                with contextlib.suppress(AttributeError):  # asyncio's of 3.11, if the connection has ended already
-                    connection.transport.abort()
+            with contextlib.suppress(AttributeError):  # there is none; or asyncio's of 3.11, if it has ended already
+                connection.transport.abort()
 
     def check_size(self, message: wire.Message) -> int:
         """Return the bytes of a message's frame.
@@ -207,7 +209,8 @@ class Session:
     def note(self, fault: str) -> None:
         """Report a fault, once however often it comes in a row."""
         if not self.faults or self.faults[-1] != fault:
-            self._report(f"{self.name}: {fault}")
+            with contextlib.suppress(Exception):  # a closed pipe, which is no reason to end
+                self._report(f"{self.name}: {fault}")
         self.faults.append(fault)
 
     async def _connect(self) -> Any:
@@ -270,7 +273,8 @@ class Session:
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         """List the tasks that run while there is a connection."""
-        return [self._until_home() if self.stands_in else self._send_no_drop(), self._take_all()]
+        self._inbox = Inbox(lambda: self._unanswered.awaited and not self.stands_in)
+        return [self._until_home() if self.stands_in else self._send_no_drop(), self._hear_all(), self._take_all()]
 
     async def _until_home(self) -> None:
         while True:
@@ -300,13 +304,17 @@ class Session:
             if self._connection is not None:
                 self.round_trip_s = await (await self._connection.ping())
 
-    async def _take_all(self) -> None:
+    async def _hear_all(self) -> None:
         async for frame in self._connection:
             if isinstance(frame, bytes):
-                await self._take(wire.decode(frame))
+                await self._inbox.put(wire.decode(frame))
             else:
                 self._answer(wire.heard(frame))
         raise ConnectionResetError("the relay has closed the connection")
+
+    async def _take_all(self) -> None:
+        async for message in self._inbox:
+            await self._take(message)
 
     async def _take(self, message: wire.Message) -> None:
         if message.no_drop and message.seq <= self._received[self.stands_in]:
@@ -317,7 +325,9 @@ class Session:
                     done = subscription.on_message(message)
                     if inspect.isawaitable(done):
                         await done
-                except Exception as error:  # the program's fault, which no new connection mends
+                except (Exception, asyncio.CancelledError) as error:  # the program's fault, which nothing here mends
+                    if asyncio.current_task().cancelling():  # type: ignore[union-attr]
+                        raise
                     about = {"message": f"on_message of {message.topic}", "exception": error}
                     asyncio.get_running_loop().call_exception_handler(about)
         if message.no_drop:

@@ -17,6 +17,7 @@ from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.held import Held, Settled, StoredSession
+from bufgym_live.relay.patterns import Pattern
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.wire import RefusedError
 
@@ -110,15 +111,24 @@ class Store:
         if not self._held.forget(session):
             self.disk.on_loop(self.sessions.setdefault, session.key, session)
 
-    async def want(self, session: StoredSession, id: str, pattern: str) -> None:
+    async def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Hold matching messages while the session is away.
 
-        Raises RefusedError: too many, also of connections that have ended; or the disk cannot be written.
+        If its identity's sessions have too many, also of connections that have ended, the one goes that has been away
+        for longest: each no_drop message is compared with all of them.
+
+        Raises RefusedError: all of them are here; or the disk cannot be written.
         """
-        if session.durable.get(id) == pattern:
+        if (before := session.durable.get(id)) == pattern:
             return
-        if id not in session.durable and len(session.durable) >= self._quota.subscriptions:
-            raise RefusedError("too_many", f"must be at most {self._quota.subscriptions} durable subscriptions")
+        own = [one for one in self.sessions.values() if one.identity.key == session.identity.key and one.durable]
+        most = self._quota.subscriptions + (before.cost if before else 0)
+        while pattern.cost + sum(each.cost for one in own for each in list(one.durable.values())) > most:
+            oldest = min(own, key=lambda one: one.unused_s, default=session)
+            if oldest.unused_s == math.inf:
+                raise RefusedError("too_many", f"must be at most {self._quota.subscriptions} durable subscriptions")
+            self._expire(oldest)
+            own.remove(oldest)
         session.kept = True
         await self.disk.do(self._held.want, session, id, pattern)
 

@@ -36,6 +36,11 @@ class Unanswered:
         self._refused = 0  # refusals since the last ack, while more are to come
         self._check: Callable[[wire.Message], object] = lambda message: None
 
+    @property
+    def awaited(self) -> bool:
+        """Whether an answer is to come."""
+        return bool(self._waiting or self._sent)
+
     def put(self, message: wire.Message) -> asyncio.Future[None]:
         """Add a message; the future is done once the relay holds it."""
         pending = Pending(message, asyncio.get_running_loop().create_future())

@@ -6,7 +6,6 @@ where the encoding is ``json``, and base64 of the payload where it is not.
 """
 
 import base64
-import binascii
 import json
 import struct
 from collections.abc import Mapping
@@ -25,6 +24,7 @@ MAX_FRAME_BYTES: Final = 2**26
 PING_S: Final = 20.0  # Time between two pings of either end
 PONG_S: Final = 60.0  # Time for a pong, which on a slow link waits long behind the message being sent
 MAX_JSON_BYTES: Final = 2**20  # Size limit of a text frame and of a JSON payload, which take time to read
+MAX_ORDER_CHARACTERS: Final = 2**16  # Size limit of a client's text frame that publishes nothing
 VERSION: Final = 1
 MESSAGE: Final = 1  # The one kind of binary frame
 NO_DROP: Final = 1  # A flag
@@ -161,7 +161,7 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
     },
     "subscribed": {"id": str},
     "unsubscribe": {"id": str},
-    "publish": _MESSAGE,
+    "publish": {**_MESSAGE, "data": msgspec.Raw},
     "message": {**_MESSAGE, "sender": str},
     "ack": {"seq": Number},
     "recordings": {"files?": list[Any]},
@@ -180,6 +180,10 @@ def _kind(op: str, fields: Mapping[str, Any]) -> Any:
     return msgspec.defstruct(op, [*needed, *optional])
 
 
+class _Order(msgspec.Struct):
+    op: str
+
+
 _KINDS: Final = {op: _kind(op, fields) for op, fields in FIELDS.items()}
 FORMS: Final = ("binary", "json")
 
@@ -189,51 +193,55 @@ def say(op: str, **fields: Any) -> str:
     return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
 
 
-def heard(text: str) -> dict[str, Any]:
+def heard(text: str, most_characters: int = MAX_FRAME_BYTES) -> dict[str, Any]:
     """The object of a text frame: its ``op`` is known, its fields are of their kinds.
+
+    The ``data`` that is published is not parsed, and stays ``msgspec.Raw``. All else has at most so many characters.
 
     Raises WireError: it is none of this protocol.
     """
     try:
-        said = strict_json.loads(text)
+        op = msgspec.json.decode(text, type=_Order).op
+    except msgspec.ValidationError:
+        op = ""
     except (ValueError, RecursionError) as error:
         raise WireError(f"text {text[:60]!r}: must be JSON: {error}") from None
-    if not isinstance(said, dict) or not isinstance(said.get("op"), str) or said["op"] not in FIELDS:
+    if op not in FIELDS:
         raise WireError(f"text {text[:60]!r}: must be an object whose op is one of {', '.join(FIELDS)}")
+    if op != "publish" and len(text) > most_characters:
+        raise WireError(f"{op}: text of {len(text)} characters: must be at most {most_characters}")
     try:
-        msgspec.convert(said, _KINDS[said["op"]])
+        if op == "publish":
+            fields = msgspec.structs.asdict(msgspec.json.decode(text, type=_KINDS[op]))
+            return {"op": op, **{name: value for name, value in fields.items() if value is not None}}
+        said: dict[str, Any] = strict_json.loads(text)
+        msgspec.convert(said, _KINDS[op])
     except msgspec.ValidationError as error:
-        raise WireError(f"{said['op']}: {error}") from None
+        raise WireError(f"{op}: {error}") from None
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"text {text[:60]!r}: must be JSON: {error}") from None
     return said
 
 
 def to_json(message: Message) -> str:
-    """The message as a text frame from the relay."""
-    data: Any
-    if message.encoding == "json":
-        try:
-            data = strict_json.loads(bytes(message.payload))
-        except (ValueError, RecursionError) as error:
-            raise WireError(f"topic {message.topic}: payload must be JSON, as its encoding says: {error}") from None
-    else:
-        data = base64.b64encode(message.payload).decode()
+    """The message as a text frame from the relay, which has seen that JSON is JSON."""
     fields = message._asdict()
     del fields["payload"]
-    return say("message", **fields, data=data)
+    if message.encoding != "json":
+        return say("message", **fields, data=base64.b64encode(message.payload).decode())
+    return f'{say("message", **fields)[:-1]},"data":{bytes(message.payload).decode()}}}'
 
 
 def from_json(said: Mapping[str, Any]) -> Message:
-    """The message of a ``publish`` or ``message`` that was heard."""
+    """The message of a ``publish`` that was heard; its JSON is checked later."""
     encoding = said.get("encoding", "json")
-    if encoding == "json":
-        payload = json.dumps(said["data"], separators=(",", ":")).encode()
-    elif isinstance(said["data"], str):
-        try:
-            payload = base64.b64decode(said["data"], validate=True)
-        except (binascii.Error, ValueError) as error:
-            raise WireError(f"data: must be base64: {error}") from None
-    else:
-        raise WireError(f"data: must be base64 text for encoding {encoding!r}")
+    try:
+        data = said["data"]
+        payload = (
+            bytes(data) if encoding == "json" else base64.b64decode(msgspec.json.decode(data, type=str), validate=True)
+        )
+    except ValueError as error:
+        raise WireError(f"data: must be base64 text for encoding {encoding!r}: {error}") from None
     fields = {name: said[name] for name in Message._fields if name in said}
     message = Message(**{**fields, "payload": payload})
     _check(message)

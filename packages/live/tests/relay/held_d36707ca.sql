@@ -5,6 +5,7 @@ INSERT INTO session VALUES(1,'robot','127.0.0.1','',0,0,3);
 INSERT INTO session VALUES(2,'operator','127.0.0.1','',0,3,0);
 CREATE TABLE durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
 INSERT INTO durable VALUES(1,'a','^/robots/a/command$');
+INSERT INTO durable VALUES(1,'b','\pL+\z');
 CREATE TABLE message (
     id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
     waiting INTEGER, lost INTEGER);

@@ -15,12 +15,13 @@ import pytest
 from refusal_cases import refuse
 from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, stranger, until, wait, within
 
+from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats import bags
 from bufgym_live.relay import disk
 from bufgym_live.relay.audit import FILE, Audit
 from bufgym_live.relay.config import Rotation, Rule
 from bufgym_live.relay.recorder import FOLDER, Recorder
-from bufgym_live.relay.replay import piece, recordings
+from bufgym_live.relay.replay import piece, recordings, told
 from bufgym_live.relay.wire import Message
 from bufgym_live.robot.mcap_file import McapFile
 from bufgym_live.robot.sockets import free_port
@@ -169,6 +170,20 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
     for name in ("../own.mcap", "/etc/passwd", "", "none.mcap"):
         refuse("there is none of this name", piece, tmp_path, name, 0, 1, every)
     refuse(r"recording own\.mcap: must be an MCAP file", piece, tmp_path, "own.mcap", 0, 1, every)
+    (tmp_path / "gone.mcap").symlink_to(tmp_path / "none")  # listed by the system, and not to be found
+    assert [one["name"] for one in recordings(tmp_path)] == ["own.mcap"]
+    file = McapFile(tmp_path / "own.mcap")
+    file.write("/a", b"1", 1, 1, schema="object")
+    file.close()
+    whole, refused = (tmp_path / "own.mcap").read_bytes(), 0
+    for k in range(8, len(whole)):  # each byte in turn is another one, and the file is read or refused
+        (tmp_path / f"{k}.mcap").write_bytes(whole[:k] + bytes([whole[k] ^ 0xFF]) + whole[k + 1 :])
+        try:
+            told("a", tmp_path, f"{k}.mcap", 0, 1, every)
+        except BufgymError as error:
+            refused += str(error).startswith(f"recording '{k}.mcap': cannot be read")
+        (tmp_path / f"{k}.mcap").unlink()
+    assert refused > 10
 
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])

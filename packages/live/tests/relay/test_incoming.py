@@ -12,7 +12,7 @@ from refusal_cases import refuse
 from relay_cases import Client, client, relay, settings, until, wait
 
 from bufgym.ground.errors import BufgymError
-from bufgym_live.relay import wire
+from bufgym_live.relay import admission, wire
 from bufgym_live.relay.config import Limits
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.plain import SkipPending
@@ -21,7 +21,7 @@ from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import Message
 
-LIMITS = Limits(message_bytes=10**6, incoming_bytes=2 * 10**6)
+LIMITS = Limits(message_bytes=10**6, incoming_bytes=2 * 10**6, messages_per_s=10**6)
 _BINARY, _MORE, _PING, _FIN, _MASKED = 0x02, 0x00, 0x89, 0x80, 0x80
 
 
@@ -71,6 +71,28 @@ async def test_of_too_many_unfinished_messages_the_oldest_ends(data: bytes) -> N
             one.socket.transport.write(data[-1:])
             assert (await viewer.next()).topic == "/a"
         await until("no bytes", lambda: not server._admission.incoming.bytes)
+
+
+async def test_a_flood_of_small_frames_is_read_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All 2,000 pings come at once, and are read 4 kB a turn; the 1,001st within a second ends the connection."""
+    monkeypatch.setattr(admission, "_TURN_S", 0.0001)
+    async with (
+        relay(settings(limits=Limits(messages_per_s=1_000))) as server,
+        client(server.port) as one,
+        client(server.port, local="127.0.0.2") as viewer,
+    ):
+        await viewer.subscribe("^/a$")
+        read = list[int]()
+        (accepted,) = (each for each in server._admission.open if each.address == "127.0.0.1")
+        receive = accepted.protocol.receive_data
+        monkeypatch.setattr(accepted.protocol, "receive_data", lambda data: (read.append(len(data)), receive(data)))
+        for _ in range(2):  # what a client says in a row comes whole, whatever the turns
+            await one.put("/a", bytes(300_000))
+            assert len((await viewer.next()).payload) == 300_000
+        assert max(read) == 4_096
+        accepted.data_received(2_000 * bytes([_PING, _MASKED, 0, 0, 0, 0]))
+        await wait("its end", one.socket.wait_closed())
+        assert one.socket.close_code == 1008 and "1000 pings" in str(one.socket.close_reason)
 
 
 async def test_identities_of_one_address_have_a_share_together() -> None:

@@ -21,6 +21,7 @@ from bufgym_live.relay import backoff
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Limits, Rotation, Rule, StoreLimits
 from bufgym_live.relay.held import Settled
+from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.session import Session
 from bufgym_live.relay.store import Store
@@ -134,8 +135,11 @@ async def test_the_identity_with_most_bytes_makes_room() -> None:
     store.close()
 
 
-async def test_no_session_is_held_for_by_more_subscriptions_than_the_limit() -> None:
-    """Two at most, over all connections of the session; one may be asked for again, and given up for another."""
+async def test_no_identity_is_held_for_by_more_subscriptions_than_the_limit() -> None:
+    """Two at most, over all its connections; one may be asked for again, and given up for another.
+
+    A second session's takes the place of the session that is away.
+    """
     async with relay(settings(limits=Limits(subscriptions=2))) as server:
         for ids, codes in (("ab", [None, None]), ("c", ["too_many"]), ("a", [None])):
             async with client(server.port, session="a") as robot:
@@ -143,6 +147,11 @@ async def test_no_session_is_held_for_by_more_subscriptions_than_the_limit() -> 
         async with client(server.port, session="a") as robot:
             await robot.say("unsubscribe", id="b")
             assert (await robot.subscribe("c", "c", durable=True))["op"] == "subscribed"
+            robot.socket.transport.abort()
+        await until("its end", lambda: not server.hub.members)
+        async with client(server.port, session="b") as robot:
+            assert (await robot.subscribe("a", "a", durable=True))["op"] == "subscribed"
+            assert [name for _, name in server.hub.store.sessions] == ["b"]
 
 
 async def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,7 +164,7 @@ async def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monk
 
     store = opened()
     robot = store.open("robot", Identity("1.1.1.1"), False, 0, 0)
-    await store.want(robot, "a", "command$")
+    await store.want(robot, "a", pattern("command$"))
     store.left(robot)
     year_s = time.time() + 366 * 86_400
     monkeypatch.setattr("time.time", lambda: year_s)

@@ -12,7 +12,7 @@ from loop_cases import beside, compiled
 from relay_cases import Corner, relay, settings, until, wait, within
 
 from bufgym.model.topics import Topic
-from bufgym_live.relay import backoff
+from bufgym_live.relay import backoff, inbox
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.config import Limits
 from bufgym_live.relay.connection import Connection
@@ -168,16 +168,21 @@ async def test_what_waiting_mends_ends_no_client(
     assert ends or any(f"refused: {code}: not now" in fault for fault in one.faults)
 
 
-async def test_a_fault_in_the_program_ends_no_client(corner: Corner) -> None:
-    """It is reported as asyncio reports faults, and the next command comes."""
+@pytest.mark.parametrize("fault", [ValueError, asyncio.CancelledError])
+async def test_a_fault_in_the_program_ends_no_client(corner: Corner, fault: type[BaseException]) -> None:
+    """It is reported as asyncio reports faults, and the next command comes; also where nobody reads what it says."""
     came, faults = list[bytes](), list[Any]()
 
     def take(message: Message) -> None:
         came.append(bytes(message.payload))
-        raise ValueError("a fault")
+        raise fault("a fault")
+
+    def say(text: str) -> None:
+        raise BrokenPipeError
 
     asyncio.get_running_loop().set_exception_handler(lambda loop, about: faults.append(about["exception"]))
-    one = Session(corner.url, "a")
+    one = Session(corner.url, "a", say=say)
+    one.note("a fault")
     one.subscribe(f"^{corner.command}$", take)
     async with beside(one.run()), corner.client() as operator:
         await wait("its subscription", one.ready.wait())
@@ -186,3 +191,34 @@ async def test_a_fault_in_the_program_ends_no_client(corner: Corner) -> None:
         await until("both", lambda: came == [b"1", b"2"])
     asyncio.get_running_loop().set_exception_handler(None)
     assert [str(fault) for fault in faults] == ["a fault", "a fault"]
+
+
+async def test_what_a_message_calls_may_wait_for_an_answer(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program answers each report with a command, while reports come on that it has no room for: the newest stays."""
+    monkeypatch.setattr(inbox, "MOST_BYTES", 1_000)
+    one, came, answers = Session(corner.url, "a"), list[bytes](), 0
+
+    async def answer(message: Message) -> None:
+        nonlocal answers
+        came.append(bytes(message.payload[:1]))
+        await one.command(corner.command, len(came))
+        answers += 1
+
+    one.subscribe(f"^{corner.topic('report')}$", answer, policy="drop-oldest", capacity=100)
+    async with beside(one.run()), corner.client() as robot:
+        await robot.subscribe(f"^{corner.command}$")
+        await wait("its subscription", one.ready.wait())
+        held, hold = asyncio.Event(), corner.hub.hold
+
+        async def late(*words: Any, **named: Any) -> None:
+            await held.wait()
+            await hold(*words, **named)
+
+        monkeypatch.setattr(corner.hub, "hold", late)
+        for k in range(9):
+            await robot.put(corner.topic("report"), b"%d" % k + bytes(600))
+        await until("all are read", lambda: b"8" in [bytes(each.payload[:1]) for each in one._inbox._waiting])
+        assert len(one._inbox._waiting) <= 3
+        held.set()
+        await until("the last answer", lambda: answers == len(came) and came[-1] == b"8")
+        assert came[0] == b"0" and len(came) <= 4

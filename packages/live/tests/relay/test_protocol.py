@@ -3,11 +3,13 @@
 import contextlib
 import json
 import random
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import Raw
 from refusal_cases import refuse
 from relay_cases import settings
 
@@ -18,6 +20,7 @@ from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.config import Config, Limits, Rule
 from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.patterns import for_client, pattern
+from bufgym_live.relay.protocol import check_json
 from bufgym_live.relay.quota import Quota, Quotas
 from bufgym_live.relay.rules import Identity, Permissions
 from bufgym_live.relay.session import Session
@@ -80,6 +83,8 @@ def test_what_a_frame_asks() -> None:
     hello = wire.say("hello", version=1)
     refuse("hello: must be one of subscribe, unsubscribe", protocol.asked, hello, 40, kind=WireError)
     refuse("text of 2097152 characters", protocol.asked, "x" * 2**21, 40, kind=WireError)
+    long = wire.say("unsubscribe", id="a" * 2**16)  # only what is published may be so long
+    refuse("unsubscribe: .* must be at most 65536", protocol.asked, long, 40, kind=WireError)
 
 
 def test_which_messages_are_taken() -> None:
@@ -116,14 +121,18 @@ def test_a_subscription_that_is_refused() -> None:
 
 
 def test_a_quota_counts_what_its_connections_have() -> None:
-    """Two connections and three subscriptions at most; a connection that fails gives back what it had."""
-    quotas = Quotas(Limits(connections=2, subscriptions=3), lambda: 0.0)
-    with contextlib.suppress(ValueError), quotas.connection("a", {"x": 1, "y": 2}) as quota:
-        quota.subscribe("z", {})
-        with quotas.connection("a", {"z": 3}) as same, pytest.raises(RefusedError, match="at most 3 subscriptions"):
+    """Two connections and four subscriptions at most, of which a long pattern counts for two.
+
+    A connection that fails gives back what it had.
+    """
+    quotas, short = Quotas(Limits(connections=2, subscriptions=4), lambda: 0.0), pattern("^/a$")
+    x, y, z = (SimpleNamespace(pattern=pattern(text)) for text in ("^/x$", "^/y$", "/[^/]+/[^/]+/[^/]+/y"))
+    with contextlib.suppress(ValueError), quotas.connection("a", {"x": x, "y": y}) as quota:
+        quota.subscribe("z", {}, z.pattern.cost)
+        with quotas.connection("a", {"z": z}) as same, pytest.raises(RefusedError, match="at most 4 subscriptions"):
             assert same is quota
-            quota.subscribe("x", {"x": 1})  # it replaces one
-            quota.subscribe("w", {"z": 3})
+            quota.subscribe("x", {"x": x}, short.cost)  # it replaces one
+            quota.subscribe("w", {"z": z}, short.cost)
         with quotas.connection("a", {}), pytest.raises(RefusedError, match="at most 2 connections"):
             quotas.connection("a", {}).__enter__()
         raise ValueError
@@ -133,6 +142,17 @@ def test_a_quota_counts_what_its_connections_have() -> None:
 # Frames byte by byte, and what is none.
 
 names = st.text(st.characters(exclude_categories=("C", "Z")), max_size=60)
+NO_JSON = (
+    b"{",
+    b"1e400",
+    b"[-1E+999]",
+    b"NaN",
+    b"-Infinity",
+    b'"\xff"',
+    "1".encode("utf-16"),
+    b"[" * 10_000,
+    b"9" * 5_000,
+)
 whole, stamps = st.integers(0, 2**53), st.integers(-(2**53), 2**53)
 messages = st.builds(
     Message, names.map("/{}".format), st.binary(max_size=50), st.just("raw"), names, names, whole, stamps, st.booleans()
@@ -150,16 +170,29 @@ def test_byte_by_byte() -> None:
     )
 
 
+def published(text: str) -> Message:
+    return wire.from_json(wire.heard(text.replace("message", "publish", 1)))
+
+
 @given(messages)
 def test_what_is_written_is_read(message: Message) -> None:
     assert wire.decode(wire.encode(message)) == message
-    assert wire.from_json(wire.heard(wire.to_json(message))) == message
+    assert published(wire.to_json(message)) == message._replace(sender="")
+
+
+@pytest.mark.parametrize("payload", NO_JSON, ids=len)
+def test_a_payload_that_is_no_json_is_refused(payload: bytes) -> None:
+    with pytest.raises(RefusedError, match="topic /a: payload must be JSON"):
+        check_json(Message("/a", payload))
+    check_json(Message("/a", b'["1e400", 1e99, 1e-400, "' + 400 * b"9" + b'"]'))
 
 
 def test_json_payloads_are_values() -> None:
+    """No Python objects are made of them in the relay: they take long, and are as many as their sender likes."""
+    assert isinstance(wire.heard('{"op":"publish","topic":"/a","data":[1]}')["data"], Raw)
     message = Message("/a", b'{"x": [1, null, "\\u00e4"]}')
     assert json.loads(wire.to_json(message))["data"] == {"x": [1, None, "ä"]}
-    assert json.loads(bytes(wire.from_json(wire.heard(wire.to_json(message))).payload)) == {"x": [1, None, "ä"]}
+    assert json.loads(bytes(published(wire.to_json(message)).payload)) == {"x": [1, None, "ä"]}
 
 
 GOOD = wire.encode(Message("/a", b"12"))
@@ -180,23 +213,26 @@ TWO = {2: "version 1", 3: "kind 1", 4: "a known flag"}
         (wire.decode, GOOD.replace(b"/a", b"aa"), "must begin with '/'"),
         (wire.decode, GOOD.replace(b"/a", b"/\n"), "must be printable"),
         (wire.decode, GOOD.replace(b"/a", b"/\xff"), "must be UTF-8"),
-        *((wire.heard, text, "must be JSON") for text in ("", "[" * 10_000, "9" * 5_000)),
+        (wire.heard, "", "must be JSON"),
+        *((wire.heard, text, "must be an object") for text in ("[" * 10_000, "9" * 5_000)),
         (wire.heard, "3", "must be an object"),
         *((wire.heard, text, "must be an object whose op") for text in ('{"op": "dance"}', '{"op": ["hello"]}')),
         (wire.heard, '{"op": "hello"}', "missing required field `version`"),
         (wire.heard, '{"op": "hello", "version": true}', "Expected `int`, got `bool`"),
         (wire.heard, '{"op": "hello", "version": -1}', "Expected `int` >= 0"),
         (wire.heard, '{"op": "hello", "version": 1e99}', "Expected `int`, got `float`"),
-        (wire.heard, '{"op": "publish", "topic": "/a", "data": NaN}', "NaN: numbers must be finite"),
+        (wire.heard, '{"op": "publish", "topic": "/a", "data": NaN}', "must be JSON: .* invalid character"),
         (wire.heard, '{"op": "subscribe", "id": "a", "topic": 3}', r"Expected `str`, got `int` - at `\$.topic`"),
         (wire.heard, '{"op": "subscribe", "id": "a", "topic": "a", "priority": "1"}', "Expected `float`, got `str`"),
         (wire.from_json, {"topic": "a", "data": 1}, "must begin with '/'"),
         (wire.from_json, {"topic": "/\ud800", "data": 1}, "must be"),
         *((wire.from_json, {"topic": f"/{name}", "data": 1}, "at most 255 bytes") for name in ("a" * 255, "ä" * 128)),
-        *((wire.from_json, {"topic": "/a", "encoding": "jpeg", "data": data}, "must be base64") for data in ("*", 3)),
-        (wire.from_json, {"topic": "/a", "encoding": "", "data": ""}, "must not be empty"),
-        (wire.heard, '{"op": "publish", "topic": "/a", "data": -1e400}', "-1e400: numbers must be finite"),
-        *((wire.to_json, Message("/a", payload), "payload must be JSON") for payload in (b"{", b"1e400")),
+        *(
+            (wire.from_json, {"topic": "/a", "encoding": "jpeg", "data": data}, "must be base64")
+            for data in (b'"*"', b"3")
+        ),
+        (wire.from_json, {"topic": "/a", "encoding": "", "data": b'""'}, "must not be empty"),
+        (wire.heard, '{"op": "ack", "seq": -1e400}', "-1e400: numbers must be finite|out of range"),
     ],
 )
 def test_each_fault_is_named(read: Any, given: Any, error: str) -> None:

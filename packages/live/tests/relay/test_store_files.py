@@ -3,12 +3,17 @@
 import shutil
 import sqlite3
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
+from refusal_cases import refuse
 from relay_cases import client, relay, settings
 
+from bufgym_live.relay.audit import Audit
+from bufgym_live.relay.config import Rotation
 from bufgym_live.relay.held import FILE
+from bufgym_live.relay.store import Store
 
 BEFORE = Path(__file__).with_name("held_d36707ca.sql")
 COMMAND = "/robots/a/command"
@@ -16,7 +21,10 @@ COMMAND = "/robots/a/command"
 
 @pytest.mark.skipif(shutil.which("sqlite3") is None, reason="no sqlite3 here")
 async def test_an_earlier_releases_store_is_backed_up_restored_and_opened(tmp_path: Path) -> None:
-    """Command 1 of 3 was acked. 2 and 3 arrive, and 4 follows. While a relay has the file, no other may read it."""
+    """Command 1 of 3 was acked. 2 and 3 arrive, and 4 follows, although one pattern is no longer taken.
+
+    While a relay has the file, no other may read it.
+    """
     held, copy = tmp_path / FILE, tmp_path / "copy.sqlite"
 
     def sqlite(order: str) -> str:
@@ -39,3 +47,11 @@ async def test_an_earlier_releases_store_is_backed_up_restored_and_opened(tmp_pa
         await robot.subscribe(f"^{COMMAND}$", durable=True)
         await operator.acked(COMMAND, 4)
         await robot.came(4)
+
+
+def test_a_store_of_a_later_release_is_refused(tmp_path: Path) -> None:
+    database = sqlite3.connect(tmp_path / FILE)
+    database.execute("CREATE TABLE session (id INTEGER PRIMARY KEY, title TEXT)")
+    database.close()
+    given = settings(folder=tmp_path), Audit(None, Rotation()), print, time.monotonic
+    refuse("held.sqlite: no such column: .*: must be a relay's own", Store, *given)

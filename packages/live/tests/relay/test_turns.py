@@ -12,7 +12,7 @@ import pytest
 from loop_cases import beside
 from relay_cases import client, relay, settings, until
 
-from bufgym_live.relay import caller, replay, turns
+from bufgym_live.relay import caller, replay, turns, wire
 
 
 async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,6 +36,26 @@ async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) 
         found = [entry for entry in server.hub.audit.recent if entry["event"] == "slow"]
         assert {entry["who"] for entry in found} == {"127.0.0.2"}
         assert sum(entry["times"] for entry in found) == 3 and found[0]["longest_ms"] == 30.0
+
+
+async def test_what_comes_together_is_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixty messages have come at once; all others have a turn after eight of them."""
+    turn, taken = 0, list[int]()
+
+    async def others() -> None:
+        nonlocal turn
+        while True:
+            turn += 1
+            await asyncio.sleep(0)
+
+    async with relay(settings()) as server, client(server.port) as one:
+        monkeypatch.setattr(server.hub, "publish", lambda sender, message: taken.append(turn) if sender else None)
+        frame = wire.encode(wire.Message("/a", b"1", "raw"))
+        (accepted,) = server._admission.open
+        async with beside(others()):
+            accepted.data_received(60 * (bytes([0x82, 0x80 | len(frame), 0, 0, 0, 0]) + frame))
+            await until("all", lambda: len(taken) == 60)
+    assert max(map(taken.count, taken)) == 8 and one.welcome["op"] == "welcome"
 
 
 async def test_a_task_is_the_same_under_the_watch() -> None:
