@@ -7,11 +7,11 @@ from pathlib import Path
 
 REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
-    "bufgym": 27_550,
-    "tests": 18_410,
-    "packages/live/bufgym_live": 12_451,
-    "packages/live/tests": 10_020,
-    "packages/papers/bufgym_papers": 5_250,
+    "bufgym": 27_525,
+    "tests": 18_405,
+    "packages/live/bufgym_live": 12_454,
+    "packages/live/tests": 10_044,
+    "packages/papers/bufgym_papers": 5_185,
     "packages/papers/tests": 1_160,
 }
 LONGEST = 350

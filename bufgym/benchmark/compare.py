@@ -1,7 +1,5 @@
 """``bufgym.compare`` and ``bufgym.make_policy``: policies side by side on the same episodes."""
 
-from __future__ import annotations
-
 import html
 import math
 import os

@@ -3,8 +3,6 @@
 ``manifest.json`` records the settings, so that runs do not mix their rows.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

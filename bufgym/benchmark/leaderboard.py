@@ -1,7 +1,5 @@
 """Leaderboard: results of each policy on each suite, with the command that repeats and checks them."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math

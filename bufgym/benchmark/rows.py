@@ -1,7 +1,5 @@
 """Rows in files: CSV or Parquet, written whole or not at all, read back to the last bit."""
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence

@@ -5,8 +5,6 @@ policy, the capacity and the order of runs. Two runs with the same trace and see
 their difference has no noise from the draw. Each trace of a scenario has the full set of seeds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

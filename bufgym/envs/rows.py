@@ -280,9 +280,7 @@ class Rows:
         try:
             number = operator.index(action)
         except TypeError:
-            raise InvalidActionError(
-                f"{name} = {action!r}: must be a whole number in 0..{self.capacity + 1} (L = {self.capacity})"
-            ) from None
+            raise self.bad_action(name, action) from None
         if not 0 <= number < self.capacity + 2:
             raise self.bad_action(name, number)
         return number
@@ -300,7 +298,7 @@ class Rows:
         unsigned = numbers.view(np.uint64)  # where negative ones are large
         if np.maximum.reduce(unsigned) >= self.capacity + 2:
             wrong = int(np.argmax(unsigned >= self.capacity + 2))
-            raise self.bad_action(f"actions[{wrong}]", numbers[wrong])
+            raise self.bad_action(f"actions[{wrong}]", numbers.item(wrong))
         return numbers
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -316,8 +314,9 @@ class Rows:
         return columns
 
     def bad_action(self, name: str, action: Any) -> InvalidActionError:
-        """Make the error for an action outside 0..L+1."""
-        return InvalidActionError(f"{name} = {action}: must lie in 0..{self.capacity + 1} (L = {self.capacity})")
+        """Make the error for an action that is none of 0..L+1."""
+        rule = f"must be a whole number in 0..{self.capacity + 1} (L = {self.capacity})"
+        return InvalidActionError(f"{name} = {action!r}: {rule}")
 
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
         """The next episode of row ``i``'s streams, and the generator of its uniform draws."""

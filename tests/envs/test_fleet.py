@@ -148,7 +148,10 @@ test_bad_input_is_told_apart = refused(
     (lambda: FleetVecEnv(frameskip=1), "unexpected keyword argument 'frameskip'", TypeError),
     (lambda: begun().step({"robot_0": 0, "robot_1": 1.7}), r"actions\['robot_1'\] = 1.7: must be a whole number"),
     (lambda: begun().step({"robot_0": 0}), "actions: none for 'robot_1'"),
-    (lambda: begun().step({"robot_0": 0, "robot_1": L + 2}), r"actions\['robot_1'\] = 6: must lie in 0..5"),
+    (
+        lambda: begun().step({"robot_0": 0, "robot_1": L + 2}),
+        r"actions\['robot_1'\] = 6: must be a whole number in 0..5",
+    ),
     (lambda: begun().reset(options={"episode": apart()}), "arrive at the same times"),
     (lambda: begun().reset(options={"episode": 3}), "3 is not a bufgym.scenario FleetEpisode"),
     (lambda: FleetVecEnv(0), "cells = 0"),

@@ -241,7 +241,7 @@ test_wrong_use_is_named = refused(
     (lambda: SenderEnv(mask_in_observation=True, actions="guided"), "actions = 'guided' have no mask"),
     (lambda: SenderEnv(mask_dtype="float32"), "mask_dtype = 'float32': must be one of 'int8', 'bool'"),
     *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}", INVALID) for a in (1.7, np.array([1]), "1", None)),
-    (lambda: begun().step(6), r"action = 6: must lie in 0\.\.5", INVALID),
+    (lambda: begun().step(6), r"action = 6: must be a whole number in 0\.\.5", INVALID),
     (lambda: make("interruption").reset(options={"episode": Interruption(t_max=30).episode(30)}), "room for 27"),
 )
 

@@ -305,7 +305,7 @@ test_wrong_use_is_named = refused(
     (lambda: begun().reset(options={"reset_mask": np.array([True])}), r"reset_mask'\] is bool\[1\]: must be bool\[3\]"),
     (lambda: begun().reset(options={"reset_mask": np.array([0, 2, 1])}), r"is int64\[3\]: must be bool\[3\]"),
     (lambda: begun().reset(options={"episodes": [None]}), "must be a list of 3, one a row"),
-    (lambda: begun().step(np.array([0, 5, 6])), r"actions\[2\] = 6: must lie in 0\.\.5"),
+    (lambda: begun().step(np.array([0, 5, 6])), r"actions\[2\] = 6: must be a whole number in 0\.\.5"),
     (lambda: begun().step(np.array([0, 1.7, 2])), "actions are float64: must be whole numbers", INVALID),
     (lambda: begun().step(np.zeros(N + 1, np.int64)), "shape"),
 )

@@ -3,8 +3,6 @@
 It reads a folder of ``bufgym bench --suite``. It simulates nothing and takes all statistics from the task.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from contextlib import suppress

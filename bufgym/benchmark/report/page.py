@@ -1,7 +1,5 @@
 """Page of a run and its summary, made of templates, style sheet and charts."""
 
-from __future__ import annotations
-
 import math
 from importlib.resources import files
 

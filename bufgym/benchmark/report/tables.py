@@ -1,7 +1,5 @@
 """Tables of the report: the ranking, and every policy in every cell."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from html import escape as escape
 from typing import NamedTuple

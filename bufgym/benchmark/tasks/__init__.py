@@ -3,8 +3,6 @@
 A new kind of task adds a file here and an entry of ``TASKS``.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Robots that share a cell: each policy runs on all robots and is compared with AFR robot by robot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """One queue: every policy is scored between Drop Oldest at 0 and the clairvoyant at 1."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """One queue under stress, where policies are ranked by their worst cell."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Several topics of one client over one uplink: every policy beside Robofleet's client as published."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial

@@ -6,8 +6,6 @@ numbers need bufgym alone. The figures on frames need the extra ``perception``. 
 refer to docs/references.bib.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext

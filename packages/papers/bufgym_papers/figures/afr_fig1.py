@@ -1,7 +1,5 @@
 """Fig. 1 of the AFR paper: the models that tracking makes of the frames received, coloured by error."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """V of the four motions of `afr_views`, computed from the overlap of views, beside the AFR paper's formulas."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

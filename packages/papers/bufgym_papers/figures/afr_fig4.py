@@ -5,8 +5,6 @@ to 16 evict 1, 3, ..., 15, which is one pass of the dropping position p over the
 doubles. The counter c now rejects every second arrival, and the next pass begins.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

@@ -7,8 +7,6 @@ AFR equals oracle-ideal where its L + 1 gaps are equal, that is T + 1 = (L + 1) 
 71. The paper prints 18, 36 and 72, where AFR is strictly below oracle-ideal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ Samples are numbered from 0, as the paper counts seconds. The paper's "about 15 
 claim about this trace.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

@@ -6,8 +6,6 @@ second map uses the poses that tracking finds along the frames received, up to w
 tracked poses would explain a difference from the paper.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

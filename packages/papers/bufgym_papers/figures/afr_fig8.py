@@ -4,8 +4,6 @@
 repeats one alignment ten times; we place the fade at ten places that were fixed beforehand.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

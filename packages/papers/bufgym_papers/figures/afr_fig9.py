@@ -7,8 +7,6 @@ motion, and `orbbuf-images` compares images of a made-up room at 640x480 and nee
 depend on this machine and differ from run to run, so compare orders of magnitude.
 """
 
-from __future__ import annotations
-
 import functools
 import time
 import timeit

@@ -1,7 +1,5 @@
 """Sec. III and IV of the AFR paper [wang2022afr], sentence by sentence: the model, the problem, Algorithm 1, Eq. 9."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from typing import Any

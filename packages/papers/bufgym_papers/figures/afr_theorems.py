@@ -3,8 +3,6 @@
 See docs/methods.md, "The theorems of AFR, exactly".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 See docs/methods.md, "Views under four motions".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """``bufgym reproduce``: reproductions of the papers' figures and tables."""
 
-from __future__ import annotations
-
 import itertools
 import sys
 from collections.abc import Callable, Iterator

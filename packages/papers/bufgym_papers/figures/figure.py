@@ -5,8 +5,6 @@ numbers, ``claims`` tests the paper's sentences with them, and ``draw`` makes th
 ``afr.toml`` and ``robofleet.toml``. Each figure has a section with its sentences and the text around them.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import sys

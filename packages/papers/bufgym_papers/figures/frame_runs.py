@@ -3,8 +3,6 @@
 See docs/methods.md, "Mapping and tracking with the frames that arrive".
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import operator

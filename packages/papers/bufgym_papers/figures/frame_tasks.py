@@ -4,8 +4,6 @@ A folder keeps each task's result by the task's inputs alone. So figures share t
 and a killed run resumes where it stopped.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Iterable

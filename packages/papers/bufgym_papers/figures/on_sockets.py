@@ -1,7 +1,5 @@
 """Figures on real sockets: a simulated run's messages pass live queues and links shaped like the simulated ones."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Iterator

@@ -4,8 +4,6 @@
 checked without them. ``bufgym reproduce afr-fig7 --claims docs/claims.md`` renews the rows of one figure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ no_drop, where all messages wait, as published and as released. Beside it run ro
 unbounded queue, and native ROS with a queue of its own. The paper gives no cloud size, round trip or publishing time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -3,8 +3,6 @@
 See docs/methods.md, "Recovery after a dropout".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ late messages are received too. A program breaks in the first second whose mean 
 that one message needs alone at the capacity of that second.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import product

@@ -6,8 +6,6 @@ publisher's queue, so we show several of each; the link can carry the smallest c
 received while clouds are published count, not messages that full queues deliver afterwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product

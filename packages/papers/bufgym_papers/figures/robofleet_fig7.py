@@ -6,8 +6,6 @@ what the priorities were. Here the link falls from one steady rate to another an
 Robofleet's example client: localization 20, laser scans 2, images 1. We also try lower priorities of images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

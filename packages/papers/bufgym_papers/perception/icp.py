@@ -5,8 +5,6 @@ point is paired with the model's point behind the same pixel. The pose moves so 
 model's planes.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -6,8 +6,6 @@ random number in this place, and the wording of the paper's formula was not at h
 around it is the same as in the policy `orbbuf`, which compares recorded motion.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Final

@@ -6,8 +6,6 @@ So its depth has steps that grow with the square of the depth, and neighbours sh
 things that the projector does not reach are missing. Noise is a stateless hash of seed, frame and place.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import Any

@@ -9,8 +9,6 @@
 Frames are read when they are asked for.
 """
 
-from __future__ import annotations
-
 import re
 import zipfile
 from collections.abc import Sequence as Seq

@@ -4,8 +4,6 @@ Everything is drawn from a seed beforehand. Each frame is ray-cast on demand, so
 pixels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

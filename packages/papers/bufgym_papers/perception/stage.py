@@ -1,7 +1,5 @@
 """A recording with everything that runs on it share: its grid, the map of all frames, and what views have in common."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from functools import cached_property

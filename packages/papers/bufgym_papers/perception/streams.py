@@ -1,7 +1,5 @@
 """A recording sent over a link: its frames as an episode, and the frames that arrive under a policy."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence as Seq
 from functools import lru_cache
 

@@ -3,8 +3,6 @@
 See docs/methods.md, "When a camera is lost".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final

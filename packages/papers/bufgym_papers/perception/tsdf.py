@@ -7,8 +7,6 @@ distance to the surface along the viewing direction, in units of the truncation:
 Kernels take ``lens`` = (fx, fy, cx, cy) as float64[4] and poses as float64[4, 4]. Sums are taken in a fixed order.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

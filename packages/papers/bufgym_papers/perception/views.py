@@ -7,8 +7,6 @@ j) is the part of frame j that is new after frame i.
 This V depends on two frames, while the paper's depends on the distance between them; `afr-overlap` compares the two.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, Final
 

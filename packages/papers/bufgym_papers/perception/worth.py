@@ -7,8 +7,6 @@ Train on `followed` and evaluate with `tracked`: ``reward={"followed": 1, "track
 counting it.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, Final
