@@ -225,6 +225,7 @@ class Connection:
             self._caller.refuse("subscribe", error, id=said["id"])
             return
         self.tell("subscribed", id=subscription.id, policy=subscription.policy.name, capacity=subscription.capacity)
+        await self._hub.offer_latched(self, subscription)
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """A message that its queues decide on."""

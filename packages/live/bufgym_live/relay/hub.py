@@ -39,6 +39,7 @@ CONNECTED: Final = "connected"  # State of the connection to the other relays
 ROBOFLEET: Final = "robofleet"
 """Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
+MOST_IN_TURN: Final = 256  # Latched topics that are offered in a turn of the event loop
 MAX_LATCHED_BYTES: Final = 2**26  # Limit on the last messages of latched topics; beyond, the oldest are forgotten
 
 
@@ -148,7 +149,7 @@ class Hub:
         self._routes.clear()
 
     async def subscribe(self, member: Member, subscription: Subscription) -> None:
-        """Add a subscription, with what is latched; it replaces one with the same id.
+        """Add a subscription; it replaces one with the same id.
 
         Raises RefusedError: it is durable, and there are too many or the store cannot be written.
         """
@@ -157,8 +158,16 @@ class Hub:
         self.unsubscribe(member, subscription.id, still_held=subscription.durable)
         member.subscriptions[subscription.id] = subscription
         self._routes.clear()
-        for topic, frame in self._latched.items():
-            if subscription.pattern.part(topic) and member.permissions.allow("receive", topic):
+
+    async def offer_latched(self, member: Member, subscription: Subscription) -> None:
+        """Offer a new subscription what is latched; all others have a turn after some of it."""
+        for k, (topic, frame) in enumerate(list(self._latched.items())):
+            if k % MOST_IN_TURN == 0:
+                await asyncio.sleep(0)
+                if member.subscriptions.get(subscription.id) is not subscription:
+                    break
+            newest = self._latched.get(topic) is frame  # otherwise it has got a newer one meanwhile
+            if newest and subscription.pattern.part(topic) and member.permissions.allow("receive", topic):
                 member.offer(subscription, frame)
 
     def unsubscribe(self, member: Member, id: str, *, still_held: bool = False) -> None:

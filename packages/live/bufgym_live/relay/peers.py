@@ -87,7 +87,9 @@ class Peers:
                 await bus.open(self._options, self._heard, self._known)
                 self._bus = bus
                 backoff.connected()
-                await self._hub.subscribe(self, Subscription("all", pattern(""), policy, DEFAULT_CAPACITY))
+                everything = Subscription("all", pattern(""), policy, DEFAULT_CAPACITY)
+                await self._hub.subscribe(self, everything)
+                await self._hub.offer_latched(self, everything)
                 self._becomes(CONNECTED)
                 if not tried.done():
                     tried.set_result(None)

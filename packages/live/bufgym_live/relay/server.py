@@ -14,6 +14,7 @@ from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, cast
 
+from msgspec.structs import replace
 from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import NegotiationError
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from bufgym_live.relay.foxglove import Window
 
 TICK_S: Final = 1.0  # Time between two ticks, which publish the relay's state and forget what has expired
+OTHER_FILES: Final = 64  # Files that a relay may have open beside its connections
 SWITCH_S: Final = 5e-4  # Time for which a thread that computes, as for a replay, may keep the event loop waiting
 _QUIET: Final = logging.getLogger("bufgym.relay.websockets")
 """Silenced logger; clients' faults go to the audit log, not to tracebacks."""
@@ -213,10 +215,25 @@ class Server:
                 self._admission.incoming.end_late()
 
 
+def _fitted(config: Config, say: Any) -> Config:
+    """Let this process open as many files as it may, and take no more connections than that."""
+    with contextlib.suppress(ImportError, ValueError):  # Windows has none, macOS allows less than it says
+        import resource
+
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+        limits = config.limits
+        if most != resource.RLIM_INFINITY and most < limits.all_connections + OTHER_FILES:
+            fewer = max(1, most - OTHER_FILES)
+            say(f"limits: all_connections is {fewer}, not {limits.all_connections}: ulimit -Hn is {most} open files")
+            return replace(config, limits=replace(limits, all_connections=fewer))
+    return config
+
+
 async def serve_forever(config: Config, say: Any = print) -> None:
     """Run a relay until cancelled, or until the process gets SIGTERM."""
     sys.setswitchinterval(SWITCH_S)
-    server = Server(config)
+    server = Server(_fitted(config, say))
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")

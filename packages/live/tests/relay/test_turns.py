@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import resource
 import threading
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,10 @@ import pytest
 from loop_cases import beside
 from relay_cases import client, relay, settings, until
 
-from bufgym_live.relay import caller, replay, turns, wire
+from bufgym_live.relay import caller, replay, server, turns, wire
+from bufgym_live.relay.connection import Connection
+from bufgym_live.relay.hub import MOST_IN_TURN, Outgoing
+from bufgym_live.relay.subscriber import Subscription
 
 
 async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,24 +42,62 @@ async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) 
         assert sum(entry["times"] for entry in found) == 3 and found[0]["longest_ms"] == 30.0
 
 
-async def test_what_comes_together_is_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sixty messages have come at once; all others have a turn after eight of them."""
-    turn, taken = 0, list[int]()
+class Others:
+    """All others, who count their turns."""
 
-    async def others() -> None:
-        nonlocal turn
+    turn = 0
+
+    async def run(self) -> None:
         while True:
-            turn += 1
+            self.turn += 1
             await asyncio.sleep(0)
 
+
+async def test_what_comes_together_is_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixty messages have come at once; all others have a turn after eight of them."""
+    others, taken = Others(), list[int]()
     async with relay(settings()) as server, client(server.port) as one:
-        monkeypatch.setattr(server.hub, "publish", lambda sender, message: taken.append(turn) if sender else None)
+        monkeypatch.setattr(
+            server.hub, "publish", lambda sender, message: taken.append(others.turn) if sender else None
+        )
         frame = wire.encode(wire.Message("/a", b"1", "raw"))
         (accepted,) = server._admission.open
-        async with beside(others()):
+        async with beside(others.run()):
             accepted.data_received(60 * (bytes([0x82, 0x80 | len(frame), 0, 0, 0, 0]) + frame))
             await until("all", lambda: len(taken) == 60)
     assert max(map(taken.count, taken)) == 8 and one.welcome["op"] == "welcome"
+
+
+async def test_what_is_latched_is_offered_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All others have a turn after 256 topics; one that gets a newer message meanwhile comes once, with that."""
+    others, came = Others(), list[tuple[int, str, bytes]]()
+
+    def offer(connection: Connection, subscription: Subscription, frame: Outgoing) -> None:
+        message = frame.message
+        came.append((others.turn, message.topic, bytes(message.payload)))
+        if len(came) == 1:
+            one.hub.publish(None, wire.Message("/map/999", b"new", "raw"))
+
+    async with relay(settings(latched=("/map/.*",))) as one, client(one.port) as viewer:
+        monkeypatch.setattr(Connection, "offer", offer)
+        for k in range(1_000):
+            one.hub.publish(None, wire.Message(f"/map/{k}", b"old", "raw"))
+        async with beside(others.run()):
+            await viewer.subscribe("^/map/")
+            await until("all", lambda: len(came) == 1_000)
+    turns_taken = [turn for turn, _, _ in came]
+    assert max(map(turns_taken.count, turns_taken)) <= MOST_IN_TURN + 1
+    assert [payload for _, topic, payload in came if topic == "/map/999"] == [b"new"]
+
+
+def test_it_takes_no_more_connections_than_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    said, given = list[str](), list[tuple[int, int]]()
+    monkeypatch.setattr(resource, "setrlimit", lambda _, both: given.append(both))
+    for most, connections in ((100_000, 4_096), (1_024, 960), (10, 1), (resource.RLIM_INFINITY, 4_096)):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, most=most: (256, most))
+        assert server._fitted(settings(), said.append).limits.all_connections == connections
+        assert given.pop() == (most, most)
+    assert len(said) == 2 and "all_connections is 960, not 4096: ulimit -Hn is 1024" in said[0]
 
 
 async def test_a_task_is_the_same_under_the_watch() -> None:
