@@ -9,6 +9,7 @@ from urllib.parse import SplitResult, urlsplit
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
+from bufgym_live.relay import wire
 from bufgym_live.robot.sockets import connected
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
@@ -16,11 +17,11 @@ _MAX_TOKEN_BYTES: Final = 2**16
 
 
 def parsed(url: str) -> SplitResult:
-    """Read ``ws://HOST:PORT`` or ``wss://HOST:PORT``; a path is the prefix of a proxy before the relay."""
+    """Read ``ws://HOST:PORT`` or ``wss://HOST:PORT``; a path is the prefix of a proxy, with or without ``/relay``."""
     try:
         address = urlsplit(url)
         if address.scheme in ("ws", "wss") and address.hostname and address.port != 0:
-            return address
+            return address._replace(path=address.path.rstrip("/").removesuffix(wire.PATH))
     except ValueError:  # no port, or no IPv6 address
         pass
     raise BufgymError(f"{url}: must be ws://HOST:PORT or wss://HOST:PORT")

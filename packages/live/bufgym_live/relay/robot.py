@@ -14,7 +14,10 @@ import json
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
+from operator import methodcaller
 from typing import Any, Final, Protocol
+
+import msgspec
 
 from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
@@ -112,8 +115,13 @@ class Robot:
             self.client.note(str(refused))
 
     def say(self, topic: str, data: Any) -> None:
-        """Publish ``data`` as JSON."""
-        self.publish(topic, json.dumps(data, separators=(",", ":"), allow_nan=False).encode(), "json")
+        """Publish ``data`` as JSON; NaN, as of a battery that is not measured, becomes null."""
+        try:
+            payload = msgspec.json.encode(data, enc_hook=methodcaller("item"))  # of NumPy's numbers
+        except (AttributeError, TypeError) as error:  # no reason for a robot to stop
+            self.client.note(f"topic {topic}: must be JSON: {error}")
+        else:
+            self.publish(topic, payload, "json")
 
     def status(self) -> dict[str, Any]:
         """Return the robot's state."""

@@ -10,7 +10,6 @@ wait for home, which alone knows what has arrived.
 import asyncio
 import contextlib
 import inspect
-import json
 import os
 import re
 import ssl
@@ -113,10 +112,10 @@ class Session:
         JSON.
 
         Raises:
-            BufgymError: the relay refused it; the error says why.
+            BufgymError: the relay refused it, or it is no JSON; the error says why.
         """
         encoding = "cdr" if type else "json"
-        payload = data if type else json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
+        payload = data if type else wire.written(topic, data)
         message = wire.Message(topic, payload, encoding, type, stamp_us=time.time_ns() // 1000, no_drop=True)
         self.check_size(message)
         answered = self._unanswered.put(message)

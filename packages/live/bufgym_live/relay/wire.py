@@ -193,6 +193,14 @@ def say(op: str, **fields: Any) -> str:
     return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
 
 
+def written(topic: str, data: Any) -> bytes:
+    """The payload of a message of JSON; raises WireError if ``data`` cannot be written so."""
+    try:
+        return json.dumps(data, separators=(",", ":"), allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        raise WireError(f"topic {topic!r}: data must be JSON: {error}") from None
+
+
 def heard(text: str, most_characters: int = MAX_FRAME_BYTES) -> dict[str, Any]:
     """The object of a text frame: its ``op`` is known, its fields are of their kinds.
 

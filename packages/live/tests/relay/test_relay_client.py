@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import math
 import re
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -18,7 +19,7 @@ from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.traces import Trace
 from bufgym_live.relay import backoff
-from bufgym_live.relay.address import security, token
+from bufgym_live.relay.address import parsed, security, token
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.session import Session
 from bufgym_live.relay.unanswered import Unanswered
@@ -235,6 +236,8 @@ def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.M
     assert token() == "one" and token(tmp_path / "token") == "two"
     for url in ("robot:7420", "ws://a:99999", "ws://a:x", "ws://[::1"):
         refuse(f"{re.escape(url)}: must be ws://HOST:PORT", Session, f"ws://b:1,{url}", "a")
+    assert [parsed(f"wss://a{path}").path for path in ("", "/", "/relay/", "/fleet/relay")] == ["", "", "", "/fleet"]
+    refuse("topic '/c': data must be JSON: Out of range", asyncio.run, Session("ws://a:1", "a").command("/c", math.nan))
     assert security() is None
     refuse("token: no certificate", security, certificate=str(tmp_path / "token"))
     refuse(r"pattern '\[': unterminated", Session("ws://a:1", "a").subscribe, "[", print)

@@ -151,6 +151,28 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
     assert bytes(came["camera"][0].payload[:2]) == b"\xff\xd8"
 
 
+class Unmeasured(MadeUp):
+    """Its first status is no JSON; the others have a battery that is not measured, and a number of NumPy's."""
+
+    states = 0
+
+    def status(self) -> dict[str, Any]:
+        self.states += 1
+        return {"battery": math.nan, "volts": np.float32(12), "error": self if self.states == 1 else None}
+
+
+@compiled
+async def test_a_state_that_is_no_json_stops_no_robot(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(viewer: Session, came: Came) -> None:
+        await until("a state", lambda: came["status"])
+
+    monkeypatch.setattr(robot, "STATUS_S", 0.05)
+    source = Unmeasured()
+    came = await watched(corner, source, story, policy="drop-oldest")
+    state = json.loads(bytes(came["status"][0].payload))
+    assert (state["battery"], state["volts"], state["error"]) == (None, 12.0, None) and source.states > 1
+
+
 @compiled
 async def test_a_robot_pings_once_at_a_time(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
     """No ping is answered while ten states come. One that ends with its connection ends no robot."""
