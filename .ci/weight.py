@@ -10,7 +10,7 @@ LIMITS = {
     "bufgym": 27_525,
     "tests": 18_405,
     "packages/live/bufgym_live": 12_499,
-    "packages/live/tests": 10_111,
+    "packages/live/tests": 10_114,
     "packages/papers/bufgym_papers": 5_185,
     "packages/papers/tests": 1_160,
 }

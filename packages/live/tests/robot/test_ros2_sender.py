@@ -252,7 +252,10 @@ async def test_a_node_that_starts_by_itself(node: Path, tmp_path: Path) -> None:
                 ""
             ] * 3
             assert await said(one, "configure") == 1  # o' is no topic's name
-            assert [await said(one, f"set {right}") for right in ("odometry odom", f"port {port}")] == [""] * 2
+            for right in ("odometry odom", f"port {port}", f"log {tmp_path}/none"):
+                assert await said(one, f"set {right}") == ""
+            assert await said(one, "configure") == 1  # no such folder
+            assert await said(one, f"set log {tmp_path}") == ""
             assert [await said(one, to) for to in ("configure", "activate", "pass 0.2")][:2] == [2, 3]
             for metres in (0, 3, 5):
                 await said(one, f"odometry /robot/odom {metres}")

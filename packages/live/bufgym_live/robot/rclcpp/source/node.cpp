@@ -1,6 +1,7 @@
 // bufgym::SenderNode: a component with a lifecycle, which sends topics of any type. Each topic has a queue under a
 // policy and a connection of its own to `bufgym ros2 receive`.
 #include <fnmatch.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <chrono>
@@ -86,6 +87,12 @@ public:
     catch (const std::exception &error)
     {
       RCLCPP_ERROR(get_logger(), "topics and odometry must be names of topics: %s", error.what());
+      return CallbackReturn::FAILURE;
+    }
+    const std::string log = get_parameter("log").as_string();
+    if (!log.empty() && access(log.c_str(), W_OK | X_OK))
+    {
+      RCLCPP_ERROR(get_logger(), "log = %s: must be a folder that can be written", log.c_str());
       return CallbackReturn::FAILURE;
     }
     capacity_ = int(get_parameter("capacity").as_int());
