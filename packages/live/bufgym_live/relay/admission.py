@@ -8,7 +8,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from functools import partial
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -27,7 +28,7 @@ from bufgym_live.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
 POLICY_VIOLATION: Final = 1008
 _CLOSE_S: Final = 1.0  # time for a client to answer that its connection is closed
 _FRAME_BYTES: Final = 256  # memory of a frame beside its bytes
-_SLICE_BYTES: Final = 4_096  # bytes that are read without a look at the clock; they may hold 680 frames
+_SLICE_BYTES: Final = 4_096  # bytes behind a frame that are read without a look at the clock; they may be 680 frames
 _TURN_S: Final = 0.005  # time for which what has come is read; the rest waits for the next turn of the event loop
 
 
@@ -140,13 +141,16 @@ class Accepted(ServerConnection):
         self._whole: deque[int] = deque()
         """Bytes of each whole message, the one that is being worked on first."""
         self._whole_bytes = self._part_bytes = 0
-        self._unread = bytearray()
+        self._unread = b""
+        reader, self._wanted_bytes = self.protocol.reader, 0
+        reader.read_exact = partial(self._read_exact, reader.read_exact)  # type: ignore[method-assign]
         self._working = self._anew = False
         self.ended = False
         """Whether it has used too much, so that nothing more is read or done of it."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
+        self.recv_messages.resume = self._resume
         try:
             self.address = plain_address(transport.get_extra_info("peername")[0])
             self.is_of(Identity(self.address))
@@ -193,18 +197,31 @@ class Accepted(ServerConnection):
         """Read what has come, for so long; the rest follows in further turns."""
         began_s = turns.clock()
         while self._unread and not self.ended and turns.clock() - began_s < most_s:
-            data = bytes(self._unread[:_SLICE_BYTES])
-            del self._unread[:_SLICE_BYTES]
+            size = _SLICE_BYTES + max(0, self._wanted_bytes - len(self.protocol.reader.buffer))
+            data, self._unread = self._unread[:size], self._unread[size:]
             super().data_received(data)
         self._count()
         self._admission.hub.turns.note(self.address, began_s)
         if self._unread and not self.ended:
             self.transport.pause_reading()
             self.loop.call_soon(self._read, _TURN_S)
-        elif not self.recv_messages.paused:
+        else:
+            self._resume()
+
+    def _resume(self) -> None:
+        if not (self._unread or self.recv_messages.paused):
             self.transport.resume_reading()
 
+    def _read_exact(self, read: Callable[[int], Generator[None, None, bytearray]], n: int) -> Generator[Any, Any, Any]:
+        """Note how many bytes the frame lacks, as long as it does."""
+        self._wanted_bytes = n
+        data = yield from read(n)
+        self._wanted_bytes = 0
+        return data
+
     def process_event(self, event: Event) -> None:
+        if self.ended:
+            return
         super().process_event(event)
         if isinstance(event, Frame) and not (event.fin and event.opcode in DATA_OPCODES):
             hub = self._admission.hub
@@ -252,7 +269,7 @@ class Accepted(ServerConnection):
     def fail(self, code: str, why: str) -> None:
         """End it at once, with the bytes that wait."""
         self.ended = True
-        self._unread.clear()
+        self._unread = b""
         self.refused(code, why)
         self._count()
         self.protocol.fail(POLICY_VIOLATION, why)

@@ -29,7 +29,7 @@ MAX_PRIORITY: Final = 1e6
 MAX_CAPACITY: Final = 1_000  # Largest L of a subscriber's queue
 ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "recordings", "replay")
 _DIGITS: Final = bytes.maketrans(b"123456789E", b"000000000e")
-_LARGE: Final = (b"e000", b"e+000", 300 * b"0")  # parts of numbers that may not be finite, with all digits made zeros
+_LARGE: Final = (b"e000", b"e+000", 200 * b"0")  # parts of numbers that may not be finite, with all digits made zeros
 _SESSION: Final = re.compile(r"[\w.-]{1,64}", re.ASCII)
 
 

@@ -118,7 +118,7 @@ class Robot:
         """Publish ``data`` as JSON; NaN, as of a battery that is not measured, becomes null."""
         try:
             payload = msgspec.json.encode(data, enc_hook=methodcaller("item"))  # of NumPy's numbers
-        except (AttributeError, TypeError) as error:  # no reason for a robot to stop
+        except Exception as error:  # also an item's own; no reason for a robot to stop
             self.client.note(f"topic {topic}: must be JSON: {error}")
         else:
             self.publish(topic, payload, "json")

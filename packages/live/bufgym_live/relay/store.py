@@ -117,18 +117,19 @@ class Store:
         If its identity's sessions have too many, also of connections that have ended, the one goes that has been away
         for longest: each no_drop message is compared with all of them.
 
-        Raises RefusedError: all of them are here; or the disk cannot be written.
+        Raises RefusedError: those that are here have too many; or the disk cannot be written.
         """
-        if (before := session.durable.get(id)) == pattern:
+        if (before := session.durable.get(id)) and before.text == pattern.text:
             return
         own = [one for one in self.sessions.values() if one.identity.key == session.identity.key and one.durable]
-        most = self._quota.subscriptions + (before.cost if before else 0)
-        while pattern.cost + sum(each.cost for one in own for each in list(one.durable.values())) > most:
-            oldest = min(own, key=lambda one: one.unused_s, default=session)
-            if oldest.unused_s == math.inf:
-                raise RefusedError("too_many", f"must be at most {self._quota.subscriptions} durable subscriptions")
+        costs = {one: sum(each.cost for each in list(one.durable.values())) for one in own}
+        left = self._quota.subscriptions - pattern.cost + (before.cost if before else 0)
+        if sum(cost for one, cost in costs.items() if one.unused_s == math.inf) > left:
+            raise RefusedError("too_many", f"must be at most {self._quota.subscriptions} durable subscriptions")
+        while sum(costs.values()) > left:
+            oldest = min(costs, key=lambda one: one.unused_s)
+            del costs[oldest]
             self._expire(oldest)
-            own.remove(oldest)
         session.kept = True
         await self.disk.do(self._held.want, session, id, pattern)
 

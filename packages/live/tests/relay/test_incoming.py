@@ -74,7 +74,10 @@ async def test_of_too_many_unfinished_messages_the_oldest_ends(data: bytes) -> N
 
 
 async def test_a_flood_of_small_frames_is_read_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All 2,000 pings come at once, and are read 4 kB a turn; the 1,001st within a second ends the connection."""
+    """All 2,000 pings come at once, and are read 4 kB a turn; the 1,001st within a second ends the connection.
+
+    A message of 300 kB before them is read in one piece, with 4 kB of them. Meanwhile nothing else is received.
+    """
     monkeypatch.setattr(admission, "_TURN_S", 0.0001)
     async with (
         relay(settings(limits=Limits(messages_per_s=1_000))) as server,
@@ -89,10 +92,17 @@ async def test_a_flood_of_small_frames_is_read_in_turns(monkeypatch: pytest.Monk
         for _ in range(2):  # what a client says in a row comes whole, whatever the turns
             await one.put("/a", bytes(300_000))
             assert len((await viewer.next()).payload) == 300_000
-        assert max(read) == 4_096
-        accepted.data_received(2_000 * bytes([_PING, _MASKED, 0, 0, 0, 0]))
+        read.clear()
+        frame = wire.encode(Message("/a", bytes(300_000), "raw"))
+        accepted.data_received(header(_FIN | _BINARY, len(frame)) + frame + 2_000 * bytes([_PING, _MASKED, 0, 0, 0, 0]))
+        accepted.recv_messages.resume()
+        assert not accepted.transport.is_reading()
+        assert len((await viewer.next()).payload) == 300_000
         await wait("its end", one.socket.wait_closed())
         assert one.socket.close_code == 1008 and "1000 pings" in str(one.socket.close_reason)
+        assert read[:2] == [4_096, 14 + len(frame)] and 4_096 <= max(read[2:]) <= 4_101
+        server.hub.audit.flush()
+        assert server.hub.audit.refusals == {"too_fast": 1}
 
 
 async def test_identities_of_one_address_have_a_share_together() -> None:

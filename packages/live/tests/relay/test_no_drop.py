@@ -25,6 +25,7 @@ from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.session import Session
 from bufgym_live.relay.store import Store
+from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import free_port
 
 CONFIG = settings(store=StoreLimits(window=2, messages=4))
@@ -136,10 +137,7 @@ async def test_the_identity_with_most_bytes_makes_room() -> None:
 
 
 async def test_no_identity_is_held_for_by_more_subscriptions_than_the_limit() -> None:
-    """Two at most, over all its connections; one may be asked for again, and given up for another.
-
-    A second session's takes the place of the session that is away.
-    """
+    """Two at most, over all its connections; one may be asked for again, and given up for another."""
     async with relay(settings(limits=Limits(subscriptions=2))) as server:
         for ids, codes in (("ab", [None, None]), ("c", ["too_many"]), ("a", [None])):
             async with client(server.port, session="a") as robot:
@@ -147,11 +145,24 @@ async def test_no_identity_is_held_for_by_more_subscriptions_than_the_limit() ->
         async with client(server.port, session="a") as robot:
             await robot.say("unsubscribe", id="b")
             assert (await robot.subscribe("c", "c", durable=True))["op"] == "subscribed"
-            robot.socket.transport.abort()
-        await until("its end", lambda: not server.hub.members)
-        async with client(server.port, session="b") as robot:
-            assert (await robot.subscribe("a", "a", durable=True))["op"] == "subscribed"
-            assert [name for _, name in server.hub.store.sessions] == ["b"]
+
+
+async def test_a_durable_subscription_that_cannot_be_had_costs_nobody_a_message() -> None:
+    """Of three places two are taken here and one by a session that is away; no room is made for two more."""
+    config = settings(limits=Limits(subscriptions=3))
+    store = Store(config, Audit(None, Rotation()), print, lambda: 0.0)
+    away, here = (store.open(name, Identity("1.1.1.1"), False, 0, 0) for name in ("away", "here"))
+    for session, ids in ((away, "a"), (here, "ab")):
+        for id in ids:
+            await store.want(session, id, pattern(id))
+    store.left(away)
+    with pytest.raises(RefusedError, match="at most 3 durable"):
+        await store.want(here, "c", pattern(40 * "c"))
+    await store.want(here, "b", pattern(40 * "c")._replace(text="b"))  # the same, whatever is compiled for it
+    assert away in store.sessions.values()
+    await store.want(here, "c", pattern("c"))
+    assert away not in store.sessions.values()
+    store.close()
 
 
 async def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

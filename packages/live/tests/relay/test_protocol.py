@@ -152,6 +152,7 @@ NO_JSON = (
     "1".encode("utf-16"),
     b"[" * 10_000,
     b"9" * 5_000,
+    b"1" + b"0" * 249 + b"e99",
 )
 whole, stamps = st.integers(0, 2**53), st.integers(-(2**53), 2**53)
 messages = st.builds(

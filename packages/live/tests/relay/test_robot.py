@@ -152,13 +152,14 @@ async def test_the_made_up_robot_and_a_command(corner: Corner, monkeypatch: pyte
 
 
 class Unmeasured(MadeUp):
-    """Its first status is no JSON; the others have a battery that is not measured, and a number of NumPy's."""
+    """Its first three are no JSON; the others have a battery that is not measured, and a number of NumPy's."""
 
     states = 0
 
     def status(self) -> dict[str, Any]:
         self.states += 1
-        return {"battery": math.nan, "volts": np.float32(12), "error": self if self.states == 1 else None}
+        error = {1: self, 2: np.zeros(2), 3: "\ud800"}.get(self.states)
+        return {"battery": math.nan, "volts": np.float32(12), "error": error}
 
 
 @compiled
@@ -170,7 +171,7 @@ async def test_a_state_that_is_no_json_stops_no_robot(corner: Corner, monkeypatc
     source = Unmeasured()
     came = await watched(corner, source, story, policy="drop-oldest")
     state = json.loads(bytes(came["status"][0].payload))
-    assert (state["battery"], state["volts"], state["error"]) == (None, 12.0, None) and source.states > 1
+    assert (state["battery"], state["volts"], state["error"]) == (None, 12.0, None) and source.states > 3
 
 
 @compiled
