@@ -9,8 +9,8 @@ REPO = Path(__file__).resolve().parent.parent
 LIMITS = {
     "bufgym": 27_525,
     "tests": 18_405,
-    "packages/live/bufgym_live": 12_499,
-    "packages/live/tests": 10_114,
+    "packages/live/bufgym_live": 12_517,
+    "packages/live/tests": 10_137,
     "packages/papers/bufgym_papers": 5_185,
     "packages/papers/tests": 1_160,
 }
