@@ -154,9 +154,16 @@ def test_a_latched_message_larger_than_the_sockets_buffer(built: Path, nodes: No
 
 
 def test_x_is_the_robots_motion(built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """The talker goes 0.1 m before each message: 0.05 of a scene of 2 m. After its end the master knows it no more."""
+    """The talker goes 0.1 m before each message: 0.05 of a scene of 2 m. After its end the master knows it no more.
+
+    Where it is a half is "0,5".
+    """
     log = tmp_path / "log"
-    talker = nodes.talker("moving", 5, 60, 1000, 30, 1, "moves", **preload(built, log, ODOMETRY="/odom"))
+    (tmp_path / "half").write_text('LC_NUMERIC\ndecimal_point ","\nthousands_sep ""\ngrouping -1\nEND LC_NUMERIC\n')
+    words = ("localedef", "-c", "-i", tmp_path / "half", "-f", "ANSI_X3.4-1968", tmp_path / "comma")
+    subprocess.run(words, capture_output=True, check=False)  # it warns of what is not defined
+    place = {"LOCPATH": str(tmp_path), "LC_ALL": "comma"}
+    talker = nodes.talker("moving", 5, 60, 1000, 30, 1, "moves", **place, **preload(built, log, ODOMETRY="/odom"))
     assert len(seqs(nodes.subscriber("moving"), 60)) == 60
     ended(talker)
     records = read_log(logs(log)[0])
@@ -202,13 +209,17 @@ def test_parameters_are_numbers_too(built: Path, nodes: Nodes, tmp_path: Path) -
 
 
 def test_no_message_waits_for_the_master(built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """Who sends holds a lock that roscpp takes second when it subscribes: it must not ask for odometry itself."""
+    """Who sends holds a lock that roscpp takes second when it subscribes: it must not ask for odometry itself.
+
+    Neither does a node that ends meanwhile.
+    """
     words = {"TOPICS": "", "VALUE": "exponential:0.5", "QUEUE_SIZE": "5", "ODOMETRY": "/odom", "POLICY": "afr"}
-    talker = nodes.talker("alone", 5, 10, 1000, 100, "__name:=alone", **preload(built, tmp_path / "log", **words))
+    talker = nodes.talker("alone", 5, 10_000, 1000, 100, "__name:=alone", **preload(built, tmp_path / "log", **words))
     found, pid = nodes.master.lookupNode("/test", "/alone"), nodes.master.getPid("/test")[2]
     os.kill(pid, signal.SIGSTOP)
     try:
         assert seqs(subscriber(SimpleNamespace(lookupNode=lambda *_: found), "alone", "/alone"), 10) == list(range(10))
+        talker.send_signal(signal.SIGINT)
     finally:
         os.kill(pid, signal.SIGCONT)
     ended(talker)
