@@ -1,6 +1,7 @@
 // talker TOPIC[,TOPIC...] QUEUE_SIZE MESSAGES BYTES HZ [SUBSCRIBERS [moves]]: publishes images on all topics; their
 // frame_id is their number. It waits for so many subscribers of each topic (1); with 0 the topics are latched.
 #include <algorithm>
+#include <clocale>
 #include <cstdlib>
 #include <sstream>
 #include <string>
@@ -12,6 +13,7 @@
 
 int main(int argc, char **argv)
 {
+  std::setlocale(LC_ALL, "");  // as Qt and GTK do
   ros::init(argc, argv, "talker", ros::init_options::AnonymousName);
   ros::NodeHandle node;
   const int count = std::atoi(argv[3]), subscribers = argc > 6 ? std::atoi(argv[6]) : 1;

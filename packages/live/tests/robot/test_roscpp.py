@@ -154,9 +154,13 @@ def test_a_latched_message_larger_than_the_sockets_buffer(built: Path, nodes: No
 
 
 def test_x_is_the_robots_motion(built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """The talker goes 0.1 m before each message: 0.05 of a scene of 2 m. After its end the master knows it no more."""
+    """The talker goes 0.1 m before each message, 0.05 of a scene. It writes a half as 0,5, and leaves no subscriber."""
     log = tmp_path / "log"
-    talker = nodes.talker("moving", 5, 60, 1000, 30, 1, "moves", **preload(built, log, ODOMETRY="/odom"))
+    (half := tmp_path / "half").write_text('LC_NUMERIC\ndecimal_point ","\nEND LC_NUMERIC\n')
+    make = "localedef", "-ci", half, "-f", "ANSI_X3.4-1968", tmp_path / "comma"
+    subprocess.run(make, capture_output=True, check=False)  # it warns of what is not defined
+    place = {"LOCPATH": str(tmp_path), "LC_ALL": "comma"}
+    talker = nodes.talker("moving", 5, 60, 1000, 30, 1, "moves", **place, **preload(built, log, ODOMETRY="/odom"))
     assert len(seqs(nodes.subscriber("moving"), 60)) == 60
     ended(talker)
     records = read_log(logs(log)[0])
@@ -202,13 +206,14 @@ def test_parameters_are_numbers_too(built: Path, nodes: Nodes, tmp_path: Path) -
 
 
 def test_no_message_waits_for_the_master(built: Path, nodes: Nodes, tmp_path: Path) -> None:
-    """Who sends holds a lock that roscpp takes second when it subscribes: it must not ask for odometry itself."""
+    """Who sends holds a lock that roscpp takes second when it subscribes: a thread does it, for which an end waits."""
     words = {"TOPICS": "", "VALUE": "exponential:0.5", "QUEUE_SIZE": "5", "ODOMETRY": "/odom", "POLICY": "afr"}
-    talker = nodes.talker("alone", 5, 10, 1000, 100, "__name:=alone", **preload(built, tmp_path / "log", **words))
+    talker = nodes.talker("alone", 5, 10_000, 1000, 100, "__name:=alone", **preload(built, tmp_path / "log", **words))
     found, pid = nodes.master.lookupNode("/test", "/alone"), nodes.master.getPid("/test")[2]
     os.kill(pid, signal.SIGSTOP)
     try:
         assert seqs(subscriber(SimpleNamespace(lookupNode=lambda *_: found), "alone", "/alone"), 10) == list(range(10))
+        talker.send_signal(signal.SIGINT)
     finally:
         os.kill(pid, signal.SIGCONT)
     ended(talker)

@@ -278,6 +278,7 @@ private:
 
   void tell()
   {
+    const Point point;
     diagnostic_msgs::msg::DiagnosticArray all;
     all.header.stamp = now();
     for (auto &[name, sending] : sendings_)

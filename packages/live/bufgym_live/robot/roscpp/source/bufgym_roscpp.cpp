@@ -33,6 +33,10 @@
 #include <ros/transport_subscriber_link.h>
 #undef private
 
+#ifndef TCP_NOTSENT_LOWAT  // Linux has it since 3.12, and some older C libraries do not name it
+#define TCP_NOTSENT_LOWAT 25
+#endif
+
 #include "log.h"
 #include "motion.h"
 #include "policy.h"
@@ -48,6 +52,7 @@ template <class Key, typename Key::type POINTER> struct Named { friend typename 
 NAMED(Socket, ros::TransportTCP, int, sock_)
 NAMED(Written, ros::Connection, uint32_t, write_sent_)
 NAMED(ToWrite, ros::Connection, uint32_t, write_size_)
+NAMED(Ending, ros::TopicManager, boost::mutex, shutting_down_mutex_)
 
 const int UNSENT_BYTES = 16384;  // the system wants more when less than this is unsent, whatever is in flight
 
@@ -75,13 +80,16 @@ struct Odometry
     options.callback_queue = &callbacks;
     try
     {
-      refused = !ros::TopicManager::instance()->subscribe(options);
+      const ros::TopicManagerPtr &topics = ros::TopicManager::instance();
+      // The node's end waits meanwhile: before noetic it takes subscribe's two locks the other way round.
+      boost::mutex::scoped_lock lock(topics.get()->*pointer(Ending()));
+      refused = ros::isShuttingDown() || !topics->subscribe(options);
     }
     catch (const ros::Exception &error)  // the node itself has the topic with another type
     {
       refused = true;
     }
-    if (refused)
+    if (refused && !ros::isShuttingDown())
       ROS_ERROR("bufgym: %s: must be a topic of nav_msgs/Odometry: x counts messages", topic.c_str());
     while (ros::ok() && !refused)
       callbacks.callAvailable(ros::WallDuration(0.1));
@@ -101,7 +109,8 @@ bufgym::Motion *motion()
   return all && !all->refused ? &all->motion : nullptr;
 }
 
-// What a subscriber's link has besides roscpp's own members; roscpp's poll thread alone uses it.
+// What a subscriber's link has besides roscpp's own members, under its outbox_mutex_: roscpp's poll thread uses it, and a
+// thread of the node's that publishes to one new subscriber.
 struct State
 {
   boost::weak_ptr<ros::SubscriberLink> link;
@@ -204,7 +213,8 @@ int64_t carried(State &state, const ros::Connection &connection)
 bool keeps(State &state, std::deque<ros::SerializedMessage> &box, int64_t size_bytes, const ros::Connection &connection)
 {
   const int64_t us = state.stamp(), seq = state.arrived++, position = carried(state, connection);
-  const double x = motion() ? motion()->x() : double(seq);
+  bufgym::Motion *moved = motion();  // asked once: its thread may refuse the topic at any time
+  const double x = moved ? moved->x() : double(seq);
   const auto begun = std::chrono::steady_clock::now();
   const int decision = state.queue->arrival(us, size_bytes, x, state.dequeued_bytes - position);
   const std::chrono::duration<double, std::micro> took = std::chrono::steady_clock::now() - begun;

@@ -30,9 +30,10 @@ public:
     std::string path;
     do  // logs of other nodes and of earlier runs stay
       path = folder + "/" + topic.substr(1) + "-" + std::to_string(count++) + ".jsonl";
-    while (!(file_ = std::fopen(path.c_str(), "wx")) && errno == EEXIST);
+    while (!(file_ = std::fopen(path.c_str(), "wxe")) && errno == EEXIST);
     if (!file_)
       return;
+    const Point point;
     std::setvbuf(file_, nullptr, _IOLBF, 1 << 16);
     std::fprintf(file_,
                  "{\"event\": \"settings\", \"us\": 0, \"policy\": \"%s\", \"parameters\": %s, \"capacity\": %d, "
@@ -43,6 +44,7 @@ public:
 
   void put(int64_t us, int64_t seq, int64_t size_bytes, double x, int64_t carried, double took_us)
   {
+    const Point point;
     if (file_)
       std::fprintf(file_,
                    "{\"event\": \"put\", \"us\": %" PRId64 ", \"seq\": %" PRId64 ", \"size_bytes\": %" PRId64

@@ -29,6 +29,12 @@ std::string known()
   return names;
 }
 
+Point::Point() : before_(uselocale(nullptr))
+{
+  static const locale_t plain = newlocale(LC_NUMERIC_MASK, "C", nullptr);
+  uselocale(plain);
+}
+
 Value v;
 
 bool set_value(const std::string &text)
@@ -36,10 +42,11 @@ bool set_value(const std::string &text)
   const size_t colon = text.find(':');
   if (colon == std::string::npos)
     return false;
+  const Point point;
   char *end = nullptr;
   const double number = std::strtod(text.c_str() + colon + 1, &end);
   const bool saturating = text.compare(0, colon, "saturating") == 0;
-  if (*end || (saturating ? !(number > 0) : text.compare(0, colon, "exponential") != 0 || !(number > 0 && number < 1)))
+  if (*end || (saturating ? !(number > 0 && std::isfinite(number)) : text.compare(0, colon, "exponential") != 0 || !(number > 0 && number < 1)))
     return false;
   v.name = text;
   v.saturating = saturating;

@@ -5,6 +5,8 @@
 #include <memory>
 #include <string>
 
+#include <locale.h>
+
 namespace bufgym
 {
 const int MOST = 64;  // a larger queue_size stays roscpp's own queue
@@ -36,6 +38,19 @@ struct Policy
 extern const Policy policies[];                // in policies.cpp, the last one without a name
 const Policy *find(const std::string &name);  // null if there is none
 std::string known();                          // all names, in one line
+
+// While it lives a half is "0.5" in this thread, whatever locale the node has set.
+class Point
+{
+public:
+  Point();
+  ~Point() { uselocale(before_); }
+  Point(const Point &) = delete;
+  Point &operator=(const Point &) = delete;
+
+private:
+  const locale_t before_;
+};
 
 // V: what a message adds at distance d from the one before it. One for all queues of the process, set before the first.
 struct Value
