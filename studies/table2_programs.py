@@ -65,6 +65,8 @@ def rosbridge(port: int) -> None:
         topic.publish(roslibpy.Message(plain(store.deserialize_ros1(raw, TYPE), True)))
     cost.say()
     ros.close()
+    while ros.is_connected:  # it has only asked for the end, and the messages before it may not have left yet
+        time.sleep(0.01)
 
 
 async def robofleet(port: int) -> None:
