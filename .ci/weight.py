@@ -10,7 +10,7 @@ LIMITS = {
     "bufgym": 27_525,
     "tests": 18_405,
     "packages/live/bufgym_live": 12_517,
-    "packages/live/tests": 10_142,
+    "packages/live/tests": 10_144,
     "packages/papers/bufgym_papers": 5_185,
     "packages/papers/tests": 1_160,
 }
