@@ -74,8 +74,8 @@ class KernelLink:
 @contextmanager
 def kernel_link() -> Iterator[KernelLink]:
     """Make one for a block."""
-    places = (Path("/run/netns/bufgym-robot"), Path("/run/netns/bufgym-base"))
-    with fade.namespaces(), places[0].open() as robot, places[1].open() as base:
+    robot_at, base_at = (Path("/run/netns", inside[-1]) for inside in (fade.ROBOT, fade.BASE))
+    with fade.namespaces(), robot_at.open() as robot, base_at.open() as base:
         fade.shaped(fade.FAST, "add")
         near, far = (tunnel.End(*end) for end in zip(fade.ADDRESSES, (robot.fileno(), base.fileno()), strict=True))
         yield KernelLink(near, far)

@@ -1,7 +1,6 @@
 // bufgym::SenderNode: a component with a lifecycle, which sends topics of any type. Each topic has a queue under a
 // policy and a connection of its own to `bufgym ros2 receive`.
 #include <fnmatch.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <chrono>
@@ -90,7 +89,7 @@ public:
       return CallbackReturn::FAILURE;
     }
     const std::string log = get_parameter("log").as_string();
-    if (!log.empty() && access(log.c_str(), W_OK | X_OK))
+    if (!log.empty() && !Log::writable(log))
     {
       RCLCPP_ERROR(get_logger(), "log = %s: must be a folder that can be written", log.c_str());
       return CallbackReturn::FAILURE;

@@ -6,6 +6,8 @@
 #include <cstdio>
 #include <string>
 
+#include <unistd.h>
+
 #include "policy.h"
 
 namespace bufgym
@@ -21,6 +23,9 @@ public:
     if (file_)
       std::fclose(file_);
   }
+
+  // False where open would make no file; errno says why.
+  static bool writable(const std::string &folder) { return access(folder.c_str(), W_OK | X_OK) == 0; }
 
   void open(const std::string &folder, std::string topic, const Policy &policy, int capacity)
   {
@@ -44,12 +49,13 @@ public:
 
   void put(int64_t us, int64_t seq, int64_t size_bytes, double x, int64_t carried, double took_us)
   {
+    if (!file_)
+      return;
     const Point point;
-    if (file_)
-      std::fprintf(file_,
-                   "{\"event\": \"put\", \"us\": %" PRId64 ", \"seq\": %" PRId64 ", \"size_bytes\": %" PRId64
-                   ", \"x\": %.17g, \"topic\": 0, \"uniform\": 0.0, \"carried\": %" PRId64 ", \"took_us\": %.3f}\n",
-                   us, seq, size_bytes, x, carried, took_us);
+    std::fprintf(file_,
+                 "{\"event\": \"put\", \"us\": %" PRId64 ", \"seq\": %" PRId64 ", \"size_bytes\": %" PRId64
+                 ", \"x\": %.17g, \"topic\": 0, \"uniform\": 0.0, \"carried\": %" PRId64 ", \"took_us\": %.3f}\n",
+                 us, seq, size_bytes, x, carried, took_us);
   }
 
   void event(const char *name, int64_t us, int64_t seq)

@@ -16,13 +16,12 @@
 #include <sstream>
 #include <string>
 
-#include <unistd.h>
-
 #include <ros/console.h>
 #include <ros/exception.h>
 #include <ros/names.h>
 #include <ros/param.h>
 
+#include "log.h"
 #include "policy.h"
 
 namespace bufgym
@@ -77,7 +76,7 @@ struct Settings
       odometry.clear();
     }
     log = text("LOG", "");
-    if (!log.empty() && access(log.c_str(), W_OK | X_OK))
+    if (!log.empty() && !Log::writable(log))
       ROS_ERROR("bufgym: no log: %s: %s", log.c_str(), std::strerror(errno));
     const std::string wanted = text("VALUE", odometry.empty() ? v.name : "exponential:0.36787944117144233");
     if (!set_value(wanted))
