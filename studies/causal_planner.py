@@ -89,7 +89,7 @@ class CausalPlanner:
         c, between, idle, begin, stop = np.zeros((5, n, messages), np.int64)
         lead, pool = np.zeros((n, messages)), (np.zeros(ROOM, np.int64), np.zeros(ROOM), np.zeros(ROOM, np.int32))
         self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, lead, *pool)
-        self._steps = [np.zeros((2, STEPS), kind) for kind in (np.int64, np.float64, np.int32)]
+        self._steps = [np.zeros((3, STEPS), kind) for kind in (np.int64, np.float64, np.int32)]
         self._work, self._values = new_work(capacity, messages), np.zeros((n, capacity + 2))
         self._mask = np.zeros((n, capacity + 2), np.int8)
         self._first = -1  # sequence number of the arrival at which the futures begin
@@ -140,7 +140,7 @@ class CausalPlanner:
                     pool: list[NDArray[Any]] = [np.resize(array, 2 * len(array)) for array in self._ahead[7:]]
                     self._ahead = Ahead(*self._ahead[:7], *pool)
                 else:
-                    self._steps = [np.zeros((2, 2 * array.shape[1]), array.dtype) for array in self._steps]
+                    self._steps = [np.zeros((3, 2 * array.shape[1]), array.dtype) for array in self._steps]
             place = end
         self._first = int(arrival.seq)
 
@@ -156,8 +156,7 @@ class CausalPlanner:
         shift = batch.arrivals["x"][:, k] - arrival.x
         batch.slots["x"][:, 0] = buffer.dequeued_x + shift
         batch.slots["x"][:, 1 : 1 + s] = buffer.slots["x"] + shift[:, None]
-        self._mask[:] = [*(np.arange(L) < s), 1, s < L]
-        find_values(batch, self._ahead, self._work, self._mask, self._values)
+        find_values(batch, self._ahead, self._work, self._values)
         return np.asarray(self._values.mean(axis=0))
 
 

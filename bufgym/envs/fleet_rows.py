@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.options import Options, read_arguments
+from bufgym.envs.options import SLOTS, Options, read_arguments
 from bufgym.envs.rows import Rows
 from bufgym.envs.step import step_cells
 from bufgym.envs.vector import SenderVectorEnv
@@ -74,7 +74,7 @@ def fleet_rows(
     cells: int, scenario: FleetScenario, *, reward: str = "team", term: Any = Options.reward, **arguments: Any
 ) -> FleetRows:
     """Make the rows of ``cells`` cells from the arguments of a fleet's environment; see ``FleetEnv``."""
-    uplink, options = read_arguments(scenario.uplink, reward=term, **arguments)
+    uplink, options = read_arguments(scenario.uplink, reward=term, **{"actions": SLOTS, **arguments})
     return FleetRows(cells, FleetScenario.of(scenario.robots, cast(Uplink, uplink)), options, reward)
 
 

@@ -62,17 +62,20 @@ class ObservationForm:
     """The observed fields of a queue of L = ``capacity`` messages, and the form of the observation.
 
     A row of numbers first holds the fields of the tables (``table_numbers``): slot fields with L + 1 entries each, the
-    newcomer's last, then context fields. Chosen fields of your own follow at ``places``. ``form`` is one of
+    newcomer's last, or candidate fields with k + 1 entries each, the head's last; then context fields. Other chosen
+    fields follow at ``places``. ``form`` is one of
 
-    - "dict", an array for each field, [L + 1] or [1],
+    - "dict", an array for each field, [L + 1], [k + 1] or [1],
     - "flat", the row itself, equal to the dict under ``gymnasium.wrappers.FlattenObservation``,
-    - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks.
+    - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks; of
+      candidates ``slots`` is [k + 1, candidate fields].
 
-    Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, and
+    Only fields named in ``chosen`` are observed, by default all of the tables. Candidate fields and their context are
+    always observed, beside those named. They keep the order of the tables, and
     your own come last. ``has_slots`` says whether rows hold slot fields of the tables. Where ``is_view``, an
     observation is a dict of views; where ``is_row``, the row itself.
     ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row. Where ``mask`` has keys,
-    ``masked`` puts the action mask into an observation.
+    ``masked`` puts the mask of all ``actions`` into an observation. ``candidates`` is k.
     """
 
     def __init__(
@@ -83,13 +86,17 @@ class ObservationForm:
         capacity: int,
         chosen: Sequence[str] | None = None,
         mask: MaskKeys | None = None,
+        *,
+        candidates: int = 0,
+        actions: int = 0,
     ) -> None:
         if form not in FORMS:
             raise BufgymError(f"observation = {form!r}: must be one of {', '.join(map(repr, FORMS))}")
-        tables = {"slot": slot_fields, "context": context_fields}
+        tables = {"candidate" if candidates else "slot": slot_fields, "context": context_fields}
         known = [field.name for field in (*slot_fields, *context_fields)]
         own: dict[str, Field] = {}
-        names = known if chosen is None else list(chosen)
+        named = [] if chosen is None else list(chosen)
+        names = known if chosen is None else [*known, *named] if candidates else named
         for k, name in enumerate(names):
             if name not in known:
                 found = own_field(name)
@@ -99,14 +106,16 @@ class ObservationForm:
         if not names:
             raise BufgymError("fields: choose at least one field to observe")
         self.form, self.has_slots = form, bool(slot_fields)
-        self._width = capacity + 1
+        widths = {"slot": capacity + 1, "candidate": candidates + 1, "context": 1}
+        per_entry = "candidate" if candidates else "slot"
+        self._width = widths[per_entry]
         self._slot_fields, self._context_fields = len(slot_fields), len(context_fields)
         self._first_context = self._slot_fields * self._width
         self.table_numbers = self.numbers = self._first_context + self._context_fields
         self.places: list[Place] = []
-        for per, entries in (("slot", self._width), ("context", 1)):
-            begins = 0 if per == "slot" else self._first_context
-            for k, field in enumerate(tables[per]):
+        for per, entries in widths.items():
+            begins = self._first_context if per == "context" else 0
+            for k, field in enumerate(tables.get(per, ())):
                 if field.name in names:
                     self.places.append(Place(field, begins + k * entries, entries))
             for field in own.values():
@@ -118,12 +127,12 @@ class ObservationForm:
         self.is_row = form == "flat" and everything
         numbers = [np.arange(place.first, place.first + place.entries) for place in self.places]
         self._numbers = None if everything else np.concatenate(numbers)
-        self._per_slot = sum(place.field.per == "slot" for place in self.places)
+        self._per_slot = sum(place.field.per == per_entry for place in self.places)
         low, high = np.zeros((2, self.numbers), np.float32)
         for field, first, entries in self.places:
             low[first : first + entries], high[first : first + entries] = field.low, field.high
         self.mask, space = mask, _space(self.of(low), self.of(high))
-        self.space: Any = space if mask is None else mask.space(space, capacity + 2)
+        self.space: Any = space if mask is None else mask.space(space, actions or capacity + 2)
 
     def masked(self, observation: Observation, mask: NDArray[np.int8]) -> Observation:
         """The observation, an array or a dict of the caller's own, with a view of the mask if this form has one."""

@@ -16,7 +16,9 @@ from bufgym.scenario.registry import parameters
 
 GUIDED = "guided"
 RULE = "rule"
-ACTIONS = ("slots", GUIDED)  # What an action is: the slot that goes, or numbers of the rule
+CANDIDATES, SLOTS = "candidates", "slots"
+ACTIONS = (CANDIDATES, SLOTS, GUIDED)  # What an action is: the candidate or slot that goes, or numbers of the rule
+MOST_CANDIDATES = 64
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
 nothing. At an episode's end the summary is always there."""
@@ -48,13 +50,14 @@ class Options:
 
     capacity: int = 8
     max_bytes: int | None = None
-    decide_at: str = "arrival"
+    decide_at: str | None = None
     reward: str | Mapping[str, float] = "retained"
     reward_scale: float | str | None = None
-    actions: str = "slots"
+    actions: str = CANDIDATES
+    candidates: int = 2
     mask: str = "valid"
     fields: str | Sequence[str] | None = None
-    observation: str = "dict"
+    observation: str | None = None
     info: str = "full"
     bound: bool = False
     pool: int | None = None
@@ -69,6 +72,13 @@ class Options:
                 raise BufgymError(f"{name} = {given!r}: must be one of {', '.join(map(repr, known))}")
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
+        for name, usual in (("decide_at", ("overflow", "arrival")), ("observation", ("flat", "dict"))):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, usual[not self.acts_on_candidates])
+        whole("candidates", self.candidates, 1, MOST_CANDIDATES)
+        if self.acts_on_candidates and (self.mask != "valid" or self.fields in ("compact", GUIDED, RULE)):
+            given = f"mask = {self.mask!r}" if self.mask != "valid" else f"fields = {self.fields!r}"
+            raise BufgymError(f"{given}: is for actions = 'slots'; {CANDIDATES!r} have fields of their own, and no mask")
         names: Any = () if self.fields in (None, "compact", GUIDED, RULE) else self.fields
         is_list = isinstance(names, Collection) and not isinstance(names, str)
         if not (is_list and all(isinstance(name, str) for name in names)):
@@ -78,6 +88,11 @@ class Options:
         whole("num_threads", self.num_threads, 1)
         if self.mask_keys and self.acts_guided:
             raise BufgymError(f"mask_in_observation: actions = {GUIDED!r} have no mask")
+
+    @property
+    def acts_on_candidates(self) -> bool:
+        """Whether an action is one of a few ordered candidates."""
+        return self.actions == CANDIDATES
 
     @property
     def acts_guided(self) -> bool:
@@ -131,6 +146,8 @@ class Options:
             )
         if self.mask == "plausible":
             raise BufgymError(f"mask = 'plausible': the plausible actions are known for one queue, not for {what}")
+        if self.acts_on_candidates:
+            raise BufgymError(f"actions = {CANDIDATES!r}: known for one queue on a link of its own, not for {what}")
         if self.acts_guided or self.sees:
             given = f"actions = {GUIDED!r}" if self.acts_guided else f"fields = {self.sees!r}"
             raise BufgymError(f"{given}: the rule serves one queue on a link of its own, not {what}")
@@ -144,6 +161,8 @@ def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
     """The scenario, with the arguments that are its parameters, and the options, which are the others."""
     options = {name: arguments.pop(name) for name in _NAMES if name in arguments}
     spec = scenarios.get(scenario)
+    if spec.topics:
+        options.setdefault("actions", SLOTS)
     known = parameters(spec)
     for name in arguments:
         if name not in known:

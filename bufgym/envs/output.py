@@ -39,7 +39,8 @@ class StepOutput(NamedTuple):
     Fields:
         flat: float32[n, numbers], field by field: first ``SLOT_FIELDS`` (L + 1 numbers each), with several topics also
             ``TOPIC_SLOT_FIELDS``; then ``CONTEXT_FIELDS`` (one number each), likewise with ``TOPIC_CONTEXT_FIELDS``.
-        action_mask: int8[n, L + 2], 1 for a valid action.
+            Where actions choose a candidate: ``CANDIDATE_FIELDS`` (k + 1 numbers each), then ``QUEUE_FIELDS``.
+        action_mask: int8[n, actions], 1 for a valid action.
         reward_terms: float64[n, reward terms], gain of each term in this step.
         weights: float64[reward terms], read by the kernels.
         rewards: float64[n], sum of the terms times their weights; without terms of your own.
@@ -47,6 +48,8 @@ class StepOutput(NamedTuple):
         invalid: int64[n], invalid actions of the episode so far.
         terminated: bool[n], whether the episode is over.
         slots: int64[1], 1 if ``flat`` has the slot fields, 0 if it has the context fields alone.
+        slot_actions: int64[n, actions], the action among slots that each action stands for: 0..L-1 evict that slot, L
+            rejects, L + 1 accepts. int64[n, 0] where actions are slots.
     """
 
     flat: NDArray[np.float32]
@@ -58,6 +61,7 @@ class StepOutput(NamedTuple):
     invalid: NDArray[np.int64]
     terminated: NDArray[np.bool_]
     slots: NDArray[np.int64]
+    slot_actions: NDArray[np.int64]
 
 
 @kernel
@@ -118,13 +122,19 @@ def delivered_qoi(batch: Batch, i: int) -> float:
 
 
 @kernel
+def write_progress(batch: Batch, i: int, ended: bool, output: StepOutput) -> None:
+    """Write whether row ``i`` has ended, its H, and its invalid actions so far."""
+    output.terminated[i] = ended
+    output.qoi[i], output.invalid[i] = delivered_qoi(batch, i), batch.senders[i].invalid
+
+
+@kernel
 def write_state(batch: Batch, i: int, ended: bool, output: StepOutput) -> bool:
     """Write whether row ``i`` has ended, its H and action mask; return whether a decision is due.
 
     Without one, also write an observation of zeros, with L as the one valid action.
     """
-    output.terminated[i] = ended
-    output.qoi[i], output.invalid[i] = delivered_qoi(batch, i), batch.senders[i].invalid
+    write_progress(batch, i, ended, output)
     if batch.senders[i].waiting == NOTHING_WAITS:
         output.flat[i, :] = 0.0
         output.action_mask[i, :] = False

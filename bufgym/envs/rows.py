@@ -13,19 +13,23 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from bufgym.envs.candidates import new_choices
 from bufgym.envs.guided import Guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import RULE, InvalidActionError, Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.plausible import keep_plausible
+from bufgym.envs.regret import Regret
 from bufgym.envs.step import step_rows
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.threads import Threads
 from bufgym.model.checks import is_number
 from bufgym.model.observe import (
+    CANDIDATE_FIELDS,
     CONTEXT_FIELDS,
     OWN_TERMS,
+    QUEUE_FIELDS,
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,
     TOPIC_SLOT_FIELDS,
@@ -55,7 +59,8 @@ def reward_weights(
     if not weights:
         raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {', '.join(known)}")
     own: dict[str, OwnTerm] = {}
-    for name, weight in weights.items():
+    # ``regret`` is the last column: it is computed apart.
+    for name, weight in sorted(weights.items(), key=lambda pair: pair[0] == "regret"):
         if not (is_number(weight) and np.isfinite(weight)):
             raise BufgymError(f"reward = {reward!r}: the weight of {name!r} must be a finite number")
         if name in tables:
@@ -119,7 +124,12 @@ class Rows:
         self.guiding = Guiding(n, options) if options.acts_guided or options.sees else None
         self._guide = self.guiding and self.guiding.guide
         self._acts = self.guiding if options.acts_guided else None
-        self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.capacity + 2)
+        self.choices = None
+        self.actions_count = self.capacity + 2
+        if options.acts_on_candidates:
+            self.choices = new_choices(n, options.candidates, options.decide_at == "arrival")
+            self.actions_count = options.candidates + 1 + (options.decide_at == "arrival")
+        self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.actions_count)
 
         self.weights, own_terms = reward_weights(options.reward, several_topics)
         self.terms = terms_for(several_topics) + own_terms
@@ -127,7 +137,9 @@ class Rows:
         self.weights[:scaled] *= options.reward_factor(scenario)
         self._term_names = [term.name for term in self.terms]
         self.rewarded = np.zeros((n, len(self.terms)))
-        self._own_terms = OwnTerms(own_terms, len(self.terms) - len(own_terms), n)
+        of_steps = tuple(term for term in own_terms if term.name != "regret")
+        self._own_terms = OwnTerms(of_steps, len(self.terms) - len(own_terms), n)
+        self._regret = Regret(self.senders, len(self.terms) - 1) if len(of_steps) < len(own_terms) else None
 
         self.form = self._observed()
         self.observation_space, self._handed = self.form.space, Handed(self.form)
@@ -143,6 +155,11 @@ class Rows:
             slots = RULE_SLOT_FIELDS if options.sees == RULE else ()
             context = RULE_FIELDS if options.sees == RULE else INPUT_FIELDS
             return ObservationForm(options.observation, slots, context, self.capacity, mask=options.mask_keys)
+        if self.choices is not None:
+            return ObservationForm(
+                options.observation, CANDIDATE_FIELDS, QUEUE_FIELDS, self.capacity, options.fields, options.mask_keys,
+                candidates=options.candidates, actions=self.actions_count,
+            )  # fmt: skip
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if several_topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if several_topics else ())
         names = [field.name for field in context_fields]
@@ -167,10 +184,10 @@ class Rows:
 
     def new_output(self) -> StepOutput:
         """Make zeroed arrays for the results of a step."""
-        n, L = len(self), self.capacity
+        n = len(self)
         return StepOutput(
             np.zeros((n, self.form.numbers), np.float32),
-            np.zeros((n, L + 2), np.int8),
+            np.zeros((n, self.actions_count), np.int8),
             np.zeros((n, len(self.terms))),
             self.weights.copy(),
             np.zeros(n),
@@ -178,6 +195,7 @@ class Rows:
             np.zeros(n, np.int64),
             np.zeros(n, np.bool_),
             np.full(1, self.form.has_slots, np.int64),
+            np.zeros((n, self.actions_count if self.choices else 0), np.int64),
         )
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
@@ -191,6 +209,8 @@ class Rows:
         self._run(self._load(rows, episodes), NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
+            if self._regret is not None:
+                self._regret.begin(rows, self.output)
             self._own_fields.write(self.senders.batch, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
@@ -201,6 +221,8 @@ class Rows:
             self._threads.each(lambda numbers: self._run(numbers, actions))
         if self._has_own:
             self._own_terms.write(self.senders.batch, self.output)
+            if self._regret is not None:
+                self._regret.write(self.output)
             self._own_fields.write(self.senders.batch, self.output)
 
     def _load(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None) -> NDArray[np.int64]:
@@ -226,7 +248,7 @@ class Rows:
         return rows
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self._guide)
+        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self._guide)
         if self.options.mask == "plausible":
             keep_plausible(self.senders.batch, rows, self.output.action_mask)
 
@@ -254,6 +276,8 @@ class Rows:
     def info(self, i: int, ended: bool) -> dict[str, Any]:
         """Gymnasium's info of row ``i`` after a reset or a step; see ``INFOS``."""
         info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self._shows_mask else {}
+        if self.choices is not None and self._shows_mask:
+            info["slots"] = self.output.slot_actions[i].copy()
         if not (self._shows_all or ended):
             return info
         if self._shows_all:
@@ -281,9 +305,14 @@ class Rows:
             number = operator.index(action)
         except TypeError:
             raise self.bad_action(name, action) from None
-        if not 0 <= number < self.capacity + 2:
+        if not 0 <= number < self.actions_count:
             raise self.bad_action(name, number)
         return number
+
+    @property
+    def idle_action(self) -> int:
+        """The action where no decision is due; it has no effect."""
+        return self.capacity if self.choices is None else 0
 
     def actions(self, actions: Any) -> NDArray[np.int64]:
         """Convert one action for each row to the kernels' form; the error names the first row that is wrong."""
@@ -296,13 +325,13 @@ class Rows:
         if numbers.shape != (len(self),):
             raise InvalidActionError(f"actions have shape {numbers.shape}: must be ({len(self)},)")
         unsigned = numbers.view(np.uint64)  # where negative ones are large
-        if np.maximum.reduce(unsigned) >= self.capacity + 2:
-            wrong = int(np.argmax(unsigned >= self.capacity + 2))
+        if np.maximum.reduce(unsigned) >= self.actions_count:
+            wrong = int(np.argmax(unsigned >= self.actions_count))
             raise self.bad_action(f"actions[{wrong}]", numbers.item(wrong))
         return numbers
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, L + 2]: the actions valid now in each row."""
+        """bool[n, actions]: the actions valid now in each row."""
         return self.output.action_mask.astype(np.bool_)
 
     def bounds(self, ended: NDArray[np.bool_], qoi: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -314,8 +343,11 @@ class Rows:
         return columns
 
     def bad_action(self, name: str, action: Any) -> InvalidActionError:
-        """Make the error for an action that is none of 0..L+1."""
-        rule = f"must be a whole number in 0..{self.capacity + 1} (L = {self.capacity})"
+        """Make the error for an action outside of the space."""
+        of = f"L = {self.capacity}"
+        if self.choices is not None:
+            of = f"the {self.options.candidates} cheapest candidates and the head"
+        rule = f"must be a whole number in 0..{self.actions_count - 1} ({of})"
         return InvalidActionError(f"{name} = {action!r}: {rule}")
 
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:

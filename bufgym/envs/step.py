@@ -9,6 +9,7 @@ as both run the same code.
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.envs.candidates import Choices, candidate_decision, write_candidates
 from bufgym.envs.guided import Guide, guided_decision, write_guided
 from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_observation, write_rewards
 from bufgym.ground.kernel import direct, kernel, prefetch
@@ -39,13 +40,14 @@ def step_rows(
     actions: NDArray[np.int64],
     rewarded: NDArray[np.float64],
     output: StepOutput,
+    choices: Choices | None,
     guide: Guide | None,
 ) -> None:
     """Take one decision in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
-    begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``guide`` is None
-    where nothing is guided; Numba compiles each case separately.
+    begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is None
+    where actions are no candidates, ``guide`` where nothing is guided; Numba compiles each case separately.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
@@ -58,7 +60,9 @@ def step_rows(
         sender = batch.senders[i]
         asks = sender.waiting
         if not begins and asks == ARRIVAL_WAITS:
-            if guide is None:
+            if choices is not None:
+                decide(batch, i, candidate_decision(batch, i, actions[i], choices))
+            elif guide is None:
                 decide(batch, i, decision_of(actions[i], sender.capacity))
             else:
                 decide(batch, i, guided_decision(batch, i, actions[i], guide))
@@ -67,7 +71,9 @@ def step_rows(
         if begins or asks != NOTHING_WAITS:
             advance(batch, i)
         write_rewards(batch, i, begins, rewarded, output)
-        if guide is None:
+        if choices is not None:
+            write_candidates(batch, i, sender.waiting == NOTHING_WAITS, output, choices)
+        elif guide is None:
             write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
         else:
             write_guided(batch, i, sender.waiting == NOTHING_WAITS, output, guide)

@@ -199,6 +199,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """(New arrays for a step, the views that are its observation, its info), and all these arrays."""
         rows, output = self.rows, self.rows.new_output()
         shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.options.shows_mask else {}
+        if rows.choices is not None and rows.options.shows_mask:
+            shown["slots"] = output.slot_actions
         terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(rows.terms)}
         if rows.options.shows_all:
             shown |= {"qoi": output.qoi, "invalid": output.invalid, "reward_terms": self._marked(terms)}

@@ -46,37 +46,114 @@ class Ahead(NamedTuple):
     follow: NDArray[np.int32]
 
 
-@kernel
-def find_steps(
-    batch: Batch, ahead: Ahead, i: int, place: int, latest: Ints, gain: Floats, follow: NDArray[np.int32]
-) -> int:
-    """Write the steps of sender ``i``'s episode from ``place`` on; return their end, NO_ROOM or NO_WORK_SPACE.
+class Rivals(NamedTuple):
+    """Messages that may follow one message best, by rising index; work space for as many as arrays have entries.
 
-    ``latest``, ``gain`` and ``follow`` are work space, each [2, room for the steps of one message]. One of the two
-    lists holds the steps found so far, and the other takes them merged with those of the next message.
+    V is concave, so a later message is the better one to follow the later the socket is free: each message of the list
+    is best from its byte ``since`` on, up to that of the next one.
     """
+
+    message: Ints  # int64[room]
+    since: Ints  # int64[room]
+    least: Ints  # int64[room], byte up to which the link waits for it anyway
+    top: Ints  # int64[room], last byte from which it can follow
+    added: Floats  # float64[room], V of its gap
+
+
+def new_rivals(room: int) -> Rivals:
+    """Work space for so many messages."""
+    return Rivals(*np.zeros((4, room), np.int64), np.zeros(room))
+
+
+@kernel
+def find_steps(batch: Batch, ahead: Ahead, i: int, place: int, rivals: Rivals) -> int:
+    """Write the steps of sender ``i``'s episode from ``place`` on; return their end, NO_ROOM or NO_WORK_SPACE."""
     for m in range(batch.senders[i].arrivals - 1, -1, -1):
-        now, held = 0, 1  # which of the two lists, and its number of steps
-        latest[0, 0], gain[0, 0], follow[0, 0] = ALWAYS, 0.0, -1
+        count = 0
         for j in range(m + 1, min(_furthest(batch, ahead, i, m) + 1, batch.senders[i].arrivals)):
             enough, top = _ends_before(ahead, i, m, j)
             if top < 0:
                 break
             if top < enough or _beaten(batch, ahead, i, m, j):
                 continue
-            if held + at(ahead.stop, i, j) - at(ahead.begin, i, j) > latest.shape[1]:
+            if count == len(rivals.message):
                 return NO_WORK_SPACE
-            held = _merge(batch, ahead, i, m, j, enough, top, now, held, latest, gain, follow)
-            now = 1 - now
-        if place + held > len(ahead.latest):
+            added = value(batch.v[batch.senders[i].v_start :], at(batch.arrivals, i, j).x - at(batch.arrivals, i, m).x)
+            rivals.message[count], rivals.least[count] = j, max(enough, at(ahead.c, i, j))
+            rivals.top[count], rivals.added[count] = top, added
+            count = _rank(ahead, i, rivals, count)
+        stop = _write_steps(ahead, i, rivals, count, place)
+        if stop < 0:
             return NO_ROOM
-        ahead.begin[i, m], ahead.stop[i, m] = place, place + held
-        for k in range(held):
-            ahead.latest[place + k], ahead.gain[place + k] = latest[now, k], gain[now, k]
-            ahead.follow[place + k] = follow[now, k]
-        place += held
+        ahead.begin[i, m], ahead.stop[i, m] = place, stop
+        place = stop
         ahead.lead[i, m] = _lead(batch, ahead, i, m)
     return place
+
+
+@kernel
+def _gain(ahead: Ahead, i: int, rivals: Rivals, k: int, e: int) -> float:
+    """Gain by rival ``k`` if it follows a message that ends at byte ``e``."""
+    end = max(e, rivals.least[k]) + ahead.link[i, 0]
+    return float(rivals.added[k] + ahead.gain[step_of(ahead, i, rivals.message[k], end)])
+
+
+@kernel
+def _rank(ahead: Ahead, i: int, rivals: Rivals, new: int) -> int:
+    """Find from which byte on rival ``new`` beats all before it; return how many rivals remain."""
+    k = new - 1
+    while k >= 0:
+        low, high = rivals.since[k], rivals.top[k]
+        if _gain(ahead, i, rivals, new, high) <= _gain(ahead, i, rivals, k, high) + TIE:
+            low = high + 1
+        elif _gain(ahead, i, rivals, new, low) > _gain(ahead, i, rivals, k, low) + TIE:
+            k -= 1
+            continue
+        else:  # it loses at ``low`` and wins at ``high``
+            while high - low > 1:
+                middle = (low + high) // 2
+                if _gain(ahead, i, rivals, new, middle) > _gain(ahead, i, rivals, k, middle) + TIE:
+                    high = middle
+                else:
+                    low = middle
+            low = high
+        if low > rivals.top[new]:
+            return new
+        break
+    at_ = k + 1
+    rivals.message[at_], rivals.least[at_], rivals.top[at_] = rivals.message[new], rivals.least[new], rivals.top[new]
+    rivals.added[at_] = rivals.added[new]
+    rivals.since[at_] = low if k >= 0 else 0
+    return at_ + 1
+
+
+@kernel
+def _write_steps(ahead: Ahead, i: int, rivals: Rivals, count: int, place: int) -> int:
+    """Write the steps that these rivals give, from the latest byte down; return their end or NO_ROOM."""
+    b, stop, best, last = ahead.link[i, 0], place, -1.0, ALWAYS
+    for k in range(count, -1, -1):
+        if k == count:
+            first, end, added = 0, 1, 0.0  # nothing follows
+        else:
+            j = rivals.message[k]
+            first, end, added = step_of(ahead, i, j, min(rivals.top[k], last) + b), at(ahead.stop, i, j), rivals.added[k]
+        for step in range(first, end):
+            e, g = last, added
+            if k < count:
+                if ahead.latest[step] - b < max(rivals.since[k], rivals.least[k]):
+                    break
+                e, g = min(ahead.latest[step] - b, min(rivals.top[k], last)), added + ahead.gain[step]
+            if g > best + TIE:
+                if stop > place and ahead.latest[stop - 1] == e:
+                    stop -= 1
+                if stop == len(ahead.latest):
+                    return NO_ROOM
+                ahead.latest[stop], ahead.gain[stop] = e, g
+                ahead.follow[stop] = rivals.message[k] if k < count else -1
+                best, stop = g, stop + 1
+        if k < count:
+            last = min(last, rivals.since[k] - 1)
+    return stop
 
 
 @kernel
@@ -148,54 +225,6 @@ def _ends_before(ahead: Ahead, i: int, m: int, j: int) -> tuple[int, int]:
     if c_j + b > ends or room == 0:
         return 0, -1
     return enough, min(c_j + room * b, ends - b, reach)
-
-
-@kernel
-def _merge(
-    batch: Batch,
-    ahead: Ahead,
-    i: int,
-    m: int,
-    j: int,
-    enough: int,
-    top: int,
-    now: int,
-    held: int,
-    latest: Ints,
-    gain: Floats,
-    follow: NDArray[np.int32],
-) -> int:
-    """Merge the ``held`` steps of list ``now`` with those by which ``j`` follows ``m``; return how many remain.
-
-    The other list takes them. Both are walked from the latest byte down, and a step stays if it gains more than those
-    before it.
-    """
-    b, v = ahead.link[i, 0], batch.v[batch.senders[i].v_start :]
-    added = value(v, at(batch.arrivals, i, j).x - at(batch.arrivals, i, m).x)
-    least = max(enough, at(ahead.c, i, j)) + b
-    k, stop = at(ahead.begin, i, j), at(ahead.stop, i, j)
-    while k + 1 < stop and ahead.latest[k + 1] - b >= top:  # the highest step of j within reach
-        k += 1
-    then, kept, old, best = 1 - now, 0, 0, -1.0
-    while True:
-        late = -1
-        if k < stop and ahead.latest[k] >= least:
-            late = min(ahead.latest[k] - b, top)
-        from_old = old < held and latest[now, old] >= late
-        if not from_old and late < 0:
-            return kept
-        if from_old:
-            e, g, f = latest[now, old], gain[now, old], follow[now, old]
-            old += 1
-        else:
-            e, g, f = late, added + ahead.gain[k], np.int32(j)
-            k += 1
-        if g > best + TIE:
-            if kept > 0 and latest[then, kept - 1] == e:
-                kept -= 1
-            latest[then, kept], gain[then, kept], follow[then, kept] = e, g, f
-            best = g
-            kept += 1
 
 
 @kernel

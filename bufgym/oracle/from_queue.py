@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bufgym.ground.kernel import Floats, Ints, at, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.ahead import TIE, Ahead, sends, step_of
+from bufgym.sim.decisions import has_room
 from bufgym.sim.state import ARRIVAL_WAITS, Batch
 
 
@@ -53,31 +54,57 @@ def new_work(capacity: int, messages: int) -> Work:
 
 
 @kernel
-def find_values(batch: Batch, ahead: Ahead, work: Work, action_mask: NDArray[np.int8], values: NDArray[Any]) -> None:
-    """Fill ``values``, float64[n, L + 2]: the best H attainable in hindsight with each action; NaN if invalid."""
+def find_values(batch: Batch, ahead: Ahead, work: Work, values: NDArray[Any]) -> None:
+    """Fill ``values``, float64[n, L + 2]: the best H attainable in hindsight with each decision; NaN if invalid."""
     for i in range(len(batch.senders)):
         sender = batch.senders[i]
         values[i, :] = np.nan
-        if sender.waiting != ARRIVAL_WAITS:
-            continue
-        h, e = so_far(batch, i, ahead.link[i, 2])
-        own = sender.occupancy + 1
-        if e <= ahead.link[i, 2]:
-            e = max(e, at(ahead.c, i, sender.next)) if sender.busy == 0 else e
-            look(batch, ahead, work, i, e)
-        for action in range(sender.capacity + 2):
-            if action_mask[i, action] == 0:
-                continue
-            values[i, action] = h
-            if e > ahead.link[i, 2]:
-                continue  # no further message is delivered
-            count = 0
-            for k in range(own):
-                gone = k == action if action < sender.capacity else action == sender.capacity and k == own - 1
-                if not gone:
-                    work.slots[count] = k
-                    count += 1
-            values[i, action] += best_from(batch, ahead, work, i, e, count)
+        if sender.waiting == ARRIVAL_WAITS:
+            h, e = reach(batch, ahead, work, i)
+            for action in range(sender.capacity + 1 + has_room(batch, i)):
+                if action < sender.occupancy or action >= sender.capacity:
+                    values[i, action] = h + best_without(batch, ahead, work, i, e, action)
+
+
+@kernel
+def find_most(batch: Batch, ahead: Ahead, work: Work, rows: Ints, most: NDArray[Any]) -> None:
+    """Fill ``most``, float64[n], at ``rows``: the largest of ``find_values``; 0 where no decision is due."""
+    for i in rows:
+        sender = batch.senders[i]
+        most[i] = 0.0
+        if sender.waiting == ARRIVAL_WAITS:
+            h, e = reach(batch, ahead, work, i)
+            best = 0.0
+            for action in range(sender.capacity + 1 + has_room(batch, i)):
+                if action < sender.occupancy or action >= sender.capacity:
+                    best = max(best, best_without(batch, ahead, work, i, e, action))
+            most[i] = h + best
+
+
+@kernel
+def reach(batch: Batch, ahead: Ahead, work: Work, i: int) -> tuple[float, int]:
+    """H of what sender ``i`` has sent, and the byte at which its socket is free; fills ``work`` if that helps."""
+    sender = batch.senders[i]
+    h, e = so_far(batch, i, ahead.link[i, 2])
+    if e <= ahead.link[i, 2]:
+        e = max(e, at(ahead.c, i, sender.next)) if sender.busy == 0 else e
+        look(batch, ahead, work, i, e)
+    return h, e
+
+
+@kernel
+def best_without(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, action: int) -> float:
+    """Best gain of sender ``i`` after a decision: 0..L-1 evicts that slot, L rejects, L + 1 accepts."""
+    if e > ahead.link[i, 2]:
+        return 0.0  # no further message is delivered
+    sender = batch.senders[i]
+    own, count = sender.occupancy + 1, 0
+    for k in range(own):
+        gone = k == action if action < sender.capacity else action == sender.capacity and k == own - 1
+        if not gone:
+            work.slots[count] = k
+            count += 1
+    return best_from(batch, ahead, work, i, e, count)
 
 
 @kernel

@@ -3,6 +3,13 @@
 ``@field`` and ``@reward_term`` add your own.
 """
 
+from bufgym.model.observe.candidates import (
+    CANDIDATE_FIELDS,
+    QUEUE_FIELDS,
+    decision_of_candidate,
+    find_candidates,
+    observe_candidates,
+)
 from bufgym.model.observe.declare import Field
 from bufgym.model.observe.on_board import (
     ON_BOARD_FIELDS,
@@ -33,9 +40,10 @@ from bufgym.model.observe.topics import (
 )
 
 __all__ = [
-    "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS", "OWN_FIELDS", "OWN_TERMS", "REWARD_TERMS",
+    "CANDIDATE_FIELDS", "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS", "OWN_FIELDS", "OWN_TERMS", "QUEUE_FIELDS",
+    "REWARD_TERMS",
     "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS", "TOPIC_FIELDS", "TOPIC_REWARD_TERMS", "TOPIC_SLOT_FIELDS", "Field",
     "OwnTerm", "RewardTerm", "field", "observe", "observe_on_board", "observe_on_board_slots",
     "observe_topic_context", "observe_topic_slots", "own_field", "own_term", "reward_term",
-    "terms_for",
+    "decision_of_candidate", "find_candidates", "observe_candidates", "terms_for",
 ]  # fmt: skip

@@ -70,6 +70,12 @@ def age(step: Any, memory: Any) -> float:
     return -area
 
 
+@reward_term("regret", unit="QoI", one_queue=True, built_in=True)
+def regret(step: Any, memory: Any) -> float:
+    "change of the best H still attainable in hindsight; sums to H less the clairvoyant's H of the whole episode"
+    raise AssertionError("envs.regret computes it for all rows at once")
+
+
 TOPIC_REWARD_TERMS: tuple[RewardTerm, ...] = (OWN_TERMS["age"], OWN_TERMS["late"])
 """Terms that environments with several topics compute besides; weights are fractions of their sum over the topics."""
 

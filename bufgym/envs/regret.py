@@ -1,0 +1,34 @@
+"""The reward ``regret``: how much of the best attainable H each decision gives up.
+
+Let V* be the best H that can still be reached from a state by somebody who knows the whole link and workload. The reward
+of a step is the change of V*, and at the end H takes its place. So the rewards of an episode sum to H - V*(start), and
+the best policy is the same as under ``retained``: this is reward shaping by a potential [ng1999policy]. The luck of link
+and motion is taken out of the reward. Only the reward sees the future: observations and evaluations do not.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.envs.output import StepOutput
+from bufgym.oracle.hindsight import Hindsight
+from bufgym.sim import Senders
+
+
+class Regret:
+    """The term's numbers for all rows of an environment, in column ``column`` of ``StepOutput.reward_terms``."""
+
+    def __init__(self, senders: Senders, column: int) -> None:
+        self._hindsight, self._column = Hindsight(senders, "reward = 'regret'"), column
+        self._most = np.zeros(len(senders))
+        self._every = np.arange(len(senders))
+
+    def begin(self, rows: NDArray[np.int64], output: StepOutput) -> None:
+        """Note V* where episodes begin in these ``rows``; an episode without a decision has its H."""
+        most = self._hindsight.most(rows)[rows]
+        self._most[rows] = np.where(self._hindsight.senders.batch.senders["waiting"][rows] == 0, output.qoi[rows], most)
+
+    def write(self, output: StepOutput) -> None:
+        """Write the change of V* in the step that all rows have just taken."""
+        now = np.where(output.terminated, output.qoi, self._hindsight.most(self._every))
+        output.reward_terms[:, self._column] = now - self._most
+        self._most = now
