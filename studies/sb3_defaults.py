@@ -1,50 +1,86 @@
-"""How far PPO comes on ``Uplink-v0`` with the defaults of stable-baselines3: the curve of docs/guide/trainers.md.
+"""How far the trainers of stable-baselines3 come by their own defaults: the curves of docs/guide/trainers.md.
 
-python -m studies.sb3_defaults --settings default --seeds 0 1 2 3 4 --steps 100000
+python -m studies.sb3_defaults --trainers PPO DQN A2C MaskablePPO --reward regret --steps 200000
 python -m studies.sb3_defaults --curves studies/sb3_defaults.csv --figure docs/figures/sb3-defaults.svg
 
-The score is that of the most likely actions on fixed episodes that training does not draw, 0 for Drop Oldest and 1 for
-the clairvoyant. Each evaluation is a line of the file of curves at once, so that a run cut short keeps what it had.
+No hyperparameter is set, of the trainer or the environment, but for those that a command names. The score is that of
+the most likely actions on fixed episodes that training does not draw, 0 for Drop Oldest and 1 for the clairvoyant. Each
+evaluation is a line of the file of curves at once, so that a run cut short keeps what it had; runs that are complete in
+the file are not made again.
 """
 
 from __future__ import annotations
 
 import csv
 import math
+import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
+import torch
 from matplotlib.figure import Figure
-from stable_baselines3 import PPO
+from sb3_contrib import MaskablePPO
+from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.tasks import QueueTask
-from bufgym.ground.errors import unknown
 from bufgym.oracle import BASELINE, normalised_score
-from bufgym.sb3 import make_vec_env
+from bufgym.sb3 import make_vec_env, takes_masks
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from studies.page import command, table
 
-ENV, CAPACITY, RULES = "bufgym/Uplink-v0", 8, ("afr", "target-gap", "gap-price")
-SETTINGS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "scaled": {"reward_scale": "episode"},
-    "rule": {"fields": "rule"},
-    "8 rows": {"n_envs": 8},
-    "8 rows, rule": {"n_envs": 8, "fields": "rule"},
-    "8 rows, guided": {"n_envs": 8, "actions": "guided", "fields": "guided"},
-}
-"""Name -> arguments of ``make_vec_env``; those of PPO are never changed."""
+TRAINERS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "A2C": A2C, "MaskablePPO": MaskablePPO}
+RULES = ("afr", "target-gap", "gap-price")
 FIRST_SEED = 2_000_000_000  # of the episodes for evaluation
-ROLLOUT = 16_384  # most steps between two updates of any settings
-LINE = ("settings", "seed", "steps", "score")
+ROLLOUT = 16_384  # most steps between two updates of any trainer
+Trainer = Literal["PPO", "DQN", "A2C", "MaskablePPO"]
+
+
+class Task(NamedTuple):
+    """An environment to train in, and the episodes to evaluate on."""
+
+    env: str
+    training: dict[str, Any]
+    evaluation: dict[str, Any]
+
+
+def task_of(name: str, data: str | None) -> Task:
+    """``Uplink-v0``, or a suite by its name: trained on its training links, evaluated on its test links."""
+    if name == "lte":
+        return Task("bufgym/Uplink-v0", {}, {})
+    suite = {"suite": name, "data": data}
+    return Task("bufgym/Suite-v0", {**suite, "split": "train"}, {**suite, "split": "test"})
+
+
+@dataclass(frozen=True)
+class Run:
+    """One seed of one trainer; its fields are columns of the file of curves."""
+
+    trainer: str
+    reward: str
+    actions: str
+    rows: int
+    task: str
+    capacity: int
+    seed: int = field(compare=False, default=0)
+
+    @property
+    def label(self) -> str:
+        """Everything but the seed, as far as it is not usual."""
+        unusual = [f"{self.rows} rows"] * (self.rows != 1) + [self.task] * (self.task != "lte")
+        unusual += [f"L = {self.capacity}"] * (self.capacity != 8) + [self.actions] * (self.actions != "candidates")
+        return ", ".join([self.trainer, self.reward, *unusual])
+
+
+LINE = (*Run.__dataclass_fields__, "steps", "score", "cpu_s")
 
 
 class Model(Protocol):
@@ -55,23 +91,28 @@ class Model(Protocol):
 
 
 class Episodes:
-    """Fixed episodes, and the scores of models and rules on them."""
+    """Fixed episodes of a task, and the scores of models and rules on them."""
 
-    def __init__(self, count: int) -> None:
-        self._scenario = scenarios.get("lte")
+    def __init__(self, count: int, task: Task | None = None, capacity: int = 8) -> None:
+        self._task, self._capacity = task or task_of("lte", None), capacity
+        named = gym.spec(self._task.env).kwargs["scenario"]
+        self._scenario: Any = scenarios.get(named, **self._task.evaluation)
         self._episodes = [draw(self._scenario, FIRST_SEED + i) for i in range(count)]
-        self._best = math.fsum(QueueTask().best(episode, CAPACITY, self._scenario).qoi for episode in self._episodes)
+        best = (QueueTask().best(episode, capacity, self._scenario).qoi for episode in self._episodes)
+        self._best = math.fsum(best)
         self._base = self._qoi_of_rule(BASELINE)
 
-    def of_model(self, model: Model, settings: dict[str, Any]) -> float:
+    def of_model(self, model: Model, actions: str = "candidates") -> float:
         """The score of a model's most likely actions."""
         n = len(self._episodes)
-        options = {name: value for name, value in settings.items() if name != "n_envs"} | {"info": "mask"}
-        envs = gym.make_vec(ENV, n, capacity=CAPACITY, **options)
-        observation, _ = envs.reset(seed=0, options={"episodes": self._episodes})
+        options: dict[str, Any] = {"actions": actions, "observation": "flat", "info": "mask"}
+        envs = gym.make_vec(self._task.env, n, capacity=self._capacity, **options, **self._task.evaluation)
+        observation, info = envs.reset(seed=0, options={"episodes": self._episodes})
         qoi, over = np.zeros(n), np.zeros(n, np.bool_)
         while not over.all():
-            observation, _, terminated, _, info = envs.step(model.predict(observation, deterministic=True)[0])
+            masks: Any = {"action_masks": info["action_mask"]} if takes_masks(model) else {}
+            action = model.predict(observation, deterministic=True, **masks)[0]
+            observation, _, terminated, _, info = envs.step(action)
             ended = terminated & ~over
             if ended.any():
                 qoi[ended] = info["qoi"][ended]
@@ -83,7 +124,7 @@ class Episodes:
         return self._score(self._qoi_of_rule(name))
 
     def _qoi_of_rule(self, name: str) -> float:
-        senders = run(policies.get(name), self._episodes, CAPACITY, self._scenario.value)
+        senders = run(policies.get(name), self._episodes, self._capacity, self._scenario.value)
         return math.fsum(outcome(senders, i).qoi for i in range(len(self._episodes)))
 
     def _score(self, qoi: float) -> float:
@@ -93,23 +134,24 @@ class Episodes:
 class Curve(BaseCallback):
     """Writes the score after every so many steps."""
 
-    def __init__(self, episodes: Episodes, settings: str, seed: int, every: int, out: Path) -> None:
+    def __init__(self, episodes: Episodes, run: Run, every: int, out: Path) -> None:
         super().__init__()
-        self._episodes, self._settings, self._seed, self._every, self._out = episodes, settings, seed, every, out
-        self._due = 0
+        self._episodes, self._run, self._every, self._out = episodes, run, every, out
+        self._due, self._begun_s = 0, time.process_time()
 
-    def _on_rollout_start(self) -> None:
+    def _on_step(self) -> bool:
         if self.num_timesteps >= self._due:
             self.write()
             self._due = (self.num_timesteps // self._every + 1) * self._every
-
-    def _on_step(self) -> bool:
         return True
 
     def write(self) -> None:
-        """Append the model's score now."""
-        score = self._episodes.of_model(self.model, SETTINGS[self._settings])
-        append(self._out, LINE, (self._settings, self._seed, self.num_timesteps, f"{score:.4f}"))
+        """Append the model's score now, and the processor time of training so far."""
+        spent_s = time.process_time() - self._begun_s
+        score = self._episodes.of_model(self.model, self._run.actions)
+        columns = (getattr(self._run, name) for name in Run.__dataclass_fields__)
+        append(self._out, LINE, (*columns, self.num_timesteps, f"{score:.4f}", f"{spent_s:.1f}"))
+        self._begun_s = time.process_time() - spent_s  # evaluations do not count
 
 
 def append(out: Path, header: Sequence[str], line: Sequence[Any]) -> None:
@@ -119,40 +161,51 @@ def append(out: Path, header: Sequence[str], line: Sequence[Any]) -> None:
         csv.writer(file).writerows([header] * begins + [line])
 
 
-def train(settings: str, seed: int, steps: int, curve: Curve) -> None:
-    """Train one seed with the defaults of stable-baselines3."""
-    envs = make_vec_env(ENV, capacity=CAPACITY, info="mask", **SETTINGS[settings])
-    PPO("MultiInputPolicy", envs, seed=seed, device="cpu").learn(steps, curve)
+def train(run: Run, task: Task, steps: int, curve: Curve) -> None:
+    """Train one seed with the trainer's defaults."""
+    settings = {"actions": run.actions, "observation": "flat", "info": "mask", "reward": run.reward}
+    envs = make_vec_env(task.env, run.rows, capacity=run.capacity, **settings, **task.training)
+    TRAINERS[run.trainer]("MlpPolicy", envs, seed=run.seed, device="cpu").learn(steps, curve)
     curve.write()
     envs.close()
 
 
-def read(curves: Path) -> dict[str, dict[int, list[tuple[int, float]]]]:
-    """Settings -> seed -> (steps, score) in the order of the file."""
-    found: dict[str, dict[int, list[tuple[int, float]]]] = {}
+Point = tuple[int, float, float]
+"""Steps, score, and processor seconds of training."""
+
+
+def read(curves: Path) -> dict[Run, dict[int, list[Point]]]:
+    """Run -> seed -> points in the order of the file; a run's key is that of its first seed."""
+    found: dict[Run, dict[int, list[Point]]] = {}
     with curves.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            curve = found.setdefault(line["settings"], {}).setdefault(int(line["seed"]), [])
-            curve.append((int(line["steps"]), float(line["score"])))
+            whole = (int(line[name]) for name in ("rows", "capacity", "seed"))
+            rows, capacity, seed = whole
+            run = Run(line["trainer"], line["reward"], line["actions"], rows, line["task"], capacity, seed)
+            point = (int(line["steps"]), float(line["score"]), float(line["cpu_s"]))
+            found.setdefault(run, {}).setdefault(seed, []).append(point)
     return found
 
 
 def summary(curves: Path, steps: int) -> list[str]:
     """A table: each seed's score at the last evaluation within so many steps and one rollout, and their median."""
     rows = []
-    for settings, of_seed in read(curves).items():
-        scores = [[score for at, score in curve if at <= steps + ROLLOUT][-1] for curve in of_seed.values()]
-        rows.append((settings, f"{np.median(scores):.2f}", ", ".join(f"{score:.2f}" for score in scores)))
-    return table(("settings", f"median after {steps:,} steps", "seeds"), rows)
+    for run, of_seed in read(curves).items():
+        last = [[point for point in curve if point[0] <= steps + ROLLOUT][-1] for curve in of_seed.values()]
+        scores, cpu_s = [score for _, score, _ in last], [seconds for *_, seconds in last]
+        each = ", ".join(f"{score:.2f}" for score in scores)
+        rows.append((run.label, f"{np.median(scores):.2f}", each, f"{np.median(cpu_s):.0f}"))
+    return table(("settings", f"median after {steps:,} steps", "seeds", "CPU s"), rows)
 
 
 def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
     """A line for each seed, a colour for each of the settings, and the rules as levels."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
-    axes = figure.add_subplot(xlabel="steps", ylabel="score")
-    for k, (settings, of_seed) in enumerate(read(curves).items()):
+    axes = figure.add_subplot(xlabel="steps", ylabel="score", ylim=(-0.2, 0.85))
+    for k, (run, of_seed) in enumerate(read(curves).items()):
         for n, curve in enumerate(of_seed.values()):
-            axes.plot(*zip(*curve, strict=True), color=f"C{k}", alpha=0.7, label=settings if n == 0 else None)
+            steps, scores, _ = zip(*curve, strict=True)
+            axes.plot(steps, scores, color=f"C{k}", alpha=0.7, label=run.label if n == 0 else None)
     for name, score in rules.items():
         axes.axhline(score, color="black", linewidth=0.8, linestyle=":")
         axes.annotate(name, (1, score), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
@@ -161,16 +214,24 @@ def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
 
 
 def page(
-    settings: Sequence[str] = ("default",),
+    trainers: Sequence[Trainer] = ("PPO",),
+    reward: str = "retained",
+    actions: str = "candidates",
+    rows: int = 1,
+    task: str = "lte",
+    capacity: int = 8,
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     steps: int = 100_000,
     every: int = 10_000,
     episodes: int = 40,
+    data: str | None = None,
     curves: Path = Path("runs/sb3_defaults.csv"),
     figure: Path | None = None,
 ) -> None:
     """Train, or with ``figure`` draw the curves and print their table."""
-    fixed = Episodes(episodes)
+    torch.set_num_threads(1)
+    of_task = task_of(task, data)
+    fixed = Episodes(episodes, of_task, capacity)
     rules = {name: fixed.of_rule(name) for name in RULES}
     print(", ".join(f"{name} {score:.3f}" for name, score in rules.items()), flush=True)
     if figure is not None:
@@ -178,11 +239,12 @@ def page(
         print(*summary(curves, steps), sep="\n")
         return
     curves.parent.mkdir(exist_ok=True)
-    for name in settings:
-        if name not in SETTINGS:
-            raise unknown("settings", name, SETTINGS)
-        for seed in seeds:
-            train(name, seed, steps, Curve(fixed, name, seed, every, curves))
+    for seed in seeds:
+        for trainer in trainers:
+            one = Run(trainer, reward, actions, rows, task, capacity, seed)
+            done = read(curves).get(one, {}).get(seed, []) if curves.exists() else []
+            if not any(reached >= steps for reached, *_ in done):
+                train(one, of_task, steps, Curve(fixed, one, every, curves))
 
 
 if __name__ == "__main__":

@@ -68,16 +68,24 @@ def find_values(batch: Batch, ahead: Ahead, work: Work, values: NDArray[Any]) ->
 
 @kernel
 def find_most(batch: Batch, ahead: Ahead, work: Work, rows: Ints, most: NDArray[Any]) -> None:
-    """Fill ``most``, float64[n], at ``rows``: the largest of ``find_values``; 0 where no decision is due."""
+    """Fill ``most``, float64[n], at ``rows``: the largest of ``find_values``; 0 where no decision is due.
+
+    The present decision may drop a message of the queue, just as that of any later arrival may.
+    """
     for i in rows:
         sender = batch.senders[i]
         most[i] = 0.0
         if sender.waiting == ARRIVAL_WAITS:
             h, e = reach(batch, ahead, work, i)
-            best = 0.0
-            for action in range(sender.capacity + 1 + has_room(batch, i)):
-                if action < sender.occupancy or action >= sender.capacity:
-                    best = max(best, best_without(batch, ahead, work, i, e, action))
+            if e > ahead.link[i, 2]:
+                most[i] = h  # no further message is delivered
+                continue
+            for k in range(sender.occupancy + 1):
+                work.slots[k] = k
+            count, best = sender.occupancy + 1, 0.0
+            for goes in range(2):  # the newcomer is accepted, where there is room, or one message of all goes
+                if goes == 1 or has_room(batch, i):
+                    best = max(best, best_from(batch, ahead, work, i, e, count, goes))
             most[i] = h + best
 
 
@@ -104,7 +112,7 @@ def best_without(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, action:
         if not gone:
             work.slots[count] = k
             count += 1
-    return best_from(batch, ahead, work, i, e, count)
+    return best_from(batch, ahead, work, i, e, count, 0)
 
 
 @kernel
@@ -134,18 +142,29 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
         work.first[k] = value(v, x - last_x) if sent else 1.0  # the very first message gains the 1 in H
         for j in range(k):
             work.pair[j, k] = value(v, x - work.x[j])
-    count = 0
+    count, chosen = 0, n + 1
     for t in range(1, own + 2):
         if t <= own:
             while n + 1 + count < sender.arrivals and at(ahead.c, i, n + 1 + count) < e + (t - 1) * b:
                 count += 1
             work.arrived[t] = count
-        # V is concave: the best successor of a later message is no earlier. So that of the last bounds all others.
-        first, last, chosen = max(0, t - 2), own - 1 if t > 1 else 0, n + 1
-        stop = look_ahead(batch, ahead, work, i, e, t, last) + 1
-        for k in range(first, last):
+        if t == 1:
+            look_ahead(batch, ahead, work, i, e)
+            continue
+        # V is concave: the best successor is no earlier if the message before it is later, or the socket free later. So
+        # that of the newcomer bounds all others, and it is known: the newcomer is message n.
+        u, first = e + (t - 1) * b, t - 2
+        step = step_of(ahead, i, n, u)
+        work.jump[t - 1, own - 1], last = ahead.gain[step], ahead.follow[step]
+        work.target[t - 1, own - 1] = last
+        if first == own - 1:
+            continue
+        chosen = max(n + 1, work.target[t - 2, first] if t > 2 else 0)
+        for m in range(chosen, last + 1):
+            work.future[m] = sends(ahead, i, m, u)
+        for k in range(first, own - 1):
             most, target = 0.0, -1
-            for m in range(chosen, stop):
+            for m in range(chosen, last + 1):
                 after = work.future[m]
                 if after >= 0 and after + 1 <= most:
                     break  # a later message has no larger gain after it
@@ -158,58 +177,57 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
 
 
 @kernel
-def look_ahead(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, t: int, k: int) -> int:
-    """Find what follows t - 1 messages of the queue of which k is the last; return it, and -1 for none.
-
-    Fills ``jump`` and ``target`` of k, and ``future`` up to the arrival found.
-    """
+def look_ahead(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
+    """Fill ``jump`` and ``target`` for no message of the queue: what follows the message sent last, and -1 for none."""
     sender = batch.senders[i]
-    v, u, n = batch.v[sender.v_start :], e + (t - 1) * ahead.link[i, 0], sender.next
-    x = at(batch.slots, i, sender.first - 1).x if t == 1 else work.x[k]
+    v, n = batch.v[sender.v_start :], sender.next
+    x = at(batch.slots, i, sender.first - 1).x
     most, target = 0.0, -1
     for m in range(n + 1, sender.arrivals):
-        if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= u:
+        if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= e:
             break  # another message could be sent in the meantime
-        work.future[m] = after = sends(ahead, i, m, u)
+        after = sends(ahead, i, m, e)
         if after < -1 or (after >= 0 and after + 1 <= most):
             break  # a later message has no larger gain after it
         if after >= 0:
-            added = value(v, at(batch.arrivals, i, m).x - x) if sender.dequeued > 0 or t > 1 else 1.0
+            added = value(v, at(batch.arrivals, i, m).x - x) if sender.dequeued > 0 else 1.0
             if added + after > most + TIE or target < 0:
                 most, target = added + after, m
-    work.jump[t - 1, k], work.target[t - 1, k] = most, target
-    return target
+    work.jump[0, 0], work.target[0, 0] = most, target
 
 
 @kernel
-def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int) -> float:
-    """Best gain with the first ``count`` of ``work.slots`` queued and the socket free at byte ``e``."""
+def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, spare: int) -> float:
+    """Best gain with the first ``count`` of ``work.slots`` queued and the socket free at byte ``e``.
+
+    ``spare`` is 1 if one of these messages has still to go before the next arrival, else 0.
+    """
     b, ends = ahead.link[i, 0], ahead.link[i, 2]
-    until = min(count, (ends - e) // b)  # transmissions of this queue that are delivered
+    until = min(count - spare, (ends - e) // b)  # transmissions of this queue that are delivered
     most, sent, target = work.jump[0, 0], 0, work.target[0, 0]
     for t in range(1, until + 1):
-        for p in range(t - 1, min(count, t + work.arrived[t])):
+        for p in range(t - 1, min(count, t + spare + work.arrived[t])):
             k = work.slots[p]
             gain = work.first[k]
             if t > 1:
                 gain = -1.0
-                for before in range(t - 2, min(p, t - 1 + work.arrived[t - 1])):
+                for before in range(t - 2, min(p, t - 1 + spare + work.arrived[t - 1])):
                     j = work.slots[before]
                     gain = max(gain, work.own[t - 1, j] + work.pair[j, k])
             work.own[t, k] = gain
             # Of equal plans those that send more: they are less often impossible.
             if gain + work.jump[t, k] >= most - TIE:
                 most, sent, target = gain + work.jump[t, k], t, work.target[t, k]
-    if possible(batch, ahead, work, i, e, (count, until, sent, target)):
+    if possible(batch, ahead, work, i, e, (count - spare, until, sent, target)):
         return float(most)
-    return forced(batch, ahead, work, i, e, count, until)
+    return forced(batch, ahead, work, i, e, count, until, spare)
 
 
 @kernel
 def possible(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, plan: tuple[int, int, int, int]) -> bool:
     """Whether a plan keeps the socket busy enough.
 
-    ``plan`` is (messages queued, transmissions delivered, queued messages that it sends, the arrival that it sends
+    ``plan`` is (messages queued after the present decision, transmissions delivered, queued messages that it sends, the arrival that it sends
     next); ``best_from`` makes it.
     """
     b, n = ahead.link[i, 0], batch.senders[i].next
@@ -222,7 +240,7 @@ def possible(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, plan: tuple
 
 
 @kernel
-def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, until: int) -> float:
+def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, until: int, spare: int) -> float:
     """Compute ``best_from`` with the condition kept by each of the first ``until`` transmissions.
 
     Candidates are numbered: the queue from 0 on, later arrivals from ``count`` on. V is concave: of a later candidate
@@ -231,14 +249,14 @@ def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, u
     b, n = ahead.link[i, 0], batch.senders[i].next
     v = batch.v[batch.senders[i].v_start :]
     last_x = at(batch.slots, i, batch.senders[i].first - 1).x
-    known = until + work.arrived[until]
+    known = min(until + spare, count) + work.arrived[until]
     for m in range(known):
         work.places[m] = work.x[work.slots[m]] if m < count else at(batch.arrivals, i, n + 1 + m - count).x
-    for m in range(1 + work.arrived[1]):
+    for m in range(min(1 + spare, count) + work.arrived[1]):
         work.forced[1, m] = work.first[work.slots[m]] if m < count else value(v, work.places[m] - last_x)
     for t in range(2, until + 1):
-        gains, before = work.forced[(t - 1) % 2], work.arrived[t - 1] + t - 1
-        first, stop, step = t - 1, t + work.arrived[t], 1
+        gains, before = work.forced[(t - 1) % 2], work.arrived[t - 1] + min(t - 1 + spare, count)
+        first, stop, step = t - 1, min(t + spare, count) + work.arrived[t], 1
         while step < stop - first:
             step *= 2
         while step > 0:
