@@ -114,7 +114,7 @@ class SlotLearner(DecisionLearner[Slots]):
     @property
     def env_options(self) -> dict[str, Any]:
         """When it is asked, and what it sees."""
-        return {"decide_at": self.settings.decide_at, "fields": self.settings.fields}
+        return {"actions": "slots", "decide_at": self.settings.decide_at, "fields": self.settings.fields}
 
     def agent_of(self, model: Any, name: str) -> Agent:
         """A policy where the model's weights are one, else the model."""

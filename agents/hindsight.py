@@ -109,7 +109,13 @@ class Rows:
         self, cell: Cell, n: int, start: Weights, shares: tuple[float, float], rng: np.random.Generator
     ) -> None:
         self.env = SenderVectorEnv(
-            n, cell.scenario, cell.capacity, decide_at="arrival", autoreset_mode="SameStep", info="mask"
+            n,
+            cell.scenario,
+            cell.capacity,
+            decide_at="arrival",
+            autoreset_mode="SameStep",
+            info="mask",
+            actions="slots",
         )
         self.env.reset(seed=int(rng.integers(2**31)))
         self._senders, self._start, self.capacity = self.env.rows.senders, start, cell.capacity

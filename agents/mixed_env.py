@@ -73,9 +73,8 @@ class MixedEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"{self.padded_slots} padded slots: a cell has L = {largest}")
 
         def rows(cell: Cell, size: int) -> Rows:
-            return Rows(
-                size, cell.scenario, Options(capacity=cell.capacity, decide_at=decide_at, reward=reward, fields=fields)
-            )
+            options: dict[str, Any] = {"decide_at": decide_at, "reward": reward, "fields": fields}
+            return Rows(size, cell.scenario, Options(capacity=cell.capacity, actions="slots", **options))
 
         self.groups = [rows(cell, size) for cell, size in zip(cells, sizes, strict=True)]
         self.num_envs = sum(sizes)

@@ -81,6 +81,7 @@ class Pupil:
             duration_s=settings.duration_s,
             info="none",
             autoreset_mode=gym.vector.AutoresetMode.SAME_STEP,
+            actions="slots",
         )
         self.envs.reset(seed=settings.seed)
         self.rows = self.envs.unwrapped.rows

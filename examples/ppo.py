@@ -116,6 +116,7 @@ def make(traces: list[str], num_envs: int, settings: Settings, mode: gym.vector.
         observation="slots",
         info="mask",
         autoreset_mode=mode,
+        actions="slots",
     )
 
 

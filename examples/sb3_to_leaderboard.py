@@ -23,7 +23,9 @@ from bufgym.sb3 import SlotPolicy, make_vec_env
 
 def train(suite: str, capacity: int, steps: int, num_envs: int, path: Path) -> None:
     """A slot network, which serves every L, whatever L it learned at; the model as a zip."""
-    envs = make_vec_env("bufgym/Suite-v0", num_envs, seed=0, suite=suite, split="train", capacity=capacity)
+    envs = make_vec_env(
+        "bufgym/Suite-v0", num_envs, seed=0, suite=suite, split="train", capacity=capacity, actions="slots"
+    )
     batch = {"n_steps": 128, "batch_size": 16 * num_envs, "n_epochs": 4}
     short_sight = {"gamma": 0.9, "gae_lambda": 0.9}  # the reward pays at once what a decision costs
     model = MaskablePPO(SlotPolicy, envs, learning_rate=2e-3, device="cpu", seed=0, **batch, **short_sight)

@@ -131,7 +131,7 @@ def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) 
     """Row (trace, seed) is what ``reset`` of bufgym/Uplink-v0 plays by these numbers; neither side has an argument."""
     assert main(["bench", "--seeds", "1", "--policies", "drop-oldest", "--format", "csv", "--out", str(tmp_path)]) == 0
     (row,) = (row for row in read_rows(tmp_path / "rows.csv") if row["trace"] == "lte-synthetic-3")
-    env = gym.make("bufgym/Uplink-v0", bound=True).unwrapped
+    env = gym.make("bufgym/Uplink-v0", bound=True, actions="slots").unwrapped
     _, info = env.reset(options={"trace": "lte-synthetic-3", "seed": 0})
     ended = False
     while not ended:

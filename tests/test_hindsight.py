@@ -59,7 +59,9 @@ def test_an_untrained_student_is_the_rule() -> None:
 
 def test_fields_show_the_rule_and_keep_their_limits() -> None:
     """At every decision of a random student the fields name what gap-price does there."""
-    env = SenderVectorEnv(16, dataclasses.replace(SHORT, size_cv=0.5), L, decide_at="arrival", info="mask")
+    env = SenderVectorEnv(
+        16, dataclasses.replace(SHORT, size_cv=0.5), L, decide_at="arrival", info="mask", actions="slots"
+    )
     env.reset(seed=1)
     senders, wild = env.rows.senders, random_student(0).weights()
     student, rule = Player(wild.policy("wild"), 16), Player(policies.get("gap-price"), 16)
@@ -194,7 +196,7 @@ def test_training_keeps_an_agent_and_goes_on(task: str, tmp_path, monkeypatch) -
 
 def test_accepting_at_an_idle_socket_is_never_unlearned() -> None:
     """A student of any usual size sends when the socket is idle and the queue empty, so that it is never silent."""
-    env = SenderVectorEnv(8, SHORT, L, decide_at="arrival", info="mask")
+    env = SenderVectorEnv(8, SHORT, L, decide_at="arrival", info="mask", actions="slots")
     env.reset(seed=3)
     player = Player(random_student(5, size=0.02).weights().policy("wild"), 8)
     assert (player.actions(env.rows.senders) == L + 1).all() and ACCEPT < 0

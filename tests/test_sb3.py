@@ -76,7 +76,9 @@ def test_rows_are_those_of_the_native_batch_and_their_ends_are_told(id: str) -> 
 
 
 def test_a_time_limit_truncates() -> None:
-    envs = make_vec_env("bufgym/Uplink-v0", 2, seed=0, max_episode_steps=5, **SMALL["bufgym/Uplink-v0"])
+    envs = make_vec_env(
+        "bufgym/Uplink-v0", 2, seed=0, max_episode_steps=5, **SMALL["bufgym/Uplink-v0"], actions="slots"
+    )
     envs.reset()
     for step in range(1, 11):
         _, _, dones, infos = envs.step(np.full(2, L))  # reject everything
@@ -87,7 +89,7 @@ def test_a_time_limit_truncates() -> None:
 
 
 def test_masks_and_attributes() -> None:
-    envs = make_vec_env("bufgym/Interruption-v0", 5, **SMALL["bufgym/Interruption-v0"])
+    envs = make_vec_env("bufgym/Interruption-v0", 5, **SMALL["bufgym/Interruption-v0"], actions="slots")
     envs.reset()
     masks = get_action_masks(envs)
     assert is_masking_supported(envs) and masks.dtype == np.bool_
@@ -105,7 +107,7 @@ def test_masks_and_attributes() -> None:
 
 
 def test_seeds_and_options_hold_for_one_reset() -> None:
-    envs = make_vec_env("bufgym/Interruption-v0", 2, **SMALL["bufgym/Interruption-v0"])
+    envs = make_vec_env("bufgym/Interruption-v0", 2, **SMALL["bufgym/Interruption-v0"], actions="slots")
     assert envs.seed(3) == [3, 4]
 
     def lengths() -> list[int]:
@@ -129,7 +131,7 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
 def test_a_monitor_file(tmp_path: Path) -> None:
     """T = 20 always: each episode has 20 decisions, and what it delivers is written to the folder as Monitor does."""
     given: dict[str, Any] = {"t_max": 20, "law": "fixed", "capacity": L, "seed": 5}
-    envs = make_vec_env("bufgym/Interruption-v0", 3, monitor_dir=str(tmp_path), **given)
+    envs = make_vec_env("bufgym/Interruption-v0", 3, monitor_dir=str(tmp_path), **given, actions="slots")
     assert envs.num_envs == 3
     envs.reset()
     for _ in range(40):
@@ -147,15 +149,19 @@ def test_a_monitor_file(tmp_path: Path) -> None:
 
 
 test_what_a_native_batch_cannot_do_is_an_error = refused(
-    (lambda: make_vec_env("bufgym/Interruption-v0", num_envs=2), "stable-baselines3 calls it n_envs"),
-    (lambda: make_vec_env("bufgym/Uplink-v0", env_kwargs={"capacity": 8}), "'env_kwargs': settings go by", TypeError),
+    (lambda: make_vec_env("bufgym/Interruption-v0", num_envs=2, actions="slots"), "stable-baselines3 calls it n_envs"),
     (
-        lambda: make_vec_env("bufgym/Uplink-v0", vec_env_cls=GymVecEnv),
+        lambda: make_vec_env("bufgym/Uplink-v0", env_kwargs={"capacity": 8}, actions="slots"),
+        "'env_kwargs': settings go by",
+        TypeError,
+    ),
+    (
+        lambda: make_vec_env("bufgym/Uplink-v0", vec_env_cls=GymVecEnv, actions="slots"),
         "'vec_env_cls': stable_baselines3.*make_",
         TypeError,
     ),
     *((lambda id=id: make_vec_env(id), "has no native batch") for id in ("CartPole-v1", Monitor)),
-    (lambda: GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2)), "SAME_STEP"),
+    (lambda: GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2, actions="slots")), "SAME_STEP"),
 )
 
 
@@ -167,7 +173,7 @@ def untrained(algorithm: Any, policy: Any, env: Any = None, seed: int = 4, **opt
     """A model with large random weights: its decisions vary."""
     if algorithm is not DQN:
         options = {"n_steps": 8, **({} if algorithm is A2C else {"batch_size": 16}), **options}
-    env = env or make_vec_env("bufgym/Uplink-v0", 2, seed=0, decide_at="arrival", **WORLD)
+    env = env or make_vec_env("bufgym/Uplink-v0", 2, seed=0, decide_at="arrival", **WORLD, actions="slots")
     model = algorithm(policy, env, seed=1, device="cpu", **options)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -177,7 +183,9 @@ def untrained(algorithm: Any, policy: Any, env: Any = None, seed: int = 4, **opt
 
 
 def flat_env() -> Any:
-    return env_util.make_vec_env(lambda: gym.wrappers.FlattenObservation(gym.make("bufgym/Uplink-v0", **WORLD)), 2)
+    return env_util.make_vec_env(
+        lambda: gym.wrappers.FlattenObservation(gym.make("bufgym/Uplink-v0", **WORLD, actions="slots")), 2
+    )
 
 
 SCENARIO = replace(scenario_of("lte"), duration_s=2.0, size_bytes=1_000_000)
@@ -218,7 +226,7 @@ def test_any_model_decides_as_in_the_environment(algorithm: Any, saved: bool, ne
 
 
 def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Path) -> None:
-    env = make_vec_env("bufgym/Uplink-v0", 2, seed=0, fields=FIELDS, **WORLD)
+    env = make_vec_env("bufgym/Uplink-v0", 2, seed=0, fields=FIELDS, **WORLD, actions="slots")
     model = untrained(MaskablePPO, SlotPolicy, env, 6, policy_kwargs={"width": 8})
     model.save(tmp_path / "slots.zip")
     for policy in (as_policy(model, "slots"), as_policy(tmp_path / "slots.zip")):
@@ -229,7 +237,7 @@ def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Pat
 
 def test_an_agent_whose_prior_is_the_rule_begins_there() -> None:
     """In torch and as a compiled policy; without the rule's fields there is no prior."""
-    env = make_vec_env("bufgym/Uplink-v0", 2, seed=0, fields="rule", **WORLD)
+    env = make_vec_env("bufgym/Uplink-v0", 2, seed=0, fields="rule", **WORLD, actions="slots")
     model = untrained(MaskablePPO, SlotPolicy, env, 6, policy_kwargs={"width": 8, "prior": 1e4})
     rule = repr(reached(policies.get("gap-price")))
     assert repr(reached(as_policy(model, "ruled"))) == repr(reached_in_env(model, "dict", "rule")) == rule
@@ -279,7 +287,7 @@ def test_an_agent_for_topics_is_a_scheduler(form: str, network: str) -> None:
     policy = as_policy(model, "scheduler")
     assert policy.for_topics and policy.schedules
     episode = draw(client, 0)
-    envs = SenderVectorEnv(1, client, 6, observation=form)
+    envs = SenderVectorEnv(1, client, 6, observation=form, actions="slots")
     envs.reset(options={"episodes": [episode]})
     rows = envs.rows
     while not rows.output.terminated.all():
@@ -292,11 +300,11 @@ def test_an_agent_for_topics_is_a_scheduler(form: str, network: str) -> None:
 
 
 def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
-    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym:bufgym/Uplink-v0", 2, **WORLD)
+    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym:bufgym/Uplink-v0", 2, **WORLD, actions="slots")
     with pytest.raises(BufgymError, match="policy ppo: trained for L = 3, not for L = 5; only a network that scores"):
         run(as_policy(untrained(PPO, "MultiInputPolicy")), [scenario.episode(20)], 5, scenario.value)
     pole = untrained(PPO, "MlpPolicy", env_util.make_vec_env("CartPole-v1", 2)).policy
-    few = make_vec_env("bufgym/Uplink-v0", 2, fields=["rank"], observation="flat", **WORLD)
+    few = make_vec_env("bufgym/Uplink-v0", 2, fields=["rank"], observation="flat", **WORLD, actions="slots")
     for model, says in (
         (pole, r"action space Discrete\(2\): must be Discrete\(L \+ 2\)"),
         (untrained(PPO, "MlpPolicy", few), "observes 4 numbers: must be the"),
@@ -309,9 +317,9 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_guided_actions_are_those_of_any_continuous_agent(algorithm: Any) -> None:
     options = {"actions": "guided", "fields": "guided", **SMALL["bufgym/Uplink-v0"]}
-    check_env(gym.make("bufgym/Uplink-v0", **options).unwrapped)
+    check_env(gym.make("bufgym/Uplink-v0", **options, actions="slots").unwrapped)
     settings = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 200, "train_freq": 16}
-    envs = make_vec_env("bufgym/Uplink-v0", 8, seed=0, observation="flat", **options)
+    envs = make_vec_env("bufgym/Uplink-v0", 8, seed=0, observation="flat", **options, actions="slots")
     model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **settings).learn(2_000)
     action, _ = model.predict(envs.reset(), deterministic=True)
     assert model.num_timesteps >= 2_000 and action.shape == (8, 10) and np.abs(action).max() <= 1

@@ -78,7 +78,9 @@ class Options:
         whole("candidates", self.candidates, 1, MOST_CANDIDATES)
         if self.acts_on_candidates and (self.mask != "valid" or self.fields in ("compact", GUIDED, RULE)):
             given = f"mask = {self.mask!r}" if self.mask != "valid" else f"fields = {self.fields!r}"
-            raise BufgymError(f"{given}: is for actions = 'slots'; {CANDIDATES!r} have fields of their own, and no mask")
+            raise BufgymError(
+                f"{given}: is for actions = 'slots'; {CANDIDATES!r} have fields of their own, and no mask"
+            )
         names: Any = () if self.fields in (None, "compact", GUIDED, RULE) else self.fields
         is_list = isinstance(names, Collection) and not isinstance(names, str)
         if not (is_list and all(isinstance(name, str) for name in names)):

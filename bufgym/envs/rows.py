@@ -314,6 +314,17 @@ class Rows:
         """The action where no decision is due; it has no effect."""
         return self.capacity if self.choices is None else 0
 
+    def of_slots(self, slots: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The actions, int64[n], that mean these actions among slots, int64[n].
+
+        Where no candidate means it, the cheapest candidate, action 0 or at arrivals 1.
+        """
+        if self.choices is None:
+            return slots
+        meant = self.output.slot_actions == slots[:, None]
+        cheapest = self.actions_count - self.options.candidates - 1
+        return np.where(meant.any(axis=1), meant.argmax(axis=1), cheapest)
+
     def actions(self, actions: Any) -> NDArray[np.int64]:
         """Convert one action for each row to the kernels' form; the error names the first row that is wrong."""
         if self._acts:

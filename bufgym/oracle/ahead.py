@@ -136,7 +136,11 @@ def _write_steps(ahead: Ahead, i: int, rivals: Rivals, count: int, place: int) -
             first, end, added = 0, 1, 0.0  # nothing follows
         else:
             j = rivals.message[k]
-            first, end, added = step_of(ahead, i, j, min(rivals.top[k], last) + b), at(ahead.stop, i, j), rivals.added[k]
+            first, end, added = (
+                step_of(ahead, i, j, min(rivals.top[k], last) + b),
+                at(ahead.stop, i, j),
+                rivals.added[k],
+            )
         for step in range(first, end):
             e, g = last, added
             if k < count:

@@ -13,7 +13,7 @@ import gymnasium as gym
 
 import bufgym
 
-env = gym.make("bufgym/Interruption-v0", capacity=8, t_max=200)
+env = gym.make("bufgym/Interruption-v0", capacity=8, t_max=200, actions="slots")
 observation, info = env.reset(seed=0)
 print(env.action_space)  # evict slot 0..7, reject, accept
 print(sorted(observation))
@@ -36,7 +36,7 @@ from sb3_contrib import MaskablePPO
 
 from bufgym.sb3 import SlotPolicy, as_policy, make_vec_env
 
-envs = make_vec_env("bufgym/Interruption-v0", 64, seed=0, capacity=8, t_max=200)
+envs = make_vec_env("bufgym/Interruption-v0", 64, seed=0, capacity=8, t_max=200, actions="slots")
 model = MaskablePPO(SlotPolicy, envs, n_steps=128, batch_size=2048, n_epochs=4, learning_rate=3e-3, gamma=1.0, seed=0)
 model.learn(65_536)
 

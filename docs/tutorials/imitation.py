@@ -18,7 +18,13 @@ from bufgym.envs import expert
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 envs = gym.make_vec(
-    "bufgym/Uplink-v0", 64, capacity=8, duration_s=10.0, traces=TRAIN, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP
+    "bufgym/Uplink-v0",
+    64,
+    capacity=8,
+    duration_s=10.0,
+    traces=TRAIN,
+    autoreset_mode=gym.vector.AutoresetMode.SAME_STEP,
+    actions="slots",
 )
 observation, info = envs.reset(seed=0)
 judge = expert.clairvoyant(envs)

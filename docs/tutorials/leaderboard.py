@@ -19,7 +19,9 @@ from bufgym.sb3 import SlotPolicy, make_vec_env
 
 folder = Path("mine")
 folder.mkdir(exist_ok=True)
-envs = make_vec_env("bufgym/Suite-v0", 128, seed=0, suite="interruption-v1", split="train", capacity=10)
+envs = make_vec_env(
+    "bufgym/Suite-v0", 128, seed=0, suite="interruption-v1", split="train", capacity=10, actions="slots"
+)
 settings = {"n_steps": 128, "batch_size": 2048, "n_epochs": 4, "learning_rate": 3e-3, "gamma": 1.0}
 model = MaskablePPO(SlotPolicy, envs, seed=0, **settings).learn(131_072)
 model.save(folder / "my-agent.zip")

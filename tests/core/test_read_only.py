@@ -55,7 +55,10 @@ def honest(buffer: Any, arrival: Any, memory: Any) -> int:
 def test_a_python_policy_cannot_write(write: str) -> None:
     with pytest.raises(ValueError, match="read-only"):
         run(writer(write), [EPISODE], 3, V)
-    env, player = SenderEnv(Uplink(traces=(EPISODE.link.trace,), size_bytes=200_000), 3), Player(writer(write))
+    env, player = (
+        SenderEnv(Uplink(traces=(EPISODE.link.trace,), size_bytes=200_000), 3, actions="slots"),
+        Player(writer(write)),
+    )
     env.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
         for _ in range(9):

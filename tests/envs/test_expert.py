@@ -40,7 +40,7 @@ def trace(knots: list[tuple[int, int]], after: str = "loop") -> Trace:
 
 def playing(episode: Episode, capacity: int, v: Any = V, **options: Any) -> SenderEnv:
     """An environment at the first decision of this episode."""
-    env = SenderEnv(replace(SHORT, value=v, rate_hz=200), capacity, **options)
+    env = SenderEnv(replace(SHORT, value=v, rate_hz=200), capacity, **options, actions="slots")
     env.reset(options={"episode": episode})
     return env
 
@@ -107,7 +107,7 @@ FAMILIES = (SHORT, Interruption(t_max=90, law="fixed", value=V), replace(SHORT, 
 def test_who_follows_it_earns_what_it_says(family: Any, steps_at_random: int, capacity: int) -> None:
     """From the start and after actions at random, in a batch, whose rows are those of the single environment."""
     n, rng = 4, np.random.default_rng(1)
-    envs = SenderVectorEnv(n, family, capacity, autoreset_mode="Disabled")
+    envs = SenderVectorEnv(n, family, capacity, autoreset_mode="Disabled", actions="slots")
     envs.reset(options={"episodes": [draw(family, seed) for seed in range(n)]})
     know = expert.clairvoyant(envs)
     for _ in range(steps_at_random):
@@ -127,7 +127,7 @@ def test_who_follows_it_earns_what_it_says(family: Any, steps_at_random: int, ca
 def test_many_episodes_share_its_room() -> None:
     """Steps of past episodes make room for new ones, and those of the others stay what they were."""
     n, steps, duration_s = (8, 100, 10.0)
-    envs = SenderVectorEnv(n, replace(SHORT, duration_s=duration_s), 4, autoreset_mode="SameStep")
+    envs = SenderVectorEnv(n, replace(SHORT, duration_s=duration_s), 4, autoreset_mode="SameStep", actions="slots")
     envs.reset(seed=0)
     know = expert.clairvoyant(envs)
     for size in (1, 60):  # first so little that it has to grow
@@ -141,7 +141,7 @@ def test_many_episodes_share_its_room() -> None:
 
 
 def judged(scenario: str = "lte", **options: Any) -> Any:
-    env = SenderEnv(scenario, **options)
+    env = SenderEnv(scenario, **options, actions="slots")
     env.reset(seed=0)
     return expert.clairvoyant(env).values()
 
@@ -150,7 +150,7 @@ test_where_one_is_not_known_it_says_so = refused(
     (lambda: judged("topics"), "several topics"),
     (lambda: judged(decide_at="overflow"), "decide_at"),
     (lambda: judged(size_cv=0.5), "for equal sizes only"),
-    (lambda: expert.online(SenderEnv(SHORT, 2)), "Interruption-v0, not for Uplink"),
+    (lambda: expert.online(SenderEnv(SHORT, 2, actions="slots")), "Interruption-v0, not for Uplink"),
     (lambda: expert.policy(gym.make("CartPole-v1"), "afr"), "no environment of bufgym"),
 )
 
@@ -164,7 +164,7 @@ def test_a_policy_reaches_what_its_rollout_reaches(name: str) -> None:
     n, family = 5, Interruption(t_max=50)
     drawn = [draw(family, seed) for seed in range(2 * n)]
     reached = run(known, drawn, 3, family.value)
-    envs: Any = gym.make_vec("bufgym/Interruption-v0", n, capacity=3, scenario=family).unwrapped
+    envs: Any = gym.make_vec("bufgym/Interruption-v0", n, capacity=3, scenario=family, actions="slots").unwrapped
     envs.reset(options={"episodes": drawn[:n]})
     asked, last = expert.policy(envs, policy), np.zeros(2 * n)
     for half in (0, n):
@@ -182,7 +182,7 @@ def test_a_policy_reaches_what_its_rollout_reaches(name: str) -> None:
 
 def test_the_online_optimum_is_an_expert_of_interruptions() -> None:
     family = Interruption(t_min=3, t_max=14, law="uniform", value=V)
-    env = SenderEnv(family, 2)
+    env = SenderEnv(family, 2, actions="slots")
     asked, best = expert.online(env), online_optimum(2, law(family), V)
     env.reset(options={"episode": family.episode(9)})
     taken, ended = [], False
@@ -203,10 +203,12 @@ STREAM = {"duration_s": 2.0, "size_bytes": 500_000}
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_recorded_can_be_played_again(kind: str) -> None:
     """Row 0's episodes, in the single environment with its seed: the same observations, rewards and masks."""
-    episodes = list(record(SenderVectorEnv(2, "lte", 4, observation="flat", **STREAM), kind, 6, seed=3))
+    episodes = list(
+        record(SenderVectorEnv(2, "lte", 4, observation="flat", **STREAM, actions="slots"), kind, 6, seed=3)
+    )
     assert len(episodes) == 6
     turns = ("expert", "medium", "random") if kind == "mixed" else (kind,) * 3
-    env = SenderEnv("lte", 4, observation="flat", **STREAM)
+    env = SenderEnv("lte", 4, observation="flat", **STREAM, actions="slots")
     for k, played in enumerate(episodes[::2]):
         assert played.player == turns[k]
         seen, info = env.reset(seed=3 if k == 0 else None)
@@ -259,7 +261,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
 def test_infos_have_the_same_entries_in_every_step() -> None:
     """As recorders that stack them step by step want it."""
     for options in ({}, {"bound": True}):
-        env = SenderEnv("lte", 4, info="steady", **STREAM, **options)
+        env = SenderEnv("lte", 4, info="steady", **STREAM, **options, actions="slots")
         _, info = env.reset(seed=0)
         ended = False
         while not ended:

@@ -28,7 +28,7 @@ PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
 
 
 def test_one_robot_is_the_single_environment():
-    fleet, single = FleetEnv(robots=1, **SMALL), SenderEnv(**SMALL)
+    fleet, single = FleetEnv(robots=1, **SMALL), SenderEnv(**SMALL, actions="slots")
     rng = np.random.default_rng(0)
     seen, infos = fleet.reset(seed=3)
     alone, info = single.reset(seed=3)

@@ -73,7 +73,7 @@ def ruled(seen: Any, valid: Any) -> int:
 @pytest.mark.parametrize("case", CASES)
 def test_to_do_what_the_rule_chooses_is_gap_price(case: str) -> None:
     scenario, options = CASES[case]
-    env = SenderEnv(scenario, L, fields="rule", **options)
+    env = SenderEnv(scenario, L, fields="rule", **options, actions="slots")
     assert last_info(env, ruled, seed=0)["invalid"] == 0
     assert np.array_equal(env.rows.senders.batch.log["dropped_us"][0], rolled(env, case, policies.get("gap-price")))
 
@@ -92,7 +92,9 @@ def test_memory_begins_anew_with_the_episode() -> None:
 
 
 def test_inputs_can_be_seen_beside_slot_actions() -> None:
-    env = SenderEnv("lte", 8, fields="guided", observation="flat", size_bytes=400_000, size_cv=0.5, duration_s=10.0)
+    env = SenderEnv(
+        "lte", 8, fields="guided", observation="flat", size_bytes=400_000, size_cv=0.5, duration_s=10.0, actions="slots"
+    )
     seen, info = env.reset(seed=0)
     assert env.action_space == gym.spaces.Discrete(10) and info["action_mask"].sum() == 2
     assert env.observation_space == gym.spaces.Box(-4, 4, (len(INPUTS),), np.float32)
@@ -126,7 +128,10 @@ def begun() -> tuple[SenderEnv, SenderVectorEnv]:
 
 test_a_wrong_option_or_action_ends_in_a_sentence = refused(
     (lambda: SenderEnv(actions="guide"), "unknown actions 'guide'; did you mean 'guided'?"),
-    (lambda: SenderEnv(fields="guide"), "fields = 'guide': must be a list of names, 'compact', 'guided' or 'rule'"),
+    (
+        lambda: SenderEnv(fields="guide", actions="slots"),
+        "fields = 'guide': must be a list of names, 'compact', 'guided' or 'rule'",
+    ),
     (lambda: SenderEnv("topics", actions="guided"), "actions = 'guided': .*, not several topics"),
     (lambda: SenderEnv("topics", fields="guided"), "fields = 'guided': .*, not several topics"),
     (lambda: FleetVecEnv(fields="rule"), "fields = 'rule': .*, not a cell of robots"),

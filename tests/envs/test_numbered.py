@@ -64,7 +64,7 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
     """Alone and in a batch, for a randomised policy too; and what the episode was worth is what the row says."""
     rows = run_sweep(Sweep(mixed, PLAYED), tmp_path, backend="sequential", form="csv", progress=False)
     assert len(rows) == 2 * 2 * 2 * 2
-    env = gym.make("bufgym/Suite-v0", suite=mixed, split="test", capacity=L, bound=True)
+    env = gym.make("bufgym/Suite-v0", suite=mixed, split="test", capacity=L, bound=True, actions="slots")
     infos = []
     for row in rows:
         numbers = {name: row[name] for name in ("scenario", "trace", "seed")}
@@ -76,7 +76,9 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
         del numbers["trace"]  # the seed tells it
         assert played(env, row["policy"], options=numbers)["qoi"] == info["qoi"]
     assert len({round(info["qoi"], 9) for info in infos}) > 8  # they differ
-    envs: Any = gym.make_vec("bufgym/Suite-v0", len(rows), suite=mixed, split="test", capacity=L, bound=True)
+    envs: Any = gym.make_vec(
+        "bufgym/Suite-v0", len(rows), suite=mixed, split="test", capacity=L, bound=True, actions="slots"
+    )
     _, _ = envs.reset(options={"episodes": [{k: row[k] for k in ("scenario", "trace", "seed")} for row in rows]})
     players = {name: Player(policies.get(name), len(rows)) for name in PLAYED}
     last: list[dict[str, Any]] = [{} for _ in rows]
@@ -93,18 +95,18 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
 
 def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
     uplink = Uplink(traces=tuple(Trace.constant(2e6, 9, name="same") for _ in range(2)), duration_s=3)
-    env = SenderEnv(uplink, L)
+    env = SenderEnv(uplink, L, actions="slots")
     for row in run([policies.get("random")], uplink, [L], 2):
         info = played(env, "random", options={"trace": row["trace"], "seed": row["seed"]})
         assert info["qoi"] == pytest.approx(row["qoi"])
     assert row["trace"] == "same#2" and played(env, "random", options={"trace": 1, "seed": 1})["qoi"] == info["qoi"]
-    alone = SenderEnv(Interruption(t_max=30), L)
+    alone = SenderEnv(Interruption(t_max=30), L, actions="slots")
     alone.reset(options={"seed": 5})
     assert alone.rows.senders.episodes[0].last_decision == draw(Interruption(t_max=30), 5).last_decision  # type: ignore[union-attr]
 
 
 def suite_env(**arguments: Any) -> Any:
-    return gym.make("bufgym/Suite-v0", **arguments)
+    return gym.make("bufgym/Suite-v0", **arguments, actions="slots")
 
 
 @pytest.mark.parametrize(
@@ -121,17 +123,26 @@ def suite_env(**arguments: Any) -> Any:
         (lambda suite: suite.reset(options={"trace": "nope"}), "unknown trace 'nope'"),
         (lambda suite: suite.reset(options={"episode": None, "seed": 0}), "options: an episode, or its scenario"),
         (lambda suite: suite.reset(options={"number": 3}), "known: episode, scenario, trace, seed"),
-        (lambda _: SenderEnv("lte", L).reset(options={"scenario": "lte", "seed": 0}), "only the episodes of a suite"),
-        (lambda _: SenderEnv("lte", L).reset(options={"seed": 0}), r"trace = None: must be 0..7 or one of lte"),
         (
-            lambda _: SenderEnv("lte", L).reset(options={"trace": "lte-synth-3"}),
+            lambda _: SenderEnv("lte", L, actions="slots").reset(options={"scenario": "lte", "seed": 0}),
+            "only the episodes of a suite",
+        ),
+        (
+            lambda _: SenderEnv("lte", L, actions="slots").reset(options={"seed": 0}),
+            r"trace = None: must be 0..7 or one of lte",
+        ),
+        (
+            lambda _: SenderEnv("lte", L, actions="slots").reset(options={"trace": "lte-synth-3"}),
             "'lte-synth-3'; did you mean 'lte-synthetic-3'",
         ),
         (
-            lambda _: SenderEnv("lte", L).reset(options={"trace": "nope"}),
+            lambda _: SenderEnv("lte", L, actions="slots").reset(options={"trace": "nope"}),
             "unknown trace 'nope'; known: lte-synthetic-0, .* 0..7",
         ),
-        (lambda _: SenderVectorEnv(1, "lte").reset(options={"episodes": [{"k": 1}]}), "unknown entry .k.; known"),
+        (
+            lambda _: SenderVectorEnv(1, "lte", actions="slots").reset(options={"episodes": [{"k": 1}]}),
+            "unknown entry .k.; known",
+        ),
         (lambda _: suite_env(suite="topics-v1"), "suite topics-v1 is one of topics"),
         (lambda _: suite_env(split="all"), "split = 'all': must be one of train, validation, test"),
         (lambda _: suite_env(suite="lte-belgium-v1"), "needs a folder of recordings"),
@@ -139,7 +150,7 @@ def suite_env(**arguments: Any) -> Any:
     ],
 )
 def test_no_such_episode_or_suite(mixed: str, act: Any, says: str) -> None:
-    refuse(says, act, SenderEnv("suite", L, suite=mixed, split="test"))
+    refuse(says, act, SenderEnv("suite", L, suite=mixed, split="test", actions="slots"))
 
 
 @pytest.mark.parametrize(
@@ -153,7 +164,7 @@ def test_no_such_episode_or_suite(mixed: str, act: Any, says: str) -> None:
 def test_the_bound_worked_by_hand(T: int, action: int, h: float, best: float, score: float) -> None:
     """L = 1, V(d) = 1 - 0.5^d, an interruption of T messages."""
     given: dict[str, Any] = {"law": "fixed", "t_max": T, "value": "exponential:0.5", "disable_env_checker": True}
-    env = gym.make("bufgym/Interruption-v0", capacity=1, bound=True, **given)
+    env = gym.make("bufgym/Interruption-v0", capacity=1, bound=True, **given, actions="slots")
     env.reset(seed=0)
     ended, info, first = False, {}, action != 1
     while not ended:
@@ -195,14 +206,18 @@ def test_text_may_name_a_file(tmp_path: Path) -> None:
     write_csv(Trace.steps([(1.0, 500_000), (2.0, 0)]), tmp_path / "mine.csv")
     (tmp_path / "recording.csv").write_text("time_s,bytes\n0,1000\n0.5,2000\n1,500\n")
     env: Any = gym.make(
-        "bufgym/Uplink-v0", traces=str(tmp_path / "mine.csv"), workload=str(tmp_path / "recording.csv"), motion="none"
+        "bufgym/Uplink-v0",
+        traces=str(tmp_path / "mine.csv"),
+        workload=str(tmp_path / "recording.csv"),
+        motion="none",
+        actions="slots",
     )
     env.reset(seed=0)
     assert env.unwrapped.rows.senders.episodes[0].arrivals["size_bytes"].tolist() == [1000, 2000, 500]
 
 
 def uplink(**arguments: Any) -> Any:
-    return gym.make("bufgym/Uplink-v0", **arguments)
+    return gym.make("bufgym/Uplink-v0", **arguments, actions="slots")
 
 
 test_text_that_names_nothing = refused(
@@ -262,7 +277,10 @@ def test_the_set_is_the_same_for_every_row_and_seed() -> None:
     """A single environment, and the rows of a batch, play no other episodes than those of the pool."""
     arrivals = set()
     for seed in range(4):
-        batch, single = SenderVectorEnv(3, UPLINK, CAPACITY, pool=2), SenderEnv(UPLINK, CAPACITY, pool=2)
+        batch, single = (
+            SenderVectorEnv(3, UPLINK, CAPACITY, pool=2, actions="slots"),
+            SenderEnv(UPLINK, CAPACITY, pool=2, actions="slots"),
+        )
         batch.reset(seed=seed)
         single.reset(seed=seed)
         played = [*batch.rows.senders.episodes, *single.rows.senders.episodes]
@@ -284,7 +302,7 @@ def test_a_pool_is_a_whole_number(pool: Any) -> None:
 
 def test_a_reset_that_is_refused_touches_no_row() -> None:
     """Of three episodes given the last is too long: the rows before it go on with what they have."""
-    batch = SenderVectorEnv(3, UPLINK, CAPACITY)
+    batch = SenderVectorEnv(3, UPLINK, CAPACITY, actions="slots")
     batch.reset(seed=1)
     before = batch.rows.senders.batch.arrivals.copy()
     long = Uplink(traces=UPLINK.traces, duration_s=2.0).draw(Streams.seeded(3))

@@ -84,7 +84,7 @@ def episode(bytes_per_s: float) -> Episode:
 
 def sums(link: float, reward: dict[str, float], action: int) -> dict[str, float]:
     """The sum of each term over the episode, L = 1, always this action."""
-    env = SenderEnv(Uplink(traces=(Trace.steps([(1.0, 1e6)]),)), 1, reward=reward)
+    env = SenderEnv(Uplink(traces=(Trace.steps([(1.0, 1e6)]),)), 1, reward=reward, actions="slots")
     _, info = env.reset(options={"episode": episode(link)})
     assert set(info["reward_terms"].values()) == {0.0}  # a reset has them too
     total, ended = dict.fromkeys(info["reward_terms"], 0.0), False
@@ -165,8 +165,8 @@ def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
 
 def test_a_batch_is_its_rows() -> None:
     arguments: dict[str, Any] = {"fields": CHOSEN, "reward": ONE_QUEUE, "capacity": 3, **SMALL["bufgym/Uplink-v0"]}
-    singles = [SenderEnv("lte", **arguments) for _ in range(3)]
-    batch = SenderVectorEnv(3, "lte", autoreset_mode="Disabled", **arguments)
+    singles = [SenderEnv("lte", **arguments, actions="slots") for _ in range(3)]
+    batch = SenderVectorEnv(3, "lte", autoreset_mode="Disabled", **arguments, actions="slots")
     many, one = batch.reset(seed=5)[0], [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
     for k in range(25):
         for name in CHOSEN:
@@ -186,12 +186,12 @@ def test_a_term_of_the_end_is_asked_once_an_episode() -> None:
         calls.append(step.ended)
         return len(step.log)
 
-    single: Any = gym.make("bufgym/Uplink-v0", duration_s=1.0, reward="at_end")
+    single: Any = gym.make("bufgym/Uplink-v0", duration_s=1.0, reward="at_end", actions="slots")
     assert calls == ["ready"]
     single.reset(seed=0)
     steps = [single.step(0) for _ in range(30)]
     assert [reward for _, reward, *_ in steps] == [0.0] * 29 + [30.0] and calls == ["ready", True]
-    batch: Any = gym.make_vec("bufgym/Uplink-v0", 3, duration_s=1.0, reward="at_end")
+    batch: Any = gym.make_vec("bufgym/Uplink-v0", 3, duration_s=1.0, reward="at_end", actions="slots")
     batch.reset(seed=0)
     for _ in range(30):
         _, rewards, ended, *_ = batch.step(np.zeros(3, np.int64))
@@ -232,7 +232,7 @@ def test_a_spec_as_text_imports_what_it_names(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "own_text_module.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     arguments: dict[str, Any] = {"fields": ["rank", "own_text_module:seen"], "reward": {"own_text_module:paid": 3}}
-    spec = gym.make("bufgym/Interruption-v0", **arguments).spec
+    spec = gym.make("bufgym/Interruption-v0", **arguments, actions="slots").spec
     assert spec is not None
     env = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json()))
     seen, _ = env.reset(seed=0)
@@ -255,12 +255,12 @@ def nothing(step: Any, memory: Any) -> float:
 
 def out_of_bounds(compiled: bool) -> None:
     field("far", per="context", compile=compiled)(far)
-    SenderEnv("interruption", fields=["far"]).reset(seed=0)
+    SenderEnv("interruption", fields=["far"], actions="slots").reset(seed=0)
 
 
 def no_number(compiled: bool) -> None:
     reward_term("n", compile=compiled)(nothing)
-    env = SenderEnv("interruption", reward={"n": 0})
+    env = SenderEnv("interruption", reward={"n": 0}, actions="slots")
     env.reset(seed=0)
     env.step(0)
 
@@ -274,11 +274,14 @@ test_what_is_refused = refused(
     (lambda: reward_term("retained")(dropped), "reward term 'retained': a built-in reward term has this name"),
     (lambda: reward_term("delay")(dropped), "reward term 'delay': a built-in reward term has this name"),
     (lambda: reward_term("mine")(waited), r"must be a function \(step, memory\)"),
-    (lambda: SenderEnv(reward={"late:deadline=1": 1}), "reward term late: unknown parameter 'deadline'"),
-    (lambda: SenderEnv(reward={"late:deadline_s=0": 1}), "deadline_s = 0.0: must be a number > 0"),
-    (lambda: SenderEnv(reward={"delay": "much"}), "the weight of 'delay' must be a finite number"),
+    (
+        lambda: SenderEnv(reward={"late:deadline=1": 1}, actions="slots"),
+        "reward term late: unknown parameter 'deadline'",
+    ),
+    (lambda: SenderEnv(reward={"late:deadline_s=0": 1}, actions="slots"), "deadline_s = 0.0: must be a number > 0"),
+    (lambda: SenderEnv(reward={"delay": "much"}, actions="slots"), "the weight of 'delay' must be a finite number"),
     (lambda: SenderEnv("topics", reward="late:deadline_s=1"), "is for one queue; each topic has"),
-    (lambda: SenderEnv(bound="yes"), "bound = 'yes': must be True or False"),
+    (lambda: SenderEnv(bound="yes", actions="slots"), "bound = 'yes': must be True or False"),
     *((lambda c=c: out_of_bounds(c), "field 'far': is 1.5: must lie in its bounds, 0..1") for c in (False, True)),
     *((lambda c=c: no_number(c), "reward term 'n': is no finite number") for c in (False, True)),
 )

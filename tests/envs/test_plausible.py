@@ -97,8 +97,8 @@ def test_the_rule_chooses_among_them() -> None:
 def test_environments_show_them_if_asked() -> None:
     """Beside an environment that shows all valid actions, in the same states; a batch shows the same."""
     made: dict[str, Any] = {"scenario": SWITCHING, "capacity": 6}
-    valid, few = SenderEnv(**made), SenderEnv(**made, mask="plausible")
-    batch = SenderVectorEnv(1, **made, mask="plausible")
+    valid, few = SenderEnv(**made, actions="slots"), SenderEnv(**made, mask="plausible", actions="slots")
+    batch = SenderVectorEnv(1, **made, mask="plausible", actions="slots")
     (_, shown), (_, info), (_, infos) = (env.reset(seed=3) for env in (valid, few, batch))
     rng = np.random.default_rng(0)
     for _ in range(100):

@@ -19,7 +19,7 @@ from bufgym.traces import Trace
 
 def test_a_frame_of_text_by_hand() -> None:
     """T = 6, L = 2: 1 and 2 are accepted, 3 evicts 1, 4 is rejected, and 5 waits."""
-    env = SenderEnv(Interruption(law="fixed", t_max=6), 2, render_mode="ansi")
+    env = SenderEnv(Interruption(law="fixed", t_max=6), 2, render_mode="ansi", actions="slots")
     env.reset(seed=0)
     for action in (3, 3, 0, 2):
         env.step(action)
@@ -65,7 +65,7 @@ def check(frame: Any, mode: str) -> None:
 
 
 def test_image_shows_each_state_in_its_colour() -> None:
-    env = SenderEnv(Interruption(law="fixed", t_max=30), 3, render_mode="rgb_array")
+    env = SenderEnv(Interruption(law="fixed", t_max=30), 3, render_mode="rgb_array", actions="slots")
     env.reset(seed=0)
     for action in (4, 4, 4, 0, 0):
         env.step(action)
@@ -79,7 +79,7 @@ def test_image_shows_each_state_in_its_colour() -> None:
 @pytest.mark.parametrize("capacity", [1, 20, 40, 300])
 def test_lines_keep_to_the_width(capacity: int) -> None:
     n = 100
-    env = SenderEnv(Interruption(law="fixed", t_max=n + 5), capacity)
+    env = SenderEnv(Interruption(law="fixed", t_max=n + 5), capacity, actions="slots")
     env.reset(seed=0)
     for k in range(n):
         env.step(capacity + 1 if k % 3 else capacity)
@@ -93,7 +93,7 @@ def test_lines_keep_to_the_width(capacity: int) -> None:
 def test_odd_episodes(arrivals_us: list[int]) -> None:
     """A single message, all at one moment, and a quarter of an hour of nothing; on a link that dies."""
     episode = Episode(messages(np.array(arrivals_us), 200), Link(Trace.steps([(1.0, 300.0)], after="stop")))
-    env = SenderEnv(Interruption(t_max=20), 2)
+    env = SenderEnv(Interruption(t_max=20), 2, actions="slots")
     env.reset(options={"episode": episode})
     ended = False
     while True:
@@ -106,8 +106,8 @@ def test_odd_episodes(arrivals_us: list[int]) -> None:
 
 def test_each_row_of_a_batch_is_drawn() -> None:
     trace = Trace.steps([(0.5, 9e6), (0.5, 1e5)])
-    envs = SenderVectorEnv(2, Uplink(traces=(trace,), duration_s=1.0), 3, render_mode="ansi")
-    alone = SenderEnv(Uplink(traces=(trace,), duration_s=1.0), 3, render_mode="ansi")
+    envs = SenderVectorEnv(2, Uplink(traces=(trace,), duration_s=1.0), 3, render_mode="ansi", actions="slots")
+    alone = SenderEnv(Uplink(traces=(trace,), duration_s=1.0), 3, render_mode="ansi", actions="slots")
     envs.reset(seed=4), alone.reset(seed=5)
     for _ in range(9):
         envs.step(np.array([4, 4])), alone.step(4)
@@ -119,13 +119,13 @@ def test_each_row_of_a_batch_is_drawn() -> None:
 def test_before_the_reset_and_without_a_mode() -> None:
     for mode in ("ansi", "rgb_array"):
         with pytest.raises(gym.error.ResetNeeded):
-            SenderEnv(render_mode=mode).render()
+            SenderEnv(render_mode=mode, actions="slots").render()
     with pytest.warns(UserWarning, match="render_mode"):
-        assert SenderEnv().render() is None
+        assert SenderEnv(actions="slots").render() is None
 
 
 def test_images_without_matplotlib_say_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = SenderEnv("interruption", render_mode="rgb_array")
+    env = SenderEnv("interruption", render_mode="rgb_array", actions="slots")
     env.reset(seed=0)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(gym.error.DependencyNotInstalled, match=r"bufgym\[plot\]"):

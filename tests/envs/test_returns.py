@@ -51,10 +51,10 @@ def test_a_fleet_has_the_scale_of_its_uplink() -> None:
 
 def test_weights_of_your_own_terms_are_the_size_that_you_give_them() -> None:
     rewards = {"retained": 1.0, "half_of_a_point": 3.0}
-    rows = SenderEnv("lte", reward=rewards, reward_scale="episode").rows
+    rows = SenderEnv("lte", reward=rewards, reward_scale="episode", actions="slots").rows
     weights = {term.name: weight for term, weight in zip(rows.terms, rows.weights.tolist(), strict=True) if weight}
     assert weights == {"retained": 0.1, "half_of_a_point": 3.0}
-    rows = SenderEnv("lte", reward=rewards, reward_scale=2).rows
+    rows = SenderEnv("lte", reward=rewards, reward_scale=2, actions="slots").rows
     assert [weight for weight in rows.weights.tolist() if weight] == [2.0, 6.0]
 
 
@@ -82,7 +82,7 @@ def test_a_rules_return_lies_between_1_and_10(id: str) -> None:
     ids=["lte", "bytes", "topics", "topics-bytes"],
 )
 def test_no_episode_is_as_long_as_the_spec_says(options: dict[str, Any], choice: str) -> None:
-    env: Any = gym.make("bufgym/Uplink-v0", capacity=3, **options)
+    env: Any = gym.make("bufgym/Uplink-v0", capacity=3, **options, actions="slots")
     _, info = env.reset(seed=0)
     rng, fixed = np.random.default_rng(0), {"hold": 3, "accept": 4, "oldest": 0}
     steps, ended = 0, False
@@ -96,7 +96,7 @@ def test_no_episode_is_as_long_as_the_spec_says(options: dict[str, Any], choice:
 
 def test_the_time_in_the_observation() -> None:
     """T = 4 has 6 messages, of which 1 to 4 ask."""
-    plain = gym.make("bufgym/Interruption-v0", law="fixed", t_max=4)
+    plain = gym.make("bufgym/Interruption-v0", law="fixed", t_max=4, actions="slots")
     env: Any = TimeAwareObservation(plain, flatten=False, normalize_time=True)
     assert env.spec.max_episode_steps == 7
     seen, _ = env.reset(seed=0)
@@ -108,7 +108,7 @@ def test_the_time_in_the_observation() -> None:
 
 
 def test_an_episode_that_arguments_lengthen_is_not_cut() -> None:
-    spec = gym.make("bufgym/Uplink-v0", duration_s=40.0).spec
+    spec = gym.make("bufgym/Uplink-v0", duration_s=40.0, actions="slots").spec
     assert spec is not None and spec.max_episode_steps == 40 * 30 + 1
     assert gym.spec("bufgym/Uplink-v0").max_episode_steps is None
 
@@ -118,8 +118,14 @@ class Bare(Interruption):
 
 
 test_scales_that_make_no_sense = refused(
-    (lambda: SenderEnv(reward_scale=0), r"reward_scale = 0: must be a number > 0, 'episode' or None"),
-    (lambda: SenderVectorEnv(reward_scale="auto"), r"reward_scale = 'auto': must be a number > 0, 'episode' or None"),
+    (lambda: SenderEnv(reward_scale=0, actions="slots"), r"reward_scale = 0: must be a number > 0, 'episode' or None"),
+    (
+        lambda: SenderVectorEnv(reward_scale="auto", actions="slots"),
+        r"reward_scale = 'auto': must be a number > 0, 'episode' or None",
+    ),
     (lambda: FleetVecEnv(reward_scale=float("nan")), "reward_scale = nan"),
-    (lambda: SenderEnv(Bare(), reward_scale="episode"), "this scenario has no `reward_scale`; give a number"),
+    (
+        lambda: SenderEnv(Bare(), reward_scale="episode", actions="slots"),
+        "this scenario has no `reward_scale`; give a number",
+    ),
 )

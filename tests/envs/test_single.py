@@ -41,7 +41,7 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
 
 
 def make(scenario: str = "fading", **options: Any) -> SenderEnv:
-    return SenderEnv(SCENARIOS[scenario], 4, **options)
+    return SenderEnv(SCENARIOS[scenario], 4, **options, actions="slots")
 
 
 def begun(**options: Any) -> SenderEnv:
@@ -85,7 +85,7 @@ def test_rewards_worked_by_hand() -> None:
     """
     v1, v2 = 1 - 0.618, 1 - 0.618**2
     for slot in (0, 1):
-        env = SenderEnv(Interruption(law="fixed", t_max=4), 2)
+        env = SenderEnv(Interruption(law="fixed", t_max=4), 2, actions="slots")
         env.reset(seed=0)
         rewarded = []
         for action in (3, 3, slot, 2):
@@ -103,7 +103,7 @@ def test_rewards_worked_by_hand() -> None:
 def test_a_message_that_arrives_at_the_server_as_the_step_ends_is_rewarded_in_it() -> None:
     """5 bytes take 5 us. 0 and 1 come at 0: 1 is received at 10 us, when 2 arrives; 2 at 15, before 3 comes."""
     link = Link(Trace("even", np.array([0, 1_000]), np.array([0, 1_000])))
-    env = SenderEnv(Interruption(t_max=25, value=qoi.saturating(4)), 3, reward="delivered")
+    env = SenderEnv(Interruption(t_max=25, value=qoi.saturating(4)), 3, reward="delivered", actions="slots")
     env.reset(options={"episode": Episode(messages(np.array([0, 0, 10, 20]), 5), link)})
     assert [env.step(4)[1] for _ in range(4)] == [0.0, 0.25, 0.25, 0.25]
 
@@ -150,7 +150,7 @@ def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> No
 
 @kernels
 def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None:
-    env = SenderEnv(Interruption(law="fixed", t_max=3), 8, decide_at="overflow")
+    env = SenderEnv(Interruption(law="fixed", t_max=3), 8, decide_at="overflow", actions="slots")
     observation, info = env.reset(seed=0)
     assert info["action_mask"].tolist() == [False] * 8 + [True, False]
     assert not any(array.any() for array in observation.values())
@@ -165,7 +165,7 @@ def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None
 def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> None:
     """Arrivals at one moment, x that stands still: every reference length is 0."""
     episode = Episode(messages(np.zeros(9, np.int64), 1000, np.zeros(9)), Link(Trace.steps([(1.0, 0), (1.0, 1e6)])))
-    env = SenderEnv(Interruption(t_max=25), 3)
+    env = SenderEnv(Interruption(t_max=25), 3, actions="slots")
     observation, _ = env.reset(seed=0, options={"episode": episode})
     ended = False
     while not ended:
@@ -181,7 +181,7 @@ def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> 
 )
 def test_info_is_built_as_far_as_asked(info: str, always: set[str]) -> None:
     """T = 2, all accepted: the second step delivers 0, 1, 2, 3 and ends the episode."""
-    env = SenderEnv("interruption", 4, law="fixed", t_max=2, info=info)
+    env = SenderEnv("interruption", 4, law="fixed", t_max=2, info=info, actions="slots")
     assert env.reset(seed=0)[1].keys() == env.step(5)[4].keys() == always
     last, summary = env.step(5)[4], {"arrived": 4, "delivered": 4, "dropped": 0, "invalid": 0}
     assert last.keys() == always | summary.keys() | {"qoi"}
@@ -220,26 +220,29 @@ def test_a_library_that_tries_an_argument_sees_pythons_own_error() -> None:
         ):
             make_one("bufgym/Uplink-v0", frameskip=1)
     with pytest.raises(ValueError, match="'capacty'; did you mean 'capacity'"):
-        SenderEnv(capacty=3)
+        SenderEnv(capacty=3, actions="slots")
 
 
 WHOLE, INVALID = r"must be a whole number in 0\.\.5 \(L = 4\)", gym.error.InvalidAction
 
 
 test_wrong_use_is_named = refused(
-    (lambda: SenderEnv(capacity=0), "capacity = 0"),
-    (lambda: SenderEnv(reward="fame"), "unknown term 'fame'"),
-    (lambda: SenderEnv(reward={"delivered": math.nan}), "finite"),
-    (lambda: SenderEnv(reward={}), "at least one term"),
-    (lambda: SenderEnv(fields=["smell"]), "unknown field 'smell'"),
-    *((lambda f=f: SenderEnv(fields=f), "must be a list of names") for f in ("rank", 3, [3])),
-    (lambda: SenderEnv(decide_at="noon"), "decide_at = 'noon'"),
-    (lambda: SenderEnv(max_bytes=0), "max_bytes = 0"),
-    (lambda: SenderEnv(render_mode="human"), "render_mode = 'human'"),
-    (lambda: SenderEnv(mask_in_observation="tianshu"), "'tianshu': must be True, False, two names"),
-    *((lambda k=k: SenderEnv(mask_in_observation=("mask", k)), "two names of keys or") for k in ("mask", 1)),
+    (lambda: SenderEnv(capacity=0, actions="slots"), "capacity = 0"),
+    (lambda: SenderEnv(reward="fame", actions="slots"), "unknown term 'fame'"),
+    (lambda: SenderEnv(reward={"delivered": math.nan}, actions="slots"), "finite"),
+    (lambda: SenderEnv(reward={}, actions="slots"), "at least one term"),
+    (lambda: SenderEnv(fields=["smell"], actions="slots"), "unknown field 'smell'"),
+    *((lambda f=f: SenderEnv(fields=f, actions="slots"), "must be a list of names") for f in ("rank", 3, [3])),
+    (lambda: SenderEnv(decide_at="noon", actions="slots"), "decide_at = 'noon'"),
+    (lambda: SenderEnv(max_bytes=0, actions="slots"), "max_bytes = 0"),
+    (lambda: SenderEnv(render_mode="human", actions="slots"), "render_mode = 'human'"),
+    (lambda: SenderEnv(mask_in_observation="tianshu", actions="slots"), "'tianshu': must be True, False, two names"),
+    *(
+        (lambda k=k: SenderEnv(mask_in_observation=("mask", k), actions="slots"), "two names of keys or")
+        for k in ("mask", 1)
+    ),
     (lambda: SenderEnv(mask_in_observation=True, actions="guided"), "actions = 'guided' have no mask"),
-    (lambda: SenderEnv(mask_dtype="float32"), "mask_dtype = 'float32': must be one of 'int8', 'bool'"),
+    (lambda: SenderEnv(mask_dtype="float32", actions="slots"), "mask_dtype = 'float32': must be one of 'int8', 'bool'"),
     *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}", INVALID) for a in (1.7, np.array([1]), "1", None)),
     (lambda: begun().step(6), r"action = 6: must be a whole number in 0\.\.5", INVALID),
     (lambda: make("interruption").reset(options={"episode": Interruption(t_max=30).episode(30)}), "room for 27"),
@@ -247,7 +250,7 @@ test_wrong_use_is_named = refused(
 
 
 def test_an_episode_that_has_ended_takes_no_step() -> None:
-    env = SenderEnv(Interruption(t_max=3), 2)
+    env = SenderEnv(Interruption(t_max=3), 2, actions="slots")
     with pytest.raises(gym.error.ResetNeeded, match=r"^call reset\(\) before step"):
         env.step(0)
     env.reset(seed=0)
@@ -292,7 +295,7 @@ def test_compact_is_the_context_fields_of_all_fields(id: str) -> None:
 
 
 def test_what_an_owner_does_to_a_batch_s_dicts_changes_no_other() -> None:
-    batch = gym.make_vec("bufgym/Uplink-v0", 2, capacity=3)
+    batch = gym.make_vec("bufgym/Uplink-v0", 2, capacity=3, actions="slots")
     batch.reset(seed=1)
     for _ in range(9):
         seen, *_, info = batch.step(np.zeros(2, np.int64))

@@ -28,7 +28,7 @@ CASES |= {"window": {"window": 3, "round_trip_us": 30_000}, "overflow": {"decide
 
 
 def make(case: str = "plain", capacity: int = L, **more: Any) -> SenderEnv:
-    return SenderEnv(CLIENT, capacity, **(CASES[case] | more))
+    return SenderEnv(CLIENT, capacity, **(CASES[case] | more), actions="slots")
 
 
 def waiting(env: SenderEnv) -> int:
@@ -41,7 +41,11 @@ def test_fields_of_topics_need_topics() -> None:
     assert (seen["silence"].shape, seen["socket_asks"].shape) == ((L + 1,), (1,))
     refuse("unknown field 'silence'", SenderEnv, "lte", fields=["silence"])
     # The terms of topics have namesakes there, computed where they are named.
-    assert [term.name for term in SenderEnv("lte", reward="age").rows.terms] == ["delivered", "retained", "age"]
+    assert [term.name for term in SenderEnv("lte", reward="age", actions="slots").rows.terms] == [
+        "delivered",
+        "retained",
+        "age",
+    ]
 
 
 V = qoi.saturating(4)
@@ -73,7 +77,7 @@ def test_an_episode_of_three_topics_by_hand() -> None:
     4 (image) evicts 1 (image); 5 (pose) is rejected; 6 (command) can't be: it evicts 3 (pose). Queued are 2 4 6. At
     10 ms 0 has crossed and the socket asks. It sends 4, at 20 ms 2, at 30 ms 6, and all have crossed at 40 ms.
     """
-    env = SenderEnv(BY_HAND, 3, reward={"retained": 1.0, "age": 1.0, "late": 10.0})
+    env = SenderEnv(BY_HAND, 3, reward={"retained": 1.0, "age": 1.0, "late": 10.0}, actions="slots")
     accept, reject = 4, 3
     script = [
         # who asks, at what time, which actions are valid, action, retained, delivered
@@ -115,7 +119,7 @@ def test_an_episode_of_three_topics_by_hand() -> None:
 
 @pytest.mark.kernels
 def test_hold_waits_for_the_next_arrival_and_an_invalid_choice_sends_the_oldest() -> None:
-    env = SenderEnv(BY_HAND, 3)
+    env = SenderEnv(BY_HAND, 3, actions="slots")
     env.reset(options={"episode": three_topics()})
     env.step(4)
     assert waiting(env) == SOCKET_WAITS
@@ -162,7 +166,7 @@ def test_rewards_add_up_to_the_outcome_under_random_play(case: str) -> None:
 def test_a_client_of_one_topic_without_weight_is_rewarded_nothing() -> None:
     """Its rules hold: two queued at most; both kinds of event."""
     stream = Stream(Topic("camera", priority=0.5, weight=0.0, deadline_s=0.05, limit=2), 20, 3_000)
-    env = SenderEnv(Client((stream,), LINKS[:1], duration_s=2.0), 4, reward=dict.fromkeys(TERMS, 1.0))
+    env = SenderEnv(Client((stream,), LINKS[:1], duration_s=2.0), 4, reward=dict.fromkeys(TERMS, 1.0), actions="slots")
     rng, (seen, info), ended, met = np.random.default_rng(0), env.reset(seed=1), False, set()
     assert seen["priority"][-1] == 1  # the largest of all
     while not ended:
@@ -176,7 +180,7 @@ def test_a_client_of_one_topic_without_weight_is_rewarded_nothing() -> None:
 
 def test_a_frame_of_text_has_a_lane_a_topic() -> None:
     """The episode by hand after 0 1 2 3 were accepted and 4 evicted 1: 0 is in transmission, 2 3 4 wait, 5 asks."""
-    env = SenderEnv(BY_HAND, 3)
+    env = SenderEnv(BY_HAND, 3, actions="slots")
     env.reset(options={"episode": three_topics()})
     env.step(4)
     for action in (0, 4, 4, 4, 0):
@@ -191,7 +195,7 @@ def test_a_frame_of_text_has_a_lane_a_topic() -> None:
 @pytest.mark.parametrize(("topics", "capacity"), [(2, 200), (8, 1), (30, 32)])
 def test_pictures_of_any_size(topics: int, capacity: int) -> None:
     streams = tuple(Stream(Topic(f"a long name of topic {k}"), 5, 900) for k in range(topics))
-    env = SenderEnv(Client(streams, LINKS[:1], duration_s=1.0), capacity, render_mode="rgb_array")
+    env = SenderEnv(Client(streams, LINKS[:1], duration_s=1.0), capacity, render_mode="rgb_array", actions="slots")
     env.reset(seed=0)
     for k in range(9):
         env.step(capacity + 1 if waiting(env) == ARRIVAL_WAITS else k % 2 * capacity)

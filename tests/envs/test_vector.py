@@ -37,12 +37,12 @@ NEXT_STEP, SAME_STEP = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
 
 def vector(case: str, **more: Any) -> SenderVectorEnv:
     scenario, arguments = CASES[case]
-    return SenderVectorEnv(N, scenario, L, **arguments, **more)
+    return SenderVectorEnv(N, scenario, L, **arguments, **{"actions": "slots", **more})
 
 
 def single(case: str, **more: Any) -> SenderEnv:
     scenario, arguments = CASES[case]
-    return SenderEnv(scenario, L, **arguments, **more)
+    return SenderEnv(scenario, L, **arguments, **{"actions": "slots", **more})
 
 
 def row(info: dict[str, Any], i: int) -> dict[str, Any]:
@@ -208,8 +208,8 @@ def test_seeds_are_told_as_gymnasium_tells_them() -> None:
 
 
 def test_autoreset_by_hand() -> None:
-    envs = SenderVectorEnv(2, "interruption", L, law="fixed", t_max=3, autoreset_mode="Disabled")
-    alone = [SenderEnv("interruption", L, law="fixed", t_max=3) for _ in range(2)]
+    envs = SenderVectorEnv(2, "interruption", L, law="fixed", t_max=3, autoreset_mode="Disabled", actions="slots")
+    alone = [SenderEnv("interruption", L, law="fixed", t_max=3, actions="slots") for _ in range(2)]
     episodes = [Interruption(t_max=3).episode(1), Interruption(t_max=3).episode(3)]
     envs.reset(seed=0, options={"episodes": episodes})
     for i in range(2):
@@ -281,9 +281,9 @@ def begun() -> SenderVectorEnv:
 
 @pytest.mark.parametrize("mode", [SAME_STEP, "SameStep", "SAME_STEP"])
 def test_autoreset_in_each_way_that_gymnasium_has(mode: Any) -> None:
-    native = gym.make_vec("bufgym/Uplink-v0", 2, autoreset_mode=mode)
+    native = gym.make_vec("bufgym/Uplink-v0", 2, autoreset_mode=mode, actions="slots")
     kwargs = {"autoreset_mode": native.metadata["autoreset_mode"]}
-    sync = gym.make_vec("bufgym/Uplink-v0", 2, "sync", vector_kwargs=kwargs)
+    sync = gym.make_vec("bufgym/Uplink-v0", 2, "sync", vector_kwargs=kwargs, actions="slots")
     assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is SAME_STEP
 
 
@@ -291,14 +291,20 @@ RESET, INVALID = gym.error.ResetNeeded, gym.error.InvalidAction
 
 
 test_wrong_use_is_named = refused(
-    (lambda: SenderVectorEnv(0), "num_envs = 0"),
-    (lambda: SenderVectorEnv(autoreset_mode="Sometimes"), "autoreset_mode = 'Sometimes'"),
-    (lambda: gym.make_vec("bufgym/Uplink-v0", 1, "sync", autoreset_mode="SameStep"), "SyncVectorEnv by vector_kwargs"),
-    *((lambda n=n: SenderVectorEnv(max_episode_steps=n), "max_episode_steps = ") for n in (0, 1.5, "5")),
-    (lambda: SenderVectorEnv(observation="vector"), "must be one of 'dict', 'flat', 'slots'"),
-    (lambda: SenderVectorEnv(info="some"), "must be one of 'full', 'steady', 'mask', 'none'"),
-    (lambda: SenderVectorEnv(info="steady"), "info = 'steady': is for recorders"),
-    (lambda: SenderVectorEnv(num_threads=0), "num_threads = 0: must be"),
+    (lambda: SenderVectorEnv(0, actions="slots"), "num_envs = 0"),
+    (lambda: SenderVectorEnv(autoreset_mode="Sometimes", actions="slots"), "autoreset_mode = 'Sometimes'"),
+    (
+        lambda: gym.make_vec("bufgym/Uplink-v0", 1, "sync", autoreset_mode="SameStep", actions="slots"),
+        "SyncVectorEnv by vector_kwargs",
+    ),
+    *(
+        (lambda n=n: SenderVectorEnv(max_episode_steps=n, actions="slots"), "max_episode_steps = ")
+        for n in (0, 1.5, "5")
+    ),
+    (lambda: SenderVectorEnv(observation="vector", actions="slots"), "must be one of 'dict', 'flat', 'slots'"),
+    (lambda: SenderVectorEnv(info="some", actions="slots"), "must be one of 'full', 'steady', 'mask', 'none'"),
+    (lambda: SenderVectorEnv(info="steady", actions="slots"), "info = 'steady': is for recorders"),
+    (lambda: SenderVectorEnv(num_threads=0, actions="slots"), "num_threads = 0: must be"),
     (lambda: vector("interruption").step(np.zeros(N, np.int64)), "call reset", RESET),
     (lambda: vector("interruption").reset(options={"reset_mask": np.arange(N) > 0}), "no episode yet", RESET),
     (lambda: vector("interruption").reset(seed=[1, 2]), "2 seeds for 3"),

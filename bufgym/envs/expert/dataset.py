@@ -36,7 +36,7 @@ class Recorded(NamedTuple):
         observations: in the environment's form, T + 1 along the first axis; the last is taken at the end.
         actions: int64[T].
         rewards: float64[T].
-        action_mask: int8[T + 1, L + 2], which actions were valid.
+        action_mask: int8[T + 1, actions], which actions were valid.
         qoi: float64[T + 1], H of the messages at the server.
         regret: float64[T + 1], the best H still attainable that each action gave up, the last 0; None if not asked for.
     """
@@ -62,14 +62,20 @@ def record(
         raise BufgymError("data sets are made of one queue, not of several topics")
     roles = ("expert", "medium", "random") if kind == "mixed" else (kind,)
     known = {"expert": "clairvoyant", "medium": medium}
-    players = {name: Player(policies.get(known[name]), n) for name in roles if name != "random"}
-    judge = Clairvoyant(envs) if regret else None
+    # Among candidates the clairvoyant's plan may not be there: it judges those that are.
+    judges = rows.choices is not None and "expert" in roles
+    players = {
+        name: Player(policies.get(known[name]), n)
+        for name in roles
+        if name != "random" and not (judges and name == "expert")
+    }
+    judge = Clairvoyant(envs) if regret or judges else None
     envs.reset(seed=seed)
     rng = np.random.default_rng([seed, 1])
     # With a limit B an arrival may ask again after an eviction, at most once more for each message.
     steps = 2 * rows.scenario.max_messages + 1
     seen = np.zeros((n, steps, rows.form.numbers), np.float32)
-    masks = np.zeros((n, steps, rows.capacity + 2), np.int8)
+    masks = np.zeros((n, steps, rows.actions_count), np.int8)
     numbers = np.zeros((n, steps, 3))  # reward, H, regret
     taken = np.zeros((n, steps), np.int64)
     every, length = np.arange(n), np.zeros(n, np.int64)
@@ -78,16 +84,18 @@ def record(
     while (left > 0).any():
         output, senders = rows.output, rows.senders
         mask = output.action_mask
-        actions = np.full(n, rows.capacity)
+        actions = np.full(n, rows.idle_action)
         for turn, name in enumerate(roles):
             mine = every[(turns == turn) & (left > 0)]
             if name in players:
-                actions[mine] = players[name].actions(senders, mine)[mine]
+                actions[mine] = rows.of_slots(players[name].actions(senders, mine))[mine]
+            elif name == "expert" and judge is not None:
+                actions[mine] = judge.actions()[mine]
             elif len(mine):
                 actions[mine] = np.argmax(rng.random((len(mine), mask.shape[1])) * mask[mine], axis=1)
         seen[every, length], masks[every, length], taken[every, length] = output.flat, mask, actions
         numbers[every, length, 1] = output.qoi
-        if judge is not None:
+        if regret and judge is not None:
             numbers[every, length, 2] = np.nan_to_num(judge.regrets()[every, actions])
         rows.step(actions)
         numbers[every, length, 0] = rows.rewards()
@@ -104,7 +112,7 @@ def record(
                 numbers[i, :T, 0].copy(),
                 masks[i, : T + 1].copy(),
                 numbers[i, : T + 1, 1].copy(),
-                None if judge is None else numbers[i, : T + 1, 2].copy(),
+                numbers[i, : T + 1, 2].copy() if regret else None,
             )
         length[ended], left[ended], turns[ended] = 0, left[ended] - 1, (turns[ended] + 1) % len(roles)
         rows.reset(ended[left[ended] > 0])

@@ -48,14 +48,17 @@ class PolicyExpert:
         self._actions = np.zeros(n, np.int64)
 
     def actions(self) -> NDArray[np.int64]:
-        """int64[n]: the policy's actions now; L, which has no effect, where no decision is due."""
+        """int64[n]: the policy's actions now; the idle action, which has no effect, where no decision is due.
+
+        Where actions are candidates and none of them means what the policy wants, the cheapest candidate goes.
+        """
         senders = self.rows.senders
         state = np.column_stack([senders.begun, *(senders.batch.senders[name] for name in _STATE)])
         new = np.flatnonzero((state != self._asked).any(axis=1))
         if len(new):
             self._actions[new] = self._player.actions(senders, new)[new]
             self._asked[new] = state[new]
-        return self._actions.copy()
+        return self.rows.of_slots(self._actions).copy()
 
 
 def online(env: Any) -> PolicyExpert:

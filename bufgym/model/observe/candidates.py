@@ -214,11 +214,7 @@ def bend(buffer: Buffer, even: float) -> float:
 
 @kernel
 def observe_candidates(
-    buffer: Buffer,
-    arrival: Any,
-    order: NDArray[Any],
-    cost: NDArray[np.float64],
-    numbers: NDArray[np.floating[Any]],
+    buffer: Buffer, arrival: Any, order: NDArray[Any], cost: NDArray[np.float64], numbers: NDArray[np.floating[Any]]
 ) -> None:
     """Write ``CANDIDATE_FIELDS``, k + 1 numbers each, and then ``QUEUE_FIELDS`` into ``numbers``.
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room take
 
 
 def made(**settings: Any) -> Any:
-    return gym.make("bufgym/Mapping-v0", **settings).unwrapped
+    return gym.make("bufgym/Mapping-v0", **settings, actions="slots").unwrapped
 
 
 def played(env: Any, action: int) -> tuple[list[float], dict[str, Any]]:
@@ -55,7 +55,7 @@ def test_what_is_paid_comes_at_the_end() -> None:
 
 def test_its_terms_are_for_its_recording_alone() -> None:
     made()  # registers the terms
-    env: Any = gym.make("bufgym/Uplink-v0", duration_s=1.0, reward="covered")
+    env: Any = gym.make("bufgym/Uplink-v0", duration_s=1.0, reward="covered", actions="slots")
     env.reset(seed=0)
     with pytest.raises(BufgymError, match=r"of 30 messages: .* is for bufgym/Mapping-v0, of 240"):
         for _ in range(40):
