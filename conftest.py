@@ -12,13 +12,14 @@ has a deadline: the first call of a kernel compiles it.
 import os
 import subprocess
 import sys
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from registries import forgotten, restored
 
 from bufgym.ground import kernel
-from bufgym.policies import registry
 
 kernel.compile_silently()  # tests count lines on stderr
 
@@ -47,10 +48,24 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture
-def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Policies that the test registers are gone after it."""
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+@pytest.fixture(autouse=True)
+def no_trace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Policies, fields, terms, scenarios and all else that the test registers are gone after it, and its modules."""
+    with forgotten(tmp_path_factory.getbasetemp()), restored():
+        yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Refuse a test file that registers something as it is imported: all other files' tests would find it."""
+    with restored() as changed:
+        report = yield
+    if changed and isinstance(collector, pytest.Module):
+        report.outcome = "failed"
+        report.longrepr = f"{collector.nodeid} registers as it is imported, and must in a fixture: {'; '.join(changed)}"
+    return report
 
 
 @pytest.fixture(scope="session")

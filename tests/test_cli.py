@@ -19,8 +19,6 @@ from bufgym.cli.listing import LISTS
 from bufgym.ground.kernel import JIT
 from bufgym.traces.shipped import shipped_calls
 
-pytestmark = pytest.mark.usefixtures("own_registry")
-
 
 @pytest.fixture
 def trace(tmp_path: Path) -> str:

@@ -73,7 +73,7 @@ def test_the_suite_runs_by_default(capsys: Capsys) -> None:
     assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
 
 
-def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Capsys, own_registry: None) -> None:
+def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Capsys) -> None:
     """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""
     mine = tmp_path / "mine.py"
     mine.write_text(FAR_OFF.format(True))

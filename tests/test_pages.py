@@ -144,7 +144,7 @@ def settings_of(line: str) -> str | None:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("line", [line for line in typed() if settings_of(line) is not None])
-def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, own_registry: None, capsys: Any) -> None:
+def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, capsys: Any) -> None:
     """In a folder with the guide's programs and the repository's examples and traces."""
     for block in blocks():
         named = re.match(r"# (\w+\.py)\n", block.text) if block.language == "python" else None
@@ -197,7 +197,7 @@ PROGRAMS = [block for block in blocks() if block.language == "python" and block.
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
-def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch, own_registry: None) -> None:
+def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> None:
     needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:

@@ -57,7 +57,7 @@ ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "
 
 
 @pytest.fixture
-def module(tmp_path: Path, monkeypatch: Patch, own_registry: None) -> str:
+def module(tmp_path: Path, monkeypatch: Patch) -> str:
     """A module of policies in the current folder; its name differs from test to test, as Python imports one once."""
     name = "m" + re.sub(r"\W", "_", tmp_path.name)
     (tmp_path / f"{name}.py").write_text(MODULE)
@@ -199,9 +199,7 @@ def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
     assert [line.split()[0] for line in done.table().splitlines()[1:3]] == ["drop-oldest", "mine"]
 
 
-def test_a_suite_takes_files_and_named_policies_and_those_registered_here(
-    tmp_path: Path, monkeypatch: Patch, own_registry: None
-) -> None:
+def test_a_suite_takes_files_and_named_policies_and_those_registered_here(tmp_path: Path, monkeypatch: Patch) -> None:
     """A suite's processes load a file themselves; a policy registered in this process runs in this process."""
     monkeypatch.chdir(tmp_path)
     shipped = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
@@ -241,7 +239,7 @@ def test_topics_and_fleets_beside_their_baseline(kind: str, policy: str, baselin
     assert done.table().startswith("policy") and head in done.table() and done.to_pandas()["scenario"][0] == "mine"
 
 
-def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: Patch, own_registry: None) -> None:
+def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text("def every_other(buffer, arrival, memory):\n    return -1 if arrival.seq % 2 else -2\n")
     assert bufgym.make_policy("decimate:every=3").parameters["every"] == 3
