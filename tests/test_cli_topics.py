@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from cli_cases import FAR_OFF, Capsys, Patch, fails, shown
+from needs import needs
 
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.tasks.fleet import ROWS as FLEET_ROWS
@@ -157,8 +158,8 @@ def test_what_does_not_go_together(here: Path, capsys: Capsys, words: str, says:
 @pytest.fixture
 def drive(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """1 m forward in a second, a turn of 90 degrees in the next; a picture every 500 ms (see bag_cases)."""
-    pytest.importorskip("mcap", reason="recordings need the extra 'ros'")
-    pytest.importorskip("rosbags", reason="recordings need the extra 'ros'")
+    pytest.importorskip("mcap", reason=needs("extras", "mcap"))
+    pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
     monkeypatch.syspath_prepend(str(Path(__file__).parent / "traces"))
     import bag_cases
 

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from env_cases import SMALL, valid_action
+from needs import needs
 from refusal_cases import refuse, refused
 
 import bufgym
@@ -278,7 +279,7 @@ test_what_is_refused = refused(
 )
 
 
-@pytest.mark.skipif(not JIT, reason="nothing is compiled")
+@pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled"))
 def test_what_numba_cannot_compile_says_so_in_one_line() -> None:
     field("odd", per="context", compile=True)(odd)
     refuse("field 'odd': Numba cannot compile it; leave out compile=True", SenderEnv, "interruption", fields=["odd"])
