@@ -61,7 +61,7 @@ def shared_data() -> Path:
 @pytest.fixture(autouse=True)
 def no_trace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Policies, fields, terms, scenarios and all else that the test registers are gone after it, and its modules."""
-    with forgotten(tmp_path_factory.getbasetemp()), restored():
+    with restored(), forgotten(tmp_path_factory.getbasetemp()):
         yield
 
 

@@ -6,12 +6,16 @@
 import importlib
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from bufgym.ground import modules
+from bufgym.policies.registry import Later
+
 REGISTER_AS_THEY_ARE_IMPORTED = (
     "bufgym", "bufgym.policies", "bufgym.oracle", "bufgym.model.observe", "bufgym.scenario", "bufgym.cli",
+    "bufgym_papers.perception.worth",
 )  # fmt: skip
 """Imported before all tests: what is registered does not depend on which test imports them first."""
 
@@ -46,7 +50,8 @@ REGISTRIES = (
 """``module:name`` of a dict or a list, or of a tuple that holds some. A module that nobody imported is left out."""
 
 for _module in REGISTER_AS_THEY_ARE_IMPORTED:
-    importlib.import_module(_module)
+    with suppress(ImportError):  # another package, or its extra
+        importlib.import_module(_module)
 
 
 def _tables(place: str, found: Any) -> Iterator[tuple[str, Any]]:
@@ -77,38 +82,44 @@ def _same(table: Any, before: Any) -> bool:
     return all(a == b and table[a] is before[b] for a, b in zip(table, before, strict=True))
 
 
+def _as_before(table: Any, before: Any) -> Any:
+    """What the table shall hold: as before, but a policy that is made at its first use may have been made."""
+    if isinstance(table, list):
+        return before
+    return {name: table.get(name, was) if isinstance(was, Later) else was for name, was in before.items()}
+
+
 @contextmanager
 def forgotten(folder: Path) -> Iterator[None]:
-    """Forget all modules that were imported from the folder, and restore where modules are found."""
-    path, known = sys.path.copy(), set(sys.modules)
+    """Forget modules from the folder, and those that bufgym imported for a user: the next import registers again."""
+    path, known, files = sys.path.copy(), set(sys.modules), modules.FILES.copy()
     try:
         yield
     finally:
         sys.path[:] = path
         for name in sys.modules.keys() - known:
-            if (file := getattr(sys.modules[name], "__file__", None)) and Path(file).is_relative_to(folder):
+            file = getattr(sys.modules[name], "__file__", None)
+            users = file in modules.FILES and file not in files and not name.startswith("bufgym")
+            if file and (users or Path(file).is_relative_to(folder)):
                 del sys.modules[name]
 
 
 @contextmanager
 def restored() -> Iterator[list[str]]:
-    """Put all registries back at the end; the list then names what was changed, as "entry in module:name"."""
+    """Put all registries back at the end; the list then names what was registered, as "name in module:table"."""
     changed: list[str] = []
     before = _copies()
     try:
         yield changed
     finally:
         for place, table, copy in before:
-            if _same(table, copy):
+            wanted = _as_before(table, copy)
+            if _same(table, wanted):
                 continue
-            new = [
-                entry
-                for entry in table
-                if entry not in copy or (isinstance(table, dict) and table[entry] is not copy[entry])
-            ]
-            changed.append(f"{', '.join(map(str, new)) or 'less than before'} in {place}")
             if isinstance(table, list):
-                table[:] = copy
+                table[:] = wanted
             else:
+                new = [str(name) for name in table if name not in wanted or table[name] is not wanted[name]]
+                changed.append(f"{', '.join(new) or 'less than before'} in {place}")
                 table.clear()
-                table.update(copy)
+                table.update(wanted)

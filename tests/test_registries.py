@@ -81,5 +81,5 @@ def test_each_table_is_put_back() -> None:
                 table["mine"] = None
             else:
                 table[:] = ["mine"]
-        assert list(table) == list(before) and registries._same(table, before)
-        assert changed == [f"mine in {place}"]
+        assert registries._same(table, before)
+        assert changed == ([f"mine in {place}"] if isinstance(table, dict) else [])
