@@ -13,13 +13,14 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 STAGES := $(BIN)/python .ci/stages.py
 
 .DEFAULT_GOAL := help
-.PHONY: help train check test nightly fuzz claims docs gallery tutorials dist install-matrix trainers format clean
+.PHONY: help train check test everything nightly fuzz claims docs gallery tutorials dist install-matrix trainers format clean
 
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
 	@echo "make check    set up if needed, then check format, lint, types, layers, weight and workflows"
 	@echo "make test     the same, then the tests that protect a commit: compiled, and kernels as plain Python"
 	@echo "                                                           (PYTEST_ARGS=... go to pytest)"
+	@echo "make everything    install what the tests that make test skipped need, as far as this machine can, and run them"
 	@echo "make nightly  everything else, up to two hours: all tests with many examples, soak and kills, fuzz, claims,"
 	@echo "              mutants, coverage, sdist, install-matrix; goes on after a failure, logs in build/nightly"
 	@echo "make fuzz     set up if needed, then feed it broken files, command lines and random episodes"
@@ -38,12 +39,15 @@ help:
 train: $(READY)
 	$(BIN)/python train.py $(ARGS)
 
-# The three tiers. What each one runs stands in .ci/stages.py.
+# The tiers. What each one runs stands in .ci/stages.py.
 check: $(READY)
 	$(STAGES) check
 
 test: $(READY)
 	$(STAGES) test $(PYTEST_ARGS)
+
+everything: $(READY)
+	$(STAGES) everything $(PYTEST_ARGS)
 
 nightly: $(READY)
 	$(STAGES) nightly $(PYTEST_ARGS)

@@ -9,16 +9,20 @@ A profile has fewer examples where compilation is off, because kernels are some 
 has a deadline: the first call of a kernel compiles it.
 """
 
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from needs import needs
+from registries import forgotten, restored
 
 from bufgym.ground import kernel
-from bufgym.policies import registry
 
 kernel.compile_silently()  # tests count lines on stderr
 
@@ -33,6 +37,13 @@ settings.register_profile("nightly", patient, max_examples=many, print_blob=True
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "commit"))
 
 
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Write which tests were skipped, and why, to the file that BUFGYM_SKIPPED names."""
+    if named := os.environ.get("BUFGYM_SKIPPED"):
+        skipped = {report.nodeid: report.longrepr[-1] for report in terminalreporter.stats.get("skipped", [])}
+        Path(named).write_text(json.dumps(skipped, indent=0), encoding="utf-8")
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of recorded traces and trajectories, too big for the repository; skips where it is absent.
@@ -43,14 +54,28 @@ def shared_data() -> Path:
     folder = Path(named) if named else REPO.parent / "shared" / "data"
     if not folder.is_dir():
         where = "$BUFGYM_SHARED_DATA" if named else "shared/data beside the checkout"
-        pytest.skip(f"recorded data absent: {where} is no folder (set BUFGYM_SHARED_DATA)")
+        pytest.skip(needs("data", f"{where} is no folder (set BUFGYM_SHARED_DATA)"))
     return folder
 
 
-@pytest.fixture
-def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Policies that the test registers are gone after it."""
-    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+@pytest.fixture(autouse=True)
+def no_trace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Policies, fields, terms, scenarios and all else that the test registers are gone after it, and its modules."""
+    with restored(), forgotten(tmp_path_factory.getbasetemp()):
+        yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Refuse a test file that registers something as it is imported: all other files' tests would find it."""
+    with restored() as changed:
+        report = yield
+    if changed and isinstance(collector, pytest.Module):
+        report.outcome = "failed"
+        report.longrepr = f"{collector.nodeid} registers as it is imported, and must in a fixture: {'; '.join(changed)}"
+    return report
 
 
 @pytest.fixture(scope="session")
@@ -62,5 +87,5 @@ def ros(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     command = [sys.executable, "-c", "import rospy, rosmaster, sensor_msgs.msg, nav_msgs.msg"]
     done = subprocess.run(command, env=where, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        pytest.skip(f"ROS 1 (python3-rospy and others) is not here: {done.stderr.strip().splitlines()[-1]}")
+        pytest.skip(needs("ros1", done.stderr.strip().splitlines()[-1]))
     return where

@@ -1,13 +1,15 @@
-"""Run a tier of checks stage by stage: ``stages.py check|test|nightly [arguments of pytest]``.
+"""Run a tier of checks stage by stage: ``stages.py check|test|everything|nightly [arguments of pytest]``.
 
-``check`` and ``test`` stop at the first stage that fails. ``nightly`` goes on, and keeps each stage's output in
-``build/nightly``. All end with a table of stages, results and seconds, then the slowest tests.
+``everything`` is what the last ``test`` skipped. ``nightly`` goes on after a failure, and keeps each stage's output in
+``build/nightly``; the others stop at the first stage that fails. All end with a table of stages, results and seconds,
+then the slowest tests; ``test`` and ``everything`` also say what was not tested.
 """
 
 from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,13 +19,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import missing
+from missing import NEEDS
+
 REPO = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 PYTHON = sys.executable
+TSC = BIN.parent / "node_modules" / ".bin" / "tsc"
+SKIPS = REPO / "build" / "test" / "skipped.json"
+"""Test that the last ``make test`` skipped -> why."""
 COVERAGE = ["--cov=bufgym", "--cov-report="]
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 SKIPPED = 77
 """Exit code of a command that cannot run here; the last line of its output says why."""
+DATA = Path(os.environ.get("BUFGYM_SHARED_DATA", REPO.parent / "shared" / "data"))
+"""Recorded traces and trajectories."""
 NO_TESTS = 5
 """Exit code of pytest where no test was chosen."""
 MINUTE = 60
@@ -85,13 +95,13 @@ def files_that_run_uncompiled() -> list[str]:
 
 def check() -> list[Stage]:
     """Format, lint, types of Python and of the page, layers, weight, stale rows, workflows."""
-    actionlint, tsc = BIN / "actionlint", BIN.parent / "node_modules" / ".bin" / "tsc"
-    no_tsc = "" if tsc.exists() else "TypeScript is not here: npm install --prefix .venv typescript@5.9.3"
+    actionlint = BIN / "actionlint"
+    no_tsc = "" if TSC.exists() else f"TypeScript is not here: {NEEDS['typescript'].command}"
     return [
         Stage("format", [str(BIN / "ruff"), "format", "--check", "."]),
         Stage("lint", [str(BIN / "ruff"), "check", "."]),
         Stage("types", [str(BIN / "mypy")]),
-        Stage("page types", [str(tsc), "-p", ".ci/tsconfig.json"], unless=no_tsc),
+        Stage("page types", [str(TSC), "-p", ".ci/tsconfig.json"], unless=no_tsc),
         Stage("imports", [str(BIN / "lint-imports")]),
         Stage("weight", [PYTHON, ".ci/weight.py"]),
         Stage("leaderboard", [PYTHON, ".ci/leaderboard.py", "stale"]),
@@ -121,7 +131,30 @@ def uncompiled(folder: Path, arguments: list[str]) -> list[Stage]:
 def test(arguments: list[str]) -> list[Stage]:
     """What protects a commit."""
     folder = REPO / "build" / "test"
-    return [*check(), pytest("compiled", folder, "-m", "not nightly", *arguments), *uncompiled(folder, arguments)]
+    told = {"BUFGYM_SKIPPED": str(SKIPS)}
+    compiled = pytest("compiled", folder, "-m", "not nightly", *arguments, environment=told)
+    return [*check(), compiled, *uncompiled(folder, arguments)]
+
+
+def everything(arguments: list[str]) -> list[Stage]:
+    """Install what the tests that ``make test`` skipped need, as far as this machine can, and run them."""
+    if not SKIPS.exists():
+        raise SystemExit("make everything runs what make test has skipped: first run make test")
+    folder = REPO / "build" / "everything"
+    chosen, left, installed = folder / "chosen.txt", folder / "skipped.json", str(folder / "installed.json")
+    told = {"BUFGYM_SKIPPED": str(left)} | ({"BUFGYM_SHARED_DATA": str(DATA)} if DATA.is_dir() else {})
+    skipped = missing.read(SKIPS)
+    chosen.write_text("".join(f"{test}\n" for test in skipped), encoding="utf-8")
+    none = "" if skipped else "make test skipped nothing"
+    no_npm = "" if shutil.which("npm") or TSC.exists() else "npm is not here"
+    tool = [PYTHON, ".ci/missing.py"]
+    tests = pytest("skipped before", folder, "-m", "not nightly", *arguments, f"@{chosen}", environment=told)
+    return [
+        Stage("install", [*tool, "install", str(SKIPS), installed]),
+        Stage("page types", [str(TSC), "-p", ".ci/tsconfig.json"], unless=no_npm),
+        replace(tests, unless=none),
+        Stage("skips", [*tool, "left", str(left), installed], unless=none),
+    ]
 
 
 def nightly(arguments: list[str]) -> list[Stage]:
@@ -138,8 +171,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
     report = [PYTHON, "-m", "coverage", "report", "--skip-covered", "--include=bufgym/*"]
     sample = [".ci/mutants", "--sample=150", "--minutes=12", f"--seed={time.strftime('%Y%m%d')}"]
     make = ["make", "--no-print-directory"]
-    data = Path(os.environ.get("BUFGYM_SHARED_DATA", REPO.parent / "shared" / "data"))
-    recordings = "" if data.is_dir() else "the recordings are not here, and without them many claims differ"
+    recordings = "" if DATA.is_dir() else "the recordings are not here, and without them many claims differ"
     return [
         *check(),
         *uncompiled(folder, arguments),
@@ -148,7 +180,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
         Stage("coverage", report, environment=measured(folder)),
         pytest("all uncompiled", folder, *plain, compiled=False, limit_s=25 * MINUTE),
         pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
-        Stage("claims", [*make, "claims", f"DATA={data}"], limit_s=30 * MINUTE, unless=recordings),
+        Stage("claims", [*make, "claims", f"DATA={DATA}"], limit_s=30 * MINUTE, unless=recordings),
         Stage("speed", [PYTHON, "-m", "studies.perf", "--history", "results/perf.jsonl"], limit_s=5 * MINUTE),
         Stage("mutants", [PYTHON, *sample], limit_s=25 * MINUTE),
         Stage("dist", [*make, "dist"], limit_s=5 * MINUTE),
@@ -251,8 +283,10 @@ def main(tier: str, arguments: list[str]) -> int:
     goes_on = tier == "nightly"
     if goes_on:
         (folder / "lines").unlink(missing_ok=True)
-    stages = {"check": lambda _: check(), "test": test, "nightly": nightly}[tier](arguments)
+    stages = {"check": lambda _: check(), "test": test, "everything": everything, "nightly": nightly}[tier](arguments)
     results: list[Result] = []
+    if tier == "test":
+        SKIPS.unlink(missing_ok=True)
     begun = time.monotonic()
     for stage in stages:
         log = folder / f"{stage.name.replace(' ', '-')}.log" if goes_on else None
@@ -267,6 +301,8 @@ def main(tier: str, arguments: list[str]) -> int:
     text = f"make {tier}{load}\n{table(results)}"
     (folder / "summary.txt").write_text(text + "\n", encoding="utf-8")
     print(f"\n{text}")
+    if tier in ("test", "everything") and (folder / "skipped.json").exists():
+        print(missing.told(folder / "skipped.json"))
     return int(any(result.failed for result in results))
 
 

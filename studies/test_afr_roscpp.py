@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from needs import needs
 
 from bufgym.ground.errors import BufgymError
 from bufgym_papers.figures import figure, run
@@ -47,7 +48,7 @@ def test_without_roscpp_or_root_it_says_so(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.nightly
 def test_a_short_run(tmp_path: Path) -> None:
     if reason := afr_roscpp.impossible():
-        pytest.skip(reason)
+        pytest.skip(needs("root" if "root" in reason or "/dev" in reason else "roscpp", reason))
     text = run("afr-roscpp", tmp_path, policies=("stock", "afr"), seconds=2.0, stock_runs=1)
     assert "holds. 0 decisions differ" in " ".join(text.split())
     assert (tmp_path / "afr-roscpp.csv").exists()

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from needs import needs
 
-pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
+pytest.importorskip("sb3_contrib", reason=needs("extras", "sb3_contrib"))
 
 from bufgym.benchmark.tasks import QueueTask
 from bufgym.ground.kernel import JIT
@@ -20,7 +21,7 @@ from bufgym.traces import Trace, drive_motion, synthetic_lte
 from studies import causal_planner, futures
 
 TRAIN = [("train", 9e6)]
-planned = pytest.mark.skipif(not JIT, reason="without compilation a plan takes seconds")
+planned = pytest.mark.skipif(not JIT, reason=needs("compiled", "without compilation a plan takes seconds"))
 
 
 def rates_of(trace: Trace) -> np.ndarray[Any, Any]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import fit_cases
 import numpy as np
 import pytest
+from needs import needs
 
 from bufgym.traces import markov_link, write_csv
 from bufgym.traces.generate.markov import link_rates
@@ -34,7 +35,7 @@ def test_the_comparison_accepts_the_link_itself_and_refuses_one_without_memory()
 
 
 def test_the_page_has_its_tables_and_pictures(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
     files = [str(tmp_path / f"report_known_{seed}.csv") for seed in range(3)]
     for seed, file in enumerate(files):
         write_csv(markov_link("known", seed, 200, links={"known": KNOWN}), file)

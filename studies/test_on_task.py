@@ -2,16 +2,17 @@
 
 import numpy as np
 import pytest
+from needs import needs
 
 for extra in ("sb3_contrib", "cma", "cv2", "rvl"):
-    pytest.importorskip(extra, reason="the extra [train] or [perception] is not installed")
+    pytest.importorskip(extra, reason=needs("extras", extra))
 
 from bufgym import policies, sim  # noqa: E402
 from bufgym.ground.kernel import JIT  # noqa: E402
 from bufgym_papers.perception import streams, worth  # noqa: E402
 from studies import on_task  # noqa: E402  (these need the extras)
 
-pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
+pytestmark = pytest.mark.skipif(not JIT, reason=needs("compiled", "without compilation a room takes minutes to draw"))
 
 
 def test_frames_arrive_as_they_do_one_episode_at_a_time() -> None:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from needs import needs
 
 REPO = Path(__file__).resolve().parent.parent
 SHORT = {
@@ -20,10 +21,10 @@ SHORT = {
     "studies.hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms evolve",
 }
 """Program and verb -> the options that make it short."""
-NEEDS = {
-    "studies.relay_load page": "chromium",
-    "studies.relay_soak": "nats-server",
-    "studies.relay_others": "mosquitto",
+NEEDED = {
+    "studies.relay_load page": ("browser", "chromium"),
+    "studies.relay_soak": ("nats", "nats-server"),
+    "studies.relay_others": ("mqtt", "mosquitto"),
 }
 ELSEWHERE = {
     "studies.causal_planner": "studies/test_causal_planner.py",
@@ -61,9 +62,9 @@ def test_each_documented_program_is_here() -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("words", SHORT)
 def test_it_runs(words: str) -> None:
-    needed = NEEDS.get(words)
-    if needed and not shutil.which(needed):
-        pytest.skip(f"no {needed} here")
+    group, program = NEEDED.get(words, ("", ""))
+    if group and not shutil.which(program):
+        pytest.skip(needs(group, f"no {program}"))
     command = [sys.executable, "-m", *shlex.split(f"{words} {SHORT[words]}")]
     done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import pytest
+from needs import needs
 
-pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
+pytest.importorskip("stable_baselines3", reason=needs("extras", "stable_baselines3"))
 
 from studies.sb3_defaults import CAPACITY, Episodes, draw_curves, summary
 

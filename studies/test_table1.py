@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from needs import needs
 from refusal_cases import refuse
 
-pytest.importorskip("rosbags", reason="extra ros")
-pytest.importorskip("flatbuffers", reason="extra robofleet")
+pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
+pytest.importorskip("flatbuffers", reason=needs("extras", "flatbuffers"))
 
 from flatbuffers.number_types import Float32Flags
 from flatbuffers.table import Table

@@ -3,6 +3,7 @@
 import sys
 
 import pytest
+from needs import needs
 
 from bufgym.ground.errors import BufgymError
 from bufgym_papers.figures import figure
@@ -10,10 +11,10 @@ from bufgym_papers.figures.rows import FigureRows
 from studies import robofleet_table2, table2_programs
 
 for library in ("rosbags", "flatbuffers", "roslibpy", "websockets"):
-    pytest.importorskip(library, reason="extra rosbridge")
+    pytest.importorskip(library, reason=needs("extras", library))
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason=needs("system", "/proc"))
 def test_both_programs_send_clouds_and_say_what_it_cost() -> None:
     """Robofleet's rule may drop some on a busy machine; the other keeps all."""
     rows = figure("robofleet-table2", runs=1, seconds=0.5, points=100).simulate()

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from needs import needs
 
-pytest.importorskip("stable_baselines3", reason="the extra [train] is not installed")
-pytest.importorskip("psutil", reason="psutil is not installed")
+pytest.importorskip("stable_baselines3", reason=needs("extras", "stable_baselines3"))
+pytest.importorskip("psutil", reason=needs("extras", "psutil"))
 
 from bufgym import BufgymError
 from studies import ten_minutes

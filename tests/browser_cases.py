@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import needs
 
 QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 QUIET += ["--disable-component-update", "--disable-sync"]
@@ -26,8 +27,8 @@ def browsing() -> Iterator[Any]:
     """A browser; skips where there is none."""
     chromium = shutil.which("chromium")
     if chromium is None:
-        pytest.skip("no chromium on this machine")
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+        pytest.skip(needs("browser", "no chromium"))
+    playwright = pytest.importorskip("playwright.sync_api", reason=needs("extras", "playwright.sync_api"))
     with playwright.sync_playwright() as play, play.chromium.launch(executable_path=chromium, args=QUIET) as browser:
         yield browser
 

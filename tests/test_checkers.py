@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 from gymnasium.utils import env_checker
+from needs import needs
 
 import bufgym.envs
 
@@ -35,7 +36,7 @@ every_int8_form = pytest.mark.parametrize("form", [form for form in FORMS if for
 def made(id: str, **options: Any) -> gym.Env[Any, Any]:
     """One of the environments, with short episodes."""
     if id not in bufgym.ENVIRONMENTS:
-        pytest.importorskip("cv2", reason="the extra [perception] is not installed")
+        pytest.importorskip("cv2", reason=needs("extras", "cv2"))
     return gym.make(id, capacity=3, **SMALL[id], **options)
 
 
@@ -54,14 +55,16 @@ def test_gymnasium_and_a_pickled_copy_is_equal(id: str, form: dict[str, Any]) ->
 @every_id
 @every_form
 def test_stable_baselines3(id: str, form: dict[str, Any]) -> None:
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra [train] is not installed")
+    checker = pytest.importorskip(
+        "stable_baselines3.common.env_checker", reason=needs("extras", "stable_baselines3.common.env_checker")
+    )
     checker.check_env(made(id, **form).unwrapped)
 
 
 @every_id
 @every_form
 def test_torchrl(id: str, form: dict[str, Any]) -> None:
-    envs = pytest.importorskip("torchrl.envs", reason="torchrl is not installed")
+    envs = pytest.importorskip("torchrl.envs", reason=needs("torchrl", "torchrl.envs"))
     envs.check_env_specs(envs.GymWrapper(made(id, **form)))
     batch = gym.make_vec(id, num_envs=2, capacity=3, **SMALL[id], **form, autoreset_mode="Disabled")
     envs.check_env_specs(envs.GymWrapper(batch))
@@ -70,7 +73,7 @@ def test_torchrl(id: str, form: dict[str, Any]) -> None:
 @pytest.mark.parametrize("robots", [1, 3])
 @every_int8_form
 def test_pettingzoo(robots: int, form: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
-    zoo = pytest.importorskip("pettingzoo.test", reason="the extra [fleet] is not installed")
+    zoo = pytest.importorskip("pettingzoo.test", reason=needs("extras", "pettingzoo.test"))
     make = partial(bufgym.envs.parallel_env, robots=robots, **ROBOTS, **form)
     zoo.parallel_api_test(make(), num_cycles=70)
     zoo.parallel_seed_test(make, num_cycles=20)
@@ -81,7 +84,7 @@ def test_pettingzoo(robots: int, form: dict[str, Any], capsys: pytest.CaptureFix
 @pytest.mark.filterwarnings("ignore:Observation")
 @every_int8_form
 def test_pettingzoo_turn_by_turn(form: dict[str, Any]) -> None:
-    zoo = pytest.importorskip("pettingzoo.test", reason="the extra [fleet] is not installed")
+    zoo = pytest.importorskip("pettingzoo.test", reason=needs("extras", "pettingzoo.test"))
     from pettingzoo.utils import parallel_to_aec
 
     def make() -> Any:

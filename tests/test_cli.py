@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
+from needs import needs
 from PIL import Image
 
 from bufgym import __version__, policies, scenario, traces
@@ -18,8 +19,6 @@ from bufgym.cli import main
 from bufgym.cli.listing import LISTS
 from bufgym.ground.kernel import JIT
 from bufgym.traces.shipped import shipped_calls
-
-pytestmark = pytest.mark.usefixtures("own_registry")
 
 
 @pytest.fixture
@@ -108,7 +107,7 @@ def test_bench_against_a_policy(capsys: Capsys) -> None:
 
 
 def test_bench_writes_parquet_where_it_can(trace: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("pyarrow")
+    pytest.importorskip("pyarrow", reason=needs("extras", "pyarrow"))
     command = ["bench", "--trace", trace, *QUICK, "--policies", "afr", "--out"]
     assert main([*command, str(tmp_path)]) == 0
     assert len(read_rows(tmp_path / "rows.parquet")) == 2
@@ -126,7 +125,7 @@ def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: Capsys) 
         assert bool(told) != policies.get(name).for_topics
 
 
-@pytest.mark.skipif(not JIT, reason="it plays whole benchmarks, which takes compiled code")
+@pytest.mark.skipif(not JIT, reason=needs("compiled", "it plays whole benchmarks, which takes compiled code"))
 def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) -> None:
     """Row (trace, seed) is what ``reset`` of bufgym/Uplink-v0 plays by these numbers; neither side has an argument."""
     assert main(["bench", "--seeds", "1", "--policies", "drop-oldest", "--format", "csv", "--out", str(tmp_path)]) == 0

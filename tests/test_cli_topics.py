@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from cli_cases import FAR_OFF, Capsys, Patch, fails, shown
+from needs import needs
 
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.tasks.fleet import ROWS as FLEET_ROWS
@@ -73,7 +74,7 @@ def test_the_suite_runs_by_default(capsys: Capsys) -> None:
     assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
 
 
-def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Capsys, own_registry: None) -> None:
+def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Capsys) -> None:
     """Each of the 2 s x (10 + 2) messages/s is sent by such a decision, whatever its topic."""
     mine = tmp_path / "mine.py"
     mine.write_text(FAR_OFF.format(True))
@@ -157,8 +158,8 @@ def test_what_does_not_go_together(here: Path, capsys: Capsys, words: str, says:
 @pytest.fixture
 def drive(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """1 m forward in a second, a turn of 90 degrees in the next; a picture every 500 ms (see bag_cases)."""
-    pytest.importorskip("mcap", reason="recordings need the extra 'ros'")
-    pytest.importorskip("rosbags", reason="recordings need the extra 'ros'")
+    pytest.importorskip("mcap", reason=needs("extras", "mcap"))
+    pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
     monkeypatch.syspath_prepend(str(Path(__file__).parent / "traces"))
     import bag_cases
 

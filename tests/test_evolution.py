@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_cases import Patch
+from needs import needs
 from safetensors.numpy import load_file
 
 from agents import cluster
@@ -108,7 +109,7 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pytest.FixtureRequest) -> None:
     """Two seeds; on the cluster half of the steps, and then the rest."""
     if importlib.util.find_spec(LIBRARY[backend]) is None:
-        pytest.skip(f"{LIBRARY[backend]} is not installed")
+        pytest.skip(needs("ray" if backend == "ray" else "extras", LIBRARY[backend]))
     local: Path = request.getfixturevalue("local")  # only where there is something to compare
     trained("cluster", 19_000, "--backend", backend)
     trained("cluster", 38_000, "--backend", backend, "--resume")

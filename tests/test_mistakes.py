@@ -85,7 +85,6 @@ TAKES = "(buffer, arrival, memory)"
 UNCOMPILED = "attribute 'no' of type Buffer; File \"mine.py\", line 5\n" if JIT else "line 5: AttributeError"
 
 
-@pytest.mark.usefixtures("own_registry")
 @pytest.mark.parametrize(
     ("text", "told"),
     [

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from cli_cases import Patch
+from needs import needs
 
 from bufgym import cli, policies
 from bufgym.cli import main
@@ -144,7 +145,7 @@ def settings_of(line: str) -> str | None:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("line", [line for line in typed() if settings_of(line) is not None])
-def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, own_registry: None, capsys: Any) -> None:
+def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, capsys: Any) -> None:
     """In a folder with the guide's programs and the repository's examples and traces."""
     for block in blocks():
         named = re.match(r"# (\w+\.py)\n", block.text) if block.language == "python" else None
@@ -154,7 +155,7 @@ def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, own_reg
         (tmp_path / name).symlink_to(REPO / name)
     monkeypatch.chdir(tmp_path)
     if "dataset make" in line:
-        pytest.importorskip("minari")
+        pytest.importorskip("minari", reason=needs("extras", "minari"))
     try:
         assert main([*shlex.split(line)[1:], *shlex.split(settings_of(line) or "")]) == 0
     except SystemExit as end:  # --help
@@ -197,11 +198,11 @@ PROGRAMS = [block for block in blocks() if block.language == "python" and block.
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
-def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch, own_registry: None) -> None:
+def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> None:
     needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:
-            pytest.importorskip(package)
+            pytest.importorskip(package, reason=needs("extras", package))
     monkeypatch.chdir(tmp_path)
     program = "\n".join([textwrap.dedent(BEFORE.get(block.page, "")), block.text, AFTER.get(block.page, "")])
     exec(compile(program, block.page, "exec"), {"__name__": "page"})
@@ -214,7 +215,7 @@ def test_each_tutorial_runs_and_ends_with_its_picture(source: Path, tmp_path: Pa
     text = source.read_text(encoding="utf-8")
     for package in ("matplotlib", "sb3_contrib", "pettingzoo"):
         if package == "matplotlib" or package in text.lower():
-            pytest.importorskip(package)
+            pytest.importorskip(package, reason=needs("extras", package))
     last = re.findall(r"^# !\[[^\]]+\]\((.+)\)$", text, re.MULTILINE)[-1]
     where = os.environ | {"PYTHONPATH": str(REPO)}
     command = [sys.executable, str(source)]
@@ -269,7 +270,7 @@ def test_pages_have_all_of_their_registry(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.nightly
 def test_the_site_builds_without_a_broken_link(tmp_path: Path) -> None:
     for package in ("mkdocs", "material", "mkdocstrings", "jupytext"):
-        pytest.importorskip(package, reason="the extra docs is not installed")
+        pytest.importorskip(package, reason=needs("extras", package))
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
     surroundings = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(command, cwd=REPO, env=surroundings, capture_output=True, text=True, check=False)

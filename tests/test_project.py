@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
+from needs import needs
 
 import bufgym
 from bufgym import cli
@@ -28,7 +29,7 @@ def test_no_text_file_holds_a_path_of_one_machine() -> None:
     search = ["git", "grep", "--untracked", "-nIP", homes]
     found = subprocess.run(search, cwd=REPO, capture_output=True, text=True, check=False)
     if found.returncode > 1:
-        pytest.skip("no checkout of git")
+        pytest.skip(needs("git"))
     assert not found.stdout
 
 

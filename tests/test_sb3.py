@@ -9,8 +9,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from needs import needs
 
-pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
+pytest.importorskip("sb3_contrib", reason=needs("extras", "sb3_contrib"))
 
 import torch
 from refusal_cases import refuse, refused

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from needs import needs
 
 REPO = Path(__file__).resolve().parent.parent
 PAGE = (REPO / "docs" / "guide" / "trainers.md").read_text(encoding="utf-8")
@@ -43,7 +44,7 @@ def test_every_library_of_the_table_has_a_program() -> None:
 def test_the_program_of_the_page_runs(package: str, tmp_path: Path) -> None:
     python = interpreter(package)
     if python is None:
-        pytest.skip(f"{package} is not installed")
+        pytest.skip(needs("torchrl" if package == "torchrl" else "trainers", package))
     path = os.pathsep.join(str(REPO / part) for part in ("", "packages/live", "packages/papers"))
     where = os.environ | {"PYTHONPATH": path, "MINARI_DATASETS_PATH": str(tmp_path / "data"), "OMP_NUM_THREADS": "1"}
     (tmp_path / "program.py").write_text(PROGRAMS[package])

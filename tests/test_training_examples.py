@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_cases import Capsys, Patch
+from needs import needs
 
 from bufgym.benchmark import leaderboard
 from bufgym.ground.kernel import JIT
 
-pytestmark = pytest.mark.skipif(not JIT, reason="they train and measure, which takes compiled code")
+pytestmark = pytest.mark.skipif(not JIT, reason=needs("compiled", "they train and measure, which takes compiled code"))
 
-torch = pytest.importorskip("torch", reason="the extra [train] is not installed")
+torch = pytest.importorskip("torch", reason=needs("extras", "torch"))
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -50,7 +51,7 @@ def test_ppos_parts_by_hand() -> None:
 
 @pytest.mark.nightly
 def test_a_model_of_stable_baselines3_gets_a_row(tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
-    pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
+    pytest.importorskip("sb3_contrib", reason=needs("extras", "sb3_contrib"))
     args = "--suite interruption-v1 --capacity 4 --steps 512 --num-envs 4 --out mine -- --seeds 3 --capacity 4 --jobs 1"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["x", *args.split()])
@@ -74,7 +75,7 @@ def test_a_moment_is_missed_more_than_half_a_view_from_what_arrived() -> None:
 @pytest.mark.nightly
 def test_imitation_learns_from_the_clairvoyant(capsys: Capsys) -> None:
     """Seconds are enough to pass AFR on short episodes; a network that learned nothing is below Drop Oldest."""
-    pytest.importorskip("sb3_contrib", reason="the extra [train] is not installed")
+    pytest.importorskip("sb3_contrib", reason=needs("extras", "sb3_contrib"))
     imitation = example("imitation.py")
     small = {"rounds": 3, "episodes": 16, "epochs": 4, "minibatch": 256, "width": 16, "test_seeds": 5}
     reached = imitation["main"](imitation["Settings"](**small, duration_s=6.0, test_duration_s=10.0))
@@ -88,7 +89,7 @@ def test_imitation_learns_from_the_clairvoyant(capsys: Capsys) -> None:
 def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: Capsys) -> None:
     """A clone of AFR is far above a network that learned nothing; CQL runs, and its values keep to the masks."""
     for package in ("d3rlpy", "minari", "sb3_contrib"):
-        pytest.importorskip(package, reason="the extra [offline] is not installed")
+        pytest.importorskip(package, reason=needs("extras", package))
     offline = example("offline.py")
     small = {"episodes": 8, "updates": 60, "minibatch": 256, "test_seeds": 2, "duration_s": 4.0}
     settings = offline["Settings"](kinds=["medium"], data=str(tmp_path), **small, test_duration_s=4.0)
@@ -105,7 +106,7 @@ MISSING = [name for name in ("ray", "tree", "ormsgpack", "torch", "pettingzoo") 
 
 
 @pytest.mark.nightly
-@pytest.mark.skipif(bool(MISSING), reason=f"the extra [rllib] is not installed: {', '.join(MISSING)} missing")
+@pytest.mark.skipif(bool(MISSING), reason=needs("trainers", f"{', '.join(MISSING)} missing"))
 def test_the_example_learns_two_iterations() -> None:
     small = ["--robots", "2", "--iterations", "2", "--ticks", "400", "--seconds", "3"]
     command = [sys.executable, "examples/fleet_rllib.py", *small]

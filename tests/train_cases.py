@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from needs import needs
 
 for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
-    pytest.importorskip(extra, reason="the extra [train] is not installed")
+    pytest.importorskip(extra, reason=needs("extras", extra))
 
 
 class KilledError(Exception):

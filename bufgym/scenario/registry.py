@@ -58,15 +58,14 @@ def register(name: str, about: str = "") -> Callable[[Maker], Maker]:
         if not callable(make):
             raise BufgymError(f"scenario {name!r}: {make!r} is neither a class nor a function")
         SCENARIOS[name] = make, about or modules.first_line(make)
-        _named.cache_clear()
         return make
 
     return add
 
 
 @functools.cache
-def _named(name: str) -> Scenario:
-    return checked(SCENARIOS[name][0](), name)
+def _made(name: str, make: Callable[[], Any]) -> Scenario:
+    return checked(make(), name)
 
 
 def checked(scenario: Any, name: str) -> Scenario:
@@ -111,7 +110,7 @@ def get(spec: str | os.PathLike[str] | Scenario, /, **overrides: Any) -> Scenari
     elif isinstance(spec, str):
         if spec not in SCENARIOS:
             raise unknown("scenario", spec, SCENARIOS, ", and module:function for one's own")
-        spec = _named(spec)
+        spec = _made(spec, SCENARIOS[spec][0])
     else:
         spec = checked(spec, type(spec).__name__)
     if not overrides:

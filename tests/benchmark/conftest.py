@@ -23,7 +23,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Sweep:
 
 
 @pytest.fixture
-def mine(tmp_path: Path, own_registry: None) -> Path:
+def mine(tmp_path: Path) -> Path:
     """A policy file: ``mine`` may fail, as the environment says."""
     path = tmp_path / "mine.py"
     path.write_text(

@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+from needs import needs
 from refusal_cases import refuse
 
 import bufgym.envs  # noqa: F401  (registers)
@@ -74,7 +75,7 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.skipif(not JIT, reason="nothing is compiled")
+@pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled"))
 def test_each_part_is_named_and_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["warmup"]) == 0
     told = capsys.readouterr()

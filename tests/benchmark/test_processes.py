@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 from cli_cases import fails, shown
+from needs import needs
 from sweep_cases import THREE, bufgym, ended
 
 from bufgym.ground.files import locked
 from bufgym.ground.kernel import announce
 
-pytest.importorskip("joblib", reason="a sweep needs joblib")
+pytest.importorskip("joblib", reason=needs("extras", "joblib"))
 
 POLICY = """
 import os, signal, time

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from browser_cases import opened
 from cli_cases import Patch
+from needs import needs
 from report_cases import MANIFEST, QOI, TIMELINE, make
 
 from bufgym.benchmark import folder as inputs
@@ -21,8 +22,8 @@ from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.ground.errors import BufgymError
 from bufgym.scenario import FleetScenario, suites
 
-pytest.importorskip("jinja2", reason="the report needs Jinja")
-pytest.importorskip("matplotlib", reason="the report needs matplotlib")
+pytest.importorskip("jinja2", reason=needs("extras", "jinja2"))
+pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
 
 
 @pytest.fixture

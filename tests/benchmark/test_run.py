@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import needs
 from refusal_cases import refuse, refused
 
 import bufgym
@@ -189,15 +190,15 @@ HARD = [
 """Numbers that need all their bits, nothing in all its forms, text that a CSV must quote."""
 
 
-def needs(ending: str) -> str:
+def layout(ending: str) -> str:
     if ending == "parquet":
-        pytest.importorskip("pyarrow")
+        pytest.importorskip("pyarrow", reason=needs("extras", "pyarrow"))
     return ending
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_rows_come_back_to_the_last_bit(tmp_path: Path, ending: str) -> None:
-    path = write_rows(HARD, tmp_path / f"rows.{needs(ending)}")
+    path = write_rows(HARD, tmp_path / f"rows.{layout(ending)}")
     # repr tells None from NaN, 3 from 3.0, 0.0 from -0.0, and shows every bit of a float.
     assert [repr(same) for same in read_rows(path)] == [repr(given) for given in HARD]
     assert list(tmp_path.iterdir()) == [path]  # nothing temporary stays
@@ -252,7 +253,7 @@ def test_a_file_that_is_none_or_cut_short_is_named(tmp_path: Path, content: byte
     """As CSV, or so much of a Parquet file."""
     path = tmp_path / "rows.csv"
     if not isinstance(content, bytes):
-        pytest.importorskip("pyarrow")
+        pytest.importorskip("pyarrow", reason=needs("extras", "pyarrow"))
         path = write_rows(HARD, tmp_path / "rows.parquet")
         content = path.read_bytes()[: round(content * path.stat().st_size)]
     path.write_bytes(content)
@@ -261,7 +262,7 @@ def test_a_file_that_is_none_or_cut_short_is_named(tmp_path: Path, content: byte
 
 def test_one_wrong_bit_in_a_parquet_page_is_noticed(tmp_path: Path) -> None:
     """Or else a number would be another and nobody the wiser. (Some bits say nothing that is needed.)"""
-    pytest.importorskip("pyarrow")
+    pytest.importorskip("pyarrow", reason=needs("extras", "pyarrow"))
     rows = [row(qoi=1234.5678 + k, mean_age_s=1 / (k + 1)) for k in range(50)]
     path = write_rows(rows, tmp_path / "rows.parquet")
     right, content = repr(rows), path.read_bytes()

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
+from needs import needs
 from refusal_cases import refuse, refused
 
 import bufgym
@@ -57,7 +58,7 @@ ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "
 
 
 @pytest.fixture
-def module(tmp_path: Path, monkeypatch: Patch, own_registry: None) -> str:
+def module(tmp_path: Path, monkeypatch: Patch) -> str:
     """A module of policies in the current folder; its name differs from test to test, as Python imports one once."""
     name = "m" + re.sub(r"\W", "_", tmp_path.name)
     (tmp_path / f"{name}.py").write_text(MODULE)
@@ -94,7 +95,7 @@ def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: Capsys) ->
 
 @pytest.mark.nightly
 def test_workers_load_them_too_and_the_folder_knows_their_version(module: str, capsys: Capsys) -> None:
-    pytest.importorskip("joblib")
+    pytest.importorskip("joblib", reason=needs("extras", "joblib"))
     shutil.copy(SHIPPED, "own.safetensors")
     suite = "--suite interruption-v1 --capacity 3 --seeds 1 --format csv --jobs 2 --out kept"
     words = ["bench", *suite.split(), "--policies", f"own.safetensors,{module}:newest"]
@@ -127,7 +128,7 @@ def test_workers_load_them_too_and_the_folder_knows_their_version(module: str, c
 )
 def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: Capsys) -> None:
     if word.endswith(".zip"):
-        pytest.importorskip("stable_baselines3")
+        pytest.importorskip("stable_baselines3", reason=needs("extras", "stable_baselines3"))
     Path("broken.zip").write_text("no zip")
     Path("broken.py").write_text("1 // 0\n")
     Path("needy.py").write_text("import a_module_not_there\n")
@@ -199,9 +200,7 @@ def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
     assert [line.split()[0] for line in done.table().splitlines()[1:3]] == ["drop-oldest", "mine"]
 
 
-def test_a_suite_takes_files_and_named_policies_and_those_registered_here(
-    tmp_path: Path, monkeypatch: Patch, own_registry: None
-) -> None:
+def test_a_suite_takes_files_and_named_policies_and_those_registered_here(tmp_path: Path, monkeypatch: Patch) -> None:
     """A suite's processes load a file themselves; a policy registered in this process runs in this process."""
     monkeypatch.chdir(tmp_path)
     shipped = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
@@ -215,14 +214,14 @@ def test_a_suite_takes_files_and_named_policies_and_those_registered_here(
 
 
 def test_a_picture() -> None:
-    pytest.importorskip("matplotlib", reason="a picture needs the extra [plot]")
+    pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
     axes = bufgym.compare(["afr", "min-gap"], "interruption", capacity=[2, 4], seeds=2, progress=False).plot()
     assert {label.get_text() for label in axes.get_yticklabels()} == {"min-gap", "afr"}
     assert len(axes.patches) == 4 and axes.get_xlabel().startswith("regret")
 
 
 def test_a_frame() -> None:
-    frame = pytest.importorskip("pandas", reason="a frame needs pandas")
+    frame = pytest.importorskip("pandas", reason=needs("extras", "pandas"))
     found = bufgym.compare(["afr"], "interruption", seeds=2, progress=False).to_pandas()
     assert isinstance(found, frame.DataFrame) and found["policy"].tolist() == ["afr", "afr"]
     assert found["scenario"].tolist() == ["interruption", "interruption"]
@@ -241,7 +240,7 @@ def test_topics_and_fleets_beside_their_baseline(kind: str, policy: str, baselin
     assert done.table().startswith("policy") and head in done.table() and done.to_pandas()["scenario"][0] == "mine"
 
 
-def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: Patch, own_registry: None) -> None:
+def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text("def every_other(buffer, arrival, memory):\n    return -1 if arrival.seq % 2 else -2\n")
     assert bufgym.make_policy("decimate:every=3").parameters["every"] == 3

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from cli_cases import Capsys, Patch, shown
+from needs import needs
 from refusal_cases import refuse
 from sweep_cases import THREE, TINY, contents, ended, interrupt
 
@@ -20,7 +21,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Uplink, numbered, suites
 from bufgym.traces import Trace
 
-pytest.importorskip("joblib", reason="a sweep needs joblib")
+pytest.importorskip("joblib", reason=needs("extras", "joblib"))
 
 WORDS = ["bench", "--suite", "interruption-v1", "--policies", ",".join(THREE), "--capacity", "2,4", "--seeds", "3"]
 """The same as ``TINY``, typed."""
@@ -48,7 +49,7 @@ def test_other_processes_know_a_users_policy(tmp_path: Path, backend: str, mine:
     """Dask and Ray: a cluster of this machine's own."""
     needed = {"loky": "joblib", "dask": "distributed", "ray": "ray"}[backend]
     if importlib.util.find_spec(needed) is None:
-        pytest.skip(f"{needed} is not installed")
+        pytest.skip(needs("ray" if needed == "ray" else "extras", needed))
     words = [word if word != ",".join(THREE) else ",".join(["mine", *THREE]) for word in WORDS]
     words += ["--policy-file", str(mine), "--backend", backend, "--jobs", "2", "--format", "csv"]
     out = tmp_path / "out"
@@ -219,7 +220,7 @@ def test_rows_without_a_manifest_are_left_alone(tmp_path: Path, small: Sweep, na
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_a_broken_part_is_named_and_made_anew(tmp_path: Path, small: Sweep, form: str, monkeypatch: Patch) -> None:
     if form == "parquet":
-        pytest.importorskip("pyarrow")
+        pytest.importorskip("pyarrow", reason=needs("extras", "pyarrow"))
     out = tmp_path / "out"
     whole = sweep.run_sweep(small, tmp_path / "whole", backend="sequential", form=form)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -258,8 +259,8 @@ def test_a_bad_sweep_writes_nothing(tmp_path: Path, small: Sweep, change: dict[s
 
 
 def test_the_command_line_prints_scores_and_the_report_reads_them(tmp_path: Path, small: Sweep, capsys: Capsys) -> None:
-    pytest.importorskip("jinja2")
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2", reason=needs("extras", "jinja2"))
+    pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
     out = tmp_path / "a folder"
     words = ["bench", "--suite", "small-v1", "--policies", "afr,random", "--backend", "sequential", "--out", out]
     said = shown(words, capsys)

@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from needs import needs
 
 from bufgym.ground import kernel
 from bufgym.ground.kernel import JIT
@@ -83,7 +84,7 @@ def test_what_code_does_not_rest_on(before: str, after: str) -> None:
     assert hash_of(TALE.replace(before, after)) == hash_of(TALE)
 
 
-needs_compilation = pytest.mark.skipif(not JIT, reason="nothing is kept without compilation")
+needs_compilation = pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is kept without compilation"))
 
 
 @needs_compilation

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 import pytest
+from needs import needs
 from numpy.typing import NDArray
 
 from bufgym.ground.kernel import JIT, announce, cache, direct, interruptible, kernel
@@ -49,7 +50,7 @@ class Numbers(NamedTuple):
     several: bool | None = None
 
 
-needs_compilation = pytest.mark.skipif(not JIT, reason="nothing is kept without compilation")
+needs_compilation = pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is kept without compilation"))
 
 
 @needs_compilation
@@ -205,7 +206,7 @@ tasks = {
 """
 
 
-@pytest.mark.skipif(not JIT, reason="Python's own loops are interrupted anyway")
+@pytest.mark.skipif(not JIT, reason=needs("compiled", "Python's own loops are interrupted anyway"))
 @pytest.mark.parametrize(("task", "warm", "n"), [("rollout", 1, 10**6), ("clairvoyant", 2_000, 65_000)])
 def test_ctrl_c_is_answered_within_a_second(task: str, warm: int, n: int, tmp_path: Path) -> None:
     """After a short run (so that nothing is left to compile) each would take minutes."""

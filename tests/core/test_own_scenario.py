@@ -1,7 +1,6 @@
 """A scenario, a link and a V of one's own: by name, as text, checked; and ``bufgym bench`` with them."""
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from bufgym.cli import main
 from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.scenario import SCENARIOS, Episode, Interruption, Uplink, messages, registry
+from bufgym.scenario import SCENARIOS, Episode, Interruption, Uplink, messages
 from bufgym.scenario.client import read_client
 from bufgym.traces import Trace
 
@@ -56,15 +55,6 @@ def nine():
     "Interruptions of nine messages."
     return Interruption(t_max=9, law="fixed")
 """
-
-
-@pytest.fixture(autouse=True)
-def clean() -> Iterator[None]:
-    before = dict(SCENARIOS)
-    yield
-    SCENARIOS.clear()
-    SCENARIOS.update(before)
-    registry._named.cache_clear()
 
 
 @pytest.fixture

@@ -17,8 +17,6 @@ from bufgym.model import qoi
 from bufgym.policies import ACCEPT, REJECT, register, registry
 from bufgym.sim.metrics import outcome
 
-pytestmark = pytest.mark.usefixtures("own_registry")
-
 ALL = tuple(name for name in policies.names() if policies.get(name).privileged is None)
 
 SETTINGS = [

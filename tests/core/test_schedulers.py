@@ -57,7 +57,7 @@ def test_made_for_topics():
     assert sorted([*policies.names(for_topics=True), *policies.names(for_topics=False)]) == sorted(policies.names())
 
 
-def test_your_own_can_be_made_for_topics(own_registry):
+def test_your_own_can_be_made_for_topics():
     def last_in(buffer, memory):
         """The oldest of the topic whose message came last."""
         newest = buffer.slots[len(buffer.slots) - 1].topic

@@ -129,7 +129,7 @@ def test_weights_that_could_not_be_read_are_not_written(path):
     refuse("cannot be written", weights.save, path / "no" / "folder", good, ABOUT)
 
 
-def test_shipped_agents_are_read_when_they_are_asked_for(path, own_registry):
+def test_shipped_agents_are_read_when_they_are_asked_for(path):
     weights.save(path, made(3), ABOUT)
     broken = path.with_name("broken.safetensors")
     broken.write_bytes(b"no weights")

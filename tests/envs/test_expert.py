@@ -10,6 +10,7 @@ import pytest
 from env_cases import valid_action
 from hypothesis import example, given
 from hypothesis import strategies as st
+from needs import needs
 from refusal_cases import refuse, refused
 
 from bufgym import oracle, policies
@@ -228,7 +229,7 @@ def test_what_is_recorded_can_be_played_again(kind: str) -> None:
 
 
 def test_a_data_set_recovers_its_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    minari = pytest.importorskip("minari")
+    minari = pytest.importorskip("minari", reason=needs("extras", "minari"))
     command = ["dataset", "make", "--env", "Interruption-v0", "--kind", "mixed", "--episodes", "7", "--capacity", "3"]
     command += ["--option", "t_max=20", "--option", "value=saturating:0.5", "--out", str(tmp_path)]
     assert main(command) == 0
@@ -249,7 +250,7 @@ def test_a_data_set_recovers_its_environment(tmp_path: Path, monkeypatch: pytest
 
 
 def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
-    pytest.importorskip("minari")
+    pytest.importorskip("minari", reason=needs("extras", "minari"))
     from bufgym.envs.expert import dataset
 
     refuse("for equal sizes only", dataset.make, "Uplink-v0", "random", 2, out=tmp_path, size_cv=0.5, **STREAM)

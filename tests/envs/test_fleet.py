@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from env_cases import same, valid_action
 from gymnasium.vector import AutoresetMode
+from needs import needs
 from refusal_cases import refuse, refused
 
 from bufgym import policies
@@ -18,7 +19,7 @@ from bufgym.scenario import FleetEpisode, FleetScenario, Streams, messages
 from bufgym.sim.cell import run_fleet
 from bufgym.traces import Trace
 
-pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
+pytest.importorskip("pettingzoo", reason=needs("extras", "pettingzoo"))
 
 from bufgym.envs import FleetEnv
 

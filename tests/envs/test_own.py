@@ -6,7 +6,6 @@ discount g, ``retained`` also pays (1 - g) F in every step: it pays for a full q
 """
 
 import math
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from env_cases import SMALL, valid_action
+from needs import needs
 from refusal_cases import refuse, refused
 
 import bufgym
@@ -24,7 +24,7 @@ from bufgym.envs.rows import Rows
 from bufgym.ground.kernel import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.model.observe import OWN_FIELDS, OWN_TERMS, field, reward_term
+from bufgym.model.observe import field, reward_term
 from bufgym.scenario import Episode, Uplink, messages
 from bufgym.scenario.numbered import draw
 from bufgym.sim.metrics import outcome, received
@@ -51,17 +51,12 @@ def dropped(step: Any, memory: Any) -> float:
 
 
 @pytest.fixture(autouse=True)
-def own() -> Iterator[None]:
+def own() -> None:
     """Each function twice: in plain Python (``_py``) and compiled."""
-    fields, terms = dict(OWN_FIELDS), dict(OWN_TERMS)
     for suffix, compiled in (("", True), ("_py", False)):
         field(f"wait{suffix}", per="slot", unit="g/10 s", compile=compiled)(waited)
         field(f"megabytes{suffix}", per="context", high=1e3, compile=compiled)(megabytes)
         reward_term(f"dropped{suffix}", memory={"steps": 0}, compile=compiled)(dropped)
-    yield
-    for entries, before in ((OWN_FIELDS, fields), (OWN_TERMS, terms)):
-        entries.clear()
-        entries.update(before)  # type: ignore[arg-type]
 
 
 CHOSEN = ["loss", "wait", "wait_py", "occupancy", "megabytes", "megabytes_py"]
@@ -287,7 +282,7 @@ test_what_is_refused = refused(
 )
 
 
-@pytest.mark.skipif(not JIT, reason="nothing is compiled")
+@pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled"))
 def test_what_numba_cannot_compile_says_so_in_one_line() -> None:
     field("odd", per="context", compile=True)(odd)
     refuse("field 'odd': Numba cannot compile it; leave out compile=True", SenderEnv, "interruption", fields=["odd"])

@@ -16,9 +16,9 @@ from bufgym.model.observe import reward_term
 from bufgym.scenario import Interruption
 
 
-@reward_term("half_of_a_point", unit="1")
-def half(step: Any, memory: Any) -> float:
-    return 0.5
+@pytest.fixture(autouse=True)
+def half() -> None:
+    reward_term("half_of_a_point", unit="1")(lambda step, memory: 0.5)
 
 
 def played(envs: Any, rule: str = "afr") -> list[Any]:

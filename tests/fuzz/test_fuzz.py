@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 from link_files import SAMPLES
 from mutations import COUNT, SEED, limited, mutated
+from needs import needs
 
 from bufgym import policies
 from bufgym.benchmark import leaderboard, report
@@ -30,7 +31,7 @@ from bufgym.traces import FORMATS, Trace, load_motion, read_motion, read_trace, 
 from bufgym.traces.datasets.unpack import unpack
 
 HERE = Path(__file__).parent
-pytestmark = pytest.mark.skipif(not hasattr(__import__("signal"), "SIGALRM"), reason="needs alarms")
+pytestmark = pytest.mark.skipif(not hasattr(__import__("signal"), "SIGALRM"), reason=needs("system", "alarms"))
 
 Kind = tuple[list[tuple[str, bytes]], Callable[[Path, random.Random], object]]
 """Sound files, by their names, and what reads them."""

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from needs import needs
 from refusal_cases import refuse
 
-pytest.importorskip("mcap", reason="recordings need the extra 'ros'")
-pytest.importorskip("rosbags", reason="recordings need the extra 'ros'")
+pytest.importorskip("mcap", reason=needs("extras", "mcap"))
+pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 
 import bag_cases as cases
 import zstandard
@@ -258,7 +259,7 @@ def test_real_recordings(shared_data: Path) -> None:
     ):
         path = shared_data / "rosbags" / name
         if not path.exists():
-            pytest.skip(f"recording absent: rosbags/{name}")
+            pytest.skip(needs("data", f"rosbags/{name}"))
         bag = read_bag(path, odom)
         assert {list(bag.topics)[k]: int(n) for k, n in enumerate(np.bincount(bag.topic))} == counts
         workload = workload_from_bag(bag, topics=[odom], bridge_gaps=True)

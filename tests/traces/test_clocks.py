@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import needs
 from refusal_cases import refuse
 
-pytest.importorskip("mcap", reason="recordings need the extra 'ros'")
-pytest.importorskip("rosbags", reason="recordings need the extra 'ros'")
+pytest.importorskip("mcap", reason=needs("extras", "mcap"))
+pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 
 import bag_cases as cases
 from rosbags.rosbag2 import StoragePlugin

@@ -13,10 +13,11 @@ from unittest.mock import Mock
 
 import pytest
 from cli_cases import fails, shown
+from needs import needs
 from refusal_cases import refuse
 
-pytest.importorskip("mcap", reason="recordings need the extra 'ros'")
-pytest.importorskip("rosbags", reason="recordings need the extra 'ros'")
+pytest.importorskip("mcap", reason=needs("extras", "mcap"))
+pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 
 import bag_cases as cases
 import zstandard
@@ -121,7 +122,7 @@ def test_other_shared_recordings(shared_data: Path) -> None:
 @STORAGES
 def test_twelve_files_are_read_and_played_in_the_order_of_the_metadata(tmp_path: Path, storage: str) -> None:
     """By name _10 and _11 come before _2. The robot's own order is that of every other reader."""
-    BagSource = pytest.importorskip("bufgym_live.relay.bag", reason="a robot is in packages/live").BagSource
+    BagSource = pytest.importorskip("bufgym_live.relay.bag", reason=needs("extras", "bufgym_live.relay.bag")).BagSource
 
     names = [f"d_{k}.{ENDING[storage]}" for k in range(12)]
     for k, name in enumerate(names):

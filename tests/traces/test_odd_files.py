@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from link_files import SAMPLES, written
+from needs import needs
 from refusal_cases import refuse
 
 from bufgym.cli import main
@@ -53,9 +54,9 @@ def test_each_odd_file_is_read_right_or_says_why_not(
 ) -> None:
     path = shared_data / "odd_files" / name
     if not path.exists():
-        pytest.skip(f"file absent: odd_files/{name}")
+        pytest.skip(needs("data", f"odd_files/{name}"))
     if path.suffix == ".mcap":
-        pytest.importorskip("mcap", reason="recordings need the extra 'ros'")
+        pytest.importorskip("mcap", reason=needs("extras", "mcap"))
     if isinstance(right, str):
         refuse(f"{name}: .*{right}", read, path, kind=TraceError)
         return

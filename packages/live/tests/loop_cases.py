@@ -6,10 +6,11 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 import pytest
+from needs import needs
 
 from bufgym.ground.kernel import JIT
 
-compiled = pytest.mark.skipif(not JIT, reason="uncompiled, decisions take as long as messages do")
+compiled = pytest.mark.skipif(not JIT, reason=needs("compiled", "uncompiled, decisions take as long as messages do"))
 
 
 @contextlib.asynccontextmanager

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_cases import fails, shown
+from needs import needs
 from refusal_cases import refuse
 
 from bufgym import policies
@@ -62,7 +63,7 @@ int main(int words, char **files)
 def compiled(folder, compiler, standard, source, text, *flags):
     """The program of this source and this header; skips where there is no compiler."""
     if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is not installed")
+        pytest.skip(needs("compiler", compiler))
     (folder / "policy.h").write_text(text, encoding="utf-8")
     program = folder / "program"
     words = [compiler, f"-std={standard}", *FLAGS, *flags, "-I", folder, source, "-o", program, "-lm"]

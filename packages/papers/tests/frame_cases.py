@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from needs import needs
 
 from bufgym_papers.perception.frames import Camera, Depth, Image, Sequence
 
-cv2 = pytest.importorskip("cv2", reason="the extra perception is not installed")
+cv2 = pytest.importorskip("cv2", reason=needs("extras", "cv2"))
 
 WIDTH, HEIGHT = 640, 480
 TURNED = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])

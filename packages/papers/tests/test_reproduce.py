@@ -11,6 +11,7 @@ import frame_cases
 import numpy as np
 import pytest
 from cli_cases import Capsys, Patch, fails
+from needs import needs
 from refusal_cases import refuse
 
 from bufgym.benchmark.bootstrap import Interval
@@ -69,9 +70,9 @@ SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9", "robofleet-table2"}
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in SLOW)) for n in SMALL])
 def test_saves_its_numbers_and_its_figure(name: str, tmp_path: Path, monkeypatch: Patch) -> None:
     for package in ("matplotlib", *NEEDS_LIBRARIES.get(name, ())):
-        pytest.importorskip(package)
+        pytest.importorskip(package, reason=needs("extras", package))
     if not JIT and name in OF_FRAMES:
-        pytest.skip("without compilation a room takes minutes to draw")
+        pytest.skip(needs("compiled", "a room takes minutes to draw"))
     monkeypatch.setattr(afr_fig5, "MEAN_OVER", (9, 40 if JIT else 20))
     text = run(name, tmp_path / "new", **SMALL[name])
     assert "paper" in text
@@ -104,7 +105,7 @@ def test_every_claim_has_its_place_or_is_ours_and_a_row_on_the_page(name: str) -
         assert len(re.findall(f"`{name}`( †)? \\|", text_of_page)) == len(texts["claims"])
     if texts.get("fast"):
         for library in NEEDS_LIBRARIES.get(name, ()):
-            pytest.importorskip(library)
+            pytest.importorskip(library, reason=needs("extras", library))
         assert set(claim_rows(name)) <= set(text_of_page.splitlines())  # what comes out now
 
 

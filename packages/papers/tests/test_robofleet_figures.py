@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from needs import needs
 from refusal_cases import refuse
 
 from bufgym.model.topics import Topic
@@ -72,8 +73,8 @@ def test_copies_follow_one_another_and_a_link_that_stays_away_is_never_recovered
 
 def test_sizes_are_table1s() -> None:
     assert all(BYTES[kind] == PAPER[kind] for kind in set(BYTES) & set(PAPER))
-    pytest.importorskip("rosbags")
-    pytest.importorskip("flatbuffers")
+    pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
+    pytest.importorskip("flatbuffers", reason=needs("extras", "flatbuffers"))
     from studies.encodings import content, encode
 
     def sizes(kind: str, **parameters: Any) -> list[int]:

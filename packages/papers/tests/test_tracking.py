@@ -3,6 +3,7 @@
 import frame_cases
 import numpy as np
 import pytest
+from needs import needs
 from refusal_cases import refuse
 
 from bufgym import scenario, sim
@@ -193,7 +194,7 @@ def test_with_motion_for_images_it_decides_as_orbbuf() -> None:
 
 
 def test_images_are_like_themselves_less_like_what_moved_and_hardly_like_others() -> None:
-    pytest.importorskip("cv2")
+    pytest.importorskip("cv2", reason=needs("extras", "cv2"))
     from bufgym_papers.perception.room import made_up_room
 
     # Squares of noise, which have corners.

@@ -5,15 +5,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from needs import needs
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import JIT
 
-pytest.importorskip("cv2", reason="the extra perception is not installed")
-pytest.importorskip("rvl", reason="the extra perception is not installed")
+pytest.importorskip("cv2", reason=needs("extras", "cv2"))
+pytest.importorskip("rvl", reason=needs("extras", "rvl"))
 from bufgym_papers.perception import streams, views, worth
 
-pytestmark = pytest.mark.skipif(not JIT, reason="without compilation a room takes minutes to draw")
+pytestmark = pytest.mark.skipif(not JIT, reason=needs("compiled", "without compilation a room takes minutes to draw"))
 
 
 def made(**settings: Any) -> Any:

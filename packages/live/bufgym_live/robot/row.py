@@ -24,6 +24,12 @@ from bufgym.traces import Trace
 ROOM = 2**16  # Columns of a new row, 7 MB. After this many messages the settled ones are forgotten.
 
 
+def refuse_rivals(policy: Policy) -> None:
+    """Raise for a policy that sees the future or ignores L, which no live queue can."""
+    if policy.unbounded or policy.privileged is not None:
+        raise BufgymError(f"policy {policy.name}: {policy.unranked_because}: no policy for a live queue")
+
+
 class LiveRow:
     """One sender under one policy. Times never fall between calls, and rise at a knot."""
 
@@ -40,8 +46,7 @@ class LiveRow:
         ends_us: int | None = None,
         room: int = ROOM,
     ) -> None:
-        if policy.unbounded or policy.privileged is not None:
-            raise BufgymError(f"policy {policy.name}: {policy.unranked_because}: no policy for a live queue")
+        refuse_rivals(policy)
         self.policy = policy
         self.value = value
         self.senders = Senders(

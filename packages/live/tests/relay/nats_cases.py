@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import needs
 from relay_cases import ALL, relay, settings, until, wait, within
 
 from bufgym_live.relay import Nats, Rule, Server
 
-nats: Any = pytest.importorskip("nats", reason="no nats here: the extra mesh")
+nats: Any = pytest.importorskip("nats", reason=needs("extras", "nats"))
 NATS_SERVER = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin")
-needs_server = pytest.mark.skipif(NATS_SERVER is None, reason="no nats-server here")
+needs_server = pytest.mark.skipif(NATS_SERVER is None, reason=needs("nats", "no nats-server"))
 SHARED = Rule(nats=True, send=True, receive=True, topic="/robots/[^/]+/(odom|secret|command)")
 
 

@@ -11,9 +11,10 @@ from typing import Any
 
 import loop_cases
 import pytest
+from needs import needs
 
 for library in ("websockets", "re2", "jwt"):
-    pytest.importorskip(library, reason=f"no {library} here: the extra relay")
+    pytest.importorskip(library, reason=needs("extras", library))
 
 from websockets.asyncio.client import ClientConnection, connect  # noqa: E402
 from websockets.typing import Subprotocol  # noqa: E402
@@ -171,7 +172,7 @@ async def relay(config: Config | None = None) -> AsyncIterator[Server]:
 @contextlib.contextmanager
 def full_disk() -> Iterator[None]:
     """No file can grow while this lasts."""
-    resource = pytest.importorskip("resource", reason="needs POSIX")
+    resource = pytest.importorskip("resource", reason=needs("system", "resource"))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
     try:

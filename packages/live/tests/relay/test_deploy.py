@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from needs import needs
 
 from bufgym_live.relay.config import Limits
 
@@ -24,7 +25,7 @@ def test_the_unit_needs_no_root_and_has_files_for_all_connections() -> None:
     assert said["ExecStartPre"] == f"{said['ExecStart']} --check"
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason=needs("systemd"))
 def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     """With this Python for the command, which is not installed here. Of other units here it may say what it likes."""
     path = tmp_path / "bufgym-relay.service"
@@ -34,7 +35,9 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
 
 
 def test_the_containers_need_no_root_and_have_a_volume_each() -> None:
-    services = pytest.importorskip("yaml").safe_load((DEPLOY / "compose.yaml").read_text(encoding="utf-8"))
+    services = pytest.importorskip("yaml", reason=needs("extras", "yaml")).safe_load(
+        (DEPLOY / "compose.yaml").read_text(encoding="utf-8")
+    )
     image = (DEPLOY / "relay.Dockerfile").read_text(encoding="utf-8")
     assert set(services) == {"services", "volumes"}
     for name, volume in (("relay", "held"), ("nats", "stream")):

@@ -16,6 +16,7 @@ from unittest.mock import Mock
 
 import pytest
 from loop_cases import beside, compiled
+from needs import needs
 from relay_cases import ALL, Server, settings, until, wait
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosedError
@@ -32,7 +33,7 @@ from bufgym_live.relay.session import Session
 from bufgym_live.relay.store import Store
 from bufgym_live.robot.mcap_file import McapFile
 
-pytest.importorskip("mcap", reason="no mcap here: the extra relay")
+pytest.importorskip("mcap", reason=needs("extras", "mcap"))
 RULES = (ALL, Rule(recorder=True, receive=True, topic="/robots/.*"))
 CAMERA, COMMAND = "/robots/a/camera", "/robots/a/command"
 COMMANDS = 4

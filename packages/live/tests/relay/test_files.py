@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from needs import needs
 from refusal_cases import refuse
 from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, stranger, until, wait, within
 
@@ -26,7 +27,7 @@ from bufgym_live.relay.wire import Message
 from bufgym_live.robot.mcap_file import McapFile
 from bufgym_live.robot.sockets import free_port
 
-pytest.importorskip("mcap", reason="no mcap here: the extra relay")
+pytest.importorskip("mcap", reason=needs("extras", "mcap"))
 RECORD = Rule(recorder=True, receive=True, topic="/robots/.*")
 
 

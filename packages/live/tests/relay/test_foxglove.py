@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 from loop_cases import beside, compiled
 from made_up_robot import ODOMETRY, SCAN, MadeUp
+from needs import needs
 from relay_cases import ALL, Corner, client, relay, settings, until, within
 
-pytest.importorskip("foxglove", reason="no foxglove here: the extra foxglove")
+pytest.importorskip("foxglove", reason=needs("extras", "foxglove"))
 
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus

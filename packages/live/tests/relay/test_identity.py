@@ -14,6 +14,7 @@ import pytest
 from issuer_cases import Issuer
 from loop_cases import beside
 from msgspec.structs import replace
+from needs import needs
 from refusal_cases import refuse
 from relay_cases import client, relay, settings, until, wait
 from websockets.exceptions import WebSocketException
@@ -24,8 +25,8 @@ from bufgym_live.relay.address import token
 from bufgym_live.relay.config import Rule, Tls, Tokens
 from bufgym_live.relay.session import Session
 
-jwt = pytest.importorskip("jwt")
-x509 = pytest.importorskip("cryptography.x509")
+jwt = pytest.importorskip("jwt", reason=needs("extras", "jwt"))
+x509 = pytest.importorskip("cryptography.x509", reason=needs("extras", "cryptography.x509"))
 from cryptography.hazmat.primitives import hashes, serialization  # noqa: E402
 from cryptography.hazmat.primitives.asymmetric import ec  # noqa: E402
 

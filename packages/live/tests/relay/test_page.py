@@ -13,9 +13,10 @@ from typing import Any
 import pytest
 from browser_cases import browsing, shows
 from loop_cases import compiled
+from needs import needs
 
 for library in ("websockets", "re2", "rosbags", "PIL"):
-    pytest.importorskip(library, reason=f"no {library} here: the extra relay")
+    pytest.importorskip(library, reason=needs("extras", library))
 
 import fleet_demo as demo  # noqa: E402
 from pose_cases import ESTIMATE, ODOMETRY, POSE, TF, message  # noqa: E402

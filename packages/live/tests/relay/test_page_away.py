@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 from browser_cases import browsing, shows
 from loop_cases import compiled
+from needs import needs
 
 for library in ("websockets", "re2", "rosbags", "PIL"):
-    pytest.importorskip(library, reason=f"no {library} here: the extra relay")
+    pytest.importorskip(library, reason=needs("extras", library))
 
 from page_cases import Fleet  # noqa: E402
 from relay_cases import settings  # noqa: E402

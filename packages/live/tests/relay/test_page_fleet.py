@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from browser_cases import browsing, shows
 from loop_cases import compiled
+from needs import needs
 
 for library in ("websockets", "re2", "rosbags", "PIL"):
-    pytest.importorskip(library, reason=f"no {library} here: the extra relay")
+    pytest.importorskip(library, reason=needs("extras", library))
 
 from made_up_robot import jpeg  # noqa: E402
 from page_cases import CLOUD, Fleet, cdr, cloud, drawn, health  # noqa: E402

@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 from browser_cases import browsing
 from loop_cases import compiled
+from needs import needs
 
 for library in ("websockets", "re2", "jwt", "cryptography", "rosbags"):
-    pytest.importorskip(library, reason=f"no {library} here: the extra relay")
+    pytest.importorskip(library, reason=needs("extras", library))
 
 from issuer_cases import SignInServer  # noqa: E402
 from page_cases import Fleet  # noqa: E402

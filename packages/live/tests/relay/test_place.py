@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 from loop_cases import compiled
+from needs import needs
 from pose_cases import ESTIMATE, POSE, TF, message
 from refusal_cases import refuse
 
-pytest.importorskip("rosbags", reason="no rosbags here: the extra relay")
+pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 
 from bufgym.traces import read_workload
 from bufgym.traces.formats.bag_poses import ODOMETRY, carries_poses

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from issuer_cases import Issuer
 from mutations import COUNT, SEED, mutated
+from needs import needs
 from relay_cases import Server, client, relay, settings, until, wait
 from test_identity import ANNA
 from websockets.asyncio.client import ClientConnection, connect
@@ -18,7 +19,7 @@ from bufgym_live.relay import robofleet
 from bufgym_live.relay.config import Limits
 from bufgym_live.relay.wire import WireError
 
-flatbuffers = pytest.importorskip("flatbuffers", reason="no flatbuffers here: the extra relay")
+flatbuffers = pytest.importorskip("flatbuffers", reason=needs("extras", "flatbuffers"))
 
 
 def flat(type: str, topic: str, *texts: str, action: int | None = None) -> bytes:
@@ -56,8 +57,8 @@ def test_what_the_schema_says_is_read() -> None:
 
 def test_whole_messages_by_another_writer() -> None:
     """The flatbuffers of Table I, which are made from ROS's definitions."""
-    encodings = pytest.importorskip("studies.encodings")
-    pytest.importorskip("rosbags", reason="no rosbags here: the extra robofleet")
+    encodings = pytest.importorskip("studies.encodings", reason=needs("extras", "studies.encodings"))
+    pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
     data = encodings.encode("LaserScan", encodings.content("LaserScan"), "robofleet", topic="/robot/scan")
     assert robofleet.read(data)[:2] == ("sensor_msgs/LaserScan", "/robot/scan")
 

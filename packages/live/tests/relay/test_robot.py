@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from loop_cases import beside, compiled
 from made_up_robot import HALF_M, ODOMETRY, PICTURE, SCAN, MadeUp, Pose, cast, jpeg, odometry, picture, pose_at, scan
+from needs import needs
 from refusal_cases import refuse
 from relay_cases import Corner, settings, until, wait
 from websockets.exceptions import ConnectionClosedError
@@ -27,8 +28,8 @@ from bufgym_live.relay.monitor import Monitor
 from bufgym_live.relay.robot import Robot
 from bufgym_live.relay.session import Session
 
-pytest.importorskip("rosbags", reason="no rosbags here: the extra relay")
-pytest.importorskip("PIL", reason="no Pillow here: the extra relay")
+pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
+pytest.importorskip("PIL", reason=needs("extras", "PIL"))
 CONFIG = settings(policies=("drop-oldest",))
 
 
@@ -268,7 +269,7 @@ def test_a_robot_of_ros(version: str, request: pytest.FixtureRequest, tmp_path: 
     if version == "1":
         where = request.getfixturevalue("ros")
     else:
-        pytest.importorskip("rclpy", reason="needs rclpy (extra ros2)")
+        pytest.importorskip("rclpy", reason=needs("ros2", "rclpy"))
         where = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     places = [where.get("PYTHONPATH", ""), *map(str, (HERE, HERE.parent, HERE.parents[1], HERE.parents[3] / "tests"))]
     where = {**where, "PYTHONPATH": os.pathsep.join(filter(None, places))}

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from needs import needs
 from refusal_cases import refuse
 from relay_cases import client, relay, settings
 
@@ -19,7 +20,7 @@ BEFORE = Path(__file__).with_name("held_d36707ca.sql")
 COMMAND = "/robots/a/command"
 
 
-@pytest.mark.skipif(shutil.which("sqlite3") is None, reason="no sqlite3 here")
+@pytest.mark.skipif(shutil.which("sqlite3") is None, reason=needs("sqlite"))
 async def test_an_earlier_releases_store_is_backed_up_restored_and_opened(tmp_path: Path) -> None:
     """Command 1 of 3 was acked. 2 and 3 arrive, and 4 follows, although one pattern is no longer taken.
 

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from needs import needs
 from relay_cases import Corner, until, within
 
 from bufgym.model.link import Link
@@ -47,7 +48,7 @@ async def client(*words: str) -> AsyncIterator[list[str]]:
     """The example's process, and the lines that it has printed."""
     command = node()
     if command is None:
-        pytest.skip("no Node with WebSockets here: 20.10 or later")
+        pytest.skip(needs("node", "no Node with WebSockets: 20.10 or later"))
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(*command, str(CLIENT), *words, stdout=pipe)
     lines = list[str]()

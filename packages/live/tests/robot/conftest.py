@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from needs import needs
 
 from bufgym_live.robot import sender
 from bufgym_live.robot.sockets import free_port
@@ -23,7 +24,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def broker_port() -> Iterator[int]:
     mosquitto = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
     if mosquitto is None:
-        pytest.skip("no mosquitto here, a broker of MQTT")
+        pytest.skip(needs("mqtt", "no mosquitto, a broker"))
     port = free_port("127.0.0.1")
     with subprocess.Popen([mosquitto, "-p", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as broker:
         try:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from loop_cases import beside
+from needs import needs
 
 from bufgym_live.robot import PolicyQueue
 from bufgym_live.robot.channels import TRANSPORTS
@@ -36,7 +37,7 @@ def as_simulated(folder: Path) -> bool:
 def meeting_port(transport: str, request: pytest.FixtureRequest) -> int:
     """Where a receiver listens: any port, or over MQTT the broker's; skips what is not installed."""
     if transport in LIBRARIES:
-        pytest.importorskip(LIBRARIES[transport], reason=f"no {LIBRARIES[transport]} here")
+        pytest.importorskip(LIBRARIES[transport], reason=needs("extras", LIBRARIES[transport]))
     return int(request.getfixturevalue("broker_port")) if transport == "mqtt" else 0
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from loop_cases import compiled
+from needs import needs
 from refusal_cases import refuse
 
 from bufgym import policies
@@ -142,7 +143,7 @@ SMALL: dict[str, dict[str, Any]] = {
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", SMALL)
 def test_each_is_played_live(name: str, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
     expected, steps = list[tuple[int, float]](), list[int]()
 
     @contextmanager

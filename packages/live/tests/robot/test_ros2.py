@@ -15,6 +15,7 @@ from cli_cases import fails
 from hypothesis import given
 from hypothesis import strategies as st
 from live_cases import VALIDATE, as_simulated
+from needs import needs
 from refusal_cases import refuse
 from ros1_cases import played
 
@@ -34,7 +35,7 @@ from bufgym_live.robot.ros2.relay import RosSender
 
 REPO = Path(__file__).resolve().parents[4]
 NO_ROS = not JIT or importlib.util.find_spec("rclpy") is None
-in_ros = pytest.mark.skipif(NO_ROS, reason="needs rclpy (extra ros2), and compiled decisions")
+in_ros = pytest.mark.skipif(NO_ROS, reason=needs("ros2" if JIT else "compiled"))
 
 
 def run(*words: object) -> str:

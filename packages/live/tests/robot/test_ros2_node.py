@@ -18,6 +18,7 @@ from typing import Final
 import pytest
 from live_cases import in_order, receiving
 from loop_cases import until
+from needs import needs
 from roscpp_cases import gone, run
 
 from bufgym.model import qoi
@@ -55,7 +56,7 @@ def where() -> dict[str, str]:
     named = [str(prefix) for prefix in prefixes if (prefix / "share" / "rclcpp" / "cmake").is_dir()]
     if not named or (importlib.util.find_spec("rclpy") is None and not shutil.which("ros2")):
         looked = ", ".join(map(str, prefixes)) or "BUFGYM_ROS2_PREFIX, AMENT_PREFIX_PATH, /opt/ros"
-        pytest.skip(f"rclcpp, or a rclpy to publish with, was not found; looked in {looked}")
+        pytest.skip(needs("rclcpp", f"rclcpp, or a rclpy to publish with, was not found; looked in {looked}"))
     setup = Path(named[0], "setup.bash")
     source = f"source {setup} && " if setup.exists() else ""
     lines = run("bash", "-c", f"{source}env -0").split("\0")
@@ -141,7 +142,7 @@ async def test_its_launch_file(installed: dict[str, str]) -> None:
     """All that the file leaves at its defaults is good enough to start with."""
     ros2 = shutil.which("ros2", path=installed.get("PATH"))
     if ros2 is None:
-        pytest.skip("no ros2 launch here")
+        pytest.skip(needs("rclcpp", "no ros2 launch"))
     async with receiving() as (_, port, came):
         given = "topics:=['/camera']", f"port:={port}", "namespace:=robot"
         launch = started(installed, ros2, "launch", "bufgym_sender", "sender.launch.xml", *given)

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import pytest
 from live_cases import in_order, receiving
 from loop_cases import until
+from needs import needs
 from refusal_cases import refuse
 from roscpp_cases import gone, run
 
@@ -48,7 +49,7 @@ def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A program without ROS over the package's library, with three policies."""
     for needed in ("cmake", "g++"):
         if shutil.which(needed) is None:
-            pytest.skip(f"no {needed} here")
+            pytest.skip(needs("compiler", needed))
     folder = tmp_path_factory.mktemp("ros2")
     source = rclcpp.write(folder / "source", roscpp.find(POLICIES))
     run("cmake", "-S", source, "-B", folder, "-DCMAKE_BUILD_TYPE=Debug", "-DCMAKE_DISABLE_FIND_PACKAGE_ament_cmake=ON")
@@ -62,7 +63,7 @@ def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def node(request: pytest.FixtureRequest, talker: Path) -> Path:
     """The node itself over a double of rclcpp, and what drives it; nightly with each access to memory checked."""
     if not (MESSAGES / "nav_msgs").is_dir():
-        pytest.skip(f"no C++ of ROS 2's messages in {MESSAGES}")
+        pytest.skip(needs("rclcpp", f"no C++ of ROS 2's messages in {MESSAGES}"))
     folder, source = talker.parent / f"node{request.param}", talker.parent / "source"
     for name in DOUBLED:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

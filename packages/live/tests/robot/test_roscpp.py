@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from needs import needs
 from refusal_cases import refuse
 from roscpp_cases import block, build, gone, missing, publishers, seqs, subscriber
 
@@ -26,7 +27,7 @@ pytestmark = pytest.mark.timeout(600)  # the build takes seconds, and minutes be
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the library with three policies, and of a node that knows nothing of it."""
     if reason := missing():
-        pytest.skip(reason)
+        pytest.skip(needs("roscpp", reason))
     return build(tmp_path_factory.mktemp("roscpp"), "afr,drop-oldest,learned").parent
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from live_cases import Channel, meeting_port
 from loop_cases import beside, until
+from needs import needs
 from ros1_cases import played
 
 from bufgym import policies
@@ -33,7 +34,8 @@ from bufgym_live.robot.sender import Sender
 
 V = qoi.exponential(0.618)
 REPO = Path(__file__).resolve().parents[4]
-in_namespaces = pytest.mark.skipif(bool(tunnel.impossible()), reason=tunnel.impossible() or "it can")
+NO_TUNNEL = "tunnel" if "the command ip" in tunnel.impossible() else "root", tunnel.impossible()
+in_namespaces = pytest.mark.skipif(bool(NO_TUNNEL[1]), reason=needs(*NO_TUNNEL))
 
 
 # --- how many messages fill a path -----------------------------------------------------------------------------------
@@ -206,7 +208,7 @@ def test_every_transport_as_in_the_simulator(transport: str, request: pytest.Fix
     """12 s over 1, 50 and 150 ms. On a quiet machine counts differ by what TCP's start costs: some round trips."""
     where = request.getfixturevalue("ros") if transport == "ros1" else {**os.environ, "PYTHONPATH": str(REPO)}
     if transport == "ros2":
-        pytest.importorskip("rclpy", reason="ROS 2 is not here")
+        pytest.importorskip("rclpy", reason=needs("ros2", "rclpy"))
     meeting_port(transport, request)
     words = ["--rtt", 1, 50, 150, "--mbit", 24, "--seconds", 12, "--senders", transport]
     rows = [row.split() for row in played(where, "-m", "studies.round_trips", *words).splitlines() if "measured" in row]
@@ -229,7 +231,7 @@ def test_where_no_namespace_can_be_made(monkeypatch: pytest.MonkeyPatch, capsys:
 # --- a program that needs no compiler --------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not JIT, reason="nothing is compiled here")
+@pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled here"))
 def test_a_live_program_decides_without_a_compiler() -> None:
     """In plain Python, Numba is not even imported, and the decisions are those of compiled code."""
     code = """

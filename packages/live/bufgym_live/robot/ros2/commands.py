@@ -54,10 +54,11 @@ async def send(
     from bufgym.scenario import read_client
     from bufgym_live.robot import LogFile
     from bufgym_live.robot.ros2.relay import SENDER, RosSender, own_node
+    from bufgym_live.robot.row import refuse_rivals
 
     client = None if config is None else read_client(config)
     if policies is not None:
-        one_policy(policies, policy_file)
+        refuse_rivals(one_policy(policies, policy_file))
     host, port = address(to)
     with contextlib.ExitStack() as stack:
         node = stack.enter_context(own_node(SENDER, ros_args))
