@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from recording_cases import FOLDERS, recorded_data
 
 from bufgym.ground import kernel
 from bufgym.policies import registry
@@ -35,15 +36,10 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "commit"))
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of recorded traces and trajectories, too big for the repository; skips where it is absent.
-
-    ``$BUFGYM_SHARED_DATA`` where that is set, else ``shared/data`` beside the checkout.
-    """
-    named = os.environ.get("BUFGYM_SHARED_DATA")
-    folder = Path(named) if named else REPO.parent / "shared" / "data"
+    """The folder of recorded data that may not be published here; skips where it is absent."""
+    folder = recorded_data()
     if not folder.is_dir():
-        where = "$BUFGYM_SHARED_DATA" if named else "shared/data beside the checkout"
-        pytest.skip(f"recorded data absent: {where} is no folder (set BUFGYM_SHARED_DATA)")
+        pytest.skip(f"recorded data absent: BUFGYM_SHARED_DATA must name a folder of {', '.join(FOLDERS.values())}")
     return folder
 
 
