@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
-from recording_cases import FOLDERS, recorded_data
+from recording_cases import recorded_data
 
 from bufgym.ground import kernel
 from bufgym.policies import registry
@@ -36,10 +36,10 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "commit"))
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of recorded data that may not be published here; skips where it is absent."""
+    """The folder of recorded data, which holds what may not be passed on; skips where it is absent."""
     folder = recorded_data()
     if not folder.is_dir():
-        pytest.skip(f"recorded data absent: BUFGYM_SHARED_DATA must name a folder of {', '.join(FOLDERS.values())}")
+        pytest.skip("recorded data absent: BUFGYM_SHARED_DATA must name a folder of files that may not be published")
     return folder
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from cli_cases import Capsys, Patch, fails, shown
 from http_server import DATA, SHA256, Site, get, left, of
+from recording_cases import RECORDINGS
 from refusal_cases import refuse
 from requests import PreparedRequest, Response
 
@@ -100,6 +101,13 @@ def test_the_table_says_what_is_known() -> None:
             assert remote.sha256 is None or re.fullmatch("[0-9a-f]{64}", remote.sha256)
             if "githubusercontent" in remote.address:
                 assert re.search("/[0-9a-f]{40}/", remote.address)  # a commit, not a branch that moves
+
+
+def test_the_sums_are_those_of_the_recordings_of_the_tests() -> None:
+    """So whoever fetches them has the very same files."""
+    files = {path.relative_to(RECORDINGS).as_posix(): path for path in RECORDINGS.glob("*/*") if path.name != "LICENSE"}
+    sums = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+    assert sums == {name: table.checksums().get(name) for name in files} != {}
 
 
 @pytest.mark.nightly
