@@ -234,7 +234,7 @@ BROKEN = [
 def test_broken_links(tmp_path: Path, text: str | bytes, says: str) -> None:
     with pytest.raises(TraceError, match=says) as caught:
         read_trace(written(tmp_path, text))
-    assert "lte.csv" in str(caught.value) and len(str(caught.value)) < 500
+    assert "lte.csv" in str(caught.value) and str(caught.value).isprintable()  # in one line
 
 
 def test_damaged_gzip(tmp_path: Path) -> None:
