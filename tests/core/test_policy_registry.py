@@ -71,7 +71,7 @@ def test_agrees_with_twin(spec, case, v):
 
 
 ELSEWHERE = {"target-gap": "test_target_gap.py", "price-dp": "test_price_dp.py", "gap-price": "test_guided.py"}
-"""Policy -> the test beside this one that has its reference model. Networks from files have theirs in test_learned.py."""
+"""Policy -> the file beside this one that has its reference model. That of networks is in test_learned.py."""
 
 
 def test_each_built_in_policy_has_a_reference_model():

@@ -72,6 +72,17 @@ def test_numbers_worked_by_hand(tmp_path: Path, format: str, text: str, expected
     assert trace.name == "link" and f"format {format}, detected" in trace.source
 
 
+def test_each_format_has_a_sample() -> None:
+    lacking = sorted({*FORMATS} - {*SAMPLES})
+    assert not lacking, f"no sample of the formats {lacking}: add them to SAMPLES of tests/traces/link_files.py"
+
+
+def test_each_format_has_a_row() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "guide" / "recordings.md").read_text(encoding="utf-8")
+    lacking = [name for name in FORMATS if f"\n| `{name}` |" not in page]
+    assert not lacking, f"docs/guide/recordings.md has no row of the formats {lacking}"
+
+
 @pytest.mark.parametrize("format", SAMPLES)
 def test_same_trace_by_any_packing(tmp_path: Path, format: str) -> None:
     text = SAMPLES[format]
