@@ -60,7 +60,7 @@ def read_kilobytes(path: StrPath) -> Knots:
     with open_text(path) as file:
         carried = [line.whole("kB", line.columns(2)[1], 10**9) for line in file.lines()]
     times_us, carried = [k * 1_000_000 for k in range(len(carried) + 1)], [0, *carried]
-    return Knots(times_us, [1000 * sum(carried[: k + 1]) for k in range(len(carried))])
+    return Knots(np.array(times_us), 1000 * np.cumsum(carried))
 '''
 FIGURE = '''
 from dataclasses import dataclass
