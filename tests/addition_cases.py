@@ -57,10 +57,11 @@ FORMAT = '''
 
 def read_kilobytes(path: StrPath) -> Knots:
     """Knots of a file with a line for each second."""
+    intervals = Intervals()
     with open_text(path) as file:
-        carried = [line.whole("kB", line.columns(2)[1], 10**9) for line in file.lines()]
-    times_us, carried = [k * 1_000_000 for k in range(len(carried) + 1)], [0, *carried]
-    return Knots(np.array(times_us), 1000 * np.cumsum(carried))
+        for line in file.lines():
+            intervals.add(1_000_000, 1000 * line.whole("kB", line.columns(2)[1], 10**9))
+    return intervals.knots(path)
 '''
 FIGURE = '''
 from dataclasses import dataclass
