@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 from needs import needs
+from recording_cases import recorded_data
 from registries import forgotten, restored
 
 from bufgym.ground import kernel
@@ -46,15 +47,10 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of recorded traces and trajectories, too big for the repository; skips where it is absent.
-
-    ``$BUFGYM_SHARED_DATA`` where that is set, else ``shared/data`` beside the checkout.
-    """
-    named = os.environ.get("BUFGYM_SHARED_DATA")
-    folder = Path(named) if named else REPO.parent / "shared" / "data"
+    """The folder of recorded data, which holds what may not be passed on; skips where it is absent."""
+    folder = recorded_data()
     if not folder.is_dir():
-        where = "$BUFGYM_SHARED_DATA" if named else "shared/data beside the checkout"
-        pytest.skip(needs("data", f"{where} is no folder (set BUFGYM_SHARED_DATA)"))
+        pytest.skip(needs("data", "BUFGYM_SHARED_DATA must name a folder of files that may not be published"))
     return folder
 
 

@@ -20,7 +20,8 @@ def test_both_programs_send_clouds_and_say_what_it_cost() -> None:
     rows = figure("robofleet-table2", runs=1, seconds=0.5, points=100).simulate()
     assert [row["program"] for row in rows] == ["robofleet", "rosbridge"]
     assert 1 <= rows[0]["received"] <= rows[1]["received"] == 5
-    assert all(row["cpu"] > 0 and row["virtual_mb"] > row["resident_mb"] > 10 for row in rows)
+    for row in rows:
+        assert row["cpu"] > 0 and row["virtual_mb"] > row["resident_mb"] > 10, row["program"]
 
 
 def test_a_claim_holds_if_it_does_in_every_run() -> None:

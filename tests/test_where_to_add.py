@@ -4,138 +4,14 @@ One process of plain Python uses them all. What is tried is where lines go, and 
 """
 
 import json
-import os
 import re
-import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from addition_cases import REPO, ROWS, copied, surroundings
 
-REPO = Path(__file__).resolve().parent.parent
-
-
-@dataclass(frozen=True)
-class Addition:
-    """What a row of the table adds."""
-
-    files: dict[str, str]
-    """New file -> its text."""
-    lines: dict[str, tuple[str, str]]
-    """File -> (text that is there once, the same text with what is added)."""
-    use: str
-    """A program that uses it, and fails without it."""
-
-
-RULE = '''
-@built_in("newest-two", source="this test")
-def newest_two(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Keep the newest two."""
-    return 0 if len(buffer.slots) >= 2 else ACCEPT
-'''
-STEADY = '''
-import numpy as np
-
-from bufgym.model import qoi
-from bufgym.model.link import Link
-from bufgym.scenario.arrivals import messages
-from bufgym.scenario.episode import Episode, Streams
-from bufgym.traces import Trace
-
-
-class Halves:
-    """A message every second over a link that carries one in two."""
-
-    value, topics, max_messages = qoi.exponential(), (), 20
-
-    def draw(self, streams: Streams) -> Episode:
-        return Episode(messages(np.arange(20) * 1_000_000, 1000), Link(Trace.steps([(60.0, 500.0)])))
-'''
-SUITE = """
-def _halves(split: str, data: str | None = None) -> dict[str, Setting]:
-    links = tuple(Trace.steps([(60.0, 1e6 * (k + 1))], name=f"{split}-{k}") for k in range(3))
-    return both_values(links, motions_of(split, 1))
-
-
-SUITES += (Suite("halves-v1", "slow links", _halves, capacities=(2,), seeds=1),)
-"""
-FORMAT = '''
-def read_kilobytes(path: StrPath) -> Knots:
-    """Knots of a file with a line for each second."""
-    with open_text(path) as file:
-        carried = [line.whole("kB", line.columns(2)[1], 10**9) for line in file.lines()]
-    times_us, carried = [k * 1_000_000 for k in range(len(carried) + 1)], [0, *carried]
-    return Knots(times_us, [1000 * sum(carried[: k + 1]) for k in range(len(carried))])
-'''
-FIGURE = '''
-from dataclasses import dataclass
-from typing import Any
-
-from bufgym_papers.figures.figure import Figure
-from bufgym_papers.figures.rows import FigureRows
-
-
-@dataclass(frozen=True)
-class Reproduction(Figure):
-    """A straight line."""
-
-    last: int = 3
-
-    def simulate(self) -> FigureRows:
-        return FigureRows({"k": k} for k in range(self.last + 1))
-
-    def claims(self, rows: FigureRows) -> dict[str, Any]:
-        return {"grows": list(rows.column("k")) == sorted(rows.column("k"))}
-
-    def draw(self, rows: FigureRows, figure: Any) -> None:
-        figure.add_subplot().plot(rows.column("k"))
-'''
-SENTENCES = """
-[afr-line]
-title = "A line"
-[afr-line.claims.grows]
-place = "Sec. IV"
-says = "It grows."
-ours = "To {last}."
-"""
-COMMAND = '''"""``bufgym hello``."""
-
-
-def hello(name: str) -> None:
-    """Greet."""
-    print(f"hello, {name}")
-'''
-FIELD = """
-    Field("half_full", "context", "queue", "flag", "1 where half of the places are taken",
-          lambda buffer, arrival: float(2 * len(buffer.slots) >= buffer.capacity)),
-"""
-TERM = """
-@built_in("starved", unit="steps")
-def starved(step: Any, memory: Any) -> float:
-    "minus 1 for a step in which nothing reaches the server"
-    return -float(len(step.delivered) == 0)
-"""
-BUS = '''
-class MemoryBus:
-    """Both ends in one process."""
-
-    ENDS: Final[dict[Any, Any]] = {}
-
-    def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
-        self.place, self.name, self.hear = (host, port), name, hear
-        self.ENDS[self.place, name] = self
-        peer(True)
-
-    def publish(self, name: str, data: bytes) -> None:
-        self.ENDS[self.place, "" if self.name else name].hear(name, data)
-
-    def close(self) -> None:
-        self.ENDS.pop((self.place, self.name), None)
-
-
-BUSES: Final[dict[str, Open]] = {"memory": MemoryBus, '''
 USES = """
 import asyncio, json, sys, traceback
 import gymnasium as gym, numpy as np
@@ -150,112 +26,6 @@ for row, use in json.loads(sys.argv[1]).items():
 print()
 print(json.dumps(faults))
 """
-LIVE, PAPERS = "packages/live/bufgym_live", "packages/papers/bufgym_papers"
-ROWS = {
-    "a policy": Addition(
-        {},
-        {"bufgym/policies/classic.py": ("\n\n@built_in(", f"\n{RULE}\n\n@built_in(")},
-        "assert 'newest-two' in bufgym.policies.names()\n"
-        "words = '--trace lte-synthetic-0 --seconds 2 --fps 5 --seeds 1 --capacity 2 --no-bound'\n"
-        "assert main(['bench', '--policies', 'newest-two', *words.split()]) == 0",
-    ),
-    "an observation field": Addition(
-        {},
-        {"bufgym/model/observe/on_board.py": ("ON_BOARD_FIELDS = (\n", f"ON_BOARD_FIELDS = ({FIELD}")},
-        "env = gym.make('bufgym/Uplink-v0', fields=['half_full', 'occupancy'], capacity=3); env.reset(seed=0)\n"
-        "for _ in range(40):\n"
-        "    seen = env.step(3)[0]\n"
-        "    assert seen['half_full'] == (seen['occupancy'] >= 0.5)\n"
-        "from bufgym.policies.learned import NAMES\n"
-        "assert 'half_full' in NAMES",
-    ),
-    "a reward term": Addition(
-        {},
-        {"bufgym/model/observe/terms.py": ('\n\n@built_in("energy"', f'\n{TERM}\n\n@built_in("energy"')},
-        "env = gym.make('bufgym/Uplink-v0', reward={'starved': 1.0}); env.reset(seed=0)\n"
-        "assert env.step(0)[1] in (-1.0, 0.0)",
-    ),
-    "a scenario": Addition(
-        {"bufgym/scenario/halves.py": STEADY},
-        {
-            "bufgym/scenario/registry.py": (
-                "SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {\n",
-                "from bufgym.scenario.halves import Halves\n"
-                "SCENARIOS: dict[str, tuple[Callable[[], Scenario], str]] = {\n    'halves': (Halves, 'one in two'),\n",
-            )
-        },
-        "assert bufgym.scenario.draw(bufgym.scenario.get('halves'), 0).arrivals['arrival_us'][1] == 1_000_000",
-    ),
-    "an environment": Addition(
-        {},
-        {
-            "bufgym/__init__.py": (
-                "ENVIRONMENTS = {\n",
-                "ENVIRONMENTS = {\n    'bufgym/Halves-v0': ('halves', 'one in two', {'capacity': 3}),\n",
-            )
-        },
-        "assert gym.make('bufgym/Halves-v0').reset(seed=0)[0]['rank'].shape == (4,)",
-    ),
-    "a suite": Addition(
-        {},
-        {"bufgym/scenario/suites/synthetic.py": ("", SUITE)},
-        "from bufgym.scenario import suites\n"
-        "assert [len(suites.get('halves-v1').settings(split)) for split in suites.SPLITS] == [2, 2, 2]",
-    ),
-    "an option of environments": Addition(
-        {},
-        {
-            "bufgym/envs/options.py": ("    bound: bool", "    sloth: int = 0\n    bound: bool"),
-            "bufgym/envs/rows.py": (
-                "        self._own_fields =",
-                "        self.sloth = options.sloth\n        self._own_fields =",
-            ),
-        },
-        "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.rows.sloth == 3",
-    ),
-    "a trace format": Addition(
-        {},
-        {
-            "bufgym/traces/formats/tables.py": ("", FORMAT),
-            "bufgym/traces/formats/links.py": (
-                '    "iperf3":',
-                '    "kilobytes": Format("kB, a number", _cells("kB", NUMBER), tables.read_kilobytes),\n    "iperf3":',
-            ),
-        },
-        "open('mine.txt', 'w').write('kB 5\\nkB 7\\n')\n"
-        "assert bufgym.traces.read_trace('mine.txt').cumulative_bytes.tolist() == [0, 5000, 12000]",
-    ),
-    "a figure of a paper": Addition(
-        {f"{PAPERS}/figures/afr_line.py": FIGURE},
-        {f"{PAPERS}/figures/afr.toml": ("", SENTENCES)},
-        "assert main(['reproduce', 'afr-line', '--out', 'figures']) == 0",
-    ),
-    "a command": Addition(
-        {"bufgym/cli/hello.py": COMMAND},
-        {"bufgym/cli/__init__.py": ('    "play":', '    "hello": "bufgym.cli.hello:hello",\n    "play":')},
-        "assert main(['hello', 'you']) == 0",
-    ),
-    "a transport": Addition(
-        {},
-        {
-            f"{LIVE}/robot/buses.py": ("BUSES: Final[dict[str, Open]] = {", BUS.lstrip("\n")),
-            f"{LIVE}/robot/commands.py": ('Literal["tcp", ', 'Literal["memory", "tcp", '),
-        },
-        "from bufgym_live.robot import TRANSPORTS, PolicyQueue, Receiver, Sender\n"
-        "async def all_come():\n"
-        "    came = []\n"
-        "    receiver = Receiver(came.append)\n"
-        "    queue = PolicyQueue('drop-oldest', 4)\n"
-        "    sender = Sender(queue, lambda: TRANSPORTS['memory']('127.0.0.1', 1), 'acked')\n"
-        "    await receiver.listen(1, '127.0.0.1', 'memory')\n"
-        "    queue.put(b'body', 4)\n"
-        "    queue.close()\n"
-        "    await asyncio.wait_for(sender.run(), 10)\n"
-        "    await receiver.close()\n"
-        "    assert [message.body for message in came] == [b'body']\n"
-        "asyncio.run(all_come())",
-    ),
-}
 
 
 ELSEWHERE = {"a learner": "test_a_new_learner_is_a_class_and_its_settings"}
@@ -269,31 +39,12 @@ def test_each_row_of_the_table_is_tried() -> None:
 
 
 @pytest.fixture(scope="module")
-def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The core and the packages with all additions."""
-    folder = tmp_path_factory.mktemp("copy")
-    for name in ("bufgym", LIVE, PAPERS, "agents", "traces"):
-        shutil.copytree(REPO / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for row, addition in ROWS.items():
-        for name, text in addition.files.items():
-            (folder / name).write_text(text, encoding="utf-8")
-        for name, (old, new) in addition.lines.items():
-            file = folder / name
-            text = file.read_text(encoding="utf-8")
-            assert not old or old in text, (row, name)
-            file.write_text(text.replace(old, new, 1) if old else text + new, encoding="utf-8")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def faults(copy: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What went wrong with a row's thing, in a process that uses all of them."""
-    places = os.pathsep.join(map(str, (copy, copy / Path(LIVE).parent, copy / Path(PAPERS).parent)))
-    environment = {**os.environ, "PYTHONPATH": places, "NUMBA_DISABLE_JIT": "1", "MPLBACKEND": "agg"}
     done = subprocess.run(
         [sys.executable, "-c", USES, json.dumps({row: addition.use for row, addition in ROWS.items()})],
         cwd=tmp_path_factory.mktemp("used"),
-        env=environment,
+        env=surroundings(copied(tmp_path_factory.mktemp("copy"), ROWS)),
         capture_output=True,
         text=True,
         check=False,
@@ -306,3 +57,52 @@ def faults(copy: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, st
 @pytest.mark.parametrize("row", ROWS)
 def test_what_a_row_adds_is_there(row: str, faults: dict[str, str]) -> None:
     assert row not in faults, faults[row]
+
+
+CONTRIBUTIONS = ("a policy", "an observation field", "a trace format")
+CHECKS = {
+    "tests/core/naive_policies.py": "core/test_policy_registry.py::test_each_built_in_policy_has_a_reference_model",
+    "docs/guide/yours-to-change.md": "core/test_observe.py::test_each_field_on_board_is_on_its_page",
+    "tests/traces/link_files.py": "traces/test_readers.py::test_each_format_has_a_sample",
+    "docs/guide/recordings.md": "traces/test_readers.py::test_each_format_has_a_row",
+}
+"""File of a step that is easily forgotten -> the test that names it."""
+
+
+def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a module in the copy."""
+    command = [sys.executable, "-m", *words]
+    return subprocess.run(command, cwd=folder, env=surroundings(folder), capture_output=True, text=True, check=False)
+
+
+def checked(folder: Path, *tests: str) -> subprocess.CompletedProcess[str]:
+    return run(
+        folder, "pytest", "-q", "-p", "no:cacheprovider", "-m", "not nightly", *(f"tests/{name}" for name in tests)
+    )
+
+
+def test_a_forgotten_step_is_named_by_its_file(tmp_path: Path) -> None:
+    done = checked(copied(tmp_path, CONTRIBUTIONS, forgotten=CHECKS), *CHECKS.values())
+    assert f"{len(CHECKS)} failed" in done.stdout, done.stdout + done.stderr
+    for file, name in zip(CHECKS, ("newest-two", "half_full", "kilobytes", "kilobytes"), strict=True):
+        assert re.search(rf"^E +AssertionError: .*({name}.*{file}|{file}.*{name})", done.stdout, re.MULTILINE), file
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(900)  # mypy has nothing cached
+def test_contributions_pass_the_checks(tmp_path: Path) -> None:
+    folder = copied(tmp_path, CONTRIBUTIONS)
+    changed = [name for row in CONTRIBUTIONS for name in ROWS[row].lines if name.startswith("bufgym/")]
+    for words in (("ruff", "format", "--check", "."), ("ruff", "check", "."), ("mypy", *changed)):
+        done = run(folder, *words)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    "file", sorted({name.partition("::")[0] for name in CHECKS.values()} | {"core/test_on_board.py"})
+)
+def test_contributions_pass_the_tests_of_their_registries(file: str, tmp_path: Path) -> None:
+    done = checked(copied(tmp_path, CONTRIBUTIONS), file)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -80,5 +80,5 @@ def test_each_part_is_named_and_runs(capsys: pytest.CaptureFixture[str]) -> None
     assert main(["warmup"]) == 0
     told = capsys.readouterr()
     text = told.out + told.err
-    assert all(f"/{len(PARTS)} {name}: " in text for name in PARTS)
+    assert not [name for name in PARTS if f"/{len(PARTS)} {name}: " not in text]
     assert FOLDER in text

@@ -135,4 +135,4 @@ def test_on_one_queue_it_drops_its_oldest_first_in_first_out(case, v):
 
 def test_weights_of_another_shape_are_refused():
     refuse(r"must be 17 x 9 finite numbers", SchedulerWeights(np.zeros((2, 3), np.float32)).policy, "some")
-    assert len(guided_topics.BASE) == 17 and guided_topics.BASE.any()
+    assert len(guided_topics.BASE) == SchedulerWeights.SHAPE[0] and guided_topics.BASE.any()

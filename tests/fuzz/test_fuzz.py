@@ -21,6 +21,7 @@ import pytest
 from link_files import SAMPLES
 from mutations import COUNT, SEED, limited, mutated
 from needs import needs
+from recording_cases import RECORDINGS, recorded_data
 
 from bufgym import policies
 from bufgym.benchmark import leaderboard, report
@@ -122,12 +123,12 @@ def archives(folder: Path) -> Kind:
 def links(folder: Path) -> Kind:
     """A file of each format, and the beginnings of recorded ones; some packed, and some of these changed after that."""
     files = [("lte.csv", text.encode()) for text in SAMPLES.values()]
-    named = os.environ.get("BUFGYM_SHARED_DATA")
-    data = Path(named) if named else HERE.parents[2] / "shared" / "data"
     globs = "mahimahi/*.gz belgium_4g/csv/*foot*.csv belgium_4g/raw/*.log belgium_4g/sabre_json/*foot*.json"
     globs += " norway_hsdpa/cooked/*bus* uplink_5g/*.gz uplink_wifi/*.gz uplink_mmwave/*.gz"
-    for pattern in globs.split():
-        for path in sorted(data.glob(pattern))[:3]:
+    recorded = [sorted(recorded_data().glob(pattern))[:3] for pattern in globs.split()]
+    own = [path for path in RECORDINGS.glob("*/*") if path.name != "LICENSE"]
+    for paths in (sorted(own), *recorded):
+        for path in paths:
             raw = path.read_bytes()
             files.append(("lte.csv", (gzip.decompress(raw) if path.suffix == ".gz" else raw)[:3000]))
     others = [raw for _, raw in files]

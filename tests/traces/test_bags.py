@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from needs import needs
+from recording_cases import fetched
 from refusal_cases import refuse
 
 pytest.importorskip("mcap", reason=needs("extras", "mcap"))
@@ -250,17 +251,14 @@ def test_cut_off_recordings_are_refused(tmp_path: Path) -> None:
             refused(path, r"cut: (cut off or damaged: |must be an MCAP file)")
 
 
-def test_real_recordings(shared_data: Path) -> None:
+def test_real_recordings() -> None:
     nav2, tree = {"/odom": 2639, "/tf": 5422, "/tf_static": 1, "/amcl_pose": 135}, {"/tf": 517, "/tf_static": 1}
     for name, counts, odom, seconds in (
         ("nav2_turtlebot.mcap", nav2, "/odom", 97.36),
         ("tf_example.bag", tree, "/tf", 51.6),
         ("tf_example", tree, "/tf", 51.6),
     ):
-        path = shared_data / "rosbags" / name
-        if not path.exists():
-            pytest.skip(needs("data", f"rosbags/{name}"))
-        bag = read_bag(path, odom)
+        bag = read_bag(fetched("evo-bags") / name, odom)
         assert {list(bag.topics)[k]: int(n) for k, n in enumerate(np.bincount(bag.topic))} == counts
         workload = workload_from_bag(bag, topics=[odom], bridge_gaps=True)
         assert workload.duration_us / 1e6 == pytest.approx(seconds, abs=0.05)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from link_files import written
+from recording_cases import fetched
 from refusal_cases import refuse
 
 from bufgym.ground.errors import TraceError
@@ -183,9 +184,10 @@ def test_matrices_to_quaternions_and_back(numbers: tuple[float, float, float, fl
     assert min(np.abs(computed - expected).max(), np.abs(computed + expected).max()) < 1e-12
 
 
-def test_real_kitti(shared_data: Path) -> None:
+def test_real_kitti() -> None:
     """Sequence 00 is 3.7 km long, 4541 poses in 470.6 s; its times come from the file beside."""
-    motion = read_motion(shared_data / "kitti" / "KITTI_00_gt.txt.gz", MotionSettings(fov_deg=1e9, scene_scale_m=1))
+    (path,) = fetched("kitti-00").glob("KITTI_00_gt.txt*")
+    motion = read_motion(path, MotionSettings(fov_deg=1e9, scene_scale_m=1))
     assert motion.total == pytest.approx(3724, abs=1) and (motion.time_us.size, motion.gaps) == (4541, ())
     assert motion.duration_us / 1e6 == pytest.approx(470.6, abs=0.1)
-    assert "times from KITTI_00_gt_times.txt.gz" in motion.source
+    assert "times from KITTI_00_gt_times.txt" in motion.source

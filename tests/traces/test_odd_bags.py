@@ -22,6 +22,7 @@ pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 import bag_cases as cases
 import zstandard
 from mcap.writer import CompressionType
+from recording_cases import ODD_FILES
 
 from bufgym.ground.errors import TraceWarning
 from bufgym.traces import read_bag, read_workload
@@ -97,15 +98,14 @@ def holds_all(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["good.mcap", "msgzstd_mcap", "msgzstd_mcap/b_0.mcap", "split", "wal_half"])
-def test_shared_recordings_have_their_right_numbers(shared_data: Path, name: str) -> None:
-    path = shared_data / "odd_files" / name
-    workload = read_workload(path, odom="/odom")
+def test_odd_recordings_have_their_right_numbers(name: str) -> None:
+    workload = read_workload(ODD_FILES / name, odom="/odom")
     assert (len(workload), int(workload.size_bytes.sum()), workload.duration_us) == (90, 45_540, 2_950_000)
     assert workload.x is not None and workload.x[-1] == pytest.approx(1.475)
 
 
-def test_other_shared_recordings(shared_data: Path) -> None:
-    folder = shared_data / "odd_files"
+def test_other_odd_recordings() -> None:
+    folder = ODD_FILES
     packed = read_workload(folder / "single.mcap.zstd", odom="/odom")
     assert (len(packed), int(packed.size_bytes.sum()), packed.name) == (100, 65_660, "single")
     with pytest.warns(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from link_files import SAMPLES, written
 from needs import needs
+from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
 from bufgym.cli import main
@@ -49,12 +50,8 @@ def read(path: Path) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(("name", "right", "warning"), RIGHT)
-def test_each_odd_file_is_read_right_or_says_why_not(
-    shared_data: Path, name: str, right: Any, warning: str | None
-) -> None:
-    path = shared_data / "odd_files" / name
-    if not path.exists():
-        pytest.skip(needs("data", f"odd_files/{name}"))
+def test_each_odd_file_is_read_right_or_says_why_not(name: str, right: Any, warning: str | None) -> None:
+    path = ODD_FILES / name
     if path.suffix == ".mcap":
         pytest.importorskip("mcap", reason=needs("extras", "mcap"))
     if isinstance(right, str):

@@ -1,5 +1,7 @@
 """The header in C: compiled with gcc, it decides as Python does, on a million decisions; a robot in C++ uses it."""
 
+import importlib
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -23,6 +25,7 @@ from bufgym.sim import run
 from bufgym.sim.metrics import received
 from bufgym.traces import Trace
 from bufgym_live.robot.c import CALL, SUPPORTED, header, random_episode, recorded
+from bufgym_live.robot.c.header import without_c
 from tests.core.weight_cases import random_weights
 
 REPO = Path(__file__).resolve().parents[3]
@@ -87,11 +90,12 @@ def driver(folder, text, *flags):
 
 
 RULE = tuple(field.name for field in BY_RULE)
+IN_C = tuple(name for name in NAMES if name not in without_c(NAMES))
 
 
 def every_field() -> Policy:
-    """A random agent of two layers that reads every field there is."""
-    return random_weights(NAMES, 7, 5, seed=3).policy("every-field")
+    """A random agent of two layers that reads every field that has C."""
+    return random_weights(IN_C, 7, 5, seed=3).policy("every-field")
 
 
 def every_output() -> Policy:
@@ -104,7 +108,7 @@ AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
 AGENTS |= {"every-field": every_field(), "every-output": every_output()}
 AGENTS |= {
     "by-rule": random_weights(RULE, 7, 5, seed=5).policy("by-rule"),
-    "by-rule-and-more": random_weights((*RULE, *NAMES), 7, seed=6).policy("by-rule-and-more"),
+    "by-rule-and-more": random_weights((*RULE, *IN_C), 7, seed=6).policy("by-rule-and-more"),
 }
 
 
@@ -257,3 +261,23 @@ def test_what_has_c_is_a_drop_rule_of_the_registry():
     with pytest.raises(BufgymError, match="policy codel: is asked when the socket is free"):
         recorded(policies.get("codel"), [random_episode(np.random.default_rng(0), 5)], 4, EXPONENTIAL)
     refuse("policy afr: has no C", header, Policy("afr", lambda buffer, arrival, memory: -1), 8, EXPONENTIAL)
+
+
+def test_a_field_without_c_is_refused_by_name_and_file(tmp_path, monkeypatch):
+    """Each part loses the lines of one field. Whoever does not read it has a header all the same."""
+    module = importlib.import_module("bufgym_live.robot.c.header")
+    parts = shutil.copytree(module._PARTS, tmp_path / "parts")
+    for part, macro in (("features.h", "LOAD"), ("inputs.h", "IN_STALL"), ("rule_fields.h", "RULE_DROPS")):
+        text = (parts / part).read_text(encoding="utf-8")
+        cut = re.sub(rf"^.*\[BUFGYM_{macro}\].* = .*\n", "", text, flags=re.MULTILINE)
+        assert cut != text
+        (parts / part).write_text(cut, encoding="utf-8")
+    monkeypatch.setattr(module, "_PARTS", parts)
+    rule = "guided_stall in inputs.h, rule_drops in rule_fields.h"
+    for name, lacking in (
+        ("every-field", "load in features.h"),
+        ("by-rule", rule),
+        ("every-output", "guided_stall in"),
+    ):
+        refuse(f"policy {name}: reads fields that have no C: {lacking}", header, AGENTS[name], 8, EXPONENTIAL)
+    assert header(random_weights(("occupancy", "rank"), 7, seed=6).policy("few"), 8, EXPONENTIAL)

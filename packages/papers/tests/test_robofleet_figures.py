@@ -72,7 +72,8 @@ def test_copies_follow_one_another_and_a_link_that_stays_away_is_never_recovered
 
 
 def test_sizes_are_table1s() -> None:
-    assert all(BYTES[kind] == PAPER[kind] for kind in set(BYTES) & set(PAPER))
+    both = set(BYTES) & set(PAPER)
+    assert {kind: BYTES[kind] for kind in both} == {kind: PAPER[kind] for kind in both}
     pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
     pytest.importorskip("flatbuffers", reason=needs("extras", "flatbuffers"))
     from studies.encodings import content, encode

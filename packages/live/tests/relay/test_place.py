@@ -8,6 +8,7 @@ import pytest
 from loop_cases import compiled
 from needs import needs
 from pose_cases import ESTIMATE, POSE, TF, message
+from recording_cases import fetched
 from refusal_cases import refuse
 
 pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
@@ -17,6 +18,7 @@ from bufgym.traces.formats.bag_poses import ODOMETRY, carries_poses
 from bufgym_live.relay.bag import BagSource
 from bufgym_live.relay.place import Place
 from bufgym_live.relay.robot import Robot
+from tests.traces.bag_cases import write_mcap
 
 Said = tuple[str, str, float, str]
 """Topic, type, x in metres and frame of a message, or frame/child."""
@@ -123,13 +125,8 @@ def test_a_transform_is_named_with_its_frames() -> None:
     refuse("odom = '/tf:a:b:c': must be a topic, TOPIC:FRAME, or TOPIC:PARENT:CHILD", Place, "/tf:a:b:c")
 
 
-@compiled
-@pytest.mark.parametrize(
-    ("named", "x", "frame"), [(None, 30.6, "odom"), ("/odom", 30.6, "odom"), ("/amcl_pose", 30.0, "map")]
-)
-def test_a_recorded_robot(shared_data: Path, named: str | None, x: float, frame: str) -> None:
-    """A drive with Nav2, by odometry and by amcl; mixed, its x would be 868.8. The robot and the benchmark agree."""
-    path = shared_data / "rosbags" / "nav2_turtlebot.mcap"
+def played(path: Path, named: str | None) -> Place:
+    """The place of a robot that has played a recording, without waiting."""
     robot = Robot("ws://127.0.0.1:1", "r", BagSource(path, loops=False), policy="drop-oldest", odometry=named)
 
     async def at_once(seconds: float) -> None:
@@ -139,15 +136,55 @@ def test_a_recorded_robot(shared_data: Path, named: str | None, x: float, frame:
         patch.setattr("bufgym_live.relay.bag.asyncio.sleep", at_once)
         patch.setattr("bufgym_live.relay.bag._LATE_S", math.inf)
         asyncio.run(robot.source.run(robot))
-    assert round(robot.place.x, 1) == x
-    assert robot.place.location is not None and robot.place.location["frame"] == frame
-    topic = named or "/odom"
-    workload = read_workload(path, topics=[topic], odom=topic, bridge_gaps=True)
+    return robot.place
+
+
+def agrees(path: Path, named: str | None, topic: str, x: float, frame: str) -> None:
+    """The robot that plays the recording and the workload of a benchmark are at x."""
+    place = played(path, named)
+    assert place.location is not None and (round(place.x, 1), place.location["frame"]) == (x, frame)
+    workload = read_workload(path, topics=[topic], odom=named or topic, bridge_gaps=True)
     assert workload.x is not None and round(float(workload.x[-1]), 1) == x
 
 
-def test_a_recording_without_the_named_topic(shared_data: Path) -> None:
-    source = BagSource(shared_data / "rosbags" / "nav2_turtlebot.mcap")
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """``DRIVE`` as a recording, a message each second."""
+    entries = []
+    for second, (topic, type, x_m, frames) in enumerate(DRIVE):
+        frame, _, child = frames.partition("/")
+        entries.append((1000 * second, f"/{topic}", type, message(type, second, x_m, frame, child or "base")))
+    return write_mcap(tmp_path / "drive.mcap", entries)
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("named", "topic", "x", "frame"),
+    [
+        (None, "/wheels", 0.5, "odom"),
+        ("/amcl_pose", "/amcl_pose", 0.5, "map"),
+        ("/fused", "/fused", 1.5, "odom"),
+        ("/tf:odom:base", "/tf", 2.5, "odom"),
+    ],
+)
+def test_a_recording_is_at_the_same_place_on_a_robot_and_in_a_benchmark(
+    drive: Path, named: str | None, topic: str, x: float, frame: str
+) -> None:
+    agrees(drive, named, topic, x, frame)
+
+
+@compiled
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("named", "x", "frame"), [(None, 30.6, "odom"), ("/odom", 30.6, "odom"), ("/amcl_pose", 30.0, "map")]
+)
+def test_a_recorded_robot(named: str | None, x: float, frame: str) -> None:
+    """A drive with Nav2, by odometry and by amcl; mixed, its x would be 868.8."""
+    agrees(fetched("evo-bags") / "nav2_turtlebot.mcap", named, named or "/odom", x, frame)
+
+
+def test_a_recording_without_the_named_topic(drive: Path) -> None:
+    source = BagSource(drive)
     robot = Robot("ws://127.0.0.1:1", "r", source, policy="drop-oldest", odometry="/nope")
-    says = r"no messages of topic '/nope'; it has: /amcl_pose, /odom, /tf, /tf_static"
+    says = r"no messages of topic '/nope'; it has: /amcl_pose, /fused, /goal_pose, /initialpose, /tf, /wheels"
     refuse(says, lambda: asyncio.run(source.run(robot)))

@@ -50,6 +50,9 @@ _CONSTANTS = {
     guided: "MOST SPREAD_US SLOW_US HEAVY HEAVIER",
 }
 """Constants that the parts name, by the module that has them."""
+_GUIDED = "guided_"
+"""Prefix under which a network reads the inputs of guided rules."""
+_BY_RULE = {field.name for field in learned.BY_RULE}
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40  # Seed, episodes and messages of the calls in the header
 
@@ -72,7 +75,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     All its names begin with ``prefix``, its macros with the same in capitals.
 
     Raises:
-        BufgymError: the policy has no C, a limit is invalid, or C has no names that begin so.
+        BufgymError: the policy or a field that it reads has no C, a limit is invalid, or C has no names that begin so.
     """
     check_limits(capacity, max_bytes)
     if re.fullmatch("[a-z][a-z0-9_]*", prefix) is None:
@@ -132,13 +135,38 @@ def _rule(policy: Policy, guides: bool) -> str:
     if not guides and (name not in SUPPORTED or policies.get(name).on_arrival is not policy.on_arrival):
         known = ", ".join(SUPPORTED)
         raise BufgymError(f"policy {policy.name}: has no C; known: {known}, and learned agents for one queue")
+    if guides:
+        _refuse_without_c(policy, [f"{_GUIDED}{name}" for name in guided.INPUTS])
     return _helped(_part("guided.h") if guides else (_RULES / f"{name}.h").read_text(encoding="utf-8"))
+
+
+def without_c(fields: Iterable[str]) -> dict[str, str]:
+    """Field -> part that lacks it, for those of the ``fields`` of one queue that no part writes."""
+    lacking = {}
+    for name in fields:
+        part, macro = "features.h", name.upper()
+        if name.startswith(_GUIDED):
+            part, macro = "inputs.h", f"IN_{name.removeprefix(_GUIDED).upper()}"
+        elif name in _BY_RULE:
+            part = "rule_fields.h"
+        if re.search(rf"\[BUFGYM_{macro}\](\[\w+\])? =\s", _part(part)) is None:
+            lacking[name] = part
+    return lacking
+
+
+def _refuse_without_c(policy: Policy, fields: Iterable[str]) -> None:
+    lacking = [f"{name} in {part}" for name, part in without_c(fields).items()]
+    if lacking:
+        where = "write them in bufgym_live/robot/c/parts/ beside the others"
+        raise BufgymError(f"policy {policy.name}: reads fields that have no C: {', '.join(lacking)}: {where}")
 
 
 def _network(policy: Policy) -> str:
     """Write the C of a learned agent for one queue, after the parts that observe what it reads."""
     scorer = _scorer(policy)
     context, slots = scorer.fields[: scorer.context], scorer.fields[scorer.context :]
+    names = [Weights.CONTEXT_NAMES[int(k)] for k in context] + [Weights.SLOT_NAMES[int(k)] for k in slots]
+    _refuse_without_c(policy, names)
     observed = ["features.h"] if (context < learned.CONTEXT).any() or (slots < learned.SLOTS).any() else []
     observed += ["rule_fields.h"] if policy.on_arrival is learned.on_arrival_by_rule else []
     body = _part("fields.h") + "".join(map(_part, observed)) + _part("scorer.h")
