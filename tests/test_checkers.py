@@ -9,6 +9,7 @@ import pytest
 from gymnasium.utils import env_checker
 
 import bufgym.envs
+from bufgym.cli.listing import environments
 
 SMALL: dict[str, dict[str, Any]] = {
     "bufgym/Interruption-v0": {"t_max": 20},
@@ -24,7 +25,7 @@ FORMS = [
     for form in ("dict", "flat", "slots")
     for mask, dtype in ((False, "int8"), (True, "int8"), (True, "bool"), ("pettingzoo", "int8"))
 ]
-IDS = sorted(id for id in gym.registry if id.startswith("bufgym/"))
+IDS = sorted(environments())
 
 every_id = pytest.mark.parametrize("id", IDS)
 every_form = pytest.mark.parametrize("form", FORMS, ids=str)
