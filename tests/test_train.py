@@ -150,18 +150,18 @@ def test_what_ctrl_c_says_goes_on(monkeypatch: Patch, capsys: Capsys) -> None:
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
+    gone_on: list[Any] = []
     for typed, more in ((words, "--name train-1 --resume"), ([*words, "--name=mine"], "--resume")):
         monkeypatch.setattr(train, "_train", stop)
         with pytest.raises(SystemExit) as ended:
             train.typed(typed)
         going_on = f"python train.py {' '.join(typed)} {more}"
         assert ended.value.code == 130 and capsys.readouterr().err == f"stopped; {going_on} goes on\n"
-        gone_on: list[Any] = []
         monkeypatch.setattr(train, "_train", lambda *run: gone_on.append(run))
         with pytest.raises(SystemExit):
             train.typed(going_on.split()[2:])
         name = "mine" if typed[-1] == "--name=mine" else "train-1"
-        assert gone_on == [(Path("runs") / name, dataclasses.replace(TINY, name=name, resume=True), ())]
+        assert gone_on.pop() == (Path("runs") / name, dataclasses.replace(TINY, name=name, resume=True), ())
 
 
 def test_a_run_is_not_overwritten_or_mixed_with_another() -> None:
