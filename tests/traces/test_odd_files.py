@@ -242,7 +242,7 @@ def test_the_events_of_iperf3(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("header", ["time_s;bytes_per_s", "Zeit (s);Rate (B/s)", ""])
 def test_semicolons_and_decimal_commas_are_named(tmp_path: Path, header: str) -> None:
-    """What a spreadsheet saves as CSV where 1/2 is written 0,5; with a header or without, of links, motion, messages."""
+    """What a spreadsheet saves as CSV where 1/2 is written 0,5; with a header or without."""
     path = written(tmp_path, f"{header}\n0,0;1200,5\n0,5;1300,5\n")
     line = 1 if header else 2
     told = rf'lte.csv, line {line}: .*: has ";" between cells, as files with decimal commas have: must have "," there'
