@@ -1,8 +1,9 @@
 """Pictures of one sender: kept and dropped messages as a timeline against the link's capacity.
 
-``ansi`` gives a few lines of text, ``rgb_array`` an image of constant size, which ``Window`` shows. Both read the
-sender's arrays and change nothing. The height of the capacity is in units of demand, the bytes that arrive per second. Full height is twice the
-demand, so messages must wait or be dropped where the capacity is below half height.
+``ansi`` gives a few lines of text, ``rgb_array`` an image of constant size, and ``Window`` shows images on the screen.
+All read the sender's arrays and change nothing. The height of the capacity is in units of demand, the bytes that arrive
+per second. Full height is twice the demand, so messages must wait or be dropped where the capacity is below half
+height.
 
 With several topics each has a lane and a letter of its own; letters tell queued messages apart.
 """
