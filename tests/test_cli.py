@@ -14,7 +14,7 @@ import pytest
 from cli_cases import Capsys, Patch, fails, shown
 from PIL import Image
 
-from bufgym import __version__, policies, scenario, traces
+from bufgym import __version__, compare, policies, scenario, traces
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.cli import main
@@ -100,6 +100,16 @@ def test_bench_writes_rows_and_a_table(trace: str, tmp_path: Path, capsys: Capsy
     assert {row["trace"] for row in rows} == {"link"} and {row["arrived"] for row in rows} == {10}
     assert "| decimate:every=2 | 2 |" in (out / "table.md").read_text()
     assert sorted(path.name for path in out.iterdir()) == ["rows.csv", "table.md"]
+
+
+def test_traces_and_motions_with_commas_are_those_of_compare(tmp_path: Path) -> None:
+    named = ["--trace", "lte-synthetic-1,20Mbit/s", "--motion", "drive-1,drive-0", "--policies", "afr"]
+    assert main(["bench", *named, *QUICK, "--format", "csv", "--out", str(tmp_path / "out")]) == 0
+    settings: dict[str, Any] = {"capacity": 2, "seeds": 2, "duration_s": 1.0, "rate_hz": 10.0}
+    done = compare("afr", "lte", traces="lte-synthetic-1,20Mbit/s", motion="drive-1,drive-0", **settings)
+    rows = read_rows(tmp_path / "out" / "rows.csv")
+    assert [row["trace"] for row in rows] == ["lte-synthetic-1"] * 2 + ["20Mbit/s"] * 2
+    assert [row["qoi"] for row in rows] == [row["qoi"] for row in done.rows]
 
 
 def test_bench_against_a_policy(capsys: Capsys) -> None:
