@@ -235,7 +235,7 @@ test_wrong_use_is_named = refused(
     *((lambda f=f: SenderEnv(fields=f), "must be a list of names") for f in ("rank", 3, [3])),
     (lambda: SenderEnv(decide_at="noon"), "decide_at = 'noon'"),
     (lambda: SenderEnv(max_bytes=0), "max_bytes = 0"),
-    (lambda: SenderEnv(render_mode="human"), "render_mode = 'human'"),
+    (lambda: SenderEnv(render_mode="depth_array"), "render_mode = 'depth_array'"),
     (lambda: SenderEnv(mask_in_observation="tianshu"), "'tianshu': must be True, False, two names"),
     *((lambda k=k: SenderEnv(mask_in_observation=("mask", k)), "two names of keys or") for k in ("mask", 1)),
     (lambda: SenderEnv(mask_in_observation=True, actions="guided"), "actions = 'guided' have no mask"),
