@@ -157,7 +157,7 @@ def compare(
         )
     of_a_queue = {name: settings.pop(name) for name in OF_A_QUEUE if name in settings}
     label, scenario = label or (on if isinstance(on, str) else ""), _scenario(on, settings)
-    words = {"label": label, "about": about or label or scenarios.about(scenario)}
+    words: dict[str, Any] = {"label": label, "about": about or label or scenarios.about(scenario)}
     play = partial(_compare_on_scenario, entrants, scenario, rival, capacities, seeds, progress=progress)
     if out is None:
         return play(**words, **of_a_queue)
