@@ -10,6 +10,8 @@ READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # Two workers side by side, each with one thread: more only make them wait for one another.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+# torch without CUDA, for Linux without an NVIDIA GPU: a tenth of the download. Where this index is away, PyPI has torch.
+TORCH_CPU := https://download.pytorch.org/whl/cpu
 STAGES := $(BIN)/python .ci/stages.py
 
 .DEFAULT_GOAL := help
@@ -102,5 +104,8 @@ $(READY): pyproject.toml packages/live/pyproject.toml packages/papers/pyproject.
 	  echo "bufgym needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || true)." >&2; \
 	  echo "Name another one: make PYTHON=python3.11 ..." >&2; exit 1; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	@[ "$$(uname)" != Linux ] || nvidia-smi >/dev/null 2>&1 || \
+	  $(PIP) install --quiet --no-compile --no-deps --retries 0 --timeout 5 -c constraints.txt --index-url $(TORCH_CPU) torch \
+	  >/dev/null 2>&1 || true
 	$(PIP) install --quiet --no-compile -c constraints.txt -e ".[dev]" -e "packages/live[all]" -e "packages/papers[all]"
 	@touch $@

@@ -1,11 +1,13 @@
 """Train an agent and compare it with the fixed policies: ``python train.py``, or ``--help`` for all settings.
 
-Results are in runs/NAME/. After a kill, the same command with ``--resume`` goes on from the last checkpoint.
+Results are in runs/NAME/. After a kill or Ctrl-C, the same command with ``--resume`` goes on from the last checkpoint.
 """
 
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App
@@ -17,7 +19,13 @@ from bufgym.cli.options import OPTIONS
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import locked
 
-app = App("train.py", help_format="plaintext", default_parameter=OPTIONS, error_formatter=lambda said: f"error: {said}")
+app = App(
+    "train.py",
+    help_format="plaintext",
+    default_parameter=OPTIONS,
+    error_formatter=lambda said: f"error: {said}",
+    suppress_keyboard_interrupt=False,
+)
 BEFORE = {"guided": "evolve", "maskable-ppo": "ppo", "ppo": "ppo --unmasked", "dqn": "dqn", "guided-ppo": "guided-ppo"}
 """A value that ``--algo`` had -> the command that now does it."""
 
@@ -48,6 +56,13 @@ for each in ALGORITHMS:
 def main(settings: Settings, others: Sequence[Settings] = ()) -> None:
     """Train by these settings, and by others of the same environment; evaluate, report, keep the best agent."""
     folder = prepare(settings)
+    try:
+        _train(folder, settings, others)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(folder.name) from None
+
+
+def _train(folder: Path, settings: Settings, others: Sequence[Settings]) -> None:
     # Only once the settings are known to be good: torch takes seconds to load.
     from agents.learner import learner_of
     from agents.report import Trained, keep
@@ -77,17 +92,27 @@ def others_of(settings: Settings) -> list[Settings]:
 
 
 def typed(words: Sequence[str]) -> None:
-    """Do what was typed; a mistake ends in one line."""
+    """Do what was typed; a mistake ends in one line, and Ctrl-C in the command that goes on."""
     try:
         for k, word in enumerate(words):
             if word.startswith("--algo"):
                 now = BEFORE.get(word.partition("=")[2] or "".join(words[k + 1 : k + 2]), "evolve")
                 raise BufgymError(f"--algo is a command now: type python train.py {now}, then the other settings")
         app(words)
+    except KeyboardInterrupt as stop:
+        print("; ".join(["stopped", *(f"{_resuming(words, name)} goes on" for name in stop.args)]), file=sys.stderr)
+        raise SystemExit(130) from None
     except BufgymError as error:
         raise SystemExit(f"error: {error}") from None
     except OSError as error:
         raise SystemExit(f"error: {error.filename or 'runs'}: {error.strerror or error}") from None
+
+
+def _resuming(words: Sequence[str], name: str) -> str:
+    """The command that was typed, and what resumes the run of this name."""
+    is_named = any(word.partition("=")[0] == "--name" for word in words)
+    more = [*([] if is_named else ["--name", name]), *([] if "--resume" in words else ["--resume"])]
+    return shlex.join(["python", "train.py", *words, *more])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""Does an installed bufgym work? An episode, a benchmark, an error. With ``--oldest FILE``: the oldest dependencies.
+"""Does an installed bufgym work? An episode, a benchmark, errors. With ``--oldest FILE``: the oldest dependencies.
 
 Needs nothing but bufgym and what it brings.
 """
 
+import contextlib
+import io
 import re
 import sys
 import tomllib
@@ -38,6 +40,16 @@ def check() -> None:
     assert info["arrived"] == info["delivered"] + info["dropped"] == 150, info
     assert main(["bench", "--policies", "learned,afr,drop-oldest", "--seconds", "5", "--seeds", "1"]) == 0
     assert main(["report", "nowhere"]) == 2
+    for command, package in {"live": "live", "ros2": "live", "relay": "live", "reproduce": "papers"}.items():
+        with contextlib.redirect_stderr(io.StringIO()) as told:
+            assert main([command]) == 2
+        where = f"bufgym-{package}: pip install packages/{package}, in bufgym's source tree"
+        assert told.getvalue() == f"bufgym: error: {command} comes with the package {where}\n", told.getvalue()
+    try:
+        gym.make("bufgym/Mapping-v0")
+        raise AssertionError("bufgym/Mapping-v0 was made")
+    except bufgym.BufgymError as error:
+        assert "comes with the package bufgym-papers: pip install packages/papers" in str(error), error
     print(f"bufgym {bufgym.__version__} on Python {sys.version.split()[0]}")
 
 

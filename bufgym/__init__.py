@@ -16,6 +16,8 @@ import gymnasium as _gym
 from bufgym.ground import __version__ as __version__
 from bufgym.ground.errors import BufgymError as BufgymError
 from bufgym.ground.modules import on_demand as _on_demand
+from bufgym.ground.packages import ENVIRONMENTS as _GROUP
+from bufgym.ground.packages import absent as _absent
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy
@@ -35,7 +37,7 @@ ENVIRONMENTS = {
 """Id -> (name of the scenario, its description, arguments that differ from the usual). Installed packages declare more
 of them, as entry points of the group ``bufgym.environments``."""
 
-_others = {entry.name: entry.load() for entry in _entry_points(group="bufgym.environments")}
+_others = {entry.name: entry.load() for entry in _entry_points(group=_GROUP)}
 for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
     if _id not in _gym.registry:
         _gym.register(
@@ -46,6 +48,9 @@ for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
             disable_env_checker=True,
             kwargs={"scenario": _scenario, **_options},
         )
+for _id, _told in _absent(_GROUP, _gym.registry).items():
+    _stand_in = "bufgym.ground.packages:raise_absent"
+    _gym.register(_id, _stand_in, vector_entry_point=_stand_in, kwargs={"told": f"{_id} {_told}"})
 
 __getattr__ = _on_demand(
     __name__, {"Comparison": "benchmark.compare", "compare": "benchmark.compare", "make_policy": "benchmark.compare"}

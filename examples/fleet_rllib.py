@@ -1,6 +1,6 @@
 """One policy for all robots of a cell, learned with PPO of Ray's RLlib and masked invalid actions.
 
-    pip install "bufgym[rllib]" torch
+    pip install ".[rllib]" torch
     python examples/fleet_rllib.py --robots 4 --iterations 20
 
 Every robot decides from its own observation with the same weights, and is rewarded with the team's mean information.

@@ -1,6 +1,6 @@
 """Imitating the clairvoyant by DAgger: a slot network learns decisions made in hindsight, and plays without it.
 
-    pip install "bufgym[train]"
+    pip install ".[train]"
     python examples/imitation.py
 
 It trains on six of the eight shipped links and is tested on the other two, on the episodes of

@@ -1,6 +1,6 @@
 """Offline learning of a policy from a data set, by behaviour cloning and by d3rlpy's conservative Q-learning.
 
-    pip install "bufgym[offline]"
+    pip install ".[offline]"
     python examples/offline.py --kinds medium mixed
 
 It reads data sets of ``bufgym dataset make``, and makes missing ones in ``--data``. Both learners train the same slot

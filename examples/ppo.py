@@ -1,6 +1,6 @@
 """PPO in one file: a camera's send buffer on the native batch, invalid actions masked, one network for every slot.
 
-    pip install "bufgym[train]"
+    pip install ".[train]"
     python examples/ppo.py
 
 It trains on six of the eight shipped links and tests on the other two, where ``bufgym bench`` has the same episodes:

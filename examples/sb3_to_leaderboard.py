@@ -1,6 +1,6 @@
 """From stable-baselines3 to a row of the leaderboard: train on a suite's train split, run its test split, read the row.
 
-    pip install "bufgym[train]"
+    pip install ".[train]"
     python examples/sb3_to_leaderboard.py --suite lte-v1 --steps 500000 --out mine
 
 The second half is what anybody does with a model of their own:

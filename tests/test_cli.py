@@ -1,5 +1,8 @@
 """Each command as a user types it, and each mistake that ends in one line and exit code 2."""
 
+import csv
+import errno
+import os
 import re
 import subprocess
 import sys
@@ -12,7 +15,7 @@ from cli_cases import Capsys, Patch, fails, shown
 from needs import needs
 from PIL import Image
 
-from bufgym import __version__, policies, scenario, traces
+from bufgym import __version__, compare, policies, scenario, traces
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.cli import main
@@ -99,6 +102,16 @@ def test_bench_writes_rows_and_a_table(trace: str, tmp_path: Path, capsys: Capsy
     assert sorted(path.name for path in out.iterdir()) == ["rows.csv", "table.md"]
 
 
+def test_traces_and_motions_with_commas_are_those_of_compare(tmp_path: Path) -> None:
+    named = ["--trace", "lte-synthetic-1,20Mbit/s", "--motion", "drive-1,drive-0", "--policies", "afr"]
+    assert main(["bench", *named, *QUICK, "--format", "csv", "--out", str(tmp_path / "out")]) == 0
+    settings: dict[str, Any] = {"capacity": 2, "seeds": 2, "duration_s": 1.0, "rate_hz": 10.0}
+    done = compare("afr", "lte", traces="lte-synthetic-1,20Mbit/s", motion="drive-1,drive-0", **settings)
+    rows = read_rows(tmp_path / "out" / "rows.csv")
+    assert [row["trace"] for row in rows] == ["lte-synthetic-1"] * 2 + ["20Mbit/s"] * 2
+    assert [row["qoi"] for row in rows] == [row["qoi"] for row in done.rows]
+
+
 def test_bench_against_a_policy(capsys: Capsys) -> None:
     """On a suite and elsewhere; the policy and AFR run too."""
     for where in (["--suite", "interruption-v1", "--jobs", "1"], ["--scenario", "interruption"]):
@@ -146,6 +159,32 @@ def test_an_output_folder_that_cannot_be_written(trace: str, tmp_path: Path, cap
     (tmp_path / "manifest.json").write_text("{}", encoding="utf-8")
     fails(["bench", "--policies", "afr", *QUICK, "--out", tmp_path], "holds the run of a suite", capsys)
     assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "taken", "link.csv"}
+
+
+def _disk_is_full(*_: Any, **__: Any) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # like a write, it names no file
+
+
+def test_a_full_disk_is_named_by_the_file_and_leaves_no_folder(
+    trace: str, tmp_path: Path, monkeypatch: Patch, capsys: Capsys
+) -> None:
+    """Of the folders ``new/results`` nothing stays; one that was there before does, and so do finished rows."""
+    bench = ["bench", "--trace", trace, *QUICK, "--policies", "afr", "--format", "csv", "--out"]
+    (tmp_path / "held").mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(csv.DictWriter, "writerows", _disk_is_full)
+        for folder in ("new/results", "held"):
+            file = tmp_path / folder / "rows.csv"
+            fails([*bench, tmp_path / folder], f"{file}: No space left on device", capsys)
+        assert main([*map(str, bench), str(tmp_path / "rows.csv")]) == 2  # the table was printed
+        assert f"{tmp_path / 'rows.csv'}: No space left on device" in capsys.readouterr().err
+    monkeypatch.setattr(Path, "write_text", _disk_is_full)
+    suite = ["bench", "--suite", "interruption-v1", "--jobs", "1", "--policies", "afr", "--seeds", "1"]
+    manifest = tmp_path / "suite" / "manifest.json"
+    fails([*suite, "--out", tmp_path / "suite"], f"{manifest}: No space left on device", capsys)
+    assert {path.name for path in tmp_path.iterdir()} == {"held", "link.csv"} and not any((tmp_path / "held").iterdir())
+    fails([*bench, tmp_path / "half"], f"{tmp_path / 'half' / 'table.md'}: No space left on device", capsys)
+    assert len(read_rows(tmp_path / "half" / "rows.csv")) == 2
 
 
 def test_the_clairvoyant_plans_for_a_sender_that_is_always_asked(trace: str, capsys: Capsys) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-from cli_cases import Capsys, Patch, fails, shown
+from cli_cases import Capsys, Patch, shown
 from needs import needs
 
 import bufgym
@@ -141,15 +141,6 @@ def test_a_package_has_the_version_of_the_core_and_what_it_declares(name: str) -
                     assert callable(getattr(importlib.import_module(module), function))
             else:
                 assert what[2].items() <= gym.registry[entry].kwargs.items()
-
-
-def test_a_missing_package_is_named_by_its_command(monkeypatch: Patch, capsys: Capsys) -> None:
-    monkeypatch.setattr(cli, "entry_points", lambda group: EntryPoints())
-    assert "live" not in shown(["--help"], capsys)
-    for words in ("live send", "relay serve --config x.toml", "export afr x.h --to c"):
-        fails(words.split(), f"of another package: pip install -e {REPO / 'packages' / 'live'}", capsys)
-    fails(["reproduce"], f"pip install -e {REPO / 'packages' / 'papers'}", capsys)
-    fails(["nonsense"], 'Unknown command "nonsense"', capsys)
 
 
 def test_a_package_of_your_own_adds_a_command(monkeypatch: Patch, capsys: Capsys, tmp_path: Path) -> None:

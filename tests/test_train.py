@@ -143,6 +143,27 @@ def test_a_killed_run_goes_on_from_its_checkpoint(monkeypatch: Patch) -> None:
     assert learner_of(again).train_seed(folder, 0).curve == run.curve
 
 
+def test_what_ctrl_c_says_goes_on(monkeypatch: Patch, capsys: Capsys) -> None:
+    """The first run has no name: the command names the folder that it got."""
+    words = dataclasses.replace(TINY, name="").command.split()[2:]
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    gone_on: list[Any] = []
+    for typed, more in ((words, "--name train-1 --resume"), ([*words, "--name=mine"], "--resume")):
+        monkeypatch.setattr(train, "_train", stop)
+        with pytest.raises(SystemExit) as ended:
+            train.typed(typed)
+        going_on = f"python train.py {' '.join(typed)} {more}"
+        assert ended.value.code == 130 and capsys.readouterr().err == f"stopped; {going_on} goes on\n"
+        monkeypatch.setattr(train, "_train", lambda *run: gone_on.append(run))
+        with pytest.raises(SystemExit):
+            train.typed(going_on.split()[2:])
+        name = "mine" if typed[-1] == "--name=mine" else "train-1"
+        assert gone_on.pop() == (Path("runs") / name, dataclasses.replace(TINY, name=name, resume=True), ())
+
+
 def test_a_run_is_not_overwritten_or_mixed_with_another() -> None:
     unnamed = dataclasses.replace(TINY, name="")
     assert runs.prepare(unnamed) == Path("runs/train-1")

@@ -157,15 +157,16 @@ def compare(
         )
     of_a_queue = {name: settings.pop(name) for name in OF_A_QUEUE if name in settings}
     label, scenario = label or (on if isinstance(on, str) else ""), _scenario(on, settings)
-    words = {"label": label, "about": about or label or scenarios.about(scenario)}
-    if out is not None:
-        folder.make_empty(Path(out))
-    comparison = _compare_on_scenario(
-        entrants, scenario, rival, capacities, seeds, **words, progress=progress, **of_a_queue
-    )
-    if out is not None:
-        comparison.write_rows(Path(out, f"rows.{form or folder.form_of_rows(Path(out))}"))
-        comparison.write_table(Path(out, "table.md"))
+    words: dict[str, Any] = {"label": label, "about": about or label or scenarios.about(scenario)}
+    play = partial(_compare_on_scenario, entrants, scenario, rival, capacities, seeds, progress=progress)
+    if out is None:
+        return play(**words, **of_a_queue)
+    place = Path(out)
+    folder.check_free(place)
+    with folder.made(place):
+        comparison = play(**words, **of_a_queue)
+        comparison.write_rows(place / f"rows.{form or folder.form_of_rows(place)}")
+        comparison.write_table(place / "table.md")
     return comparison
 
 

@@ -4,7 +4,8 @@
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -111,9 +112,22 @@ def _are_numbers(entries: Any) -> bool:
     return isinstance(entries, list) and all(isinstance(number, int | float) for number in entries)
 
 
+@contextmanager
+def made(out: Path) -> Iterator[None]:
+    """Make the folder. If the block fails and nothing is in it, remove it, with the parents that were made for it."""
+    new = [folder for folder in (out, *out.parents) if not folder.exists()]
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):  # the first that is not empty
+            for folder in new:
+                folder.rmdir()
+        raise
+
+
 def claim(out: Path, manifest: dict[str, Any]) -> None:
     """Write the manifest into the folder; raise an error if another run's rows are in it."""
-    out.mkdir(parents=True, exist_ok=True)
     file = out / "manifest.json"
     if not file.exists():
         if (out / "parts").exists() or any(out.glob("rows.*")):
@@ -129,10 +143,8 @@ def claim(out: Path, manifest: dict[str, Any]) -> None:
             )
 
 
-def make_empty(out: Path) -> None:
-    """Make the folder for a run that is not a suite's; raise an error if rows are in it, which are never written
-    over."""
-    out.mkdir(parents=True, exist_ok=True)
+def check_free(out: Path) -> None:
+    """Raise an error if rows are in the folder, which a run that is not a suite's never writes over."""
     if (out / "manifest.json").exists():
         raise BufgymError(f"{out}: holds the run of a suite; choose another --out (its rows are never written over)")
     for rows in sorted(out.glob("rows.*")):

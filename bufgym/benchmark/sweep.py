@@ -188,8 +188,7 @@ def run_sweep(
     form = form or folder.form_of_rows(out)
     whole, parts = out / f"rows.{form}", out / "parts"
     shards = sweep.shards()
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out):
+    with folder.made(out), locked(out):
         folder.claim(out, _manifest(sweep, shards, command))
         if whole.exists():
             rows = read_rows(whole, layout)

@@ -10,7 +10,6 @@ import io
 import os
 import re
 import sys
-import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
@@ -19,9 +18,8 @@ from typing import Any
 from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandError, UnknownOptionError
 
 from bufgym.cli.options import OPTIONS
-from bufgym.ground import __version__, modules
+from bufgym.ground import __version__, modules, packages
 from bufgym.ground.errors import BufgymError, TraceWarning, printable
-from bufgym.ground.files import PACKAGE
 
 __all__ = ["app", "main"]
 
@@ -56,7 +54,7 @@ COMMANDS: dict[str, Any] = {
 }
 """The core's commands in the order of ``--help``: where the function is, or (purpose, commands below it)."""
 
-GROUP = "bufgym.commands"
+GROUP = packages.COMMANDS
 """Entry points of this group are commands of other packages, declared as in ``COMMANDS``; one may stand in for the
 core's of its name, and do more."""
 
@@ -86,13 +84,14 @@ def _with(parent: App, commands: Mapping[str, Any]) -> App:
     return parent
 
 
-def _elsewhere(command: str) -> str:
-    """What to install for a command that a package of this checkout declares and no installed one; "" if none does."""
-    if command not in entry_points(group=GROUP).names:
-        for file in sorted((PACKAGE.parent / "packages").glob("*/pyproject.toml")):
-            if command in tomllib.loads(file.read_text(encoding="utf-8"))["project"]["entry-points"][GROUP]:
-                return f"{command} is a command of another package: pip install -e {file.parent}"
-    return ""
+def _unknown(error: CycloptsError, command: str) -> str:
+    """What is unknown; if a program or a package that is not installed has it, how to get that."""
+    if command == "train":
+        return 'train is a program of bufgym\'s source tree: type there "make train", or "python train.py --help"'
+    told = packages.absent(GROUP, entry_points(group=GROUP).names).get(command)
+    if told is None:
+        return str(error)
+    return f"{error} With more options {command} {told}" if command in COMMANDS else f"{command} {told}"
 
 
 def _shown(root: App, words: Sequence[str]) -> App:
@@ -122,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MissingArgumentError as error:
         return _failed(_missing(error))
     except (UnknownCommandError, UnknownOptionError) as error:
-        return _failed(_elsewhere(words[0]) or str(error))
+        return _failed(_unknown(error, words[0]))
     except (BufgymError, CycloptsError) as error:
         return _failed(str(error))
     except OSError as error:

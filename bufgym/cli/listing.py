@@ -24,7 +24,7 @@ def environments() -> dict[str, str]:
     import gymnasium
 
     specs = [spec for spec in gymnasium.registry.values() if spec.namespace == "bufgym"]
-    return {spec.id: str(spec.kwargs.get("scenario", "")) for spec in specs}
+    return {spec.id: str(spec.kwargs["scenario"]) for spec in specs if "scenario" in spec.kwargs}
 
 
 def _list_environments() -> str:

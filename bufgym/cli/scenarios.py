@@ -33,8 +33,8 @@ _OF_A_CLIENT = ("trace", "motion", "scale")  # Options that a client of one's ow
 @dataclass(frozen=True)
 class LinkOptions:
     trace: list[str] | None = None
-    """Bandwidth traces: files, shipped names, a rate as in 20Mbit/s, or module:function, a seed -> Trace (default:
-    shipped LTE)."""
+    """Bandwidth traces, as in a,b or a b: files, shipped names, a rate as in 20Mbit/s, or module:function, a seed ->
+    Trace (default: shipped LTE)."""
     motion: list[str] | None = None
     """Motion recordings, likewise (default: shipped drives); 'none': x is the frame index."""
     scale: Positive | None = None
@@ -234,10 +234,11 @@ def _recording(file: str, stream: StreamOptions, recording: RecordingOptions, se
 def _motions(names: Sequence[str], measured: MotionOptions) -> tuple[Motion, ...]:
     """Load motions by shipped name or from files, measured as the options say; ``["none"]`` gives none."""
     from bufgym import traces
+    from bufgym.scenario.checks import names_in
     from bufgym.traces.formats.motions import MOTION_HEADER
 
     settings, motions = measured.settings(), []
-    for name in () if list(names) == ["none"] else names:
+    for name in () if list(names) == ["none"] else [name for text in names for name in names_in(text)]:
         if settings is None:
             motions.append(traces.load_motion(name))
             continue

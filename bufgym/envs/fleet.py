@@ -74,6 +74,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     ) -> None:
         self.rows = fleet_rows(1, FleetScenario.of(robots, scenario), capacity=capacity, **arguments)
         self.render_mode = self.rows.options.render_mode
+        self._window = self.rows.options.window()
         self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
         self.agents: list[str] = []
         self.np_random, _ = seeding.np_random()
@@ -101,6 +102,8 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
             rows.seed(0, self.np_random)
         rows.reset(np.arange(len(rows)), [(options or {}).get("episode")])
         self.agents = list(self.possible_agents)
+        if self._window is not None:
+            self.render()
         return self._observations(), self._infos(False)
 
     def step(
@@ -118,6 +121,8 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         terminated = bool(rows.output.terminated[0])
         if terminated:
             self.agents = []
+        if self._window is not None:
+            self.render()
         return (
             self._observations(),
             dict(zip(agents, rows.rewards().tolist(), strict=True)),
@@ -131,16 +136,27 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         return self.rows.output.flat[:, : self.rows.form.table_numbers].flatten()
 
     def render(self) -> Any:
-        """A line for each robot with its buffer and the fate of its messages, as text or as uint8[400, 800, 3]."""
+        """A line for each robot with its buffer and the fate of its messages, as text or as uint8[400, 800, 3].
+
+        With "human" it shows that image in the window, as each reset and step does, and returns None.
+        """
         if self.render_mode is None:
-            gym.logger.warn("render() needs a render_mode: parallel_env(..., render_mode='ansi' or 'rgb_array')")
+            gym.logger.warn(
+                "render() needs a render_mode: parallel_env(..., render_mode='ansi', 'rgb_array' or 'human')"
+            )
             return None
         if self.rows.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before render()")
         from bufgym.envs.render import cell  # loaded only to draw
 
         draw = cell.cell_ansi if self.render_mode == "ansi" else cell.cell_rgb_array
-        return draw(self.rows, self.possible_agents)
+        drawn: Any = draw(self.rows, self.possible_agents)
+        return drawn if self._window is None else self._window.show([drawn], self.metadata["render_fps"])
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
 
     def _observations(self) -> dict[str, Observation]:
         return {agent: self.rows.observation(i) for i, agent in enumerate(self.possible_agents)}

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,9 @@ from bufgym.model.checks import above_0, whole
 from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
 
+if TYPE_CHECKING:
+    from bufgym.envs.render import Window
+
 GUIDED = "guided"
 RULE = "rule"
 CANDIDATES, SLOTS = "candidates", "slots"
@@ -24,7 +27,7 @@ INFOS = ("full", "steady", "mask", "none")
 nothing. At an episode's end the summary is always there."""
 MASKS = ("valid", "plausible")
 """Actions that the mask shows: all valid ones, or those of them that a good rule chooses among (``plausible``)."""
-RENDER_MODES = ("ansi", "rgb_array")
+RENDER_MODES = ("ansi", "rgb_array", "human")
 MASK_KEYS = {
     "rllib": ("observations", "action_mask"),
     "tianshou": ("obs", "mask"),
@@ -90,6 +93,14 @@ class Options:
         whole("num_threads", self.num_threads, 1)
         if self.mask_keys and self.acts_guided:
             raise BufgymError(f"mask_in_observation: actions = {GUIDED!r} have no mask")
+
+    def window(self) -> "Window | None":
+        """A window that shows each step, for the ``render_mode`` "human"."""
+        if self.render_mode != "human":
+            return None
+        from bufgym.envs.render import Window  # loaded only to draw
+
+        return Window()
 
     @property
     def acts_on_candidates(self) -> bool:

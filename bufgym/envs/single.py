@@ -76,7 +76,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
       (``observations``, ``action_mask``), "tianshou" (``obs``, ``mask``), "pettingzoo" (``observation``,
       ``action_mask``). A "flat" observation is always nested, by True as for "pettingzoo".
     - ``mask_dtype``: "int8" or "bool", of the mask in observations; in ``info`` it is int8, which Gymnasium samples by.
-    - ``render_mode``: "ansi" or "rgb_array".
+    - ``render_mode``: "ansi", "rgb_array", or "human" for a window that shows each step (extra ``human``).
     - ``bound``: whether the last ``info`` also has ``clairvoyant``, ``regret`` and ``score``, for one queue only. The
       clairvoyant is the best H or an upper bound of it. The score is 0 for Drop Oldest and 1 for the clairvoyant, NaN
       where they are equal. Computing them takes a tenth of a second after a long episode.
@@ -100,6 +100,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     def __init__(self, scenario: str | Scenario = "lte", capacity: int = Options.capacity, **arguments: Any) -> None:
         self.rows = Rows(1, *read_arguments(scenario, capacity=capacity, **arguments))
         self.render_mode = self.rows.options.render_mode
+        self._window = self.rows.options.window()
         self.observation_space = self.rows.observation_space
         self.action_space = self.rows.action_space
         self._action = np.zeros(1, np.int64)
@@ -129,6 +130,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
         self.rows.reset(_ROW, [options.get("episode", options or None)])
         self.rows.output.terminated[0] = False  # also if no arrival asks: the first step then ends the episode
+        if self._window is not None:
+            self.render()
         return self.rows.observation(0), self.rows.info(0, False)
 
     def step(
@@ -141,6 +144,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         self._action[0] = rows.action("action", action)
         rows.step(self._action)
         ended = terminated.item()
+        if self._window is not None:
+            self.render()
         return rows.observation(0), rows.rewards().item(), ended, False, rows.info(0, ended)
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -148,10 +153,19 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         return cast(NDArray[np.bool_], self.rows.action_masks()[0])
 
     def render(self) -> Any:
-        """Kept and dropped messages as a timeline against the link's capacity: text, or uint8[400, 800, 3]."""
+        """Kept and dropped messages as a timeline against the link's capacity: text, or uint8[400, 800, 3].
+
+        With "human" it shows that image in the window, as each reset and step does, and returns None.
+        """
         if self.render_mode is None:
-            gym.logger.warn("render() needs a render_mode: gym.make(..., render_mode='ansi' or 'rgb_array')")
+            gym.logger.warn("render() needs a render_mode: gym.make(..., render_mode='ansi', 'rgb_array' or 'human')")
             return None
         from bufgym.envs import render  # loaded only to draw
 
-        return render.draw(self.rows.senders, 0, self.render_mode)
+        drawn = render.draw(self.rows.senders, 0, self.render_mode)
+        return drawn if self._window is None else self._window.show([drawn], self.metadata["render_fps"])
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()

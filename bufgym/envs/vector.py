@@ -62,6 +62,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}")
         self.autoreset_mode = modes[autoreset_mode]
         self.render_mode = rows.options.render_mode
+        self._window = rows.options.window()
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.rows, self.num_envs = rows, len(rows)
         self.max_episode_steps = max_episode_steps
@@ -117,6 +118,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._steps[mask] = 0
         self._done = self._done & ~mask  # a new array: the last step may have handed out the old one
         self._any_done = bool(self._done.any())
+        if self._window is not None:
+            self.render()
         return self._observed(), self._info()
 
     def step(
@@ -146,6 +149,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if self._any_done and self.autoreset_mode == AutoresetMode.SAME_STEP:
             rewards = rewards.copy()  # the rows that ended begin anew
         info = self._end(self._done) | self._info() if self._any_done else self._info()
+        if self._window is not None:
+            self.render()
         return self._observed(), rewards, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -153,13 +158,22 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return self.rows.action_masks()
 
     def render(self) -> Any:
-        """Each row as the single environment renders it."""
+        """Each row as the single environment renders it; with "human" the first 16 in one window, and None."""
         if self.render_mode is None:
-            gym.logger.warn("render() needs a render_mode: gym.make_vec(..., render_mode='ansi' or 'rgb_array')")
+            gym.logger.warn(
+                "render() needs a render_mode: gym.make_vec(..., render_mode='ansi', 'rgb_array' or 'human')"
+            )
             return None
         from bufgym.envs import render  # loaded only to draw
 
-        return tuple(render.draw(self.rows.senders, i, self.render_mode) for i in range(self.num_envs))
+        shown = self.num_envs if self._window is None else min(self.num_envs, render.MOST)
+        drawn = tuple(render.draw(self.rows.senders, i, self.render_mode) for i in range(shown))
+        return drawn if self._window is None else self._window.show(drawn, self.metadata["render_fps"])
+
+    def close_extras(self, **_: Any) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
 
     def _end(self, done: NDArray[np.bool_]) -> dict[str, Any]:
         """The infos of rows that have ended; with SAME_STEP autoreset these rows begin anew at once."""

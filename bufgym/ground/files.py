@@ -78,7 +78,10 @@ def unpacked_limit(packed_bytes: int) -> int:
 
 @contextmanager
 def replaced(target: Path) -> Iterator[Path]:
-    """Yield a temporary file beside ``target``, which replaces the target if the block ends without an error."""
+    """Yield a temporary file beside ``target``, which replaces the target if the block ends without an error.
+
+    An OSError that names no file, such as that of a full disk, then names the target.
+    """
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     os.close(handle)
     temporary = Path(name)
@@ -89,6 +92,10 @@ def replaced(target: Path) -> Iterator[Path]:
         os.umask(mask)
         temporary.chmod(0o666 & ~mask)
         os.replace(temporary, target)
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(target)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

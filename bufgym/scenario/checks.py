@@ -61,7 +61,8 @@ def check_value(scenario: object) -> None:
 def recordings(scenario: object) -> None:
     """Make tuples of Trace and Motion of the parameters ``traces`` and ``motion``, even of a single one.
 
-    Text names a shipped recording, a file, or for traces a generator (``links``); the motion "none" stands for none.
+    Text names a shipped recording, a file, or for traces a generator (``links``), or several with commas between. The
+    motion "none" stands for none.
     """
     if getattr(scenario, "motion") in ("none", ["none"]):  # noqa: B009
         object.__setattr__(scenario, "motion", ())
@@ -74,7 +75,7 @@ def as_tuple(
 ) -> None:
     """Make the parameter a tuple, even of a single item, and check its items; ``what`` names their kind in words.
 
-    ``load`` makes items from text.
+    ``load`` makes items from one name in text (``names_in``).
     """
     value = getattr(scenario, name)
     items = list(value if isinstance(value, Sequence) and not isinstance(value, str | os.PathLike) else (value,))
@@ -82,12 +83,18 @@ def as_tuple(
         items = [
             made
             for item in items
-            for made in (load(os.fspath(item)) if isinstance(item, str | os.PathLike) else [item])
+            for named in ([item] if not isinstance(item, str | os.PathLike) else names_in(os.fspath(item)))
+            for made in (load(named) if isinstance(named, str) else [named])
         ]
     for item in items:
         if not isinstance(item, kind):
             raise BufgymError(f"{name}: {item!r} is not {what}")
     object.__setattr__(scenario, name, tuple(items))
+
+
+def names_in(text: str) -> list[str]:
+    """The names between commas; a file that there is has a single name, commas and all."""
+    return [text] if os.path.exists(text) else [name for part in text.split(",") if (name := part.strip())]
 
 
 GENERATED = 8  # Links that a generator makes without given seeds

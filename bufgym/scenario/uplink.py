@@ -43,7 +43,8 @@ class Uplink:
     ``size_bytes``, ``sizes``, ``size_cv`` and ``duration_s`` describe. Its topics share the queue; it may give x.
 
     Text in place of an object is read as on the command line: ``traces="lte-synthetic-0"`` (a shipped name or a file,
-    or a list of them), ``motion="drive-0"`` (or "none"), ``value="saturating:0.5"``, ``workload="drive.mcap"``.
+    several with commas between, or a list of them), ``motion="drive-0"`` (or "none"), ``value="saturating:0.5"``,
+    ``workload="drive.mcap"``.
     """
 
     traces: tuple[Trace, ...] = ()

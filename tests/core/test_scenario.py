@@ -120,6 +120,15 @@ def test_other_rates_jitters_and_sizes_meet_the_same_motion_and_link(changes, mo
     assert len(set(places)) == 4
 
 
+def test_text_names_several_recordings_with_commas_between(tmp_path, monkeypatch):
+    """A file whose own name has a comma is one; beside others it stands in a list."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "slow,fast").write_text("0 8\n1 8\n")
+    made = scenario.get("lte", traces=["lte-synthetic-1, 8Mbit/s,", "slow,fast"], motion="drive-1,drive-0")
+    assert [one.name for one in made.traces] == ["lte-synthetic-1", "8Mbit/s", "slow,fast"]
+    assert [one.name for one in made.motion] == ["drive-1", "drive-0"]
+
+
 test_what_is_refused = refused(
     (lambda: Interruption(law="normal"), "law = 'normal': must be one of fixed, uniform, log-uniform, geometric"),
     (lambda: Interruption(t_min=0), "t_min = 0, t_max = 400"),
@@ -131,6 +140,8 @@ test_what_is_refused = refused(
     (lambda: Interruption(rate_hz=1e-6), "t_max = 400 messages at rate_hz = 1e-06: must arrive"),
     (lambda: Interruption(t_max=40).episode(0), "T = 0: must lie between 1 and t_max = 40"),
     (lambda: uplink(traces=()), "traces: an uplink needs at least one"),
+    (lambda: uplink(traces="lte-synthetic-0,lte-a"), "^lte-a: no such file, and no shipped trace"),
+    (lambda: uplink(traces=","), "traces: an uplink needs at least one"),
     (lambda: uplink(traces="lte-a"), "lte-a: no such file, and no shipped trace"),
     (lambda: uplink(scale=(1.0, 0.0)), r"scale = \(1.0, 0.0\): every factor"),
     (lambda: uplink(jitter=1.5), "jitter = 1.5: must lie between 0 and 1"),

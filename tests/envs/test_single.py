@@ -235,7 +235,7 @@ test_wrong_use_is_named = refused(
     *((lambda f=f: SenderEnv(fields=f, actions="slots"), "must be a list of names") for f in ("rank", 3, [3])),
     (lambda: SenderEnv(decide_at="noon", actions="slots"), "decide_at = 'noon'"),
     (lambda: SenderEnv(max_bytes=0, actions="slots"), "max_bytes = 0"),
-    (lambda: SenderEnv(render_mode="human", actions="slots"), "render_mode = 'human'"),
+    (lambda: SenderEnv(render_mode="depth_array", actions="slots"), "render_mode = 'depth_array'"),
     (lambda: SenderEnv(mask_in_observation="tianshu", actions="slots"), "'tianshu': must be True, False, two names"),
     *(
         (lambda k=k: SenderEnv(mask_in_observation=("mask", k), actions="slots"), "two names of keys or")

@@ -111,7 +111,7 @@ def detect_format(path: StrPath) -> str:
         raise line.error(line.text, rule)
     if not names:
         layouts = "; ".join(f"{name}: {format.layout}" for name, format in FORMATS.items())
-        raise line.error(line.text, f"must fit a known format ({layouts})")
+        raise line.misfit(f"must fit a known format ({layouts})")
     return names[0]
 
 

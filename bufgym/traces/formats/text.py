@@ -66,6 +66,12 @@ class Line(NamedTuple):
         """The error to raise about this line."""
         return fault(self.path, rule, line=self.number or None, value=value, field=field)
 
+    def misfit(self, rule: str) -> TraceError:
+        """The error of a line that breaks the ``rule`` for its cells."""
+        if ";" in self.text:
+            rule = 'has ";" between cells, as files with decimal commas have: must have "," there and decimal points'
+        return self.error(self.text, rule)
+
     def columns(self, count: int, separator: Literal[","] | None = None) -> list[str]:
         """The line's cells; there must be `count`; separated by white space unless by commas.
 
@@ -75,7 +81,7 @@ class Line(NamedTuple):
         if separator and len(cells) == count + 1 and not cells[-1]:
             cells.pop()
         if len(cells) != count:
-            raise self.error(self.text, f"must have {count} columns, has {len(cells)}")
+            raise self.misfit(f"must have {count} columns, has {len(cells)}")
         return cells
 
     def whole(self, field: str, text: str, most: int) -> int:
@@ -148,7 +154,7 @@ class TextFile:
         if first is None:
             raise fault(self.path, f"is empty: must begin with {header}")
         if not fits(first.text):
-            raise first.error(first.text, f"must be {header}")
+            raise first.misfit(f"must be {header}")
         return first.text, lines
 
     def first(self) -> Line | None:

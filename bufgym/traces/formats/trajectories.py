@@ -205,7 +205,7 @@ def _pose_row(format: str, unit: str) -> RowReader:
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
         cells = _cells(line)
         if len(cells) not in columns:
-            raise line.error(line.text, f"must have 8 columns{more}, has {len(cells)}")
+            raise line.misfit(f"must have 8 columns{more}, has {len(cells)}")
         return cells[0], _time_us(line, cells[0], unit), _pose(line, cells[1:8], names)
 
     return row

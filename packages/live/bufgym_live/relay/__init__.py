@@ -5,13 +5,10 @@ on bufgym's queues. ``Server`` serves what a ``Config`` allows. ``RobotClient``,
 it, and ``wire`` defines the protocol on its WebSockets.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bufgym.ground.libraries import needs
 from bufgym.ground.modules import on_demand
-
-with needs("msgspec", "bufgym-live[relay]", "bufgym_live.relay"):  # the other libraries of the extra come with it
-    import msgspec  # noqa: F401
 
 if TYPE_CHECKING:
     from bufgym_live.relay.address import security, token
@@ -29,10 +26,15 @@ __all__ = [
     "Rule", "Server", "Session", "Source", "StoreLimits", "Tls", "Tokens", "compiled", "load", "security",
     "serve_forever", "token",
 ]  # fmt: skip
-__getattr__ = on_demand(__name__, {
+_on_demand = on_demand(__name__, {
     "BagSource": "bag", "RobotClient": "client", "Config": "config", "Foxglove": "config", "Limits": "config",
     "Nats": "config", "Rotation": "config", "Rule": "config", "StoreLimits": "config", "Tls": "config",
     "Tokens": "config", "load": "config", "compiled": "policies", "Robot": "robot", "Source": "robot",
     "Server": "server", "serve_forever": "server", "Session": "session", "security": "address", "token": "address",
     "Message": "wire", "RefusedError": "wire"
 })  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    with needs("msgspec", "bufgym-live[relay]", "bufgym_live.relay"):  # the other libraries of the extra come with it
+        return _on_demand(name)

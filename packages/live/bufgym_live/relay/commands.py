@@ -9,6 +9,7 @@ from cyclopts import Group, Parameter
 
 from bufgym.cli.options import Count, PolicyFile, PortNumber, one_policy
 from bufgym.ground.errors import BufgymError
+from bufgym.ground.libraries import library
 from bufgym_live.robot import commands as live
 from bufgym_live.robot.decided_in import Compiled, decide_in_python
 
@@ -36,6 +37,10 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def _needs_the_extra() -> None:
+    library("msgspec", "bufgym-live[relay]", "bufgym relay")
+
+
 async def serve(*, config: str, check: bool = False) -> None:
     """Run the server under a configuration; Ctrl-C ends it.
 
@@ -43,6 +48,7 @@ async def serve(*, config: str, check: bool = False) -> None:
         config: As examples/relay.toml.
         check: Only read it and print its permissions.
     """
+    _needs_the_extra()
     from bufgym_live.relay import config as configurations
     from bufgym_live.relay import policies, server
 
@@ -82,6 +88,7 @@ async def robot(
         policies: The policy, as in bench.
         capacity: L, messages.
     """
+    _needs_the_extra()
     decide_in_python(unless=compiled)
     from bufgym.scenario import read_client
     from bufgym_live.relay.robot import Robot
@@ -125,6 +132,7 @@ async def foxglove(
         topics: Topics to show, a regular expression.
         origins: Other web pages that may connect, as https://lichtblick.example.org.
     """
+    _needs_the_extra()
     from bufgym_live.relay.foxglove import Bridge
     from bufgym_live.relay.session import Session
 
