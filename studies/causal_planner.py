@@ -35,7 +35,7 @@ from bufgym.benchmark.tasks.queue import QueueTask, columns
 from bufgym.cli.options import Capacities, Count, Natural, Positive
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.link import FOREVER
-from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps
+from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps, new_rivals
 from bufgym.oracle.from_queue import find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.policies import Policy
@@ -89,7 +89,7 @@ class CausalPlanner:
         c, between, idle, begin, stop = np.zeros((5, n, messages), np.int64)
         lead, pool = np.zeros((n, messages)), (np.zeros(ROOM, np.int64), np.zeros(ROOM), np.zeros(ROOM, np.int32))
         self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, lead, *pool)
-        self._steps = [np.zeros((3, STEPS), kind) for kind in (np.int64, np.float64, np.int32)]
+        self._rivals = new_rivals(STEPS)
         self._work, self._values = new_work(capacity, messages), np.zeros((n, capacity + 2))
         self._mask = np.zeros((n, capacity + 2), np.int8)
         self._first = -1  # sequence number of the arrival at which the futures begin
@@ -135,12 +135,12 @@ class CausalPlanner:
         for i in range(n):
             c, between, idle = (numbers[i, :count] for numbers in self._ahead[:3])
             find_idle(c, sizes, limit, limit, between, idle)
-            while (end := find_steps(batch, self._ahead, i, place, *self._steps)) < 0:
+            while (end := find_steps(batch, self._ahead, i, place, self._rivals)) < 0:
                 if end == NO_ROOM:
                     pool: list[NDArray[Any]] = [np.resize(array, 2 * len(array)) for array in self._ahead[7:]]
                     self._ahead = Ahead(*self._ahead[:7], *pool)
                 else:
-                    self._steps = [np.zeros((3, 2 * array.shape[1]), array.dtype) for array in self._steps]
+                    self._rivals = new_rivals(2 * len(self._rivals.message))
             place = end
         self._first = int(arrival.seq)
 

@@ -163,7 +163,7 @@ def append(out: Path, header: Sequence[str], line: Sequence[Any]) -> None:
 
 def train(run: Run, task: Task, steps: int, curve: Curve) -> None:
     """Train one seed with the trainer's defaults."""
-    settings = {"actions": run.actions, "observation": "flat", "info": "mask", "reward": run.reward}
+    settings: dict[str, Any] = {"actions": run.actions, "observation": "flat", "info": "mask", "reward": run.reward}
     envs = make_vec_env(task.env, run.rows, capacity=run.capacity, **settings, **task.training)
     TRAINERS[run.trainer]("MlpPolicy", envs, seed=run.seed, device="cpu").learn(steps, curve)
     curve.write()
@@ -190,11 +190,11 @@ def read(curves: Path) -> dict[Run, dict[int, list[Point]]]:
 def summary(curves: Path, steps: int) -> list[str]:
     """A table: each seed's score at the last evaluation within so many steps and one rollout, and their median."""
     rows = []
-    for run, of_seed in read(curves).items():
+    for one, of_seed in read(curves).items():
         last = [[point for point in curve if point[0] <= steps + ROLLOUT][-1] for curve in of_seed.values()]
         scores, cpu_s = [score for _, score, _ in last], [seconds for *_, seconds in last]
         each = ", ".join(f"{score:.2f}" for score in scores)
-        rows.append((run.label, f"{np.median(scores):.2f}", each, f"{np.median(cpu_s):.0f}"))
+        rows.append((one.label, f"{np.median(scores):.2f}", each, f"{np.median(cpu_s):.0f}"))
     return table(("settings", f"median after {steps:,} steps", "seeds", "CPU s"), rows)
 
 
@@ -202,10 +202,10 @@ def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
     """A line for each seed, a colour for each of the settings, and the rules as levels."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.add_subplot(xlabel="steps", ylabel="score", ylim=(-0.2, 0.85))
-    for k, (run, of_seed) in enumerate(read(curves).items()):
+    for k, (one, of_seed) in enumerate(read(curves).items()):
         for n, curve in enumerate(of_seed.values()):
             steps, scores, _ = zip(*curve, strict=True)
-            axes.plot(steps, scores, color=f"C{k}", alpha=0.7, label=run.label if n == 0 else None)
+            axes.plot(steps, scores, color=f"C{k}", alpha=0.7, label=one.label if n == 0 else None)
     for name, score in rules.items():
         axes.axhline(score, color="black", linewidth=0.8, linestyle=":")
         axes.annotate(name, (1, score), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)

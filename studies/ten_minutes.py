@@ -30,7 +30,9 @@ import torch
 import bufgym  # noqa: F401  (registers the environments)
 from bufgym.ground.errors import unknown
 from studies.page import command
-from studies.sb3_defaults import CAPACITY, ENV, Episodes, append
+from studies.sb3_defaults import Episodes, append
+
+ENV, CAPACITY = "bufgym/Uplink-v0", 8
 
 FLAT: dict[str, Any] = {"observation": "flat"}
 BOOL = FLAT | {"mask_dtype": "bool"}

@@ -75,9 +75,6 @@ class Options:
                 raise BufgymError(f"{name} = {given!r}: must be one of {', '.join(map(repr, known))}")
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
-        for name, usual in (("decide_at", ("overflow", "arrival")), ("observation", ("flat", "dict"))):
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, usual[not self.acts_on_candidates])
         whole("candidates", self.candidates, 1, MOST_CANDIDATES)
         if self.acts_on_candidates and (self.mask != "valid" or self.fields in ("compact", GUIDED, RULE)):
             given = f"mask = {self.mask!r}" if self.mask != "valid" else f"fields = {self.fields!r}"
@@ -108,6 +105,16 @@ class Options:
         return self.actions == CANDIDATES
 
     @property
+    def asked_at(self) -> str:
+        """When it is asked: ``decide_at``, by default "overflow" for candidates and "arrival" for others."""
+        return self.decide_at or ("overflow" if self.acts_on_candidates else "arrival")
+
+    @property
+    def form(self) -> str:
+        """Form of an observation: ``observation``, by default "flat" for candidates and "dict" for others."""
+        return self.observation or ("flat" if self.acts_on_candidates else "dict")
+
+    @property
     def acts_guided(self) -> bool:
         """Whether an action sets the numbers of a rule."""
         return self.actions == GUIDED
@@ -132,7 +139,7 @@ class Options:
         """Keys of an observation that holds the action mask; None if it does not."""
         asked = self.mask_in_observation
         if isinstance(asked, bool):
-            beside = None if self.observation != "flat" else "observation"
+            beside = None if self.form != "flat" else "observation"
             return MaskKeys(beside, "action_mask", self.mask_dtype) if asked else None
         keys = MASK_KEYS.get(asked) if isinstance(asked, str) else asked
         if not isinstance(keys, Sequence) or len({key for key in keys if isinstance(key, str)}) != 2 or len(keys) != 2:

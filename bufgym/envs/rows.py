@@ -111,7 +111,7 @@ class Rows:
             scenario.value,
             max_messages=scenario.max_messages,
             max_bytes=options.max_bytes,
-            decide_at=options.decide_at,
+            decide_at=options.asked_at,
             topics=scenario.topics,
         )
         self.capacity = self.senders.capacity
@@ -127,8 +127,8 @@ class Rows:
         self.choices = None
         self.actions_count = self.capacity + 2
         if options.acts_on_candidates:
-            self.choices = new_choices(n, options.candidates, options.decide_at == "arrival")
-            self.actions_count = options.candidates + 1 + (options.decide_at == "arrival")
+            self.choices = new_choices(n, options.candidates, options.asked_at == "arrival")
+            self.actions_count = options.candidates + 1 + (options.asked_at == "arrival")
         self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.actions_count)
 
         self.weights, own_terms = reward_weights(options.reward, several_topics)
@@ -154,10 +154,10 @@ class Rows:
         if options.sees:
             slots = RULE_SLOT_FIELDS if options.sees == RULE else ()
             context = RULE_FIELDS if options.sees == RULE else INPUT_FIELDS
-            return ObservationForm(options.observation, slots, context, self.capacity, mask=options.mask_keys)
+            return ObservationForm(options.form, slots, context, self.capacity, mask=options.mask_keys)
         if self.choices is not None:
             return ObservationForm(
-                options.observation, CANDIDATE_FIELDS, QUEUE_FIELDS, self.capacity, options.fields, options.mask_keys,
+                options.form, CANDIDATE_FIELDS, QUEUE_FIELDS, self.capacity, options.fields, options.mask_keys,
                 candidates=options.candidates, actions=self.actions_count,
             )  # fmt: skip
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if several_topics else ())
@@ -166,7 +166,7 @@ class Rows:
         chosen = names if isinstance(options.fields, str) and options.fields == "compact" else options.fields
         if not self.keeps_slots and chosen and all(name in names or own_field(name) for name in chosen):
             slot_fields = ()
-        form = options.observation
+        form = options.form
         return ObservationForm(form, slot_fields, context_fields, self.capacity, chosen, options.mask_keys)
 
     def __len__(self) -> int:

@@ -46,8 +46,8 @@ def step_rows(
     """Take one decision in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
-    begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is None
-    where actions are no candidates, ``guide`` where nothing is guided; Numba compiles each case separately.
+    begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is
+    None where actions are no candidates, ``guide`` where nothing is guided; Numba compiles each case separately.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):

@@ -62,7 +62,8 @@ class Rivals(NamedTuple):
 
 def new_rivals(room: int) -> Rivals:
     """Work space for so many messages."""
-    return Rivals(*np.zeros((4, room), np.int64), np.zeros(room))
+    message, since, least, top = np.zeros((4, room), np.int64)
+    return Rivals(message, since, least, top, np.zeros(room))
 
 
 @kernel

@@ -227,8 +227,8 @@ def best_from(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int
 def possible(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, plan: tuple[int, int, int, int]) -> bool:
     """Whether a plan keeps the socket busy enough.
 
-    ``plan`` is (messages queued after the present decision, transmissions delivered, queued messages that it sends, the arrival that it sends
-    next); ``best_from`` makes it.
+    ``plan`` is (messages queued after the present decision, transmissions delivered, queued messages that it sends, the
+    arrival that it sends next); ``best_from`` makes it.
     """
     b, n = ahead.link[i, 0], batch.senders[i].next
     count, until, sent, m = plan

@@ -44,7 +44,7 @@ class Hindsight:
         self._most = np.zeros(n)
 
     def values(self) -> NDArray[np.float64]:
-        """float64[n, L + 2]: the best H still attainable in hindsight after each decision: evict a slot, reject, accept.
+        """float64[n, L + 2]: the best H attainable in hindsight after each decision: evict a slot, reject, accept.
 
         NaN for invalid decisions, and where no decision is due. The next call writes the array again.
         """

@@ -240,7 +240,7 @@ SLOW: dict[str, dict[str, Any]] = {
 def test_a_randomised_policy_is_random_in_an_environment(env_id: str) -> None:
     """Same seed same run, alone and as a row of a batch; other seeds and Drop Oldest differ; and the episode keeps
     its draws, so that a rollout does the same."""
-    env: Any = gym.make(env_id, capacity=3, **SLOW[env_id])
+    env: Any = gym.make(env_id, capacity=3, **SLOW[env_id], actions="slots")
 
     def sent(policy: str, seed: int) -> list[int]:
         played(env, policy, seed=seed)

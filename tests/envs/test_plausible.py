@@ -32,7 +32,7 @@ def plausible(rows: Rows) -> Any:
 
 def begun(scenario: Any, L: int, n: int = 1) -> Rows:
     """Rows at their first decision."""
-    rows = Rows(n, scenario, Options(capacity=L))
+    rows = Rows(n, scenario, Options(capacity=L, actions="slots"))
     for i in range(n):
         rows.seed(i, np.random.default_rng(i))
     rows.reset(np.arange(n))

@@ -35,7 +35,7 @@ def test_a_frame_of_text_by_hand() -> None:
 
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
 def test_every_environment_draws_itself_in_both_modes(env_id: str) -> None:
-    smaller = SMALL[env_id] | ({"law": "fixed"} if "Interruption" in env_id else {})
+    smaller = SMALL[env_id] | {"actions": "slots"} | ({"law": "fixed"} if "Interruption" in env_id else {})
     for mode in ("ansi", "rgb_array"):
         env = gym.make(env_id, render_mode=mode, **smaller)
         plain = gym.make(env_id, **smaller)

@@ -285,7 +285,9 @@ def test_what_someone_holds_stays_as_it_is() -> None:
 
 @pytest.mark.parametrize("id", ["bufgym/Uplink-v0", "bufgym/Topics-v0"])
 def test_compact_is_the_context_fields_of_all_fields(id: str) -> None:
-    whole, compact = (gym.make_vec(id, 3, capacity=5, **options) for options in ({}, {"fields": "compact"}))
+    whole, compact = (
+        gym.make_vec(id, 3, capacity=5, actions="slots", **options) for options in ({}, {"fields": "compact"})
+    )
     (seen, _), (part, _) = whole.reset(seed=1), compact.reset(seed=1)
     for action in range(60):
         context = [name for name, numbers in seen.items() if numbers.shape[1] == 1]

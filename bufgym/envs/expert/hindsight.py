@@ -40,7 +40,7 @@ class Clairvoyant:
         return np.where(rows.output.action_mask == 0, np.nan, values)
 
     def regrets(self) -> NDArray[np.float64]:
-        """float64[n, actions]: the part of H that each action gives up for good, 0 for the best; NaN as in ``values``."""
+        """float64[n, actions]: the part of H that each action gives up for good, 0 for the best; NaN as ``values``."""
         values = self.values()
         most = np.where(np.isnan(values), -np.inf, values).max(axis=1, keepdims=True)
         return np.asarray(most - values)

@@ -141,7 +141,8 @@ class Candidate(NamedTuple):
 
 _RATIO = "logarithm of a ratio"
 CANDIDATE_FIELDS = (
-    Field("candidate_place", "candidate", "queue", "-1 to 1", "2 (j + 1) / (s + 1) - 1 for slot j of s; 1 for the newcomer",
+    Field("candidate_place", "candidate", "queue", "-1 to 1",
+          "2 (j + 1) / (s + 1) - 1 for slot j of s; 1 for the newcomer",
           lambda c: 2.0 * c.place - 1.0, -1.0),
     Field("candidate_newcomer", "candidate", "queue", "0 or 1", "1 for the newcomer",
           lambda c: 1.0 if c.is_newcomer else 0.0),

@@ -27,7 +27,8 @@ class Field:
     name: str
     """Unique over all tables."""
     per: str
-    """"slot" for L + 1 entries, the newcomer's last; "candidate" for k + 1, the head's last; "context" for one."""
+    """"slot" for L + 1 entries, the newcomer's last; "candidate" for k + 1, the head's last; "context" for
+    one."""
     group: str
     """Knowledge that it needs: queue (counting), time (a clock), motion (odometry), value (V), link (its own socket) or
     topic (the topics' settings and past)."""
@@ -61,7 +62,7 @@ def _of_table(module: str, name: str) -> Field:
 
 
 def writer(fields: Sequence[Field], facts: str, first: int = 0) -> Any:
-    """Make the kernel of a table: ``write(facts, column, rows)`` of slots or candidates, or ``write(facts, row)`` of a context.
+    """Make the kernel of a table: ``write(facts, column, rows)``, or ``write(facts, row)`` of a context's fields.
 
     It puts the i-th field's number at index ``first + i``. ``facts`` are the names of the functions' arguments.
     """
