@@ -28,6 +28,7 @@ MOST = 3.0
 _LEAST, _LARGEST = math.exp(-MOST), math.exp(MOST)
 _SQRT_HALF = int(np.float32(math.sqrt(0.5)).view(np.int32))
 _LOG_2, _C3, _C5, _C7 = np.float32(math.log(2)), np.float32(2 / 3), np.float32(2 / 5), np.float32(2 / 7)
+MOST_CANDIDATES = 64
 NONE = -3
 """Entry of ``order`` for a candidate that is not there; no decision has this number."""
 TIE = 1e-12
@@ -125,6 +126,19 @@ def decision_of_candidate(order: NDArray[Any], newcomer: int, at_arrivals: bool,
     if slot == NONE:
         slot = int(order[0])
     return REJECT if slot == newcomer else slot
+
+
+@kernel
+def is_offered(order: NDArray[Any], at_arrivals: bool, room: bool, action: int) -> bool:
+    """Whether the action mask shows ``action``: its candidate is there.
+
+    Without room action 0 at arrivals does what action 1 does, and only action 0 is shown.
+    """
+    if not at_arrivals:
+        return bool(order[action] != NONE)
+    if action == 1 and not room:
+        return False
+    return bool(action == 0 or order[action - 1] != NONE)
 
 
 class Candidate(NamedTuple):
