@@ -34,7 +34,7 @@ from bufgym.policies.scoring import add
 
 CANDIDATES, MASKS, TANH, HIDDEN, WIDTHS = range(5)
 """Header of the parameters: k; whether actions that are not offered are left out; whether g is tanh; hidden
-layers; then the width of each layer, the outputs last. The layers' numbers follow: W, a row for each input, and b."""
+layers; then the width of each layer, outputs last. The layers' numbers follow: W, a row for each input, and b."""
 _PER_CANDIDATE, _QUEUE = len(CANDIDATE_FIELDS), len(QUEUE_FIELDS)
 
 
@@ -162,12 +162,18 @@ class CandidateWeights:
         """What defines the observation: weights found with another one would decide nonsense."""
         return [(field.name, field.per, field.unit, field.meaning) for field in (*CANDIDATE_FIELDS, *QUEUE_FIELDS)]
 
+    @staticmethod
+    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+        """What the shapes follow from."""
+        asked = "at arrivals" if settings["at_arrivals"] else "at a full buffer"
+        return f"{settings['candidates']} candidates, {asked},"
+
     @classmethod
     def shapes(
         cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]
     ) -> dict[str, tuple[int, ...]]:
         """The shapes of ``tensors`` for hidden layers of these widths, by name."""
-        k, shapes = settings["candidates"], {}
+        k, shapes = settings["candidates"], dict[str, tuple[int, ...]]()
         sizes = [inputs(k), *widths, k + 1 + settings["at_arrivals"]]
         names = [*map(str, range(len(widths))), "out"]
         for name, shape in zip(names, itertools.pairwise(sizes), strict=True):

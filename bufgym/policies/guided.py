@@ -319,6 +319,11 @@ class GuidedWeights:
         """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
         return cls.TABLE
 
+    @staticmethod
+    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+        """What the shapes follow from."""
+        return f"{len(fields)} fields"
+
     @classmethod
     def shapes(
         cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]

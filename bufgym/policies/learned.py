@@ -181,6 +181,11 @@ class Weights:
         table: list[Any] = [(field.name, field.per, field.unit, field.meaning) for field in (*FIELDS, *beside)]
         return [*table, price_dp.PARAMETERS] if set(BY_RULE) & set(beside) else table
 
+    @staticmethod
+    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+        """What the shapes follow from."""
+        return f"{len(fields)} fields"
+
     @classmethod
     def shapes(
         cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]

@@ -123,7 +123,7 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     fields, settings = metadata["fields"], {name: metadata[name] for name in kind.SETTINGS}
     tensors = _checked_tensors(path, entries, fields, settings, kind)
     if _sha256(fields, settings, tensors) != metadata["sha256"]:
-        rule = "fields and tensors have another one: the file was changed"
+        rule = "fields, settings and tensors have another one: the file was changed"
         raise _wrong(path, "sha256", rule, metadata["sha256"])
     return kind.of(fields, tensors, settings), metadata
 
@@ -224,4 +224,6 @@ def _check_shapes(
             raise _wrong(path, f"tensor {name}", rule)
     for name, shape in required.items():
         if shapes[name] != shape:
-            raise misshapen(name, f"must be {list(shape)} for {len(fields)} fields and hidden layers of {widths}")
+            raise misshapen(
+                name, f"must be {list(shape)} for {kind.told(fields, settings)} and hidden layers of {widths}"
+            )

@@ -34,13 +34,15 @@ _ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 
 def candidates_of(agent: Any) -> int | None:
     """k, if the model observes k candidates and the head, otherwise None."""
-    space, actions = agent.observation_space, getattr(agent.action_space, "n", 0)
+    space, actions = agent.observation_space, int(getattr(agent.action_space, "n", 0))
+    names = set(space) if isinstance(space, spaces.Dict) else set()
     for k in (actions - 1, actions - 2):
         if k < 1:
             continue
-        if isinstance(space, spaces.Dict):
-            shape = getattr(space.get("slots", space.get(_FIRST)), "shape", None)
-            if shape == ((k + 1, len(CANDIDATE_FIELDS)) if "slots" in space else (k + 1,)):
+        if names:
+            if "slots" in names and space["slots"].shape == (k + 1, len(CANDIDATE_FIELDS)):
+                return k
+            if _FIRST in names and space[_FIRST].shape == (k + 1,):
                 return k
         elif space == _form("flat", k).space:
             return k
@@ -83,7 +85,7 @@ class CandidateDecisions:
         self.capacity: int | None = None
         """L that the model was trained for; None if it serves every L."""
         if isinstance(space, spaces.Dict):
-            form, names = ("slots", None) if "slots" in space else ("dict", list(space))
+            form, names = ("slots", None) if "slots" in set(space) else ("dict", list(space))
         known = {field.name for field in (*CANDIDATE_FIELDS, *QUEUE_FIELDS)}
         for key in names or ():
             field = own_field(key)

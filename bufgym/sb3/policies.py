@@ -15,7 +15,7 @@ from bufgym.envs.own import write_in_python
 from bufgym.ground.errors import BufgymError
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.policies import Policy
+from bufgym.policies import Policy, candidate_network
 from bufgym.policies.chains import SCRATCH
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, REMEMBERED, SCALES, WORK, follow, inputs, recall
 from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
@@ -124,6 +124,9 @@ class _Decisions:
         expected = spaces.flatdim(self.form.space)
         if numbers != expected:
             rule = f"must be the {expected} of {', '.join(names or known)} for L = {self.capacity}"
+            if form == "flat":
+                known_sizes = " or ".join(str(candidate_network.inputs(k)) for k in (self.capacity, self.capacity + 1))
+                rule += f'; of candidates {known_sizes}, and further fields by name (observation="dict")'
             raise BufgymError(f"model {name}: observes {numbers} numbers: {rule}")
 
     def on_arrival(self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:

@@ -1,7 +1,6 @@
 """Networks among ordered candidates decide as their weights say: against a reference model in plain Python."""
 
 import functools
-import itertools
 import math
 
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 from cases import VALUES, cases, newcomer, queue_of, same
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from weight_cases import random_choices
 
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
@@ -17,16 +17,6 @@ from bufgym.policies.registry import Policy
 
 kernels = pytest.mark.kernels
 NO_CANDIDATE = None
-
-
-def some(k, at_arrivals, *widths, masks=False, activation="tanh", seed=0):
-    """A network of random numbers."""
-    rng = np.random.default_rng(seed)
-    pairs = itertools.pairwise([inputs(k), *widths, k + 1 + at_arrivals])
-    layers = tuple(
-        (rng.normal(size=pair).astype(np.float32), rng.normal(size=pair[1]).astype(np.float32)) for pair in pairs
-    )
-    return CandidateWeights(k, at_arrivals, masks, activation, layers)
 
 
 def lg(a, b):
@@ -50,7 +40,7 @@ def found(buffer, arrival, k):
         return a - b if abs(cost[a] - cost[b]) <= 1e-12 else math.copysign(1, cost[a] - cost[b])
 
     there.sort(key=functools.cmp_to_key(compare))
-    best = (there + k * [NO_CANDIDATE])[:k] + [0 if s > 0 else NO_CANDIDATE]
+    best = [*(there + k * [NO_CANDIDATE])[:k], 0 if s > 0 else NO_CANDIDATE]
     return [(j, 0.0 if j is None else cost[j]) for j in best], x
 
 
@@ -131,7 +121,7 @@ def networks(draw):
     widths = draw(st.sampled_from([(), (1,), (5,), (4, 3), (3, 2, 4)]))
     masks, activation = draw(st.booleans()), draw(st.sampled_from(["tanh", "relu"]))
     k, at_arrivals, seed = draw(st.integers(1, 5)), draw(st.booleans()), draw(st.integers(0, 2**32))
-    return some(k, at_arrivals, *widths, masks=masks, activation=activation, seed=seed)
+    return random_choices(k, at_arrivals, *widths, masks=masks, activation=activation, seed=seed)
 
 
 @kernels
