@@ -121,7 +121,9 @@ def networks(draw):
     widths = draw(st.sampled_from([(), (1,), (5,), (4, 3), (3, 2, 4)]))
     masks, activation = draw(st.booleans()), draw(st.sampled_from(["tanh", "relu"]))
     k, at_arrivals, seed = draw(st.integers(1, 5)), draw(st.booleans()), draw(st.integers(0, 2**32))
-    return random_choices(k, at_arrivals, *widths, masks=masks, activation=activation, seed=seed)
+    return random_choices(
+        k, at_arrivals, *widths, masks=masks, activation=activation, seed=seed, accept=3.0 * at_arrivals
+    )
 
 
 @kernels

@@ -43,11 +43,12 @@ def random_weights(fields, *widths, seed=0):
     return Weights(tuple(fields), *(network(rng, len(fields), *widths) for _ in Weights.NETWORKS))
 
 
-def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed=0):
-    """Of a network among k candidates and the head."""
+def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed=0, accept=0.0):
+    """Of a network among k candidates and the head, inclined to its first action by ``accept``."""
     rng = np.random.default_rng(seed)
     pairs = itertools.pairwise([inputs(k), *widths, k + 1 + at_arrivals])
-    layers = ((rng.normal(size=pair), rng.normal(size=pair[1])) for pair in pairs)
+    layers = [(2 * rng.normal(size=pair) / pair[0] ** 0.5, rng.normal(size=pair[1])) for pair in pairs]
+    layers[-1][1][0] += accept
     single = tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
     return CandidateWeights(k, at_arrivals, masks, activation, single)
 
