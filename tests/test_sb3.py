@@ -266,7 +266,7 @@ def test_export_takes_over_what_the_run_noted(tmp_path: Path) -> None:
     untrained(MaskablePPO, "MultiInputPolicy").save(tmp_path / "plain.zip")
     (tmp_path / "text.zip").write_text("hello", encoding="utf-8")
     for name, says in (
-        ("plain.zip", "only an agent that scores slots"),
+        ("plain.zip", "only an agent that chooses among candidates, observed flat, or scores slots"),
         ("other.zip", "no such file"),
         ("text.zip", r"text\.zip: no model of stable-baselines3"),
     ):

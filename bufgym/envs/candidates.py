@@ -17,9 +17,9 @@ from bufgym.model.observe import (
     QUEUE_FIELDS,
     decision_of_candidate,
     find_candidates,
+    is_offered,
     observe_candidates,
 )
-from bufgym.model.observe.candidates import NONE
 from bufgym.sim.decisions import has_room
 from bufgym.sim.state import NOTHING_WAITS, Batch
 from bufgym.sim.view import arrival_of, view
@@ -60,8 +60,8 @@ def candidate_decision(batch: Batch, i: int, action: int, choices: Choices) -> i
 def write_candidates(batch: Batch, i: int, ended: bool, output: StepOutput, choices: Choices) -> None:
     """Write row ``i``'s state, candidates, action mask and observation.
 
-    The mask marks candidates that are there. Without room action 0 at arrivals does what action 1 does, and the mask
-    shows only action 0. Without a decision due action 0 alone is marked, and the observation is zeros.
+    The mask marks the actions that are offered. Without a decision due action 0 alone is marked, and the observation is
+    zeros.
     """
     write_progress(batch, i, ended, output)
     sender = batch.senders[i]
@@ -76,13 +76,11 @@ def write_candidates(batch: Batch, i: int, ended: bool, output: StepOutput, choi
     order, cost = stretch(choices.order, i, 0, places), stretch(choices.cost, i, 0, places)
     find_candidates(buffer, arrival, order, cost)
     observe_candidates(buffer, arrival, order, cost, stretch(output.flat, i, 0, _PER_CANDIDATE * places + _QUEUE))
-    room, first = has_room(batch, i), actions - places
+    room, at_arrivals = has_room(batch, i), choices.at_arrivals == 1
     for action in range(actions):
-        decision = decision_of_candidate(order, sender.occupancy, choices.at_arrivals == 1, room, action)
+        decision = decision_of_candidate(order, sender.occupancy, at_arrivals, room, action)
         slot = decision
         if decision < 0:
             slot = capacity + 1 if decision == ACCEPT else capacity
         output.slot_actions[i, action] = slot
-        mask[i, action] = 1 if action < first else order[action - first] != NONE
-    if first == 1 and not room:
-        mask[i, 1] = 0
+        mask[i, action] = is_offered(order, at_arrivals, room, action)

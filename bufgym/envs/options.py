@@ -11,6 +11,7 @@ from bufgym import scenario as scenarios
 from bufgym.envs.observation import MaskKeys
 from bufgym.ground.errors import BufgymError, UnknownArgumentError, unknown
 from bufgym.model.checks import above_0, whole
+from bufgym.model.observe.candidates import MOST_CANDIDATES
 from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
 
@@ -21,7 +22,6 @@ GUIDED = "guided"
 RULE = "rule"
 CANDIDATES, SLOTS = "candidates", "slots"
 ACTIONS = (CANDIDATES, SLOTS, GUIDED)  # What an action is: the candidate or slot that goes, or numbers of the rule
-MOST_CANDIDATES = 64
 INFOS = ("full", "steady", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
 nothing. At an episode's end the summary is always there."""

@@ -283,6 +283,7 @@ class GuidedWeights:
     CONTEXT_NAMES: ClassVar[tuple[str, ...]] = tuple(INPUTS)
     NETWORKS: ClassVar[tuple[str, ...]] = ("guided",)
     LAYERS: ClassVar[int] = 0
+    SETTINGS: ClassVar[Mapping[str, Any]] = {}
     SHAPE: ClassVar[tuple[int, int]] = (2 * N_OUTPUTS, N_INPUTS)
     LIGHT: ClassVar[tuple[int, int]] = (N_OUTPUTS, N_INPUTS)
     TABLE: ClassVar[list[Any]] = [MEANINGS, [tuple(output) for output in OUTPUTS], price_dp.PARAMETERS]
@@ -318,13 +319,20 @@ class GuidedWeights:
         """What defines inputs, outputs and the rule: weights found with others would decide nonsense."""
         return cls.TABLE
 
+    @staticmethod
+    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+        """What the shapes follow from."""
+        return f"{len(fields)} fields"
+
     @classmethod
-    def shapes(cls, inputs: int, widths: Sequence[int], given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    def shapes(
+        cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]
+    ) -> dict[str, tuple[int, ...]]:
         """The shapes of ``tensors`` by name; of two that are possible, the ``given`` one."""
         name = f"{cls.NETWORKS[0]}.weight"
         return {name: cls.LIGHT if given.get(name) == cls.LIGHT else cls.SHAPE}
 
     @classmethod
-    def of(cls, fields: Sequence[str], tensors: Mapping[str, NDArray[np.float32]]) -> Self:
+    def of(cls, fields: Sequence[str], tensors: Mapping[str, NDArray[np.float32]], settings: Mapping[str, Any]) -> Self:
         """Make the weights of these ``tensors``."""
         return cls(*tensors.values())

@@ -124,6 +124,7 @@ class Weights:
     CONTEXT_NAMES: ClassVar[tuple[str, ...]] = CONTEXT_NAMES + tuple(field.name for field in RULE_FIELDS)
     NETWORKS: ClassVar[tuple[str, ...]] = ("drop", "accept")
     LAYERS: ClassVar[int] = 2
+    SETTINGS: ClassVar[Mapping[str, Any]] = {}
 
     fields: tuple[str, ...]
     """Names of the fields read, in the order of the networks' inputs."""
@@ -180,13 +181,23 @@ class Weights:
         table: list[Any] = [(field.name, field.per, field.unit, field.meaning) for field in (*FIELDS, *beside)]
         return [*table, price_dp.PARAMETERS] if set(BY_RULE) & set(beside) else table
 
-    @classmethod
-    def shapes(cls, inputs: int, widths: Sequence[int], given: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-        """The shapes of ``tensors`` for so many fields and hidden layers of these widths, by name."""
-        return {f"{n}.{name}": shape for n in cls.NETWORKS for name, shape in Network.shapes(inputs, widths).items()}
+    @staticmethod
+    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+        """What the shapes follow from."""
+        return f"{len(fields)} fields"
 
     @classmethod
-    def of(cls, fields: Sequence[str], tensors: Mapping[str, NDArray[np.float32]]) -> "Weights":
+    def shapes(
+        cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]
+    ) -> dict[str, tuple[int, ...]]:
+        """The shapes of ``tensors`` for these fields and hidden layers of these widths, by name."""
+        one = Network.shapes(len(fields), widths)
+        return {f"{n}.{name}": shape for n in cls.NETWORKS for name, shape in one.items()}
+
+    @classmethod
+    def of(
+        cls, fields: Sequence[str], tensors: Mapping[str, NDArray[np.float32]], settings: Mapping[str, Any]
+    ) -> "Weights":
         """Make the weights of these fields and ``tensors``."""
         return cls(tuple(fields), *(Network.of(tensors, f"{n}.") for n in cls.NETWORKS))
 

@@ -18,6 +18,7 @@ from safetensors.numpy import save as serialized
 from bufgym.ground import __version__, strict_json
 from bufgym.ground.errors import BufgymError, where
 from bufgym.ground.files import read_whole, replaced
+from bufgym.policies.candidate_network import CandidateWeights
 from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Weights
@@ -25,8 +26,8 @@ from bufgym.policies.registry import Policy
 
 StrPath = str | os.PathLike[str]
 Tensors = dict[str, NDArray[np.float32]]
-AnyWeights = Weights | GuidedWeights
-Kind = type[Weights] | type[GuidedWeights]
+AnyWeights = Weights | GuidedWeights | CandidateWeights
+Kind = type[Weights] | type[GuidedWeights] | type[CandidateWeights]
 
 FORMAT = 1
 MAX_BYTES = 1 << 20  # Largest file accepted, bytes: a slot scorer has a few kilobytes
@@ -61,16 +62,18 @@ def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
     """
     # Little-endian and in C order, as in the file.
     target, tensors = Path(path), {n: np.ascontiguousarray(t, "<f4") for n, t in weights.tensors().items()}
-    reserved = sorted(set(WRITTEN) & set(about))
+    settings = {name: getattr(weights, name) for name in weights.SETTINGS}
+    reserved = sorted({*WRITTEN, *settings} & set(about))
     if reserved:
         raise BufgymError(f"{target}: metadata {', '.join(reserved)}: written by save itself")
     metadata = {
         "format": FORMAT,
         **about,
         "fields": list(weights.fields),
+        **settings,
         "observation": observation_hash(type(weights), weights.fields),
         "bufgym": __version__,
-        "sha256": _sha256(weights.fields, tensors),
+        "sha256": _sha256(weights.fields, settings, tensors),
     }
     try:
         text = json.dumps(metadata, allow_nan=False)
@@ -86,9 +89,11 @@ def save(path: StrPath, weights: AnyWeights, about: Mapping[str, Any]) -> Path:
     return target
 
 
-def _sha256(fields: Sequence[str], tensors: Tensors) -> str:
-    """Hash of the fields, and of the tensors' names, shapes and bytes in the order of the names."""
+def _sha256(fields: Sequence[str], settings: Mapping[str, Any], tensors: Tensors) -> str:
+    """Hash of the fields, the settings, and the tensors' names, shapes and bytes in the order of the names."""
     state = hashlib.sha256(",".join(fields).encode())
+    for name, value in settings.items():
+        state.update(f"{name}={json.dumps(value)}".encode())
     for name in sorted(tensors):
         state.update(f"{name}{list(tensors[name].shape)}".encode())
         state.update(tensors[name].tobytes())
@@ -112,14 +117,15 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     except safetensors.SafetensorError as error:
         raise BufgymError(f"{path}: no safetensors file, or a broken one: {error}") from None
     prefixes = {name.partition(".")[0] for name in entries}
-    kinds: tuple[Kind, ...] = (GuidedWeights, SchedulerWeights)
+    kinds: tuple[Kind, ...] = (GuidedWeights, SchedulerWeights, CandidateWeights)
     kind = next((kind for kind in kinds if kind.NETWORKS[0] in prefixes), Weights)
     metadata = _metadata(path, data, kind)
-    tensors = _checked_tensors(path, entries, metadata["fields"], kind)
-    if _sha256(metadata["fields"], tensors) != metadata["sha256"]:
-        rule = "fields and tensors have another one: the file was changed"
+    fields, settings = metadata["fields"], {name: metadata[name] for name in kind.SETTINGS}
+    tensors = _checked_tensors(path, entries, fields, settings, kind)
+    if _sha256(fields, settings, tensors) != metadata["sha256"]:
+        rule = "fields, settings and tensors have another one: the file was changed"
         raise _wrong(path, "sha256", rule, metadata["sha256"])
-    return kind.of(metadata["fields"], tensors), metadata
+    return kind.of(fields, tensors, settings), metadata
 
 
 def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
@@ -160,6 +166,11 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
             raise _wrong(path, "field", f"unknown; known: {', '.join(known)}", field)
         if fields.count(field) > 1:
             raise _wrong(path, "field", "given more than once", field)
+    for key, (holds, rule) in kind.SETTINGS.items():
+        if not holds(metadata.get(key)):
+            raise wrong(key, rule)
+    if kind is CandidateWeights and tuple(fields) != known:
+        raise wrong("fields", f"must be {', '.join(known)}")
     return metadata
 
 
@@ -168,10 +179,12 @@ def _wrong(path: StrPath, what: str, rule: str, value: object = None) -> BufgymE
     return BufgymError(where(path, None, value, rule, field=what))
 
 
-def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[str], kind: Kind) -> Tensors:
+def _checked_tensors(
+    path: StrPath, entries: dict[str, Any], fields: Sequence[str], settings: Mapping[str, Any], kind: Kind
+) -> Tensors:
     """Name -> tensor; each is float32, finite, and of the shape that the others require."""
     shapes = {name: tuple(entry["shape"]) for name, entry in entries.items()}
-    _check_shapes(path, shapes, fields, kind)
+    _check_shapes(path, shapes, fields, settings, kind)
     tensors: Tensors = {}
     for name, entry in entries.items():
         if entry["dtype"] != "F32":
@@ -183,7 +196,9 @@ def _checked_tensors(path: StrPath, entries: dict[str, Any], fields: Sequence[st
     return tensors
 
 
-def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: Sequence[str], kind: Kind) -> None:
+def _check_shapes(
+    path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: Sequence[str], settings: Mapping[str, Any], kind: Kind
+) -> None:
     """Check that the tensors are complete and fit each other."""
 
     def misshapen(name: str, rule: str) -> BufgymError:
@@ -191,15 +206,16 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
 
     widths: list[int] = []
     for k in range(kind.LAYERS):
-        name = f"drop.{k}.bias"
+        layer = f"{kind.NETWORKS[0]}.{k}"
+        name = f"{layer}.bias"
         if name not in shapes:
-            if f"drop.{k}.weight" in shapes:
+            if f"{layer}.weight" in shapes:
                 raise _wrong(path, f"tensor {name}", "is missing")
             break
         if len(shapes[name]) != 1 or not 1 <= shapes[name][0] <= MAX_WIDTH:
             raise misshapen(name, f"must be one number for each of 1 to {MAX_WIDTH} hidden units")
         widths += shapes[name]
-    required = kind.shapes(len(fields), widths, shapes)
+    required = kind.shapes(fields, widths, shapes, settings)
     for name in (*required, *shapes):
         if name not in shapes:
             raise _wrong(path, f"tensor {name}", "is missing")
@@ -208,4 +224,6 @@ def _check_shapes(path: StrPath, shapes: Mapping[str, tuple[int, ...]], fields: 
             raise _wrong(path, f"tensor {name}", rule)
     for name, shape in required.items():
         if shapes[name] != shape:
-            raise misshapen(name, f"must be {list(shape)} for {len(fields)} fields and hidden layers of {widths}")
+            raise misshapen(
+                name, f"must be {list(shape)} for {kind.told(fields, settings)} and hidden layers of {widths}"
+            )

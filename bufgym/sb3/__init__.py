@@ -13,8 +13,8 @@ from bufgym.ground.libraries import needs
 
 with needs(("stable_baselines3", "sb3_contrib", "torch"), "train", "bufgym.sb3"):
     from bufgym.sb3.export import export, weights_of
-    from bufgym.sb3.networks import SlotExtractor, SlotPolicy, SlotScorer
-    from bufgym.sb3.policies import as_policy, takes_masks
+    from bufgym.sb3.networks import SlotExtractor, SlotPolicy, SlotScorer, takes_masks
+    from bufgym.sb3.policies import as_policy
     from bufgym.sb3.vec_env import GymVecEnv, make_vec_env
 
 __all__ = [

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from torch import Tensor, nn
@@ -14,9 +13,11 @@ from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength
 from bufgym.policies import Policy
 from bufgym.policies import weights as files
+from bufgym.policies.candidate_network import CandidateWeights
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.weights import StrPath
-from bufgym.sb3.networks import SlotExtractor, SlotScorer
+from bufgym.policies.weights import MAX_WIDTH, StrPath
+from bufgym.sb3.candidates import candidates_of, perceptron
+from bufgym.sb3.networks import SlotExtractor, SlotScorer, array
 from bufgym.scenario import suites
 
 CHECKED = (4, 8, 16, 32)  # Values of L for the regrets noted in the file
@@ -27,14 +28,14 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
 
     Args:
         model: an evolved agent's ``model.safetensors``, which gets its name and its scores; or the zip of a model of
-            stable-baselines3 with ``SlotPolicy``. A zip holds pickles, and reading it can run any code: export your
-            own alone.
+            stable-baselines3 that chooses among candidates or has the ``SlotPolicy``. A zip holds pickles, and reading
+            it can run any code: export your own alone.
         out: the file to write, .safetensors.
         name: the policy's name.
         about: a sentence on what it was trained for.
 
     Raises:
-        BufgymError: ``model`` is no agent that scores slots, or ``out`` cannot be written.
+        BufgymError: ``model`` is no such agent, or ``out`` cannot be written.
     """
     path = Path(model)
     weights = files.read(path)[0] if path.suffix == ".safetensors" else weights_of(read_policy(path))
@@ -65,12 +66,34 @@ def read_policy(path: StrPath) -> BasePolicy:
     return policy
 
 
-def weights_of(model: Any) -> Weights:
-    """Weights of the actor of a model with ``SlotPolicy``, or of that policy; the critic only served training."""
+def weights_of(model: Any) -> Weights | CandidateWeights:
+    """Weights of a model's actor or Q-network; a critic only served training.
+
+    Args:
+        model: PPO, A2C, MaskablePPO or DQN with "MlpPolicy" on ``actions="candidates"``, or MaskablePPO with
+            ``SlotPolicy``; or the ``policy`` of one.
+
+    Raises:
+        BufgymError: a file has no place for its network.
+    """
+    refuse_normalized(model)
     policy = getattr(model, "policy", model)
+    candidates = candidates_of(policy)
+    if candidates is not None:
+        found = perceptron(policy, candidates)
+        if found is None:
+            raise BufgymError(
+                f'only networks of PPO, A2C, MaskablePPO or DQN with "MlpPolicy" and at most {CandidateWeights.LAYERS} '
+                f"hidden layers of {MAX_WIDTH} units, tanh or relu, can be exported among candidates, and "
+                f"{type(policy).__name__} is another; as_policy runs it in torch"
+            )
+        return found
     features, scorer = (getattr(policy, part, None) for part in ("features_extractor", "mlp_extractor"))
     if not isinstance(features, SlotExtractor) or not isinstance(scorer, SlotScorer):
-        raise BufgymError("only an agent that scores slots can be exported (train.py ppo --network slots)")
+        raise BufgymError(
+            "only an agent that chooses among candidates, observed flat, or scores slots can be exported "
+            "(train.py ppo --network slots)"
+        )
     fields = (*features.slot_fields, *features.context_fields)
     return Weights(fields, _network(scorer.score, scorer.priors[0]), _network(scorer.accept, scorer.priors[1]))
 
@@ -79,15 +102,21 @@ def _network(perceptron: nn.Sequential, prior: Tensor) -> Network:
     """ReLU layers, one output and direct weights of the inputs; torch keeps weights as [outputs, inputs]."""
     *hidden, last = [layer for layer in perceptron if isinstance(layer, nn.Linear)]
     return Network(
-        _array(prior),
-        _array(last.bias),
-        tuple((np.ascontiguousarray(_array(layer.weight).T), _array(layer.bias)) for layer in hidden),
-        _array(last.weight)[0],
+        array(prior),
+        array(last.bias),
+        tuple((np.ascontiguousarray(array(layer.weight).T), array(layer.bias)) for layer in hidden),
+        array(last.weight)[0],
     )
 
 
-def _array(parameter: Any) -> NDArray[np.float32]:
-    return np.array(parameter.detach().cpu().numpy(), np.float32)
+def refuse_normalized(model: Any) -> None:
+    """Raise a BufgymError if the model observes through ``VecNormalize``."""
+    found = getattr(model, "get_vec_normalize_env", lambda: None)()
+    if found is not None and found.norm_obs:
+        raise BufgymError(
+            "a model that observes through VecNormalize needs its running means, which a policy does not have: train "
+            "with norm_obs=False, as all fields are scaled already"
+        )
 
 
 def regrets(policy: Policy) -> dict[str, float]:

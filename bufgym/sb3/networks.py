@@ -4,10 +4,13 @@ Scoring slots one by one builds knowledge of the problem in. A message's worth d
 features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
 """
 
+import inspect
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
@@ -21,6 +24,16 @@ OCCUPIED = ("occupied", "rule_place")
 """Slot fields that are 0 for an empty slot alone."""
 RULED = ("rule_drops", "rule_accepts")
 """Fields that say what the rule chooses: of a slot, and of the context."""
+
+
+def takes_masks(agent: Any) -> bool:
+    """Whether the agent's ``predict`` takes ``action_masks``, as MaskablePPO's does."""
+    return "action_masks" in inspect.signature(agent.predict).parameters
+
+
+def array(parameter: Any) -> NDArray[np.float32]:
+    """A copy of torch's numbers."""
+    return np.array(parameter.detach().cpu().numpy(), np.float32)
 
 
 def field_names(space: spaces.Dict) -> tuple[list[str], list[str]]:

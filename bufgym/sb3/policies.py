@@ -1,6 +1,5 @@
 """``as_policy``: any trained model of stable-baselines3 or sb3-contrib as a policy for runs and benchmarks."""
 
-import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,23 +15,25 @@ from bufgym.envs.own import write_in_python
 from bufgym.ground.errors import BufgymError
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
-from bufgym.policies import Policy
+from bufgym.policies import Policy, candidate_network
 from bufgym.policies.chains import SCRATCH
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, REMEMBERED, SCALES, WORK, follow, inputs, recall
 from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
-from bufgym.sb3.export import read_policy, weights_of
-from bufgym.sb3.networks import SlotScorer
+from bufgym.sb3.candidates import CandidateDecisions, candidates_of, perceptron
+from bufgym.sb3.export import read_policy, refuse_normalized, weights_of
+from bufgym.sb3.networks import SlotScorer, takes_masks
 
 
 def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Policy:
     """Make a bufgym policy of a trained model; it takes the model's most likely or most valued action.
 
-    A network that scores slots with masks (``SlotPolicy`` under MaskablePPO) runs compiled and serves every L. Any
-    other network runs in torch, one decision at a time, and serves the L it was trained for; every L if its actions and
-    its observation, "flat", are guided. Algorithms that take action masks get them. For others, an invalid action does
-    the same as in the environment. An observation "flat" or "slots" must be of every field; a "dict" names its fields.
+    Two kinds of networks run compiled and serve every L: "MlpPolicy" of PPO, A2C, MaskablePPO and DQN that observes
+    candidates, "flat", and a network that scores slots with masks (``SlotPolicy`` under MaskablePPO). Any other network
+    runs in torch, one decision at a time. It serves every L if it observes candidates or is guided, and otherwise the L
+    it was trained for. Algorithms that take action masks get them. For others, an invalid action does the same as in
+    the environment. An observation "flat" or "slots" must be of every field; a "dict" names its fields.
 
         policy = as_policy("model.zip", "mine")
         bufgym.benchmark.run.run([policy, policies.get("afr")], scenario, capacities=[8], seeds=10)
@@ -43,7 +44,7 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
         name: the policy's name; by default that of the file or class.
 
     Raises:
-        BufgymError: no such file, or a model that was not trained on a bufgym environment.
+        BufgymError: no such file, or a model that was not trained on a bufgym environment, or through ``VecNormalize``.
     """
     agent: Any = model if isinstance(model, BaseAlgorithm | BasePolicy) else read_policy(model)
     if not name:
@@ -51,11 +52,20 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     network = agent.policy if isinstance(agent, BaseAlgorithm) else agent
     if getattr(network, "lstm_actor", None) is not None:
         raise BufgymError(f"model {name}: has a recurrent network, whose state a policy cannot keep")
+    refuse_normalized(agent)
     about = f"A trained {type(agent).__name__}."
     guided = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)
     if agent.action_space == guided and agent.observation_space.shape == (N_INPUTS,):
         return _guided(name, agent, about)
     masked = takes_masks(agent) and getattr(network, "masked", True)
+    candidates = candidates_of(agent)
+    if candidates is not None:
+        weights = perceptron(network, candidates)
+        if weights is not None:
+            return weights.policy(name, about)
+        return Policy(
+            name, CandidateDecisions(name, agent, candidates, masked).on_arrival, about=about, reads_rate=True
+        )
     decisions = _Decisions(name, agent, masked)
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
         return weights_of(network).policy(name, about)
@@ -63,11 +73,6 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
         memory: Any = {"memory": REMEMBERED, "work": SCRATCH} if decisions.by_rule else {}
         return Policy(name, decisions.on_arrival, about=about, reads_rate=True, **memory)
     return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True)
-
-
-def takes_masks(agent: Any) -> bool:
-    """Whether the agent's ``predict`` takes ``action_masks``, as MaskablePPO's does."""
-    return "action_masks" in inspect.signature(agent.predict).parameters
 
 
 def _guided(name: str, agent: Any, about: str) -> Policy:
@@ -90,7 +95,8 @@ class _Decisions:
         space, actions = agent.observation_space, agent.action_space
         self.capacity = int(getattr(actions, "n", 0)) - 2
         if self.capacity < 1:
-            raise BufgymError(f"model {name}: action space {actions}: must be Discrete(L + 2), or guided and seen flat")
+            rule = "must be Discrete(L + 2), or that of candidates, or guided and seen flat"
+            raise BufgymError(f"model {name}: action space {actions}: {rule}")
         form = "dict" if isinstance(space, spaces.Dict) else "flat"
         if form == "dict" and {"slots", "context"} & set(space):
             form = "slots"
@@ -118,6 +124,9 @@ class _Decisions:
         expected = spaces.flatdim(self.form.space)
         if numbers != expected:
             rule = f"must be the {expected} of {', '.join(names or known)} for L = {self.capacity}"
+            if form == "flat":
+                known_sizes = " or ".join(str(candidate_network.inputs(k)) for k in (self.capacity, self.capacity + 1))
+                rule += f'; of candidates {known_sizes}, and further fields by name (observation="dict")'
             raise BufgymError(f"model {name}: observes {numbers} numbers: {rule}")
 
     def on_arrival(self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
@@ -143,7 +152,7 @@ class _Decisions:
         if L != self.capacity:
             raise BufgymError(
                 f"policy {self.name}: trained for L = {self.capacity}, not for L = {L}; only a network that scores "
-                "slots with masks (MaskablePPO with bufgym.sb3.SlotPolicy) serves every L"
+                "slots with masks (MaskablePPO with bufgym.sb3.SlotPolicy) or chooses among candidates serves every L"
             )
         row = np.zeros(self.form.numbers, np.float32)
         slots, context = self.form.split(row)

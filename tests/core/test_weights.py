@@ -12,7 +12,7 @@ import pytest
 from cases import same
 from refusal_cases import refuse
 from safetensors.numpy import save as safetensors
-from weight_cases import ABOUT, KINDS, QUEUE, TOPICS, made, parts_of, put, put_changed, random_weights, refused
+from weight_cases import ABOUT, CHOICES, KINDS, QUEUE, TOPICS, made, parts_of, put, put_changed, random_weights, refused
 
 from bufgym import __version__, policies
 from bufgym.ground.errors import BufgymError
@@ -95,6 +95,20 @@ def test_a_policy_for_one_queue_may_not_read_what_only_topics_have(path):
     assert not policies.load(path).schedules
 
 
+@pytest.mark.parametrize("widths", [(), (5,), (64, 64), (3, 2, 4)], ids=str)
+def test_a_network_among_candidates_comes_back_bit_for_bit(path, widths):
+    before = made(*widths, kind=CHOICES)
+    weights.save(path, before, ABOUT)
+    after, metadata = weights.read(path)
+    assert isinstance(after, CHOICES)
+    assert after.parameters().tobytes() == before.parameters().tobytes()
+    names = ("candidates", "at_arrivals", "masks", "activation")
+    assert [metadata[name] for name in names] == [getattr(after, name) for name in names] == [2, True, False, "tanh"]
+    policy = policies.load(path)
+    assert (policy.name, policy.ranked, policy.for_topics, policy.measures) == ("small", True, False, True)
+    refuse("metadata masks: written by save itself", weights.save, path, before, {**ABOUT, "masks": True})
+
+
 @pytest.mark.parametrize(
     ("about", "rule"),
     [
@@ -121,6 +135,9 @@ def test_weights_that_could_not_be_read_are_not_written(path):
         (replace(good, accept=made(4).accept), r"accept\.0\.weight = .*must be \[2, 3\]"),
         (made(3, 3, 3), "2 at most"),
         (made(257), "1 to 256 hidden units"),
+        (made(3, 3, 3, 3, kind=CHOICES), "3 at most"),
+        (replace(made(3, kind=CHOICES), candidates=5), r"must be \[45, 3\] for 5 candidates"),
+        (replace(made(3, kind=CHOICES), activation="elu"), "activation = elu: must be one of relu, tanh"),
         (TOPICS(nan), r"tensor scheduler\.weight must hold"),
         (made(3, fields=("speed", "service_ratio")), "field = speed: unknown"),
     ):
@@ -186,7 +203,7 @@ def test_a_truncated_or_changed_file_is_refused(path, kind):
         refused(path, "no safetensors file, or a broken one")
     data[-4] ^= 1
     path.write_bytes(data)
-    refused(path, "sha256", "fields and tensors have another one")
+    refused(path, "sha256", "fields, settings and tensors have another one")
 
 
 @pytest.mark.parametrize(
@@ -222,6 +239,17 @@ def test_metadata_that_are_no_json_object_are_refused(path, text, rule):
         (QUEUE, "fields", ["service_ratio"], "must be [1] for 1 fields and hidden layers of [3]"),
         (TOPICS, "fields", ["one", "speed"], "field = speed: unknown; known: one, fill"),
         (TOPICS, "fields", ["fill", "one"], "the file was changed"),
+        (CHOICES, "fields", ["candidate_place"], "fields = ['candidate_place']: must be candidate_place, candidate_n"),
+        (CHOICES, "candidates", 65, "candidates = 65: must be a whole number from 1 to 64"),
+        (CHOICES, "candidates", True, "candidates = True: must be a whole number"),
+        (CHOICES, "candidates", 3, "must be [33, 3] for 3 candidates, at arrivals, and hidden layers of [3]"),
+        (CHOICES, "at_arrivals", 1, "at_arrivals = 1: must be true or false"),
+        (CHOICES, "at_arrivals", False, "must be [3, 3] for 2 candidates, at a full buffer, and hidden layers of [3]"),
+        (CHOICES, "masks", None, "masks must be true or false"),
+        (CHOICES, "masks", True, "sha256 = "),
+        (CHOICES, "activation", "elu", "activation = elu: must be one of relu, tanh"),
+        (CHOICES, "activation", "relu", "fields, settings and tensors have another one: the file was changed"),
+        (CHOICES, "observation", weights.observation_hash(QUEUE), "trained on other observations than this bufgym's"),
         *((QUEUE, key, "absent", key) for key in ("format", "name", "fields", "observation", "bufgym", "sha256")),
     ],
 )
@@ -264,6 +292,13 @@ def numbers(*shape, kind=np.float32):
         (QUEUE, "still.drop.out", numbers(3), "tensor still.drop.out has no place"),
         (TOPICS, "scheduler.weight", numbers(3, 5), "tensor scheduler.weight = '[3, 5]': must be [17, 9]"),
         (TOPICS, "drop.mix", numbers(1, 2), "tensor drop.mix has no place"),
+        (CHOICES, "candidates.out.weight", None, "tensor candidates.out.weight is missing"),
+        (CHOICES, "candidates.0.bias", None, "tensor candidates.0.bias is missing"),
+        (CHOICES, "candidates.0.bias", numbers(257), "1 to 256 hidden units"),
+        (CHOICES, "candidates.0.weight", numbers(26, 3), "must be [27, 3] for 2 candidates, at arrivals"),
+        (CHOICES, "candidates.1.bias", numbers(3), "tensor candidates.1.weight is missing"),
+        (CHOICES, "candidates.out.bias", np.float32([0, 0, np.inf, 0]), "must hold finite numbers alone"),
+        (CHOICES, "critic", numbers(3), "tensor critic has no place"),
     ],
 )
 def test_tensors_that_break_a_rule_are_refused(path, kind, name, tensor, rule):

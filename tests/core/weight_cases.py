@@ -1,4 +1,4 @@
-"""Random weights of learned policies and their files, for the tests of both kinds."""
+"""Random weights of learned policies and their files, for the tests of all kinds."""
 
 import itertools
 import json
@@ -12,6 +12,7 @@ from safetensors.numpy import save as safetensors
 from bufgym import policies
 from bufgym.ground.errors import BufgymError
 from bufgym.policies import weights
+from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Network, Weights
 
@@ -42,15 +43,27 @@ def random_weights(fields, *widths, seed=0):
     return Weights(tuple(fields), *(network(rng, len(fields), *widths) for _ in Weights.NETWORKS))
 
 
-KINDS = QUEUE, TOPICS = Weights, SchedulerWeights
+def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed=0, accept=0.0):
+    """Of a network among k candidates and the head, inclined to its first action by ``accept``."""
+    rng = np.random.default_rng(seed)
+    pairs = itertools.pairwise([inputs(k), *widths, k + 1 + at_arrivals])
+    layers = [(2 * rng.normal(size=pair) / pair[0] ** 0.5, rng.normal(size=pair[1])) for pair in pairs]
+    layers[-1][1][0] += accept
+    single = tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
+    return CandidateWeights(k, at_arrivals, masks, activation, single)
+
+
+KINDS = QUEUE, TOPICS, CHOICES = Weights, SchedulerWeights, CandidateWeights
 FIELDS = ("time_merged", "service_ratio")
 ABOUT = {"name": "small", "about": "Drops what is in its way.", "seeds": [0, 1], "scores": {"regret": 0.25}}
 
 
 def made(*widths, kind=QUEUE, fields=FIELDS, seed=0):
-    """Weights of either kind."""
+    """Weights of any kind; the network among candidates is asked at arrivals, and has no masks."""
     if kind is TOPICS:
         return TOPICS(np.random.default_rng(seed).normal(size=TOPICS.SHAPE).astype(np.float32))
+    if kind is CHOICES:
+        return random_choices(2, True, *widths, seed=seed)
     return random_weights(fields, *widths, seed=seed)
 
 

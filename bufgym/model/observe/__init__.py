@@ -8,6 +8,7 @@ from bufgym.model.observe.candidates import (
     QUEUE_FIELDS,
     decision_of_candidate,
     find_candidates,
+    is_offered,
     observe_candidates,
 )
 from bufgym.model.observe.declare import Field
@@ -43,6 +44,6 @@ __all__ = [
     "CANDIDATE_FIELDS", "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS", "OWN_FIELDS",
     "OWN_TERMS", "QUEUE_FIELDS", "REWARD_TERMS", "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS", "TOPIC_FIELDS",
     "TOPIC_REWARD_TERMS", "TOPIC_SLOT_FIELDS", "Field", "OwnTerm", "RewardTerm", "decision_of_candidate", "field",
-    "find_candidates", "observe", "observe_candidates", "observe_on_board", "observe_on_board_slots",
+    "find_candidates", "is_offered", "observe", "observe_candidates", "observe_on_board", "observe_on_board_slots",
     "observe_topic_context", "observe_topic_slots", "own_field", "own_term", "reward_term", "terms_for",
 ]  # fmt: skip

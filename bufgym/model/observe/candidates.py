@@ -25,9 +25,10 @@ from bufgym.model.qoi import merging_loss, value
 
 MOST = 3.0
 """Largest absolute value of a logarithm observed."""
-_LEAST, _LARGEST = math.exp(-MOST), math.exp(MOST)
-_SQRT_HALF = int(np.float32(math.sqrt(0.5)).view(np.int32))
-_LOG_2, _C3, _C5, _C7 = np.float32(math.log(2)), np.float32(2 / 3), np.float32(2 / 5), np.float32(2 / 7)
+LEAST, LARGEST = math.exp(-MOST), math.exp(MOST)
+SQRT_HALF = int(np.float32(math.sqrt(0.5)).view(np.int32))
+LOG_2, C3, C5, C7 = np.float32(math.log(2)), np.float32(2 / 3), np.float32(2 / 5), np.float32(2 / 7)
+MOST_CANDIDATES = 64
 NONE = -3
 """Entry of ``order`` for a candidate that is not there; no decision has this number."""
 TIE = 1e-12
@@ -38,8 +39,8 @@ TIE = 1e-12
 def ratio(a: float, b: float) -> float:
     """The ratio a / b of two numbers >= 0, between e^-3 and e^3; 1 if both are 0."""
     if b > 0:
-        return min(max(a / b, _LEAST), _LARGEST)
-    return _LARGEST if a > 0 else 1.0
+        return min(max(a / b, LEAST), LARGEST)
+    return LARGEST if a > 0 else 1.0
 
 
 @kernel
@@ -51,12 +52,12 @@ def take_logarithms(ratios: NDArray[np.floating[Any]]) -> None:
     """
     for k in range(np.uint64(len(ratios))):  # an unsigned index is not checked
         bits = np.int64(np.float32(ratios[k]).view(np.int32))
-        power = (bits - _SQRT_HALF) >> 23
+        power = (bits - SQRT_HALF) >> 23
         m = np.int32(bits - (power << 23)).view(np.float32)
         t = (m - np.float32(1)) / (m + np.float32(1))
         u = t * t
-        series = ((u * _C7 + _C5) * u + _C3) * u + np.float32(2)
-        ratios[k] = np.float32(power) * _LOG_2 + t * series
+        series = ((u * C7 + C5) * u + C3) * u + np.float32(2)
+        ratios[k] = np.float32(power) * LOG_2 + t * series
 
 
 @kernel
@@ -125,6 +126,19 @@ def decision_of_candidate(order: NDArray[Any], newcomer: int, at_arrivals: bool,
     if slot == NONE:
         slot = int(order[0])
     return REJECT if slot == newcomer else slot
+
+
+@kernel
+def is_offered(order: NDArray[Any], at_arrivals: bool, room: bool, action: int) -> bool:
+    """Whether the action mask shows ``action``: its candidate is there.
+
+    Without room action 0 at arrivals does what action 1 does, and only action 0 is shown.
+    """
+    if not at_arrivals:
+        return bool(order[action] != NONE)
+    if action == 1 and not room:
+        return False
+    return bool(action == 0 or order[action - 1] != NONE)
 
 
 class Candidate(NamedTuple):

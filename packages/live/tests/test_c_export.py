@@ -26,7 +26,7 @@ from bufgym.sim.metrics import received
 from bufgym.traces import Trace
 from bufgym_live.robot.c import CALL, SUPPORTED, header, random_episode, recorded
 from bufgym_live.robot.c.header import without_c
-from tests.core.weight_cases import random_weights
+from tests.core.weight_cases import random_choices, random_weights
 
 REPO = Path(__file__).resolve().parents[3]
 EXPONENTIAL = qoi.exponential()
@@ -110,6 +110,11 @@ AGENTS |= {
     "by-rule": random_weights(RULE, 7, 5, seed=5).policy("by-rule"),
     "by-rule-and-more": random_weights((*RULE, *IN_C), 7, seed=6).policy("by-rule-and-more"),
 }
+AGENTS |= {
+    "among-candidates": random_choices(2, False, 64, 64, seed=7).policy("among-candidates"),
+    "at-arrivals": random_choices(3, True, 6, 5, 4, activation="relu", seed=13, accept=4.0).policy("at-arrivals"),
+    "masked": random_choices(5, True, masks=True, seed=16, accept=4.0).policy("masked"),
+}
 
 
 def play_in_c(folder, policy, L, episodes, value=EXPONENTIAL, B=None, flags=("-O0",)):
@@ -159,10 +164,12 @@ def test_with_a_window_several_messages_are_in_the_socket(tmp_path):
         ("afr", "<= 2.0 / 3.0", "<= 0.2"),
         ("learned", "bufgym_v[] = {\n    0.0, -0.48", "bufgym_v[] = {\n    0.0, -0.08"),
         ("min-motion-gap", ": gaps.before_x + gaps.after_x;", ": gaps.before_x;"),
+        ("at-arrivals", "2.0 * s / q->capacity - 1.0", "1.0 * s / q->capacity - 1.0"),
+        ("among-candidates", "? tanh(sums[o])", "? tanh(-sums[o])"),
     ],
 )
 def test_parity_finds_another_number(name, number, other, tmp_path):
-    text = header(policies.get(name), 8, EXPONENTIAL)
+    text = header(AGENTS.get(name) or policies.get(name), 8, EXPONENTIAL)
     assert text.count(number) == 1
     assert output(driver(tmp_path, text)).startswith("0 ")
     assert not output(driver(tmp_path, text.replace(number, other))).startswith("0 ")

@@ -1,5 +1,6 @@
 """Builder of a policy's header from parts in C and the policy's numbers as constants."""
 
+import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,10 +13,11 @@ from bufgym.ground import __version__
 from bufgym.ground.errors import BufgymError, printable
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import FOREVER
+from bufgym.model.observe import candidates
 from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
-from bufgym.policies import Policy, chains, gaps, guided, learned, price_dp, target_gap, thinning
+from bufgym.policies import Policy, candidate_network, chains, gaps, guided, learned, price_dp, target_gap, thinning
 from bufgym.policies.learned import Weights
 from bufgym.policies.scoring import Scorer, unpack
 from bufgym.policies.target_gap import straight
@@ -82,7 +84,8 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         raise BufgymError(f"prefix {prefix!r}: must be small letters, digits and _, as names in C begin")
     learns = policy.on_arrival in (learned.on_arrival, learned.on_arrival_by_rule)
     guides = policy.on_arrival is guided.on_arrival
-    body = _network(policy) if learns else _rule(policy, guides)
+    chooses = policy.on_arrival is candidate_network.on_arrival
+    body = _part("candidates.h") if chooses else _network(policy) if learns else _rule(policy, guides)
     parameters = policy.parameters
     if policy.on_arrival is learned.on_arrival_by_rule:
         parameters = price_dp.PARAMETERS
@@ -124,6 +127,8 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
     }
     if learns:
         numbers |= _numbers(policy, _scorer(policy))
+    if chooses:
+        numbers |= _candidate_numbers(policy)
     text = _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
     named = re.sub(r"\bbufgym_", f"{prefix}_", text)
     return re.sub(r"\bBUFGYM_", f"{prefix.upper()}_", named)
@@ -209,6 +214,26 @@ def _numbers(policy: Policy, scorer: Scorer) -> dict[str, Any]:
         "SLOT_FIELDS": _enum(slots),
         "CONTEXT_FIELDS": _enum(context),
     }
+
+
+def _candidate_numbers(policy: Policy) -> dict[str, Any]:
+    """Collect the values for the C of a network among candidates: its layers, the scratch and constants."""
+    hidden = int(policy.weights[candidate_network.HIDDEN])
+    begin = candidate_network.WIDTHS + hidden + 1
+    k, masks, tanh = (int(policy.weights[i]) for i in range(candidate_network.HIDDEN))
+    widths = [int(width) for width in policy.weights[candidate_network.WIDTHS : begin]]
+    units = candidate_network.inputs(k) + sum(widths)
+    layers = _array("int", "bufgym_widths", widths) + _array("double", "bufgym_layers", policy.weights[begin:])
+    scratch = "    /* scratch of the policy: its candidates, and units of all layers */\n"
+    scratch += f"    int order[{k + 1}];\n    double cost[{k + 1}], units[{units}];\n"
+    return {
+        "WEIGHTS": layers, "SCRATCH": scratch, "CANDIDATES": k, "HIDDEN": hidden, "ACTIONS": widths[-1],
+        "MASKS": masks, "TANH": tanh, "NONE": candidates.NONE, "TIE": repr(candidates.TIE),
+        "LEAST_RATIO": repr(candidates.LEAST), "LARGEST_RATIO": repr(candidates.LARGEST), "E": repr(math.e),
+        "E_SQUARED": repr(math.e**2), "SQRT_HALF": candidates.SQRT_HALF, "LOG_TWO": repr(float(candidates.LOG_2)),
+        "C_THREE": repr(float(candidates.C3)), "C_FIVE": repr(float(candidates.C5)),
+        "C_SEVEN": repr(float(candidates.C7)),
+    }  # fmt: skip
 
 
 def _part(name: str) -> str:
