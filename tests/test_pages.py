@@ -201,7 +201,12 @@ PROGRAMS = [block for block in blocks() if block.language == "python" and block.
 @pytest.mark.nightly
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
 def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> None:
-    needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
+    needed = {
+        "sb3_contrib": "sb3_contrib",
+        "stable_baselines3": "bufgym.sb3",
+        "cma": "agents.objectives",
+        "pettingzoo": "parallel_env",
+    }
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:
             pytest.importorskip(package, reason=needs("extras", package))

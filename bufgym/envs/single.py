@@ -48,9 +48,9 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     Over an episode both ``delivered`` and ``retained`` add up to H - 1, or to 0 if nothing was delivered. The default
     is ``retained``, which charges a drop at once.
 
-    ``regret`` is the change of V*, the best H that can still be reached. It adds up to H - V*(start), so the best policy
-    stays the same, and the luck of link and motion is taken out. V* needs the link's future. Only the reward sees that
-    future: observations and evaluations never do. It serves one queue of messages of equal size.
+    ``regret`` is the change of V*, the best H that can still be reached. It adds up to H - V*(start), so the best
+    policy stays the same, and the luck of link and motion is taken out. V* needs the link's future. Only the reward
+    sees that future: observations and evaluations never do. It serves one queue of messages of equal size.
 
     **Slots** ``actions="slots"`` is the other interface, for networks that score every message. Its defaults are
     ``decide_at="arrival"`` and ``observation="dict"``.
