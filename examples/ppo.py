@@ -55,6 +55,8 @@ class Settings:
     gae_lambda: float = 0.95
     clip: float = 0.2
     """Largest relative change of an action's probability in an update."""
+    reward: str = "regret"
+    """Term of the reward in training; "retained" knows no future."""
     width: int = 64
     """Hidden units a layer."""
     test_seeds: int = 40
@@ -88,7 +90,9 @@ def advantages_of(rewards: Tensor, values: Tensor, ended: Tensor, gamma: float, 
     return advantages
 
 
-def make(traces: list[str], num_envs: int, settings: Settings, mode: gym.vector.AutoresetMode) -> gym.vector.VectorEnv:
+def make(
+    traces: list[str], num_envs: int, settings: Settings, reward: str, mode: gym.vector.AutoresetMode
+) -> gym.vector.VectorEnv:
     """The native batch; the agent is asked where the buffer is full."""
     return gym.make_vec(
         "bufgym/Uplink-v0",
@@ -96,7 +100,7 @@ def make(traces: list[str], num_envs: int, settings: Settings, mode: gym.vector.
         capacity=settings.capacity,
         traces=traces,
         duration_s=settings.duration_s,
-        reward="regret" if traces is TRAIN else "retained",  # the test reads H alone
+        reward=reward,
         info="none",
         autoreset_mode=mode,
     )
@@ -114,7 +118,7 @@ class Test:
         self.h = {p.name: sum(row["qoi"] for row in rows if row["policy"] == p.name) for p in fixed}
         self.best = sum(row["clairvoyant"] for row in rows if row["policy"] == "afr")
         self.episodes = [{"trace": trace, "seed": seed} for trace in TEST for seed in range(settings.test_seeds)]
-        self.envs = make(TEST, len(self.episodes), settings, gym.vector.AutoresetMode.NEXT_STEP)
+        self.envs = make(TEST, len(self.episodes), settings, "retained", gym.vector.AutoresetMode.NEXT_STEP)
 
     def play(self, network: Network) -> float:
         """Sum of H if the network always takes its best action."""
@@ -142,7 +146,7 @@ def main(settings: Settings) -> dict[str, float]:
     """Train and test; return regret and score of the agent and of AFR, and the CPU seconds of training."""
     torch.manual_seed(settings.seed)
     torch.set_num_threads(1)  # more only wait for one another on batches this small
-    envs = make(TRAIN, settings.num_envs, settings, gym.vector.AutoresetMode.SAME_STEP)
+    envs = make(TRAIN, settings.num_envs, settings, settings.reward, gym.vector.AutoresetMode.SAME_STEP)
     test = Test(settings)
     inputs, actions = envs.single_observation_space.shape[0], int(envs.single_action_space.n)
     network = Network(inputs, actions, settings.width)
