@@ -1,8 +1,10 @@
 """The budget cuts a block after its processor time, and the lines of the file."""
 
 import csv
+from importlib import import_module
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,8 +48,20 @@ def test_each_score_is_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         page("tianshu", minutes=0.5, out=tmp_path / "scores.csv")
 
 
-def test_the_examples_ppo_learns_from_the_reward_that_is_named() -> None:
-    """A budget of no time cuts it at its first look; its network still answers with actions of the environment."""
-    trained = ten_minutes.cleanrl(Budget(0.0), ten_minutes.Task("retained"))
-    actions, _ = trained.predict(np.zeros((4, 27), np.float32), deterministic=True)
-    assert actions.shape == (4,) and set(actions.tolist()) <= {0, 1, 2}
+def test_the_network_of_the_examples_ppo_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its critic is not asked: with a bias of 1 on the second logit and weights of 0, action 1 is the most likely."""
+    ppo: Any = import_module("examples.ppo")
+    learned: list[Any] = []
+
+    def main(settings: Any) -> None:
+        network = ppo.Network(27, 3, 4)
+        for part in network.actor.parameters():
+            part.data.zero_()
+        network.actor[-1].bias.data[1] = 1.0
+        learned.append(settings)
+
+    monkeypatch.setattr(ppo, "main", main)
+    monkeypatch.setattr(ppo, "Network", ppo.Network)  # which cleanrl replaces
+    trained = ten_minutes.cleanrl(Budget(10), ten_minutes.Task("retained"))
+    assert trained.predict(np.zeros((4, 27)), deterministic=True)[0].tolist() == [1, 1, 1, 1]
+    assert [(settings.reward, settings.steps) for settings in learned] == [("retained", 6_000_000)]
