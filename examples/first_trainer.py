@@ -17,13 +17,13 @@ from bufgym.sb3 import as_policy, make_vec_env
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--steps", type=int, default=200_000, help="decisions to learn from (%(default)s)")
+    parser.add_argument("--steps", type=int, default=50_000, help="decisions to learn from (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the training (%(default)s)")
     parser.add_argument("--seeds", type=int, default=5, help="episodes of the comparison on each link (%(default)s)")
     options = parser.parse_args()
 
     torch.set_num_threads(1)  # more only wait for one another on a network this small
-    envs = make_vec_env("bufgym/Uplink-v0", 8, reward="regret")
+    envs = make_vec_env("bufgym/Uplink-v0", reward="regret")
     model = PPO("MlpPolicy", envs, seed=options.seed, device="cpu").learn(options.steps)
 
     mine = as_policy(model, "mine")
