@@ -14,7 +14,7 @@ import gymnasium as gym
 import bufgym
 
 env = gym.make("bufgym/Interruption-v0", capacity=8, t_max=200)
-observation, info = env.reset(seed=0)
+observation, info = env.reset(seed=2)
 print(env.action_space)  # drop the cheapest candidate, the second cheapest, or the head
 print(observation.shape)
 
