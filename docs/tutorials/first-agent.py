@@ -39,7 +39,7 @@ from bufgym.sb3 import as_policy, make_vec_env
 
 envs = make_vec_env("bufgym/Interruption-v0", 8, seed=0, capacity=8, t_max=200)
 model = PPO("MlpPolicy", envs, n_steps=256, seed=0, device="cpu")
-model.learn(65_536)
+model.learn(32_768)
 
 # %% [markdown]
 # ## Comparing

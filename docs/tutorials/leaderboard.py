@@ -20,7 +20,7 @@ from bufgym.sb3 import make_vec_env
 folder = Path("mine")
 folder.mkdir(exist_ok=True)
 envs = make_vec_env("bufgym/Suite-v0", 8, seed=0, suite="interruption-v1", split="train", capacity=10)
-model = PPO("MlpPolicy", envs, n_steps=256, seed=0, device="cpu").learn(65_536)
+model = PPO("MlpPolicy", envs, n_steps=256, seed=0, device="cpu").learn(32_768)
 model.save(folder / "my-agent.zip")
 
 # %% [markdown]
