@@ -32,8 +32,8 @@ model.save(folder / "my-agent.zip")
 # bufgym bench --suite interruption-v1 --policies mine/my-agent.zip,min-gap,afr,drop-oldest --out mine/rows
 # ```
 #
-# Here the same is called from Python, with fewer episodes and one capacity to save time. Actions and observation are the
-# same at every L, so the agent can be tested at an L that it never saw.
+# Here the same is called from Python, with fewer episodes and one capacity to save time. Actions and observation are
+# the same at every L, so the agent can be tested at an L that it never saw.
 
 # %%
 from bufgym.cli import main as bufgym
