@@ -42,10 +42,10 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="episodes of the benchmark")
     options = parser.parse_args()
 
-    env = gym.make("bufgym/Uplink-v0", scenario="halls", slow_bytes_per_s=2e6, actions="slots")
+    env = gym.make("bufgym/Uplink-v0", scenario="halls", slow_bytes_per_s=2e6)
     _, info = env.reset(seed=0)
     for _ in range(options.steps):
-        _, _, ended, _, info = env.step(env.action_space.sample(info["action_mask"]))
+        _, _, ended, _, info = env.step(env.action_space.sample())
         if ended:
             print(f"at random: {info['delivered']} of {info['arrived']} delivered, QoI {info['qoi']:.1f}")
             _, info = env.reset()

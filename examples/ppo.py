@@ -1,4 +1,4 @@
-"""PPO in one file: a camera's send buffer on the native batch, invalid actions masked, one network for every slot.
+"""PPO in one file: a camera's send buffer on the native batch, with ordered candidates as actions.
 
     pip install ".[train]"
     python examples/ppo.py
@@ -8,13 +8,9 @@ It trains on six of the eight shipped links and tests on the other two, where ``
     bufgym bench --trace lte-synthetic-6 lte-synthetic-7 --seeds 40 --policies afr,min-motion-gap,drop-oldest
 
 Proximal policy optimisation (Schulman et al. 2017) with generalised advantage estimation (2016), as in CleanRL's
-``ppo.py``. Three points are special to a buffer.
-
-- **The observation** is ``observation="slots"``: [L + 1, slot fields] for the queued messages and the newcomer, and a
-  vector of context. The same small network scores each slot, so a message's worth does not depend on its slot's number.
-- **Masks are logits**: an action that is not valid gets a logit of -1e9, in sampling and in learning.
-- **The reward** ``retained`` charges a decision's cost at once, so gamma 0.9 is enough and keeps out the noise of the
-  camera's motion.
+``ppo.py``. Nothing in it is special to a buffer: the environment's three actions are all valid, so there are no masks,
+and its 27 numbers are scaled already. The reward ``regret`` compares each decision with the best that was still
+possible. It knows the link's future; the observation and the test do not.
 """
 
 import argparse
@@ -43,54 +39,44 @@ class Settings:
     """L, messages."""
     duration_s: float = 30.0
     """Length of an episode."""
-    steps: int = 1_200_000
+    steps: int = 600_000
     """Decisions to learn from."""
-    num_envs: int = 256
+    num_envs: int = 64
     """Environments side by side, stepped by one compiled call."""
-    num_steps: int = 64
+    num_steps: int = 32
     """Decisions of each environment between updates."""
-    minibatch: int = 2_048
+    minibatch: int = 256
     """Decisions of one gradient step."""
     epochs: int = 3
     """Passes over the decisions of an update."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 1e-3
     """Learning rate at the start; it falls linearly to 0."""
-    gamma: float = 0.9
-    gae_lambda: float = 0.9
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
     clip: float = 0.2
     """Largest relative change of an action's probability in an update."""
-    width: int = 32
+    reward: str = "regret"
+    """Term of the reward in training; "retained" knows no future."""
+    width: int = 64
     """Hidden units a layer."""
     test_seeds: int = 40
     """Test episodes on each held-out link."""
 
 
-class SlotNetwork(nn.Module):
-    """Slots [n, L + 1, fields] and context [n, fields] -> logits [n, L + 2] of all actions, and values [n]."""
+class Network(nn.Module):
+    """Observations [n, inputs] -> logits [n, actions] and values [n]."""
 
-    def __init__(self, slot_fields: int, context_fields: int, width: int) -> None:
+    def __init__(self, inputs: int, actions: int, width: int) -> None:
         super().__init__()
-        self.slots = nn.Linear(slot_fields, 3 * width)
-        self.context = nn.Linear(context_fields, 3 * width)
-        """First layers of the three heads below, computed at once."""
-        self.drop = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
-        """Logit of dropping each slot; the newcomer's is the logit of rejecting it."""
-        self.accept = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
-        """Logit of accepting the newcomer."""
-        self.value = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
-        """Value from the mean over slots."""
-        nn.init.constant_(self.accept[-1].bias, 2.0)  # dropping messages where there is room teaches little
+        self.actor, self.critic = (
+            nn.Sequential(
+                *(nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, outputs))
+            )
+            for outputs in (actions, 1)
+        )
 
-    def forward(self, slots: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-        first = torch.relu(self.slots(slots) + self.context(context)[:, None])
-        drop, accept, value = first.chunk(3, dim=-1)
-        logits = torch.cat([self.drop(drop)[..., 0], self.accept(accept[:, -1])], dim=1)
-        return logits, self.value(value.mean(dim=1))[:, 0]
-
-
-def masked(logits: Tensor, mask: Tensor) -> Tensor:
-    """Lower the logits of invalid actions so far that they are never drawn and get no gradient."""
-    return logits.masked_fill(mask == 0, -1e9)
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        return self.actor(observation), self.critic(observation)[:, 0]
 
 
 def advantages_of(rewards: Tensor, values: Tensor, ended: Tensor, gamma: float, gae_lambda: float) -> Tensor:
@@ -104,7 +90,9 @@ def advantages_of(rewards: Tensor, values: Tensor, ended: Tensor, gamma: float, 
     return advantages
 
 
-def make(traces: list[str], num_envs: int, settings: Settings, mode: gym.vector.AutoresetMode) -> gym.vector.VectorEnv:
+def make(
+    traces: list[str], num_envs: int, settings: Settings, reward: str, mode: gym.vector.AutoresetMode
+) -> gym.vector.VectorEnv:
     """The native batch; the agent is asked where the buffer is full."""
     return gym.make_vec(
         "bufgym/Uplink-v0",
@@ -112,11 +100,9 @@ def make(traces: list[str], num_envs: int, settings: Settings, mode: gym.vector.
         capacity=settings.capacity,
         traces=traces,
         duration_s=settings.duration_s,
-        decide_at="overflow",
-        observation="slots",
-        info="mask",
+        reward=reward,
+        info="none",
         autoreset_mode=mode,
-        actions="slots",
     )
 
 
@@ -132,16 +118,15 @@ class Test:
         self.h = {p.name: sum(row["qoi"] for row in rows if row["policy"] == p.name) for p in fixed}
         self.best = sum(row["clairvoyant"] for row in rows if row["policy"] == "afr")
         self.episodes = [{"trace": trace, "seed": seed} for trace in TEST for seed in range(settings.test_seeds)]
-        self.envs = make(TEST, len(self.episodes), settings, gym.vector.AutoresetMode.NEXT_STEP)
+        self.envs = make(TEST, len(self.episodes), settings, "retained", gym.vector.AutoresetMode.NEXT_STEP)
 
-    def play(self, network: SlotNetwork) -> float:
+    def play(self, network: Network) -> float:
         """Sum of H if the network always takes its best action."""
-        observation, info = self.envs.reset(options={"episodes": self.episodes})
+        observation, _ = self.envs.reset(options={"episodes": self.episodes})
         h, live = 0.0, np.ones(len(self.episodes), np.bool_)
         while live.any():
             with torch.no_grad():
-                logits, _ = network(*tensors(observation))
-            actions = masked(logits, torch.from_numpy(info["action_mask"])).argmax(dim=1)
+                actions = network.actor(torch.from_numpy(observation)).argmax(dim=1)
             observation, _, ended, _, info = self.envs.step(actions.numpy())
             if ended.any():
                 h += info["qoi"][ended & live].sum()
@@ -157,24 +142,18 @@ class Test:
         return (h - self.h["drop-oldest"]) / (self.best - self.h["drop-oldest"])
 
 
-def tensors(observation: dict[str, np.ndarray]) -> tuple[Tensor, Tensor]:
-    """Make tensors of slots and context without a copy, because the next step writes other arrays."""
-    return torch.from_numpy(observation["slots"]), torch.from_numpy(observation["context"])
-
-
 def main(settings: Settings) -> dict[str, float]:
     """Train and test; return regret and score of the agent and of AFR, and the CPU seconds of training."""
     torch.manual_seed(settings.seed)
     torch.set_num_threads(1)  # more only wait for one another on batches this small
-    envs = make(TRAIN, settings.num_envs, settings, gym.vector.AutoresetMode.SAME_STEP)
+    envs = make(TRAIN, settings.num_envs, settings, settings.reward, gym.vector.AutoresetMode.SAME_STEP)
     test = Test(settings)
-    fields = (space.shape[-1] for space in envs.single_observation_space.values())
-    network = SlotNetwork(*fields, settings.width)
+    inputs, actions = envs.single_observation_space.shape[0], int(envs.single_action_space.n)
+    network = Network(inputs, actions, settings.width)
     optimizer = torch.optim.Adam(network.parameters(), settings.learning_rate, eps=1e-5)
     steps, n = settings.num_steps, settings.num_envs
     updates = max(1, settings.steps // (steps * n))
-    observation, info = envs.reset(seed=settings.seed)
-    (slots, context), mask = tensors(observation), torch.from_numpy(info["action_mask"])
+    observation = torch.from_numpy(envs.reset(seed=settings.seed)[0])
     print(f"afr: score {test.score(test.h['afr']):.3f}, regret {test.regret(test.h['afr']):.2%}")
     spent_s = 0.0
     for update in range(updates + 1):
@@ -190,17 +169,17 @@ def main(settings: Settings) -> dict[str, float]:
         played: dict[str, list[Tensor]] = {}
         for _ in range(steps):
             with torch.no_grad():
-                logits, value = network(slots, context)
-                choice = Categorical(logits=masked(logits, mask), validate_args=False)
+                logits, value = network(observation)
+                choice = Categorical(logits=logits, validate_args=False)
                 action = choice.sample()
-            decision = {"slots": slots, "context": context, "mask": mask, "action": action, "value": value}
-            observation, reward, ended, _, info = envs.step(action.numpy())
-            (slots, context), mask = tensors(observation), torch.from_numpy(info["action_mask"])
-            decision |= {"log_p": choice.log_prob(action), "reward": torch.from_numpy(reward).float()}
-            for name, column in (decision | {"ended": torch.from_numpy(ended).float()}).items():
+            decision = {"observation": observation, "action": action, "value": value, "log_p": choice.log_prob(action)}
+            seen, reward, ended, _, _ = envs.step(action.numpy())
+            observation = torch.from_numpy(seen)  # no copy: the next step writes another array
+            decision |= {"reward": torch.from_numpy(reward).float(), "ended": torch.from_numpy(ended).float()}
+            for name, column in decision.items():
                 played.setdefault(name, []).append(column)
         with torch.no_grad():
-            played["value"].append(network(slots, context)[1])
+            played["value"].append(network(observation)[1])
         batch = {name: torch.stack(column) for name, column in played.items()}
         advantages = advantages_of(batch["reward"], batch["value"], batch["ended"], settings.gamma, settings.gae_lambda)
         batch["target"] = advantages + batch["value"][:-1]
@@ -210,8 +189,8 @@ def main(settings: Settings) -> dict[str, float]:
         for _ in range(settings.epochs):
             for chosen in torch.randperm(steps * n).split(settings.minibatch):
                 part = {name: column[chosen] for name, column in flat.items()}
-                logits, value = network(part["slots"], part["context"])
-                log_p = torch.log_softmax(masked(logits, part["mask"]), dim=1)
+                logits, value = network(part["observation"])
+                log_p = torch.log_softmax(logits, dim=1)
                 ratio = (log_p.gather(1, part["action"][:, None])[:, 0] - part["log_p"]).exp()
                 gain = (part["advantage"] - part["advantage"].mean()) / (part["advantage"].std() + 1e-8)
                 clipped = ratio.clamp(1 - settings.clip, 1 + settings.clip)

@@ -3,9 +3,11 @@
 python -m studies.ten_minutes --library tianshou --minutes 10 --out runs/ten_minutes.csv
 
 Each library has its own PPO, with its defaults or the numbers of its first example, on ``Uplink-v0`` with L = 8. Only
-Tianshou has its DQN, which knows masks. The minutes are processor time of the process and all those below it, so other
-work on the machine does not matter; imports and the score itself do not count. Training is cut wherever it is by then.
-The score is computed as in ``studies.sb3_defaults``, which needs the extras ``train`` and ``plot`` beside the library.
+Tianshou has its DQN. Actions are the environment's default, ordered candidates, and all of them are valid. So no
+library needs a mask. The reward is ``regret`` unless ``--reward`` names another. The minutes are processor time of the
+process and all those below it, so other work on the machine does not matter. Imports and the score itself do not count.
+Training is cut wherever it is by then. The score is computed as in ``studies.sb3_defaults``, which needs the extras
+``train`` and ``plot`` beside the library.
 """
 
 from __future__ import annotations
@@ -33,10 +35,7 @@ from studies.page import command
 from studies.sb3_defaults import Episodes, append
 
 ENV, CAPACITY = "bufgym/Uplink-v0", 8
-
-FLAT: dict[str, Any] = {"observation": "flat"}
-BOOL = FLAT | {"mask_dtype": "bool"}
-LINE = ("library", "minutes", "score")
+LINE = ("library", "reward", "minutes", "score")
 
 
 class TimeIsUp(BaseException):
@@ -72,10 +71,9 @@ def _processor_s() -> float:
 
 
 class Trained(NamedTuple):
-    """What a library made: the most likely actions to a batch of observations, under these settings."""
+    """What a library made: the most likely actions to a batch of observations."""
 
     act: Callable[[Any], Any]
-    settings: dict[str, Any]
 
     def predict(self, observation: Any, deterministic: bool) -> tuple[Any, None]:
         """Actions int64[n], under the name that ``Episodes.of_model`` calls."""
@@ -83,24 +81,28 @@ class Trained(NamedTuple):
             return np.asarray(self.act(observation)), None
 
 
-def make(**settings: Any) -> gym.Env[Any, Any]:
-    """One environment."""
-    return gym.make(ENV, capacity=CAPACITY, info="mask", **settings)
+class Task(NamedTuple):
+    """What each library learns: the environment, with this reward."""
 
+    reward: str
 
-def make_batch(n: int, **settings: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """n rows of the native batch."""
-    return gym.make_vec(ENV, n, capacity=CAPACITY, info="mask", **settings)
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the environment for training."""
+        return {"capacity": CAPACITY, "info": "none", "reward": self.reward}
+
+    def make(self) -> gym.Env[Any, Any]:
+        """One environment."""
+        return gym.make(ENV, **self.settings)
+
+    def make_batch(self, n: int) -> gym.vector.VectorEnv[Any, Any, Any]:
+        """n rows of the native batch."""
+        return gym.make_vec(ENV, n, **self.settings)
 
 
 def tensor(numbers: Any) -> torch.Tensor:
     """Numbers as float32."""
     return torch.as_tensor(numbers, dtype=torch.float32)
-
-
-def best(logits: torch.Tensor, mask: Any) -> torch.Tensor:
-    """The valid action with the highest logit, int64[n]."""
-    return logits.masked_fill(torch.as_tensor(mask) == 0, -torch.inf).argmax(dim=-1)
 
 
 def layers(*widths: int) -> torch.nn.Sequential:
@@ -109,56 +111,51 @@ def layers(*widths: int) -> torch.nn.Sequential:
     return torch.nn.Sequential(linear[0], *(part for layer in linear[1:] for part in (torch.nn.Tanh(), layer)))
 
 
-def cleanrl(budget: Budget) -> Trained:
+def cleanrl(budget: Budget, task: Task) -> Trained:
     """examples/ppo.py with as many decisions as fit, because its learning rate falls to 0 over them."""
     ppo: Any = import_module("examples.ppo")
     networks: list[Any] = []
 
-    class Network(ppo.SlotNetwork):  # type: ignore[misc]
+    class Network(ppo.Network):  # type: ignore[misc]
         def __init__(self, *sizes: int) -> None:
             super().__init__(*sizes)
             networks.append(self)
 
-    ppo.SlotNetwork = Network
+    ppo.Network = Network
     with budget:
-        ppo.main(ppo.Settings(steps=int(budget.minutes * 1_500_000)))
-
-    def act(seen: Any) -> Any:
-        return best(networks[0](*ppo.tensors(seen))[0], seen["action_mask"])
-
-    return Trained(act, {"observation": "slots", "decide_at": "overflow", "mask_in_observation": True})
+        ppo.main(ppo.Settings(steps=int(budget.minutes * 600_000), reward=task.reward))
+    return Trained(lambda seen: networks[0].actor(tensor(seen)).argmax(dim=-1))
 
 
-def sbx(budget: Budget) -> Trained:
-    """Its PPO knows no masks."""
+def sbx(budget: Budget, task: Task) -> Trained:
+    """The defaults of its PPO."""
     from sbx import PPO
 
     from bufgym.sb3 import make_vec_env
 
-    model = PPO("MlpPolicy", make_vec_env(ENV, capacity=CAPACITY, info="mask", **FLAT))
+    model = PPO("MlpPolicy", make_vec_env(ENV, **task.settings))
     with budget:
         model.learn(10**9)
-    return Trained(lambda seen: model.predict(seen, deterministic=True)[0], FLAT)
+    return Trained(lambda seen: model.predict(seen, deterministic=True)[0])
 
 
-def torchrl(budget: Budget) -> Trained:
-    """The loop and the numbers of its tutorial on PPO, without its schedule; the actor is masked."""
+def torchrl(budget: Budget, task: Task) -> Trained:
+    """The loop and the numbers of its tutorial on PPO, without its schedule."""
     from tensordict.nn import TensorDictModule
     from torchrl.collectors import Collector
     from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
     from torchrl.envs import GymWrapper
-    from torchrl.modules import MaskedCategorical, ProbabilisticActor, ValueOperator
+    from torchrl.modules import ProbabilisticActor, ValueOperator
     from torchrl.objectives import ClipPPOLoss
     from torchrl.objectives.value import GAE
 
-    settings = BOOL | {"mask_in_observation": True}
-    env = GymWrapper(make(**settings), categorical_action_encoding=True)
+    env = GymWrapper(task.make(), categorical_action_encoding=True)
     inputs, actions = env.observation_spec["observation"].shape[-1], env.action_spec.n
     scorer = TensorDictModule(layers(inputs, 256, 256, 256, actions), in_keys=["observation"], out_keys=["logits"])
     actor = ProbabilisticActor(
         scorer,
-        in_keys={"logits": "logits", "mask": "action_mask"},
-        distribution_class=MaskedCategorical,
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
         spec=env.action_spec,
         return_log_prob=True,
     )
@@ -179,10 +176,10 @@ def torchrl(budget: Budget) -> Trained:
                     optimizer.step()
                     optimizer.zero_grad()
     net = scorer.module
-    return Trained(lambda seen: best(net(tensor(seen["observation"])), seen["action_mask"]), settings)
+    return Trained(lambda seen: net(tensor(seen)).argmax(dim=-1))
 
 
-def tianshou(budget: Budget) -> Trained:
+def tianshou(budget: Budget, task: Task) -> Trained:
     """The numbers of the DQN in its README."""
     from tianshou.algorithm import DQN
     from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
@@ -192,14 +189,13 @@ def tianshou(budget: Budget) -> Trained:
     from tianshou.trainer import OffPolicyTrainerParams
     from tianshou.utils.net.common import Net
 
-    settings = FLAT | {"mask_in_observation": "tianshou"}
-    env: Any = make(**settings)
+    env: Any = task.make()
     space, actions = env.observation_space, env.action_space
-    net = Net(state_shape=space["obs"].shape, action_shape=actions.n, hidden_sizes=[128, 128, 128])
+    net = Net(state_shape=space.shape, action_shape=actions.n, hidden_sizes=[128, 128, 128])
     policy = DiscreteQLearningPolicy(model=net, action_space=actions, observation_space=space, eps_training=0.1)
     optimizer = AdamOptimizerFactory(lr=1e-3)
     algorithm = DQN(policy=policy, optim=optimizer, gamma=0.9, n_step_return_horizon=3, target_update_freq=320)
-    envs = DummyVectorEnv([lambda: make(**settings)] * 10)
+    envs = DummyVectorEnv([task.make] * 10)
     collector = Collector(algorithm, envs, VectorReplayBuffer(20_000, 10), exploration_noise=True)
     with budget:
         algorithm.run_training(
@@ -212,35 +208,29 @@ def tianshou(budget: Budget) -> Trained:
                 test_in_training=False,
             )
         )
-    return Trained(lambda seen: best(net(seen["obs"])[0], seen["mask"]), settings)
+    return Trained(lambda seen: net(seen)[0].argmax(dim=-1))
 
 
-def rllib(budget: Budget) -> Trained:
-    """The defaults of its PPO, with its own masked network."""
+def rllib(budget: Budget, task: Task) -> Trained:
+    """The defaults of its PPO."""
     from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.rllib.core.rl_module.rl_module import RLModuleSpec
-    from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
     from ray.tune.registry import register_env
 
-    settings = FLAT | {"mask_in_observation": "rllib"}
-    register_env("uplink", lambda _: make(**settings))
-    network = RLModuleSpec(module_class=ActionMaskingTorchRLModule)
-    config = PPOConfig().environment("uplink").env_runners(num_env_runners=0).rl_module(rl_module_spec=network)
-    algorithm = config.build_algo()
+    register_env("uplink", lambda _: task.make())
+    algorithm = PPOConfig().environment("uplink").env_runners(num_env_runners=0).build_algo()
     with budget:
         while True:
             algorithm.train()
     net = algorithm.get_module()
 
     def act(seen: Any) -> Any:
-        logits = net.forward_inference({"obs": {name: tensor(part) for name, part in seen.items()}})
-        return logits["action_dist_inputs"].argmax(dim=-1)
+        return net.forward_inference({"obs": tensor(seen)})["action_dist_inputs"].argmax(dim=-1)
 
-    return Trained(act, settings)
+    return Trained(act)
 
 
-def skrl(budget: Budget) -> Trained:
-    """The defaults of its PPO on four environments, as in its examples; it knows no masks."""
+def skrl(budget: Budget, task: Task) -> Trained:
+    """The defaults of its PPO on four environments, as in its examples."""
     from skrl.envs.wrappers.torch import wrap_env
     from skrl.utils.runner.torch import Runner
 
@@ -258,20 +248,19 @@ def skrl(budget: Budget) -> Trained:
     cfg = {"seed": 0, "models": models, "memory": {"class": "RandomMemory", "memory_size": -1}}
     cfg["agent"] = {"class": "PPO", "rollouts": 16}  # its default, which the memory reads here
     cfg["trainer"] = {"class": "SequentialTrainer", "timesteps": 10**9, "headless": True, "environment_info": "log"}
-    runner = Runner(wrap_env(make_batch(4, **FLAT)), cfg)
+    runner = Runner(wrap_env(task.make_batch(4)), cfg)
     with budget:
         runner.run("train")
     policy = runner.agent.models["policy"]
-    return Trained(lambda seen: policy.compute({"observations": tensor(seen)}, role="policy")[0].argmax(-1), FLAT)
+    return Trained(lambda seen: policy.compute({"observations": tensor(seen)}, role="policy")[0].argmax(-1))
 
 
-def agilerl(budget: Budget) -> Trained:
-    """The defaults of its PPO on one native batch of eight, as on our page; it reads the mask of ``info``."""
+def agilerl(budget: Budget, task: Task) -> Trained:
+    """The defaults of its PPO on one native batch of eight, as on our page."""
     from agilerl.algorithms import PPO
     from agilerl.rollouts.on_policy import collect_rollouts
 
-    settings = FLAT | {"mask_in_observation": True}
-    envs = make_batch(8, **FLAT)
+    envs = task.make_batch(8)
     spaces = envs.single_observation_space, envs.single_action_space
     agent = PPO(*spaces, num_envs=8, use_rollout_buffer=True, device="cpu")
     agent.set_training_mode(True)
@@ -280,13 +269,10 @@ def agilerl(budget: Budget) -> Trained:
             collect_rollouts(agent, envs)
             agent.learn()
     net = agent.actor
-    return Trained(
-        lambda seen: best(net.head_net.wrapped(net.extract_features(tensor(seen["observation"]))), seen["action_mask"]),
-        settings,
-    )
+    return Trained(lambda seen: net.head_net.wrapped(net.extract_features(tensor(seen))).argmax(dim=-1))
 
 
-LIBRARIES: dict[str, Callable[[Budget], Trained]] = {
+LIBRARIES: dict[str, Callable[[Budget, Task], Trained]] = {
     "cleanrl": cleanrl,
     "sbx": sbx,
     "torchrl": torchrl,
@@ -297,16 +283,22 @@ LIBRARIES: dict[str, Callable[[Budget], Trained]] = {
 }
 
 
-def page(library: str, minutes: float = 10.0, out: Path = Path("runs/ten_minutes.csv"), episodes: int = 40) -> None:
+def page(
+    library: str,
+    reward: str = "regret",
+    minutes: float = 10.0,
+    out: Path = Path("runs/ten_minutes.csv"),
+    episodes: int = 40,
+) -> None:
     """Train with one library and append its score to ``out``."""
     if library not in LIBRARIES:
         raise unknown("library", library, LIBRARIES)
     fixed = Episodes(episodes)
-    trained: Any = LIBRARIES[library](Budget(minutes))
-    score = fixed.of_model(trained, trained.settings)
+    trained: Any = LIBRARIES[library](Budget(minutes), Task(reward))
+    score = fixed.of_model(trained)
     print(f"{library}: {score:.3f}")
     out.parent.mkdir(exist_ok=True)
-    append(out, LINE, (library, f"{minutes:g}", f"{score:.4f}"))
+    append(out, LINE, (library, reward, f"{minutes:g}", f"{score:.4f}"))
 
 
 if __name__ == "__main__":

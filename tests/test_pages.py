@@ -201,7 +201,12 @@ PROGRAMS = [block for block in blocks() if block.language == "python" and block.
 @pytest.mark.nightly
 @pytest.mark.parametrize("block", PROGRAMS, ids=[f"{block.page}-{k}" for k, block in enumerate(PROGRAMS)])
 def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> None:
-    needed = {"sb3_contrib": "sb3_contrib", "cma": "agents.objectives", "pettingzoo": "parallel_env"}
+    needed = {
+        "sb3_contrib": "sb3_contrib",
+        "stable_baselines3": "bufgym.sb3",
+        "cma": "agents.objectives",
+        "pettingzoo": "parallel_env",
+    }
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:
             pytest.importorskip(package, reason=needs("extras", package))
@@ -215,7 +220,7 @@ def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> N
 def test_each_tutorial_runs_and_ends_with_its_picture(source: Path, tmp_path: Path) -> None:
     """A process of its own: tutorials register policies, scenarios and fields."""
     text = source.read_text(encoding="utf-8")
-    for package in ("matplotlib", "sb3_contrib", "pettingzoo"):
+    for package in ("matplotlib", "sb3_contrib", "stable_baselines3", "pettingzoo"):
         if package == "matplotlib" or package in text.lower():
             pytest.importorskip(package, reason=needs("extras", package))
     last = re.findall(r"^# !\[[^\]]+\]\((.+)\)$", text, re.MULTILINE)[-1]

@@ -44,9 +44,6 @@ def test_ppos_parts_by_hand() -> None:
     values = torch.tensor([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
     advantages = ppo["advantages_of"](torch.ones(2, 2), values, torch.tensor([[0.0, 1.0], [0.0, 0.0]]), 0.5, 0.5)
     assert advantages.tolist() == [[1.125, 0.0], [0.5, 0.5]]
-    # An invalid action is never drawn, whatever its logit.
-    logits = ppo["masked"](torch.tensor([[50.0, 0.0, 1.0]]), torch.tensor([[0, 1, 1]], dtype=torch.int8))
-    assert logits.softmax(1)[0, 0] == 0 and logits.argmax() == 2
 
 
 @pytest.mark.nightly

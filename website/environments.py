@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import inspect
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,17 @@ from typing import Any
 import bufgym
 from bufgym import scenario
 from bufgym.ground.errors import BufgymError
-from bufgym.model.observe import FIELDS, REWARD_TERMS, TOPIC_FIELDS, TOPIC_REWARD_TERMS
+from bufgym.model.observe import (
+    CANDIDATE_FIELDS,
+    FIELDS,
+    OWN_TERMS,
+    QUEUE_FIELDS,
+    REWARD_TERMS,
+    TOPIC_FIELDS,
+    TOPIC_REWARD_TERMS,
+    Field,
+    RewardTerm,
+)
 from bufgym.scenario import FleetScenario
 from bufgym_papers.environments import MAPPING
 from website.films import FILMS
@@ -51,6 +62,16 @@ SCENARIOS = bufgym.ENVIRONMENTS | {"bufgym/Mapping-v0": MAPPING}
 
 TOPICS = """\
 Many topics share one uplink: decide at every arrival what to drop, and at every free socket what to send next."""
+
+
+INTERFACES = """\
+![A queue of eight messages and a newcomer: three actions with candidates, ten with slots](../figures/candidates.svg)
+
+*Above the default, below `actions="slots"`. Made by `python -m website.interfaces`*"""
+
+RATIOS = """\
+s is the number of messages queued, e the even spacing (x_new - x_dequeued) / (L + 1), r the link's rate over 2 s, and p
+the time between arrivals."""
 
 
 RETURN = """\
@@ -102,19 +123,24 @@ def page(id: str) -> str:
     """One environment's page."""
     kind: Any = _class(id)
     parts = sections(inspect.getdoc(kind) or "")
-    topics = id == "bufgym/Topics-v0"
-    of_one = sections(inspect.getdoc(_class("bufgym/Uplink-v0")) or "")
+    topics, one_queue = id == "bufgym/Topics-v0", id not in ("bufgym/Topics-v0", FLEET)
+    more: tuple[RewardTerm, ...] = TOPIC_REWARD_TERMS if topics else (OWN_TERMS["regret"],) if one_queue else ()
     intro = TOPICS if topics else parts[""]
     lines = [f"# {title(id)}", f"{about(id)[0].upper()}{about(id)[1:]}.", *_films(id), code(intro), _make(id)]
-    lines += ["## Action", code(parts.get("Action", "") or parts["Action, observation"])]
-    if topics:
+    if id == FLEET:
+        lines += ["## Action", code(parts["Action, observation"]), _slot_fields(topics)]
+    elif topics:
         asked = re.sub(r"^\([^)]*\): ", "", parts["Several topics"])
-        lines += [code(asked[:1].upper() + asked[1:])]
-    lines += ["## Observation", code(of_one["Observation"])]
-    lines += ["Every field lies in [0, 1]. r is a reference: the field is 0.5 where the quantity is as large as r."]
-    lines += [_fields(topics)]
-    lines += ["## Reward", code(parts["Reward"]), _rewards(topics)]
+        lines += ["## Action and observation", code(asked[:1].upper() + asked[1:])]
+        lines += ["### Slots", code(parts["Slots"]), _slot_fields(topics)]
+    else:
+        lines += ["## Action", INTERFACES, code(parts["Action"])]
+        lines += ["## Observation", code(parts["Observation"])]
+        lines += [RATIOS, _fields((*CANDIDATE_FIELDS, *QUEUE_FIELDS))]
+    lines += ["## Reward", code(parts["Reward"]), _rewards(REWARD_TERMS + more)]
     lines += ["### Returns of rules", RETURN, _returns(id)]
+    if one_queue:
+        lines += ["## Slots", code(parts["Slots"]), _slot_fields(topics)]
     lines += ["## Episode end", code(parts["Episode end"])]
     lines += ["## Arguments", code(parts["Arguments"])]
     lines += [
@@ -167,8 +193,13 @@ def _films(id: str) -> list[str]:
     ]
 
 
-def _fields(topics: bool) -> str:
-    fields = FIELDS + TOPIC_FIELDS if topics else FIELDS
+def _slot_fields(topics: bool) -> str:
+    """What an agent observes of slots."""
+    scale = "Every field lies in [0, 1]. r is a reference: the field is 0.5 where the quantity is as large as r."
+    return f"{scale}\n\n{_fields(FIELDS + TOPIC_FIELDS if topics else FIELDS)}"
+
+
+def _fields(fields: Iterable[Field]) -> str:
     rows = [(f"`{f.name}`", f.per, f.group, f.unit, code(f.meaning)) for f in fields]
     return table(("field", "per", "takes", "unit", "meaning"), rows)
 
@@ -181,6 +212,5 @@ def _returns(id: str) -> str:
     return table(("rule", "return", "steps"), rows)
 
 
-def _rewards(topics: bool) -> str:
-    terms = REWARD_TERMS + TOPIC_REWARD_TERMS if topics else REWARD_TERMS
+def _rewards(terms: Iterable[RewardTerm]) -> str:
     return table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in terms])

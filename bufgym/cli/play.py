@@ -54,7 +54,7 @@ def play(
     if out is not None:
         library("PIL", "plot", "--out")
     mode = "ansi" if out is None else "rgb_array"
-    world: Any = gymnasium.make(id, capacity=capacity, render_mode=mode).unwrapped
+    world: Any = gymnasium.make(id, capacity=capacity, render_mode=mode, actions="slots").unwrapped
     player = Player(policy)
     world.reset(options={"episode": draw(world.rows.scenario, seed)})
     # On a terminal each picture replaces the one before, unless the user wants no escape codes (no-color.org).

@@ -18,57 +18,96 @@ _ROW = np.zeros(1, np.int64)
 
 
 class SenderEnv(gym.Env[Observation, np.int64]):
-    """A robot's send buffer holds L messages, and a fading link empties it: decide at every arrival what to drop.
+    """A robot's send buffer holds L messages, and a fading link empties it: decide at a full buffer what to drop.
 
-    **Action** ``Discrete(L + 2)``: 0..L-1 evict that slot, 0 being the oldest, and enqueue the newcomer. L rejects the
-    newcomer, and L + 1 accepts it. ``info["action_mask"]``, int8[L + 2], marks the valid actions for
-    ``action_space.sample(mask)``; ``action_masks()``, bool[L + 2], does so for sb3-contrib. An invalid action does what
-    a plain queue does: it accepts if there is room and otherwise rejects. ``info["invalid"]`` counts invalid actions.
-    If B has no room for the newcomer even after an eviction, the next step is about the same arrival again. An arrival
-    larger than B is dropped without a step.
+    **Action** ``Discrete(3)``, whatever L is: drop the cheapest candidate, the second cheapest, or the head.
 
-    **Observation** a Dict with one float32 array for each field of ``bufgym.model.observe.FIELDS``, all in [0, 1]. Slot
-    fields have shape (L + 1,), with the newcomer last; context fields have shape (1,). With ``observation="flat"`` the
-    same numbers are one array, slot fields first. With "slots" they are a Dict of ``slots`` [L + 1, slot fields] and
-    ``context``.
+    A candidate is a message that could go: each queued message, and the newcomer. The message in transmission is none.
+    Dropping a candidate merges the motion gaps before and after it. The smaller the merged gap, the cheaper the drop.
+    Where sizes differ, the gap counts per byte. ``bufgym.model.observe.candidates`` has the definition.
 
-    **Reward** one of the terms of ``bufgym.model.observe.REWARD_TERMS`` or a weighted sum of them. Over an episode both
-    ``delivered`` and ``retained`` add up to H - 1, or to 0 if nothing was delivered. ``info["reward_terms"]`` has each
-    term.
+    Every action is valid. If a candidate is missing, its action drops the cheapest. ``info["slots"]`` names the slot
+    that each action drops: 0 is the oldest, and L is the newcomer.
 
-    **Several topics** (a scenario with ``topics``, as of ``bufgym/Topics-v0``): the environment asks at a free socket
-    too. Where the field ``socket_asks`` is 1 there is no newcomer. Then an action 0..L-1 *sends* that slot, which must
-    be the oldest of its topic, and L + 1 is invalid. L *holds* the socket until the next arrival or ack, as long as one
-    is to come. An invalid choice sends the oldest message. At an arrival all is as above, but a ``no_drop`` message can
-    be neither evicted nor rejected while another message can make room. If an action tries this and the queue is full,
-    the oldest message of the lowest priority goes. The fields of ``TOPIC_FIELDS`` and the terms ``age`` and ``late`` of
-    ``TOPIC_REWARD_TERMS`` (both in ``bufgym.model.observe``) are added. H is the weighted sum over the topics, so
-    ``delivered`` and ``retained`` add up to H minus the weights of all topics with a delivery.
+    With ``decide_at="arrival"`` every arrival asks, and the space is ``Discrete(4)``. Action 0 then accepts the
+    newcomer if there is room, and drops the cheapest candidate if not. The others follow.
+
+    If B has no room for the newcomer even after an eviction, the next step is about the same arrival again, and the
+    newcomer is no candidate. An arrival larger than B is dropped without a step.
+
+    **Observation** 27 numbers, float32: six of each candidate and nine of the queue. Most are logarithms of ratios in
+    [-3, 3], so they mean the same at every L, frame rate and size. ``CANDIDATE_FIELDS`` and ``QUEUE_FIELDS`` of
+    ``bufgym.model.observe`` list them.
+
+    ``observation="dict"`` gives an array for each field. "slots" gives ``slots`` [candidates, candidate fields] and
+    ``context`` [queue fields].
+
+    **Reward** one of the terms of ``bufgym.model.observe.REWARD_TERMS``, another term by its name, or a weighted sum.
+    ``info["reward_terms"]`` has each term.
+
+    Over an episode both ``delivered`` and ``retained`` add up to H - 1, or to 0 if nothing was delivered. The default
+    is ``retained``, which charges a drop at once.
+
+    ``regret`` is the change of V*, the best H that can still be reached. It adds up to H - V*(start), so the best
+    policy stays the same, and the luck of link and motion is taken out. V* needs the link's future. Only the reward
+    sees that future: observations and evaluations never do. It serves one queue of messages of equal size.
+
+    **Slots** ``actions="slots"`` is the other interface, for networks that score every message. Its defaults are
+    ``decide_at="arrival"`` and ``observation="dict"``.
+
+    The action is ``Discrete(L + 2)``. Actions 0..L-1 evict that slot, 0 being the oldest, and enqueue the newcomer. L
+    rejects the newcomer. L + 1 accepts it.
+
+    ``info["action_mask"]``, int8[L + 2], marks the valid actions for ``action_space.sample(mask)``. ``action_masks()``,
+    bool[L + 2], does so for sb3-contrib. An invalid action does what a plain queue does: it accepts if there is room
+    and otherwise rejects. ``info["invalid"]`` counts invalid actions.
+
+    The observation is a Dict with one float32 array for each field of ``bufgym.model.observe.FIELDS``, all in [0, 1].
+    Slot fields have shape (L + 1,), with the newcomer last. Context fields have shape (1,). With ``observation="flat"``
+    the same numbers are one array, slot fields first. With "slots" they are a Dict of ``slots`` [L + 1, slot fields]
+    and ``context``.
+
+    **Several topics** (a scenario with ``topics``, as of ``bufgym/Topics-v0``): actions are slots, and the environment
+    asks at a free socket too. Where the field ``socket_asks`` is 1 there is no newcomer. Then an action 0..L-1 *sends*
+    that slot, which must be the oldest of its topic, and L + 1 is invalid. L *holds* the socket until the next arrival
+    or ack, as long as one is to come. An invalid choice sends the oldest message.
+
+    At an arrival all is as above, but a ``no_drop`` message can be neither evicted nor rejected while another message
+    can make room. If an action tries this and the queue is full, the oldest message of the lowest priority goes.
+
+    The fields of ``TOPIC_FIELDS`` and the terms ``age`` and ``late`` of ``TOPIC_REWARD_TERMS`` (both in
+    ``bufgym.model.observe``) are added. H is the weighted sum over the topics, so ``delivered`` and ``retained`` add up
+    to H minus the weights of all topics with a delivery.
 
     **Episode end** ``terminated`` when the episode's last message has left; never ``truncated``. In the step that ends
-    it, ``info`` also counts messages as ``arrived``, ``delivered`` and ``dropped``. Every step has ``qoi``, H of the
-    messages delivered so far, so episodes that a ``TimeLimit`` truncates have it too. An episode that asks for no
-    decision (``decide_at="overflow"`` and never full) ends with the first step, whose action has no effect.
+    it, ``info`` also counts messages as ``arrived``, ``delivered`` and ``dropped``.
+
+    Every step has ``qoi``, H of the messages delivered so far, so episodes that a ``TimeLimit`` truncates have it too.
+    An episode that asks for no decision (never full) ends with the first step, whose action has no effect.
 
     **Arguments**
 
     - ``scenario``: a name in ``bufgym.scenario.SCENARIOS``, ``module:function`` that makes one, or a scenario.
     - ``capacity``: L, messages.
     - ``max_bytes``: B, bytes, by default without limit.
-    - ``decide_at``: "arrival", or "overflow" to ask only when the buffer is full.
-    - ``reward``: a term's name, or weights by name; terms of your own take part only if named.
+    - ``actions``: "candidates", the default of one queue; "slots", the only one of several topics; or "guided" (one
+      queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule gap-price for this decision, by the table
+      ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is no mask, and no invalid action.
+    - ``candidates``: how many of the cheapest candidates are actions beside the head, 1 to 64.
+    - ``decide_at``: "overflow" asks only when the buffer is full, "arrival" at every arrival. Candidates are asked at
+      overflow by default, slots and guided actions at arrivals.
+    - ``observation``: "flat", the default of candidates; "dict", the default of slots and guided actions; or "slots".
+    - ``fields``: with candidates, names of fields to observe beside the 27 numbers, your own or those of
+      ``ON_BOARD_FIELDS``. With slots, names of the fields to observe, by default all of the tables; "compact" means all
+      of the context's. With slots and guided actions, "guided" means ``bufgym.policies.guided.INPUTS``, which lie in
+      [-4, 4].
+    - ``reward``: a term's name, or weights by name; ``regret`` and terms of your own take part only if named.
     - ``reward_scale``: factor on the reward, by default none. "episode" is the constant ``reward_scale`` of the
       scenario's class, which brings a rule's return in a default episode between 1 and 10; weights of your own terms
       stay as they are. ``info["reward_terms"]`` is not scaled.
-    - ``actions``: "slots", as above, or "guided" (one queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule
-      gap-price for this decision, by the table ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is
-      no mask, and no invalid action.
-    - ``mask``: "valid", or "plausible" (one queue) for the few valid actions that a good rule chooses among: accept,
-      reject, evict what leaves one of the two smallest gaps, evict the head when its turn is near. The others stay
-      valid, and do what they say.
-    - ``fields``: names of the fields to observe, your own included; by default all of the tables. "compact" means
-      all of the context's. "guided" means ``bufgym.policies.guided.INPUTS``, which lie in [-4, 4].
-    - ``observation``: "dict", "flat" or "slots".
+    - ``mask``: "valid", or "plausible" (slots of one queue) for the few valid actions that a good rule chooses among:
+      accept, reject, evict what leaves one of the two smallest gaps, evict the head when its turn is near. The others
+      stay valid, and do what they say.
     - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,
       and at an episode's end its summary; "none" has only this summary.
     - ``mask_in_observation``: whether observations hold the action mask, for libraries that look for it there. True
@@ -149,7 +188,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         return rows.observation(0), rows.rewards().item(), ended, False, rows.info(0, ended)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[L + 2]: the actions valid now, under the name that sb3-contrib looks for."""
+        """bool[actions]: the actions valid now, under the name that sb3-contrib looks for."""
         return cast(NDArray[np.bool_], self.rows.action_masks()[0])
 
     def render(self) -> Any:

@@ -21,8 +21,9 @@ from bufgym.scenario import Scenario
 class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     """A batch of ``SenderEnv``: the same actions, observations, rewards, episode ends and arguments, row by row.
 
-    With several topics some rows may ask what to drop and others what to send: the field ``socket_asks`` tells them
-    apart.
+    With candidates, the default of one queue, actions are int64[n] and observations float32[n, 27]. With slots, an
+    observation is a dict of arrays. With several topics some rows may ask what to drop and others what to send: the
+    field ``socket_asks`` tells them apart.
 
     ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
     ``autoreset_mode``: one of Gymnasium's, or its value or name ("SameStep", "SAME_STEP").
@@ -33,10 +34,14 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     ``reset`` takes two options. ``reset_mask``, bool[n], selects rows. ``episodes`` has an entry for each row: an
     ``Episode``, a dict of the options that name one in ``SenderEnv``, or None to draw the next.
 
-    ``info`` has Gymnasium's form, with ``action_mask`` int8[n, L + 2], ``qoi`` float64[n], ``invalid`` int64[n], and
-    ``reward_terms`` by name, float64[n] each. With SAME_STEP autoreset it also has ``final_obs`` and ``final_info`` for
-    the rows that ended, marked in ``info["_final_obs"]``. Rows that end, truncated ones too, have their summary. Arrays
-    from a step are never written again while anyone holds them.
+    ``info`` has Gymnasium's form:
+
+    - ``action_mask`` int8[n, actions], and ``slots`` int64[n, actions] of candidates,
+    - ``qoi`` float64[n], ``invalid`` int64[n], and ``reward_terms`` by name, float64[n] each.
+
+    Rows that end, truncated ones too, have their summary. With SAME_STEP autoreset ``info`` also has ``final_obs`` and
+    ``final_info`` for the rows that ended, marked in ``info["_final_obs"]``. Arrays from a step are never written again
+    while anyone holds them.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -154,7 +159,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return self._observed(), rewards, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, L + 2]: the actions valid now in each row."""
+        """bool[n, actions]: the actions valid now in each row."""
         return self.rows.action_masks()
 
     def render(self) -> Any:

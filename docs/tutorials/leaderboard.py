@@ -13,17 +13,14 @@
 # %%
 from pathlib import Path
 
-from sb3_contrib import MaskablePPO
+from stable_baselines3 import PPO
 
-from bufgym.sb3 import SlotPolicy, make_vec_env
+from bufgym.sb3 import make_vec_env
 
 folder = Path("mine")
 folder.mkdir(exist_ok=True)
-envs = make_vec_env(
-    "bufgym/Suite-v0", 128, seed=0, suite="interruption-v1", split="train", capacity=10, actions="slots"
-)
-settings = {"n_steps": 128, "batch_size": 2048, "n_epochs": 4, "learning_rate": 3e-3, "gamma": 1.0}
-model = MaskablePPO(SlotPolicy, envs, seed=0, **settings).learn(131_072)
+envs = make_vec_env("bufgym/Suite-v0", 8, seed=0, suite="interruption-v1", split="train", capacity=10)
+model = PPO("MlpPolicy", envs, n_steps=256, seed=0, device="cpu").learn(32_768)
 model.save(folder / "my-agent.zip")
 
 # %% [markdown]
@@ -35,8 +32,8 @@ model.save(folder / "my-agent.zip")
 # bufgym bench --suite interruption-v1 --policies mine/my-agent.zip,min-gap,afr,drop-oldest --out mine/rows
 # ```
 #
-# Here the same is called from Python, with fewer episodes and one capacity to save time. A slot network serves every L,
-# so it can be tested at an L that it never saw.
+# Here the same is called from Python, with fewer episodes and one capacity to save time. Actions and observation are
+# the same at every L, so the agent can be tested at an L that it never saw.
 
 # %%
 from bufgym.cli import main as bufgym
