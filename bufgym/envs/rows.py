@@ -21,21 +21,18 @@ from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.plausible import keep_plausible
 from bufgym.envs.regret import Regret
+from bufgym.envs.reward import reward_weights
 from bufgym.envs.step import step_rows
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.threads import Threads
-from bufgym.model.checks import is_number
 from bufgym.model.observe import (
     CANDIDATE_FIELDS,
     CONTEXT_FIELDS,
-    OWN_TERMS,
     QUEUE_FIELDS,
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,
     TOPIC_SLOT_FIELDS,
-    OwnTerm,
     own_field,
-    own_term,
     terms_for,
 )
 from bufgym.oracle.measure import MEASURED, measured
@@ -45,35 +42,6 @@ from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
 from bufgym.sim.senders import Begun
-
-
-def reward_weights(
-    reward: str | Mapping[str, float], several_topics: bool = False
-) -> tuple[NDArray[np.float64], tuple[OwnTerm, ...]]:
-    """float64[reward terms] from one term's name or from weights by name, and the named terms that are in no table."""
-    tables = [term.name for term in terms_for(several_topics)]
-    known = [*tables, *(name for name in OWN_TERMS if name not in tables)]
-    if not isinstance(reward, str | Mapping):
-        raise BufgymError(f"reward = {reward!r}: must be the name of a term ({', '.join(known)}) or weights by name")
-    weights = {reward: 1.0} if isinstance(reward, str) else dict(reward)
-    if not weights:
-        raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {', '.join(known)}")
-    own: dict[str, OwnTerm] = {}
-    # ``regret`` is the last column: it is computed apart.
-    for name, weight in sorted(weights.items(), key=lambda pair: pair[0] == "regret"):
-        if not (is_number(weight) and np.isfinite(weight)):
-            raise BufgymError(f"reward = {reward!r}: the weight of {name!r} must be a finite number")
-        if name in tables:
-            continue
-        term = own_term(name) if isinstance(name, str) else None
-        if term is None:
-            raise unknown("term", name, known, place=f"reward = {reward!r}")
-        if several_topics and term.one_queue:
-            raise BufgymError(f"reward = {reward!r}: {name!r} is for one queue; each topic has settings of its own")
-        own[name] = term
-    numbers = [weights.get(name, 0.0) for name in tables] + [weights[name] for name in own]
-    return np.array(numbers, np.float64), tuple(own.values())
-
 
 NO_ACTIONS: NDArray[np.int64] = np.zeros(0, np.int64)
 """Argument of ``step_rows`` and ``step_cells`` where episodes begin."""

@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 from bufgym.ground.files import PACKAGE, replaced
 from bufgym.ground.kernel import FOLDER
 
-SOURCES = ("oracle", "model")
-"""Folders of the package whose files say what a plan is. Another text of theirs finds no plan that was kept before."""
+SOURCES = (
+    *(
+        f"oracle/{name}.py"
+        for name in ("beam", "clairvoyant", "interruption", "labels", "pieces", "programme", "unequal")
+    ),
+    *(f"model/{name}.py" for name in ("buffer", "link", "qoi")),
+)
+"""Files of the package that say what a plan is. Another text of theirs finds no plan that was kept before."""
 
 _HEAD = "<d?"  # H, and whether it is certified; a bit for each message follows, then the digest of all before it
 _OTHERS = 3  # Folders that stay of other texts of the sources
@@ -58,5 +64,5 @@ def kept(inputs: tuple[Any, ...], messages: int, find: Callable[[], Found]) -> F
 @functools.cache
 def sources() -> str:
     """Hash of all that says what a plan is."""
-    files = sorted(file for folder in SOURCES for file in (PACKAGE / folder).glob("*.py"))
-    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()[:16]
+    texts = ((PACKAGE / file).read_bytes() for file in SOURCES)
+    return hashlib.sha256(b"".join(hashlib.sha256(text).digest() for text in texts)).hexdigest()[:16]
