@@ -37,12 +37,12 @@ NEXT_STEP, SAME_STEP = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
 
 def vector(case: str, **more: Any) -> SenderVectorEnv:
     scenario, arguments = CASES[case]
-    return SenderVectorEnv(N, scenario, L, **arguments, **{"actions": "slots", **more}, actions="slots")
+    return SenderVectorEnv(N, scenario, L, **arguments, **{"actions": "slots", **more})
 
 
 def single(case: str, **more: Any) -> SenderEnv:
     scenario, arguments = CASES[case]
-    return SenderEnv(scenario, L, **arguments, **{"actions": "slots", **more}, actions="slots")
+    return SenderEnv(scenario, L, **arguments, **{"actions": "slots", **more})
 
 
 def row(info: dict[str, Any], i: int) -> dict[str, Any]:
