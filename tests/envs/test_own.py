@@ -133,7 +133,7 @@ def test_a_step_tells_what_happened_in_it() -> None:
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
 def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
     arguments: dict[str, Any] = {"fields": CHOSEN, "reward": terms_of(env_id), "capacity": 4, **SMALL[env_id]}
-    env = gym.make(env_id, **arguments).unwrapped
+    env = gym.make(env_id, **arguments, actions="slots").unwrapped
     assert isinstance(env, SenderEnv)
     rng = np.random.default_rng(3)
     for seed in range(2):
@@ -297,7 +297,7 @@ SCENARIO = Uplink(traces=(LINK,), rate_hz=10, duration_s=FRAMES / 10, size_bytes
 def played() -> tuple[Any, Any, Any]:
     """Delivered and retained rewards and the QoI held afterwards, float64[sequences, steps], of all sequences."""
     sequences = np.array(list(product(range(L + 2), repeat=FRAMES)))
-    rows = Rows(len(sequences), SCENARIO, Options(capacity=L))
+    rows = Rows(len(sequences), SCENARIO, Options(capacity=L, actions="slots"))
     rows.reset(np.arange(len(rows)), [draw(SCENARIO, 0)] * len(rows))
     rewards, held = [], []
     for actions in sequences.T:
