@@ -63,7 +63,7 @@ def measure_peers(sizes: Sizes, figures: Sequence[Measurement]) -> tuple[list[Me
 def _observe_all(batch: Batch, output: StepOutput) -> None:
     """Every row's observation and mask."""
     for i in range(len(batch.senders)):
-        write_observation(batch, i, False, output)
+        write_observation(batch, i, False, output, None)
 
 
 @kernel

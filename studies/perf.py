@@ -45,6 +45,8 @@ TOPICS = "bufgym/Topics-v0"
 POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")
 NATIVE = "vector_entry_point"
 SEED = 1
+NAMED = ["rank", "loss", "occupancy", "rate_long"]
+"""Fields that a batch names: two for each slot, one of the context's and one outside the tables."""
 LABELLED = 64
 """Environments side by side whose decisions the clairvoyant labels."""
 FELL, BEFORE = 0.15, 5  # A ratio fell if it is lower by more than this share than the median of so many runs before
@@ -166,7 +168,10 @@ def _batches(meter: _Meter) -> Iterator[Measurement]:
         return meter.of_env(f"native batch{what}, {id}, n = {n}", told, vector, sizes.steps(n), clock=clock)
 
     yield from (figure(id, n) for id in (*ENVIRONMENTS, TOPICS) for n in sizes.batches)
-    yield figure(ENVIRONMENTS[0], max(sizes.batches), ' with fields="compact"', fields="compact")
+    largest = max(sizes.batches)
+    yield figure(ENVIRONMENTS[0], largest, ' with fields="compact"', fields="compact", actions="slots")
+    yield figure(ENVIRONMENTS[0], largest, " of slots with four named fields", fields=NAMED, actions="slots")
+    yield figure(ENVIRONMENTS[0], largest, " with four named fields", fields=NAMED)
     yield figure(ENVIRONMENTS[0], max(sizes.batches), " on 2 threads", time.perf_counter, num_threads=2)
 
 

@@ -60,7 +60,7 @@ class FleetRows(Rows):
         return cells
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        step_cells(self.senders.batch, self.fleet.shares, rows, actions, self.rewarded, self.output)
+        step_cells(self.senders.batch, self.fleet.shares, rows, actions, self.rewarded, self.output, self.form.named)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[rows]: each robot's own weighted sum, or for a "team" the mean within its cell."""

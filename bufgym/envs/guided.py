@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from bufgym.envs.options import GUIDED, RULE, InvalidActionError, Options
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
 from bufgym.ground.kernel import kernel, stretch, table
+from bufgym.model.observe import Chosen
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, GuidedWeights, follow, inputs, recall
 from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.sim.state import Batch
@@ -50,10 +51,10 @@ def guided_decision(batch: Batch, i: int, action: int, guide: Guide) -> int:
 
 
 @kernel
-def write_guided(batch: Batch, i: int, ended: bool, output: StepOutput, guide: Guide) -> None:
+def write_guided(batch: Batch, i: int, ended: bool, output: StepOutput, guide: Guide, chosen: Chosen | None) -> None:
     """Let the rule learn of what happened, and write row ``i``'s state and observation, the rule's inputs if seen."""
     if guide.sees == 0:
-        write_observation(batch, i, ended, output)
+        write_observation(batch, i, ended, output, chosen)
     else:
         write_state(batch, i, ended, output)
     if ended:

@@ -2,7 +2,7 @@
 
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from bufgym.ground.errors import BufgymError, unknown
-from bufgym.model.observe import OWN_FIELDS, Field, own_field
+from bufgym.model.observe import BUILT_IN, OWN_FIELDS, Field, chosen_at, own_field
 
 Observation = Any
 """A dict of arrays; for "flat", one array."""
@@ -63,17 +63,20 @@ class ObservationForm:
 
     A row of numbers first holds the fields of the tables (``table_numbers``): slot fields with L + 1 entries each, the
     newcomer's last, or candidate fields with k + 1 entries each, the head's last; then context fields. Other chosen
-    fields follow at ``places``. ``form`` is one of
+    fields follow at ``places``. Where ``only_chosen``, a row holds the chosen fields alone. ``form`` is one of
 
     - "dict", an array for each field, [L + 1], [k + 1] or [1],
     - "flat", the row itself, equal to the dict under ``gymnasium.wrappers.FlattenObservation``,
     - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks; of
       candidates ``slots`` is [k + 1, candidate fields].
 
-    Only fields named in ``chosen`` are observed, by default all of the tables. Candidate fields and their context are
-    always observed, beside those named. They keep the order of the tables, and
-    your own come last. ``has_slots`` says whether rows hold slot fields of the tables. Where ``is_view``, an
-    observation is a dict of views; where ``is_row``, the row itself.
+    Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, slots
+    before the context, and other fields come last in each. Candidate fields and their context are always observed, and
+    named fields follow; in the form "slots" these are numbers of ``context``. ``has_slots`` says whether rows hold slot
+    fields of the tables. Where ``is_view``, an observation is a dict of views; where ``is_row``, the row itself.
+    ``named`` are the built-in fields that are observed only because they are named; None if there are none,
+    and the row holds tables.
+    ``own_places`` are the places of your own fields.
     ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row. Where ``mask`` has keys,
     ``masked`` puts the mask of all ``actions`` into an observation. ``candidates`` is k.
     """
@@ -89,45 +92,52 @@ class ObservationForm:
         *,
         candidates: int = 0,
         actions: int = 0,
+        only_chosen: bool = False,
     ) -> None:
         if form not in FORMS:
             raise BufgymError(f"observation = {form!r}: must be one of {', '.join(map(repr, FORMS))}")
-        tables = {"candidate" if candidates else "slot": slot_fields, "context": context_fields}
-        known = [field.name for field in (*slot_fields, *context_fields)]
-        own: dict[str, Field] = {}
-        named = [] if chosen is None else list(chosen)
-        names = known if chosen is None else [*known, *named] if candidates else named
+        known = {field.name: field for field in (*slot_fields, *context_fields)}
+        others: dict[str, Field] = {}
+        names = [*known] if chosen is None or candidates else []
+        names += chosen or ()
         for k, name in enumerate(names):
             if name not in known:
-                found = own_field(name)
+                found = BUILT_IN.get(name) or own_field(name)
                 if found is None:
-                    raise unknown("field", name, [*known, *OWN_FIELDS], place="fields")
-                own[found.name], names[k] = found, found.name
+                    raise unknown("field", name, list({**known, **BUILT_IN, **OWN_FIELDS}), place="fields")
+                others[found.name], names[k] = found, found.name
         if not names:
             raise BufgymError("fields: choose at least one field to observe")
-        self.form, self.has_slots = form, bool(slot_fields)
+        self.form, self.has_slots = form, bool(slot_fields) and not only_chosen
         widths = {"slot": capacity + 1, "candidate": candidates + 1, "context": 1}
         per_entry = "candidate" if candidates else "slot"
         self._width = widths[per_entry]
         self._slot_fields, self._context_fields = len(slot_fields), len(context_fields)
         self._first_context = self._slot_fields * self._width
-        self.table_numbers = self.numbers = self._first_context + self._context_fields
+        self.table_numbers = 0 if only_chosen else self._first_context + self._context_fields
+        of_tables = {} if only_chosen else dict(zip(known, _firsts(known.values(), widths), strict=True))
+        fields = [*(field for name, field in known.items() if name in names), *others.values()]
+        if candidates:
+            fields.sort(key=lambda field: (field.name in others, field.per == "context"))
+        else:
+            fields.sort(key=lambda field: field.per == "context")
         self.places: list[Place] = []
-        for per, entries in widths.items():
-            begins = self._first_context if per == "context" else 0
-            for k, field in enumerate(tables.get(per, ())):
-                if field.name in names:
-                    self.places.append(Place(field, begins + k * entries, entries))
-            for field in own.values():
-                if field.per == per:
-                    self.places.append(Place(field, self.numbers, entries))
-                    self.numbers += entries
-        everything = not own and len(self.places) == len(known)
+        self.numbers = self.table_numbers
+        for field in fields:
+            first, entries = of_tables.get(field.name, self.numbers), widths[field.per]
+            self.places.append(Place(field, first, entries))
+            self.numbers = max(self.numbers, first + entries)
+        numbers = np.concatenate([np.arange(place.first, place.first + place.entries) for place in self.places])
+        everything = np.array_equal(numbers, np.arange(self.numbers))
         self.is_view = form == "dict" or (form == "slots" and everything)
         self.is_row = form == "flat" and everything
-        numbers = [np.arange(place.first, place.first + place.entries) for place in self.places]
-        self._numbers = None if everything else np.concatenate(numbers)
+        self._numbers = None if everything else numbers
         self._per_slot = sum(place.field.per == per_entry for place in self.places)
+        beside = [place for place in self.places if place.first >= self.table_numbers]
+        built_in = [place for place in beside if place.field in BUILT_IN.values()]
+        firsts = {place.field.name: place.first for place in built_in}
+        self.named = chosen_at(firsts) if only_chosen or built_in else None
+        self.own_places = [place for place in beside if place not in built_in]
         low, high = np.zeros((2, self.numbers), np.float32)
         for field, first, entries in self.places:
             low[first : first + entries], high[first : first + entries] = field.low, field.high
@@ -137,11 +147,6 @@ class ObservationForm:
     def masked(self, observation: Observation, mask: NDArray[np.int8]) -> Observation:
         """The observation, an array or a dict of the caller's own, with a view of the mask if this form has one."""
         return observation if self.mask is None else self.mask.put(observation, mask.view(self.mask.dtype))
-
-    @property
-    def own_places(self) -> list[Place]:
-        """Places of the fields that are observed only because they are named."""
-        return [place for place in self.places if place.first >= self.table_numbers]
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
@@ -159,6 +164,14 @@ class ObservationForm:
         slots = rows[..., :first].reshape(*rows.shape[:-1], self._per_slot, self._width)
         parts = {"slots": slots.swapaxes(-1, -2), "context": rows[..., first:]}
         return {name: part for name, part in parts.items() if part.size}
+
+
+def _firsts(fields: Iterable[Field], widths: Mapping[str, int]) -> Iterator[int]:
+    """Index of each field's first number in a row of all of them."""
+    first = 0
+    for field in fields:
+        yield first
+        first += widths[field.per]
 
 
 def _space(low: Observation, high: Observation) -> Any:

@@ -15,15 +15,18 @@ from bufgym.model.observe import (
     TOPIC_CONTEXT_FIELDS,
     TOPIC_REWARD_TERMS,
     TOPIC_SLOT_FIELDS,
+    Chosen,
     observe,
     observe_topic_context,
     observe_topic_slots,
+    write_chosen,
+    write_chosen_on_board,
 )
 from bufgym.sim.decisions import can_evict, can_hold, can_reject, can_send, has_room
 from bufgym.sim.rules import age_until
 from bufgym.sim.socket import credit
 from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch
-from bufgym.sim.view import arrival_of, view
+from bufgym.sim.view import arrival_of, last_arrival, view
 
 DELIVERED, RETAINED, AGE, LATE = range(len(REWARD_TERMS) + len(TOPIC_REWARD_TERMS))
 """Columns of ``StepOutput.reward_terms``."""
@@ -47,7 +50,7 @@ class StepOutput(NamedTuple):
         qoi: float64[n], H of the messages at the server so far.
         invalid: int64[n], invalid actions of the episode so far.
         terminated: bool[n], whether the episode is over.
-        slots: int64[1], 1 if ``flat`` has the slot fields, 0 if it has the context fields alone.
+        slots: int64[1], for several topics: 1 if ``flat`` has the slot fields, 0 if it has the context fields alone.
         slot_actions: int64[n, actions], the action among slots that each action stands for: 0..L-1 evict that slot, L
             rejects, L + 1 accepts. int64[n, 0] where actions are slots.
     """
@@ -145,13 +148,14 @@ def write_state(batch: Batch, i: int, ended: bool, output: StepOutput) -> bool:
 
 
 @kernel
-def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> None:
-    """Write row ``i``'s state and the observation of its tables' fields."""
+def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput, chosen: Chosen | None) -> None:
+    """Write row ``i``'s state and the observation of its tables' fields; with one queue only if none are ``chosen``."""
     if not write_state(batch, i, ended, output):
         return
     sender = batch.senders[i]
-    buffer, entries = view(batch, i), (sender.capacity + 1) * output.slots[0]
+    buffer, entries = view(batch, i), sender.capacity + 1
     if batch.several is not None:
+        entries *= output.slots[0]
         arriving = sender.waiting == ARRIVAL_WAITS
         # When the socket asks there is no newcomer: the last arrival fills the argument and is not read.
         arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
@@ -159,11 +163,24 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput) -> 
         if entries > 0:
             observe_topic_slots(buffer, arrival, arriving, table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries))
         observe_topic_context(buffer, arrival, arriving, stretch(output.flat, i, first, _ALL_CONTEXT_FIELDS))
-    else:
+    elif chosen is None:
         arrival = arrival_of(batch, i)
         first = _SLOT_FIELDS * entries
         rows, context = table(output.flat, i, 0, _SLOT_FIELDS, entries), stretch(output.flat, i, first, _CONTEXT_FIELDS)
         observe(buffer, arrival, rows, context)
+
+
+@kernel
+def write_named(batch: Batch, i: int, chosen: Chosen, flat: NDArray[np.float32]) -> None:
+    """Write the fields that row ``i`` observes because they are named, if it waits for a decision."""
+    waiting = batch.senders[i].waiting
+    if waiting == NOTHING_WAITS:
+        return
+    buffer, row = view(batch, i), stretch(flat, i, 0, flat.shape[1])
+    if batch.several is None:
+        write_chosen(buffer, arrival_of(batch, i), chosen, row)
+    else:
+        write_chosen_on_board(buffer, last_arrival(batch, i), waiting == ARRIVAL_WAITS, chosen, row)
 
 
 @kernel

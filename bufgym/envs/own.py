@@ -22,7 +22,7 @@ from bufgym.model.observe import Field, OwnTerm
 from bufgym.policies.registry import view_type
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch, batch_type
-from bufgym.sim.view import view
+from bufgym.sim.view import last_arrival, view
 
 # Columns of ``marks``: counts of a sender at the step before, and that step's end.
 TRANSMITTED, CREDITED, DROPS, UNTIL = range(4)
@@ -63,13 +63,6 @@ class Step(NamedTuple):
     """TOPIC[topics]: settings and past of each topic."""
     parameters: NDArray[np.float64]
     """float64[parameters], read-only: the term's settings, in the order of its registration."""
-
-
-@kernel
-def last_arrival(batch: Batch, i: int) -> Any:
-    """The arrival that waits for a decision; where the socket asks, the latest arrival."""
-    sender = batch.senders[i]
-    return at(batch.arrivals, i, sender.next if sender.waiting == ARRIVAL_WAITS else sender.next - 1)
 
 
 def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:

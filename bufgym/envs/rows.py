@@ -26,6 +26,7 @@ from bufgym.envs.step import step_rows
 from bufgym.ground.errors import BufgymError, unknown
 from bufgym.ground.threads import Threads
 from bufgym.model.observe import (
+    BUILT_IN,
     CANDIDATE_FIELDS,
     CONTEXT_FIELDS,
     QUEUE_FIELDS,
@@ -117,7 +118,10 @@ class Rows:
         self.output = self.new_output()
 
     def _observed(self) -> ObservationForm:
-        """The fields to observe; without slot fields where none is, as a step computes those for every message."""
+        """The fields to observe. A step computes whole tables: all of one queue's unless fields are named.
+
+        With several topics it leaves out the slot fields if none of them is observed.
+        """
         options, several_topics = self.options, bool(self.scenario.topics)
         if options.sees:
             slots = RULE_SLOT_FIELDS if options.sees == RULE else ()
@@ -132,10 +136,14 @@ class Rows:
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if several_topics else ())
         names = [field.name for field in context_fields]
         chosen = names if isinstance(options.fields, str) and options.fields == "compact" else options.fields
-        if not self.keeps_slots and chosen and all(name in names or own_field(name) for name in chosen):
+        beside = [*names, *(name for name in BUILT_IN if name not in (field.name for field in slot_fields))]
+        only_chosen = chosen is not None and not several_topics and not self.keeps_slots
+        if several_topics and not self.keeps_slots and chosen and all(n in beside or own_field(n) for n in chosen):
             slot_fields = ()
-        form = options.form
-        return ObservationForm(form, slot_fields, context_fields, self.capacity, chosen, options.mask_keys)
+        return ObservationForm(
+            options.form, slot_fields, context_fields, self.capacity, chosen, options.mask_keys,
+            only_chosen=only_chosen,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.senders)
@@ -216,7 +224,8 @@ class Rows:
         return rows
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self._guide)
+        how = self.choices, self._guide, self.form.named
+        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, *how)
         if self.options.mask == "plausible":
             keep_plausible(self.senders.batch, rows, self.output.action_mask)
 

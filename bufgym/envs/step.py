@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from bufgym.envs.candidates import Choices, candidate_decision, write_candidates
 from bufgym.envs.guided import Guide, guided_decision, write_guided
-from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_observation, write_rewards
+from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_named, write_observation, write_rewards
 from bufgym.ground.kernel import direct, kernel, prefetch
 from bufgym.model.buffer import HOLD
+from bufgym.model.observe import Chosen
 from bufgym.sim.decisions import answer_send, decide
 from bufgym.sim.shared_link import Shares, next_in_cell
 from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, END, NOTHING_WAITS, SOCKET_WAITS, Batch
@@ -42,12 +43,14 @@ def step_rows(
     output: StepOutput,
     choices: Choices | None,
     guide: Guide | None,
+    chosen: Chosen | None,
 ) -> None:
     """Take one decision in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
     begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is
-    None where actions are no candidates, ``guide`` where nothing is guided; Numba compiles each case separately.
+    None where actions are no candidates, ``guide`` where nothing is guided, ``chosen`` where no built-in fields are
+    named. Numba compiles each case separately.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
@@ -74,9 +77,11 @@ def step_rows(
         if choices is not None:
             write_candidates(batch, i, sender.waiting == NOTHING_WAITS, output, choices)
         elif guide is None:
-            write_observation(batch, i, sender.waiting == NOTHING_WAITS, output)
+            write_observation(batch, i, sender.waiting == NOTHING_WAITS, output, chosen)
         else:
-            write_guided(batch, i, sender.waiting == NOTHING_WAITS, output, guide)
+            write_guided(batch, i, sender.waiting == NOTHING_WAITS, output, guide, chosen)
+        if chosen is not None:
+            write_named(batch, i, chosen, output.flat)
 
 
 @kernel
@@ -114,11 +119,12 @@ def step_cells(
     actions: NDArray[np.int64],
     rewarded: NDArray[np.float64],
     output: StepOutput,
+    chosen: Chosen | None,
 ) -> None:
     """Take every decision that is due in ``cells``, or bring cells to their first tick, as ``step_rows`` does.
 
     Cells that have ended stay as they are. A cell moves on once no decision is due: robots asked again about the same
-    arrival hold up the others.
+    arrival hold up the others. The ``chosen`` fields come beside the tables.
     """
     begins = len(actions) == 0
     for c in cells:
@@ -135,4 +141,6 @@ def step_cells(
         ended = not decisions_due(batch, shares, c)
         for i in range(first, first + robots):
             write_rewards(batch, i, begins, rewarded, output)
-            write_observation(batch, i, ended, output)
+            write_observation(batch, i, ended, output, None)
+            if chosen is not None:
+                write_named(batch, i, chosen, output.flat)

@@ -115,11 +115,11 @@ class _Decisions:
         per_slot, context = all_fields if self.for_topics else one_queue
         known = [field.name for field in per_slot + context]
         for field in names or ():
-            if field not in known and observe.own_field(field) is None:
+            if field not in (*known, *observe.BUILT_IN) and observe.own_field(field) is None:
                 raise BufgymError(f"model {name}: observes {field!r}, which is no field (bufgym list observations)")
-        self.form = ObservationForm(form, per_slot, context, self.capacity, names)
-        self.own = self.form.own_places
-        if self.own and self.for_topics:
+        only_chosen = names is not None and not (self.for_topics or self.by_rule)
+        self.form = ObservationForm(form, per_slot, context, self.capacity, names, only_chosen=only_chosen)
+        if self.for_topics and (self.form.named is not None or self.form.own_places):
             raise BufgymError(f"model {name}: observes fields of one's own; with several topics no policy can")
         expected = spaces.flatdim(self.form.space)
         if numbers != expected:
@@ -155,15 +155,18 @@ class _Decisions:
                 "slots with masks (MaskablePPO with bufgym.sb3.SlotPolicy) or chooses among candidates serves every L"
             )
         row = np.zeros(self.form.numbers, np.float32)
-        slots, context = self.form.split(row)
-        if self.for_topics:
-            observe.observe_topic_slots(buffer, arrival, arriving, slots)
-            observe.observe_topic_context(buffer, arrival, arriving, context)
-        elif self.by_rule:
-            observe_rule(buffer, arrival, memory, slots, context)
+        if self.form.named is not None:
+            observe.write_chosen(buffer, arrival, self.form.named, row)
         else:
-            observe.observe(buffer, arrival, slots, context)
-        for place in self.own:
+            slots, context = self.form.split(row)
+            if self.for_topics:
+                observe.observe_topic_slots(buffer, arrival, arriving, slots)
+                observe.observe_topic_context(buffer, arrival, arriving, context)
+            elif self.by_rule:
+                observe_rule(buffer, arrival, memory, slots, context)
+            else:
+                observe.observe(buffer, arrival, slots, context)
+        for place in self.form.own_places:
             write_in_python(place, buffer, arrival, arriving, row)
         mask = np.zeros(L + 2, np.bool_)
         mask[: len(buffer.slots)], mask[L:] = valid[:-2], valid[-2:]

@@ -64,3 +64,10 @@ def view(batch: Batch, i: int) -> Buffer:
 def arrival_of(batch: Batch, i: int) -> Any:
     """The arrival that waits for a decision."""
     return at(batch.arrivals, i, batch.senders[i].next)
+
+
+@kernel
+def last_arrival(batch: Batch, i: int) -> Any:
+    """The arrival that waits for a decision; where the socket asks, the latest arrival."""
+    sender = batch.senders[i]
+    return at(batch.arrivals, i, sender.next if sender.waiting == ARRIVAL_WAITS else sender.next - 1)

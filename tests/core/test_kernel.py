@@ -119,17 +119,17 @@ def test_a_direct_call_is_the_call() -> None:
     """Rows are stepped without a look at the types of their arrays: by the code that Numba would have found."""
 
     @kernel
-    def double(numbers: Numbers, factor: Any) -> None:
+    def double(numbers: Numbers, factor: Any, more: Any) -> None:
         for k in range(len(numbers.of)):
-            numbers.of[k] *= 2 * factor
+            numbers.of[k] *= 2 * factor + more
             if numbers.several is not None:
                 numbers.of[k] += 1
 
     one, directly = np.arange(12.0), direct(double)
     several = one.copy()
     for _ in range(3):
-        directly(Numbers(one), 1.0)
-        directly(Numbers(several, True), 1.0)
+        directly(Numbers(one), 0.5, 1)
+        directly(Numbers(several, True), 0.5, 1)
     assert one[:4].tolist() == [0, 8, 16, 24] and several[:4].tolist() == [7, 15, 23, 31]
     assert len(double.overloads) == 2  # type: ignore[attr-defined]
 

@@ -16,7 +16,13 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.model.observe import ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, observe_on_board, observe_on_board_slots
+from bufgym.model.observe import (
+    ON_BOARD_FIELDS,
+    ON_BOARD_SLOT_FIELDS,
+    observe_on_board,
+    observe_on_board_slots,
+    on_board,
+)
 from bufgym.scenario import draw
 from bufgym.sim import rollout, run
 
@@ -108,6 +114,12 @@ NUMBERS = [field.name for field in observe.ON_BOARD_SLOT_FIELDS]
 OTHERS = [field.name for field in observe.SLOT_FIELDS]
 
 
+def slots_of(field, buffer, arrival):
+    """The field's number for each queued message and the newcomer."""
+    whole = on_board.queue_of(buffer, arrival)
+    return [field.function(buffer, arrival, k, whole) for k in range(len(buffer.slots) + 1)]
+
+
 def rows_of(buffer, arrival):
     rows = np.zeros((len(NUMBERS), buffer.capacity + 1))
     observe.observe_on_board_slots(buffer, arrival, rows)
@@ -122,7 +134,7 @@ def test_gaps_in_messages_by_hand():
     def on_arrival(buffer, arrival, memory):
         seen.append((buffer.dequeued_seq, rows_of(buffer, arrival)))
         s = len(buffer.slots)
-        one_by_one = [[f.function(buffer, arrival, k) for k in range(s + 1)] for f in observe.ON_BOARD_SLOT_FIELDS]
+        one_by_one = [slots_of(field, buffer, arrival) for field in observe.ON_BOARD_SLOT_FIELDS]
         np.testing.assert_array_equal(seen[-1][1][:, [*range(s), buffer.capacity]], one_by_one)
         return ACCEPT if arrival.seq in (0, 1, 4) else REJECT
 
@@ -173,7 +185,7 @@ def of_sizes(sizes, **known):
     observe_on_board_slots(buffer, arrival, rows)
     assert dict(zip(found, table, strict=True)) == found
     for field, row in zip(ON_BOARD_SLOT_FIELDS, rows, strict=True):
-        found[field.name] = [field.function(buffer, arrival, k) for k in range(len(sizes))]
+        found[field.name] = slots_of(field, buffer, arrival)
         assert [*row[: len(sizes) - 1], row[-1]] == found[field.name]
         assert not row[len(sizes) - 1 : -1].any()
     return found
@@ -208,7 +220,7 @@ def test_gap_per_byte():
     # A newcomer that nothing has moved before: no gap, and nothing to compare it with.
     buffer, arrival = queue([1_000])
     still = buffer._replace(dequeued_x=1.0, previous_x=1.0)
-    assert next(f for f in ON_BOARD_SLOT_FIELDS if f.name == "gap_per_byte").function(still, arrival, 0) == 0
+    assert slots_of(next(f for f in ON_BOARD_SLOT_FIELDS if f.name == "gap_per_byte"), still, arrival)[0] == 0
 
 
 def test_what_arrives_counts_although_it_is_not_kept():
@@ -226,7 +238,7 @@ def test_what_arrives_counts_although_it_is_not_kept():
 
 @pytest.mark.parametrize("id", ["bufgym/Uplink-v0", "bufgym/Topics-v0"])
 def test_environments_observe_them_where_they_are_named(id):
-    env = gym.make(id, fields=["rank", *BYTE_FIELDS], capacity=4)
+    env = gym.make(id, fields=["rank", *BYTE_FIELDS], capacity=4, observation="dict")
     _, info = env.reset(seed=1)
     for _ in range(60):
         observation, _, ended, _, info = env.step(int(np.flatnonzero(info["action_mask"])[0]))

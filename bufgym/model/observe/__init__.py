@@ -11,6 +11,7 @@ from bufgym.model.observe.candidates import (
     is_offered,
     observe_candidates,
 )
+from bufgym.model.observe.chosen import BUILT_IN, Chosen, chosen_at, write_chosen, write_chosen_on_board
 from bufgym.model.observe.declare import Field
 from bufgym.model.observe.on_board import (
     ON_BOARD_FIELDS,
@@ -41,9 +42,10 @@ from bufgym.model.observe.topics import (
 )
 
 __all__ = [
-    "CANDIDATE_FIELDS", "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS", "OWN_FIELDS",
-    "OWN_TERMS", "QUEUE_FIELDS", "REWARD_TERMS", "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS", "TOPIC_FIELDS",
-    "TOPIC_REWARD_TERMS", "TOPIC_SLOT_FIELDS", "Field", "OwnTerm", "RewardTerm", "decision_of_candidate", "field",
-    "find_candidates", "is_offered", "observe", "observe_candidates", "observe_on_board", "observe_on_board_slots",
-    "observe_topic_context", "observe_topic_slots", "own_field", "own_term", "reward_term", "terms_for",
+    "BUILT_IN", "CANDIDATE_FIELDS", "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS",
+    "OWN_FIELDS", "OWN_TERMS", "QUEUE_FIELDS", "REWARD_TERMS", "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS",
+    "TOPIC_FIELDS", "TOPIC_REWARD_TERMS", "TOPIC_SLOT_FIELDS", "Chosen", "Field", "OwnTerm", "RewardTerm",
+    "chosen_at", "decision_of_candidate", "field", "find_candidates", "is_offered", "observe", "observe_candidates",
+    "observe_on_board", "observe_on_board_slots", "observe_topic_context", "observe_topic_slots", "own_field",
+    "own_term", "reward_term", "terms_for", "write_chosen", "write_chosen_on_board",
 ]  # fmt: skip

@@ -37,8 +37,8 @@ class Field:
     meaning: str
     """Meaning in words."""
     function: Function
-    """Facts of its table -> number. A field observed where it is named has the facts (buffer, arrival) for the context
-    and (buffer, arrival, k) for a slot."""
+    """Facts of its table -> number. A field of your own has the facts (buffer, arrival) for the context and
+    (buffer, arrival, k) for a slot."""
     low: float = 0.0
     """Least value."""
     high: float = 1.0
@@ -62,19 +62,45 @@ def _of_table(module: str, name: str) -> Field:
 
 
 def writer(fields: Sequence[Field], facts: str, first: int = 0) -> Any:
-    """Make the kernel of a table: ``write(facts, column, rows)``, or ``write(facts, row)`` of a context's fields.
+    """Make the kernel of a table: ``write(facts, column, rows)`` of slots or candidates, ``write(facts, row)`` else.
 
     It puts the i-th field's number at index ``first + i``. ``facts`` are the names of the functions' arguments.
     """
     into, index = ("column, rows", "rows[{}, column]") if fields[0].per != "context" else ("row", "row[{}]")
-    names: dict[str, Any] = {"__name__": __name__}
-    lines = [f"def write({facts}, {into}):"]
-    for i, field in enumerate(fields, first):
+    lines = [f"{index.format(first + i)} = field_{i}({facts})" for i in range(len(fields))]
+    return _made(fields, f"{facts}, {into}", lines)
+
+
+def chooser(fields: Sequence[Field], facts: str) -> Any:
+    """Make the kernel that writes only some fields of a table into a row of numbers.
+
+    It is ``write(facts, column, places, row)`` of slots, or ``write(facts, places, row)`` of a context. ``places``,
+    int64[fields], has the index of each field's first number in ``row``, or -1 for a field that is left out.
+    """
+    into, at = ("column, places, row", " + column") if fields[0].per != "context" else ("places, row", "")
+    # An unsigned index is not checked.
+    write = "if places[{i}] >= 0: row[np.uint64(places[{i}]{at})] = field_{i}({facts})"
+    lines = [write.format(i=i, at=at, facts=facts) for i in range(len(fields))]
+    return _made(fields, f"{facts}, {into}", lines)
+
+
+def _made(fields: Sequence[Field], arguments: str, lines: Sequence[str]) -> Any:
+    """The kernel ``write(arguments)`` of these lines, in which the i-th field's function is ``field_i``."""
+    names: dict[str, Any] = {"__name__": __name__, "np": np}
+    for i, field in enumerate(fields):
         _IN_TABLES[field.function.__module__, field.name] = field
         names[f"field_{i}"] = kernel(field.function)
-        lines.append(f"    {index.format(i)} = field_{i}({facts})")
-    exec("\n".join(lines), names)
+    exec("\n    ".join([f"def write({arguments}):", *lines]), names)
     return kernel(names["write"])
+
+
+@kernel
+def clear(places: NDArray[np.int64], occupied: int, entries: int, row: NDArray[np.floating[Any]]) -> None:
+    """Write zeros for all slots but the first ``occupied`` of chosen slot fields, which have so many ``entries``."""
+    for first in places:
+        if first >= 0:
+            for column in range(occupied, entries):
+                row[np.uint64(first + column)] = 0.0
 
 
 @kernel

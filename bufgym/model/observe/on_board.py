@@ -4,7 +4,6 @@ They describe the link's rate as the socket shows it, bytes beside that, and gap
 """
 
 import math
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +12,7 @@ from numpy.typing import NDArray
 from bufgym.ground.kernel import kernel
 from bufgym.model.buffer import Buffer, gaps
 from bufgym.model.link import FOREVER
-from bufgym.model.observe.declare import Field, Function, squash, writer
-from bufgym.model.observe.own import OWN_FIELDS
+from bufgym.model.observe.declare import Field, chooser, clear, squash, writer
 
 
 @kernel
@@ -86,6 +84,8 @@ ON_BOARD_FIELDS = (
 """Context fields, in the order in which ``observe_on_board`` writes them."""
 observe_on_board = writer(ON_BOARD_FIELDS, "buffer, arrival")
 """Write every value of ``ON_BOARD_FIELDS`` into ``row``, float[fields]: ``observe_on_board(buffer, arrival, row)``."""
+choose_context = chooser(ON_BOARD_FIELDS, "buffer, arrival")
+"""Write the fields that have a place: ``choose_context(buffer, arrival, places, row)``."""
 
 
 @kernel
@@ -133,7 +133,7 @@ def queue_of(buffer: Buffer, arrival: Any) -> WholeQueue:
     return WholeQueue(even_index, carried(buffer, arrival), per_byte / n)
 
 
-_SLOTS = (
+ON_BOARD_SLOT_FIELDS = (
     Field("index_before", "slot", "queue", "g/(g+r), r = even spacing in messages",
           "messages that arrived since the message kept before it, itself included",
           lambda buffer, arrival, k, queue: squash(index_gaps(buffer, arrival, k)[0], queue.even_index)),
@@ -147,18 +147,9 @@ _SLOTS = (
           "motion gap left if it is dropped, for each of its bytes",
           lambda buffer, arrival, k, queue: squash(merged_per_byte(buffer, arrival, k), queue.mean_per_byte)),
 )  # fmt: skip
-_write_slot = writer(_SLOTS, "buffer, arrival, k, queue")
-
-
-def _of_one_slot(function: Function) -> Function:
-    """The function of one slot alone, for a field that is observed where it is named."""
-    of_queue = kernel(function)
-    return lambda buffer, arrival, k: of_queue(buffer, arrival, k, queue_of(buffer, arrival))
-
-
-ON_BOARD_SLOT_FIELDS = tuple(replace(field, function=_of_one_slot(field.function)) for field in _SLOTS)
 """Slot fields, in the order in which ``observe_on_board_slots`` writes them."""
-OWN_FIELDS.update({field.name: field for field in (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS)})
+_write_slot = writer(ON_BOARD_SLOT_FIELDS, "buffer, arrival, k, queue")
+_choose_slot = chooser(ON_BOARD_SLOT_FIELDS, "buffer, arrival, k, queue")
 
 
 @kernel
@@ -169,3 +160,18 @@ def observe_on_board_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floati
     rows[:, s:last] = 0.0
     for k in range(s + 1):
         _write_slot(buffer, arrival, k, queue, k if k < s else last, rows)
+
+
+@kernel
+def choose_on_board_slots(
+    buffer: Buffer, arrival: Any, arriving: bool, places: NDArray[np.int64], row: NDArray[np.floating[Any]]
+) -> None:
+    """Write the ON_BOARD_SLOT_FIELDS that have a place, as ``chooser`` has it.
+
+    Where the socket asks (not ``arriving``), ``arrival`` is the latest one and has no column.
+    """
+    s, last = len(buffer.slots), buffer.capacity
+    queue = queue_of(buffer, arrival)
+    clear(places, s, last + 1, row)
+    for k in range(s + 1 if arriving else s):
+        _choose_slot(buffer, arrival, k, queue, k if k < s else last, places, row)

@@ -19,8 +19,10 @@ from bufgym.ground import modules
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.settings import named_settings
 from bufgym.model.checks import changed, check_name, constants, is_number
+from bufgym.model.observe.candidates import CANDIDATE_FIELDS, QUEUE_FIELDS
+from bufgym.model.observe.chosen import BUILT_IN
 from bufgym.model.observe.declare import Field, Function
-from bufgym.model.observe.topics import FIELDS, TOPIC_FIELDS
+from bufgym.model.observe.topics import TOPIC_FIELDS
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,8 @@ def field(
     Raises:
         BufgymError: the name is taken or no name, or a rule above is broken.
     """
-    _check_name("field", name, (known.name for known in FIELDS + TOPIC_FIELDS), OWN_FIELDS)
+    others = (known.name for known in CANDIDATE_FIELDS + QUEUE_FIELDS + TOPIC_FIELDS)
+    _check_name("field", name, (*BUILT_IN, *others), OWN_FIELDS)
     if per not in ("slot", "context"):
         raise BufgymError(f"field {name!r}: per = {per!r}: must be 'slot' or 'context'")
     if not (is_number(low) and is_number(high) and -math.inf < low <= 0 <= high < math.inf and low < high):
@@ -136,7 +139,7 @@ def reward_term(name: str, *, unit: str = "", **fields: Any) -> Callable[[Functi
 
 
 def own_field(text: str) -> Field | None:
-    """The field of that name, or the field that ``module:function`` registers; None if there is none."""
+    """The field of one's own of that name, or the one that ``module:function`` registers; None if there is none."""
     return _found(text, OWN_FIELDS, "field")
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.ground.kernel import item, kernel
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
-from bufgym.model.observe.declare import TINY, Field, kept, length, ratio, single, squash, writer
+from bufgym.model.observe.declare import TINY, Field, chooser, clear, kept, length, ratio, single, squash, writer
 from bufgym.model.qoi import EXPONENTIAL, merging_loss, value
 
 # Where V is straight a merger loses nothing but rounding errors, whose differences mean nothing.
@@ -56,44 +56,104 @@ SLOT_FIELDS = (
           lambda slot: ratio(slot.lost, slot.even_lost)),
 )  # fmt: skip
 write_slot = writer(SLOT_FIELDS, "slot")
+_choose_slot = chooser(SLOT_FIELDS, "slot")
+
+
+class Shared(NamedTuple):
+    """What all slots share."""
+
+    rank: float  # 1 / (s + 1)
+    newest: float  # V of the newcomer's gap
+    even_us: Any  # as in ``Slot``, and so on
+    even_x: Any
+    even_lost: Any
+    mean_bytes: Any
+
+
+class Before(NamedTuple):
+    """The message kept before a slot, and V of the gap between the two."""
+
+    gain: float
+    arrival_us: int
+    x: float
+
+
+@kernel
+def _shared_by_slots(buffer: Buffer, arrival: Any, even_lost: float) -> Shared:
+    per_rank, even = 1 / (len(buffer.slots) + 1), 1 / (buffer.capacity + 1)
+    even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
+    mean_bytes = (buffer.backlog_bytes + arrival.size_bytes) * per_rank
+    newest = arrival_gain(buffer, arrival)
+    return Shared(
+        per_rank, newest, single(even_us), single(even_x), single(max(even_lost, ROUNDING)), single(mean_bytes)
+    )
+
+
+@kernel
+def _before_all(buffer: Buffer, newest: float) -> Before:
+    """What comes before slot 0."""
+    gain = item(buffer.slots, 0).gain if len(buffer.slots) > 0 else newest
+    return Before(gain, buffer.dequeued_arrival_us, buffer.dequeued_x)
+
+
+@kernel
+def _slot_of(
+    buffer: Buffer, arrival: Any, k: int, shared: Shared, before: Before, numbers: NDArray[np.floating[Any]]
+) -> tuple[Slot, Before]:
+    """Slot ``k``, whose numbers will be kept in ``numbers``, and what comes before slot ``k + 1``.
+
+    Losses equal ``buffer.loss``, from the gains that the messages carry.
+    """
+    s, newest = len(buffer.slots), shared.newest
+    message, place = (item(buffer.slots, k), (k + 1) * shared.rank) if k < s else (arrival, 1.0)
+    at_us, x, size_bytes = message.arrival_us, message.x, message.size_bytes
+    back_us, back_x = at_us - before.arrival_us, x - before.x
+    if k < s:
+        behind, next_gain = arrival, newest
+        if k + 1 < s:
+            behind = item(buffer.slots, k + 1)
+            next_gain = behind.gain
+        merged_us, on_x, merged_x = behind.arrival_us - before.arrival_us, behind.x - x, behind.x - before.x
+    else:  # the next step is expected to be as long as the last one
+        on_x = x - buffer.previous_x
+        merged_us, merged_x = back_us + at_us - buffer.previous_us, back_x + on_x
+        next_gain = newest if s > 0 and on_x == back_x else value(buffer.v, on_x)
+    # Rounding may make a loss negative. A first message has no gap before it to merge, so nothing is lost with it.
+    is_exponential = buffer.v[0] == EXPONENTIAL
+    lost = before.gain * next_gain if is_exponential else merging_loss(buffer.v, back_x, before.gain, on_x, next_gain)
+    lost = max(lost, 0.0)
+    slot = Slot(
+        place, length(back_us, numbers), length(merged_us, numbers), length(back_x, numbers),
+        length(merged_x, numbers), length(lost, numbers), lost, length(size_bytes, numbers),
+        shared.even_us, shared.even_x, shared.even_lost, shared.mean_bytes,
+    )  # fmt: skip
+    return slot, Before(next_gain, at_us, x)
 
 
 @kernel
 def _write_slots(buffer: Buffer, arrival: Any, even_lost: float, rows: NDArray[np.floating[Any]]) -> None:
-    """Write every SLOT_FIELDS value; losses equal ``buffer.loss``, from the gains that the messages carry."""
+    """Write every SLOT_FIELDS value."""
     s, last = len(buffer.slots), buffer.capacity
-    per_rank, even = 1 / (s + 1), 1 / (buffer.capacity + 1)
     rows[:, :] = 0.0
-    even_us, even_x = even * (arrival.arrival_us - buffer.dequeued_arrival_us), even * (arrival.x - buffer.dequeued_x)
-    mean_bytes = (buffer.backlog_bytes + arrival.size_bytes) * per_rank
-    r_us, r_x, r_lost, r_bytes = single(even_us), single(even_x), single(max(even_lost, ROUNDING)), single(mean_bytes)
-    newest = arrival_gain(buffer, arrival)
-    gain = item(buffer.slots, 0).gain if s > 0 else newest
-    is_exponential = buffer.v[0] == EXPONENTIAL
-    from_us, from_x = buffer.dequeued_arrival_us, buffer.dequeued_x
+    shared = _shared_by_slots(buffer, arrival, even_lost)
+    before = _before_all(buffer, shared.newest)
     for k in range(s + 1):
-        message, column, place = (item(buffer.slots, k), k, (k + 1) * per_rank) if k < s else (arrival, last, 1.0)
-        at_us, x, size_bytes = message.arrival_us, message.x, message.size_bytes
-        back_us, back_x = at_us - from_us, x - from_x
-        if k < s:
-            behind, next_gain = arrival, newest
-            if k + 1 < s:
-                behind = item(buffer.slots, k + 1)
-                next_gain = behind.gain
-            merged_us, on_x, merged_x = behind.arrival_us - from_us, behind.x - x, behind.x - from_x
-        else:  # the next step is expected to be as long as the last one
-            on_x = x - buffer.previous_x
-            merged_us, merged_x = back_us + at_us - buffer.previous_us, back_x + on_x
-            next_gain = newest if s > 0 and on_x == back_x else value(buffer.v, on_x)
-        # Rounding may make a loss negative. A first message has no gap before it to merge, so nothing is lost with it.
-        lost = gain * next_gain if is_exponential else merging_loss(buffer.v, back_x, gain, on_x, next_gain)
-        lost = max(lost, 0.0)
-        slot = Slot(
-            place, length(back_us, rows), length(merged_us, rows), length(back_x, rows), length(merged_x, rows),
-            length(lost, rows), lost, length(size_bytes, rows), r_us, r_x, r_lost, r_bytes,
-        )  # fmt: skip
-        write_slot(slot, np.uint64(column), rows)
-        gain, from_us, from_x = next_gain, at_us, x
+        slot, before = _slot_of(buffer, arrival, k, shared, before, rows)
+        write_slot(slot, np.uint64(k if k < s else last), rows)
+
+
+@kernel
+def _choose_slots(
+    buffer: Buffer, arrival: Any, even_lost: float, places: NDArray[np.int64], row: NDArray[np.floating[Any]]
+) -> None:
+    """Write the SLOT_FIELDS that have a place."""
+    s, last = len(buffer.slots), buffer.capacity
+    clear(places, s, last, row)
+    shared = _shared_by_slots(buffer, arrival, even_lost)
+    before = _before_all(buffer, shared.newest)
+    for k in range(s + 1):
+        slot, before = _slot_of(buffer, arrival, k, shared, before, row)
+        _choose_slot(slot, k if k < s else last, places, row)
 
 
 class Newcomer(NamedTuple):
@@ -133,21 +193,43 @@ CONTEXT_FIELDS = (
           lambda buffer, newcomer: newcomer.even_lost / max(newcomer.even_gain, TINY)),
 )  # fmt: skip
 write_context = writer(CONTEXT_FIELDS, "buffer, newcomer")
+_choose_context = chooser(CONTEXT_FIELDS, "buffer, newcomer")
+
+
+@kernel
+def newcomer_of(buffer: Buffer, arrival: Any, numbers: NDArray[np.floating[Any]]) -> Newcomer:
+    """Facts of the context, whose numbers will be kept in ``numbers``."""
+    spread = buffer.capacity + 1
+    even_us = (arrival.arrival_us - buffer.dequeued_arrival_us) / spread
+    even_x = (arrival.x - buffer.dequeued_x) / spread
+    gain = value(buffer.v, even_x)
+    lost = merging_loss(buffer.v, even_x, gain, even_x, gain)
+    gap_us, gap_x = float(arrival.arrival_us - buffer.previous_us), arrival.x - buffer.previous_x
+    return Newcomer(gap_us, gap_x, even_us, even_x, kept(gain, numbers), gain, lost)
 
 
 @kernel
 def observe(buffer: Buffer, arrival: Any, rows: NDArray[np.floating[Any]], context: NDArray[np.floating[Any]]) -> None:
     """Write every SLOT_FIELDS value into ``rows``, float[fields, L + 1], every CONTEXT_FIELDS value into ``context``.
 
-    Empty slots are 0, the newcomer is last. ``rows`` without columns is left out.
+    Empty slots are 0, the newcomer is last.
     """
-    spread = buffer.capacity + 1
-    even_us = (arrival.arrival_us - buffer.dequeued_arrival_us) / spread
-    even_x = (arrival.x - buffer.dequeued_x) / spread
-    gain = value(buffer.v, even_x)
-    lost = merging_loss(buffer.v, even_x, gain, even_x, gain)
-    if rows.shape[1] > 0:
-        _write_slots(buffer, arrival, lost, rows)
-    gap_us, gap_x = float(arrival.arrival_us - buffer.previous_us), arrival.x - buffer.previous_x
-    newcomer = Newcomer(gap_us, gap_x, even_us, even_x, kept(gain, context), gain, lost)
+    newcomer = newcomer_of(buffer, arrival, context)
+    _write_slots(buffer, arrival, newcomer.even_lost, rows)
     write_context(buffer, newcomer, context)
+
+
+@kernel
+def choose_of_tables(
+    buffer: Buffer,
+    arrival: Any,
+    slots: NDArray[np.int64],
+    any_slots: bool,
+    context: NDArray[np.int64],
+    row: NDArray[np.floating[Any]],
+) -> None:
+    """Write the SLOT_FIELDS, if there are ``any_slots``, and the CONTEXT_FIELDS that have a place; see ``chooser``."""
+    newcomer = newcomer_of(buffer, arrival, row)
+    if any_slots:
+        _choose_slots(buffer, arrival, newcomer.even_lost, slots, row)
+    _choose_context(buffer, newcomer, context, row)
