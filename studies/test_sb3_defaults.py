@@ -1,4 +1,4 @@
-"""The table of curves, from a file of a run that was cut short and one that ended."""
+"""The table of curves, from a file of a run that was cut short and one that ended; and the scores of rules."""
 
 from pathlib import Path
 
@@ -7,28 +7,38 @@ from needs import needs
 
 pytest.importorskip("stable_baselines3", reason=needs("extras", "stable_baselines3"))
 
-from studies.sb3_defaults import CAPACITY, Episodes, draw_curves, summary
+from studies.sb3_defaults import Episodes, Run, draw_curves, read, summary
 
 CURVES = """\
-settings,seed,steps,score
-default,0,0,-0.5
-default,0,100352,0.2
-default,0,200704,0.9
-default,1,0,-0.5
-default,1,51200,0.4
-"8 rows",3,114688,0.5
+trainer,reward,actions,rows,task,capacity,seed,steps,score,cpu_s
+PPO,regret,candidates,1,lte,8,0,0,-0.5,0.0
+PPO,regret,candidates,1,lte,8,0,100352,0.2,30.0
+PPO,regret,candidates,1,lte,8,0,200704,0.9,60.0
+PPO,regret,candidates,1,lte,8,1,0,-0.5,0.0
+PPO,regret,candidates,1,lte,8,1,51200,0.4,20.0
+DQN,retained,slots,8,generated-v1,16,3,114688,0.5,9.0
 """
 
 
 def test_the_score_after_so_many_steps_is_that_of_the_rollout_that_reaches_them(tmp_path: Path) -> None:
     (tmp_path / "curves.csv").write_text(CURVES)
     lines = summary(tmp_path / "curves.csv", 100_000)
-    assert lines[2:] == ["| default | 0.30 | 0.20, 0.40 |", "| 8 rows | 0.50 | 0.50 |"]
+    assert lines[2:] == [
+        "| PPO, regret | 0.30 | 0.20, 0.40 | 25 |",
+        "| DQN, retained, 8 rows, generated-v1, L = 16, slots | 0.50 | 0.50 | 9 |",
+    ]
     draw_curves(tmp_path / "curves.csv", {"afr": 0.3}, tmp_path / "curves.svg")
     assert "<svg" in (tmp_path / "curves.svg").read_text()
 
 
+def test_a_seed_is_found_by_all_else(tmp_path: Path) -> None:
+    (tmp_path / "curves.csv").write_text(CURVES)
+    found = read(tmp_path / "curves.csv")
+    assert [*found[Run("PPO", "regret", "candidates", 1, "lte", 8, seed=7)]] == [0, 1]
+    assert Run("PPO", "retained", "candidates", 1, "lte", 8) not in found
+
+
 def test_drop_oldest_is_0_and_other_rules_are_better() -> None:
     episodes = Episodes(3)
-    assert CAPACITY == 8 and episodes.of_rule("drop-oldest") == 0
+    assert episodes.of_rule("drop-oldest") == 0
     assert 0 < episodes.of_rule("afr") < episodes.of_rule("target-gap") < 1
