@@ -151,7 +151,8 @@ ROWS = {
             "bufgym/model/observe/on_board.py": ("ON_BOARD_FIELDS = (\n", f"ON_BOARD_FIELDS = ({FIELD}"),
             "docs/guide/yours-to-change.md": ("- `rate_trend`\n", "- `rate_trend`\n- `half_full`\n"),
         },
-        "env = gym.make('bufgym/Uplink-v0', fields=['half_full', 'occupancy'], capacity=3); env.reset(seed=0)\n"
+        "env = gym.make('bufgym/Uplink-v0', actions='slots', fields=['half_full', 'occupancy'], capacity=3)\n"
+        "env.reset(seed=0)\n"
         "for _ in range(40):\n"
         "    seen = env.step(3)[0]\n"
         "    assert seen['half_full'] == (seen['occupancy'] >= 0.5)\n"
@@ -183,7 +184,7 @@ ROWS = {
                 "ENVIRONMENTS = {\n    'bufgym/Halves-v0': ('halves', 'one in two', {'capacity': 3}),\n",
             )
         },
-        "assert gym.make('bufgym/Halves-v0').reset(seed=0)[0]['rank'].shape == (4,)",
+        "assert gym.make('bufgym/Halves-v0', actions='slots').reset(seed=0)[0]['rank'].shape == (4,)",
     ),
     "a suite": Addition(
         {},

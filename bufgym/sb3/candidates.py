@@ -16,6 +16,7 @@ from bufgym.envs.own import write_in_python
 from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
 from bufgym.model.observe import (
+    BUILT_IN,
     CANDIDATE_FIELDS,
     QUEUE_FIELDS,
     decision_of_candidate,
@@ -23,6 +24,7 @@ from bufgym.model.observe import (
     is_offered,
     observe_candidates,
     own_field,
+    write_chosen,
 )
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.weights import MAX_WIDTH
@@ -88,7 +90,7 @@ class CandidateDecisions:
             form, names = ("slots", None) if "slots" in set(space) else ("dict", list(space))
         known = {field.name for field in (*CANDIDATE_FIELDS, *QUEUE_FIELDS)}
         for key in names or ():
-            field = own_field(key)
+            field = BUILT_IN.get(key) or own_field(key)
             if key not in known and field is None:
                 raise BufgymError(f"model {name}: observes {key!r}, which is no field (bufgym list observations)")
             if field is not None and field.per == "slot":
@@ -111,6 +113,8 @@ class CandidateDecisions:
         order, cost, row = np.zeros(places, np.int64), np.zeros(places), np.zeros(self.form.numbers, np.float32)
         find_candidates(buffer, arrival, order, cost)
         observe_candidates(buffer, arrival, order, cost, row[: self.form.table_numbers])
+        if self.form.named is not None:
+            write_chosen(buffer, arrival, self.form.named, row)
         for place in self.form.own_places:
             write_in_python(place, buffer, arrival, True, row)
         offered = [is_offered(order, self.at_arrivals, room, a) for a in range(places + self.at_arrivals)]

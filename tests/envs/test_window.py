@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from cli_cases import Patch
+from needs import needs
 from numpy.typing import NDArray
 
 import bufgym.envs
@@ -23,7 +24,7 @@ def waits(monkeypatch: Patch) -> Iterator[list[float]]:
     """The rates of the clock that paces the window; it does not wait."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    pygame = pytest.importorskip("pygame", reason="the extra [human] is not installed")
+    pygame = pytest.importorskip("pygame", reason=needs("extras", "pygame"))
     rates: list[float] = []
 
     class Clock:
@@ -93,7 +94,7 @@ def test_of_many_rows_the_first_sixteen_are_shown(waits: list[float]) -> None:
 
 
 def test_a_fleet_is_shown(waits: list[float]) -> None:
-    pytest.importorskip("pettingzoo", reason="the extra [fleet] is not installed")
+    pytest.importorskip("pettingzoo", reason=needs("extras", "pettingzoo"))
     seen, drawn = (bufgym.envs.parallel_env(robots=2, duration_s=2.0, render_mode=m) for m in ("human", "rgb_array"))
     for env in (seen, drawn):
         env.reset(seed=1)
