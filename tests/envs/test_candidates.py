@@ -251,6 +251,7 @@ def test_regrets_of_an_episode_sum_to_what_it_lacks(asks: str, actions: str) -> 
     assert total == pytest.approx(reached - start, abs=1e-9)
 
 
+@kernels
 def test_regret_is_the_same_alone_and_in_a_batch() -> None:
     envs, env = rows_of(SHORT, 2, capacity=3, reward="regret"), SenderEnv(SHORT, 3, reward={"regret": 1.0})
     envs.reset(seed=0)
