@@ -1,7 +1,7 @@
-"""CI. First it is a stranger: ``make test`` in a fresh clone that sees no program or Debian package of the tests.
+"""CI is a stranger: ``make test`` in a fresh clone that sees no program or Debian package that tests use besides.
 
-Then ``make everything`` there installs them, and runs what the first run skipped. It fails where either does.
-With arguments it installs all of that for this checkout and runs ``make`` with them: ``.ci/run nightly``.
+With arguments it installs all of these for this checkout and runs ``make`` with them: ``.ci/run test``, and
+``.ci/run nightly`` each night.
 """
 
 import glob
@@ -58,17 +58,12 @@ def main(words: list[str]) -> int:
     if subprocess.run(["git", "status", "--porcelain"], cwd=REPO, capture_output=True, check=False).stdout:
         print("what is not committed is not in the clone", flush=True)
     clone = Path(tempfile.mkdtemp(prefix="bufgym-")) / "bufgym"
-    data = REPO.parent / "shared" / "data"
     try:
         subprocess.run(["git", "clone", "--quiet", str(REPO), str(clone)], check=True)
         # In the order of files: other orders are for people, who can look for what an order brought to light.
         os.environ.setdefault("PYTEST_ADDOPTS", "-p no:randomly")
         given = [f"PYTEST_ARGS={os.environ['PYTEST_ARGS']}"] if "PYTEST_ARGS" in os.environ else []
-        if code := make("test", *given, folder=clone, hide=True):
-            return code
-        if data.is_dir():
-            os.environ.setdefault("BUFGYM_SHARED_DATA", str(data))
-        return make("everything", folder=clone)
+        return make("test", *given, folder=clone, hide=True)
     finally:
         shutil.rmtree(clone.parent)
 

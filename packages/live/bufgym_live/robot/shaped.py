@@ -88,7 +88,9 @@ class ShapedLink:
             near, _ = await asyncio.get_running_loop().sock_accept(listening)
             near.setblocking(False)
             if self._open.is_set():
-                self._tasks.begin(self._forward(near), "connection")
+                forwarding = self._tasks.begin(self._forward(near), "connection")
+                # A task that is cancelled before it begins closes nothing.
+                forwarding.add_done_callback(lambda _, near=near: near.close())
             else:
                 near.close()
 
