@@ -10,6 +10,7 @@ import contextlib
 import socket
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -90,7 +91,7 @@ class ShapedLink:
             if self._open.is_set():
                 forwarding = self._tasks.begin(self._forward(near), "connection")
                 # A task that is cancelled before it begins closes nothing.
-                forwarding.add_done_callback(lambda _, near=near: near.close())
+                forwarding.add_done_callback(partial(_close, near))
             else:
                 near.close()
 
@@ -175,3 +176,8 @@ def _starved_s() -> float:
         return int(Path("/proc/thread-self/schedstat").read_text(encoding="ascii").split()[1]) / 1e9
     except (OSError, ValueError, IndexError):
         return 0.0
+
+
+def _close(one: socket.socket, task: asyncio.Task[None]) -> None:
+    """Close the socket of a task that has ended."""
+    one.close()
