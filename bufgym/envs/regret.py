@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bufgym.envs.output import StepOutput
 from bufgym.oracle.hindsight import Hindsight
 from bufgym.sim import Senders
+from bufgym.sim.state import NOTHING_WAITS
 
 
 class Regret:
@@ -25,8 +26,8 @@ class Regret:
 
     def begin(self, rows: NDArray[np.int64], output: StepOutput) -> None:
         """Note V* where episodes begin in these ``rows``; an episode without a decision has its H."""
-        most = self._hindsight.most(rows)[rows]
-        self._most[rows] = np.where(self._hindsight.senders.batch.senders["waiting"][rows] == 0, output.qoi[rows], most)
+        waiting = self._hindsight.senders.batch.senders["waiting"][rows]
+        self._most[rows] = np.where(waiting == NOTHING_WAITS, output.qoi[rows], self._hindsight.most(rows)[rows])
 
     def write(self, output: StepOutput) -> None:
         """Write the change of V* in the step that all rows have just taken."""
