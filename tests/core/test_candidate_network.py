@@ -163,15 +163,15 @@ def test_a_network_without_hidden_layers_by_hand():
 
 
 def test_masks_decide_about_actions_whose_candidate_is_missing():
-    """An empty queue of L = 1 and room: the newcomer is the only candidate, and there is no head.
+    """An empty queue of L = 1 behind a busy link: the newcomer is the only candidate, and there is no head.
 
     Output 3, the head, is the highest. With masks the next one is taken, which is 0 and accepts. Without masks the head
-    that is missing does what the cheapest does: the newcomer goes.
+    that is missing does what the cheapest does: the newcomer goes. Where the link is idle nothing may go.
     """
     bias = np.float32([2, 1, 0, 3])
-    for masks, decision in ((True, ACCEPT), (False, REJECT)):
+    for masks, busy, decision in ((True, 1, ACCEPT), (False, 1, REJECT), (False, 0, ACCEPT)):
         layer = np.zeros((inputs(2), 4), np.float32), bias
         made = CandidateWeights(2, True, masks, "relu", (layer,))
         policy = made.policy("masked")
-        buffer = queue_of(0, 1, made.parameters())
+        buffer = queue_of(0, 1, made.parameters())._replace(busy=busy)
         assert policy.on_arrival(buffer, newcomer(), policy.new_memory(1, 1)[0]) == decision

@@ -56,11 +56,13 @@ def reference(rows: Rows, i: int, k: int) -> tuple[list[int], list[float]]:
     after = [*before[1:], step]
     mean = sum(message.size_bytes for message in queue) / (s + 1)
     cost = [(a + b) * mean / message.size_bytes for a, b, message in zip(before, after, queue, strict=True)]
-    could = range(s) if buffer.evictions else range(s + 1)
+    idle = s == 0 and buffer.busy == 0
+    could = range(s) if buffer.evictions or idle else range(s + 1)
     cheapest = sorted(could, key=lambda j: (round(cost[j], 9), j))[:k]
     order = [*cheapest, *[None] * (k - len(cheapest)), 0 if s else None]
     room = s < L and buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
-    slots = [L if j == s else j for j in (order[0] if j is None else j for j in order)]
+    none = (L + 1 if room else L) if order[0] is None else None
+    slots = [none if j is None else L if j == s else j for j in (order[0] if j is None else j for j in order)]
     if rows.options.asked_at == "arrival":
         slots = [L + 1 if room else slots[0], *slots]
     e = (x[-1] - x[0]) / (L + 1)
@@ -137,6 +139,19 @@ def test_a_queue_by_hand() -> None:
     batch = named(env.rows.senders.batch)
     first = batch.senders[0].first
     assert batch.slots.x[0, first : first + 3].tolist() == [1, 4, 7]
+
+
+def test_no_action_leaves_the_link_idle() -> None:
+    """A message a second over a link that takes .5 s for each: every action accepts all of them."""
+    arrivals = messages(np.arange(6) * 1_000_000, 100, x=np.arange(6.0))
+    env = SenderEnv(Interruption(t_max=20), 3, decide_at="arrival")
+    for action in range(4):
+        _, info = env.reset(options={"episode": Episode(arrivals, Link(Trace.steps([(100.0, 200.0)])))})
+        ended = False
+        while not ended:
+            assert info["slots"].tolist() == [4, 4, 4, 4] and info["action_mask"].tolist() == [1, 0, 0, 0]
+            _, _, ended, _, info = env.step(action)
+        assert named(env.rows.senders.batch).senders[0].dequeued == 6
 
 
 @kernels

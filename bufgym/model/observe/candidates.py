@@ -3,7 +3,8 @@
 Every queued message and the newcomer could go; the message in transmission could not. Dropping one merges the motion
 gaps before and after it. Candidates are sorted by that merged gap, per byte where sizes differ: the cheapest drop comes
 first. The head is one more candidate, since its turn to be sent comes next. So a choice among three or four candidates
-serves every L, and a random choice does little harm. See docs/methods.md, "Ordered candidates".
+serves every L, and a random choice does little harm. With nothing queued and nothing in transmission there is no
+candidate, and the newcomer is accepted: no policy leaves the link idle. See docs/methods.md, "Ordered candidates".
 
 All numbers observed are logarithms of ratios, so one set of weights serves every L, frame rate and size. With
 
@@ -64,8 +65,8 @@ def take_logarithms(ratios: NDArray[np.floating[Any]]) -> None:
 def find_candidates(buffer: Buffer, arrival: Any, order: NDArray[Any], cost: NDArray[np.float64]) -> None:
     """Find the cheapest candidates and the head.
 
-    Behind the newcomer its last step is expected again. Once a message was evicted for the newcomer, which happens
-    under a byte limit, the newcomer is no candidate.
+    Behind the newcomer its last step is expected again. The newcomer is no candidate once a message was evicted for it,
+    which happens under a byte limit, nor when nothing is queued or in transmission.
 
     Args:
         buffer: the queue of s messages.
@@ -78,7 +79,8 @@ def find_candidates(buffer: Buffer, arrival: Any, order: NDArray[Any], cost: NDA
     mean_bytes = (buffer.backlog_bytes + arrival.size_bytes) / (s + 1)
     found, head = 0, 0.0
     from_x = buffer.dequeued_x
-    for j in range(s + 1 if buffer.evictions == 0 else s):
+    may_reject = buffer.evictions == 0 and (s > 0 or buffer.busy > 0)
+    for j in range(s + 1 if may_reject else s):
         if j < s:
             message = item(buffer.slots, j)
             x, size_bytes = message.x, message.size_bytes
@@ -116,6 +118,7 @@ def decision_of_candidate(order: NDArray[Any], newcomer: int, at_arrivals: bool,
             is the cheapest candidate.
         room: whether there is room for the newcomer.
         action: 0..k at a full buffer, 0..k + 1 at arrivals; of a candidate that is not there, the cheapest goes.
+            Without any candidate a newcomer that fits is accepted.
     """
     place = action
     if at_arrivals:
@@ -125,6 +128,8 @@ def decision_of_candidate(order: NDArray[Any], newcomer: int, at_arrivals: bool,
     slot = int(order[place])
     if slot == NONE:
         slot = int(order[0])
+    if slot == NONE:
+        return ACCEPT if room else REJECT
     return REJECT if slot == newcomer else slot
 
 
@@ -134,11 +139,11 @@ def is_offered(order: NDArray[Any], at_arrivals: bool, room: bool, action: int) 
 
     Without room action 0 at arrivals does what action 1 does, and only action 0 is shown.
     """
+    if action == 0:
+        return True
     if not at_arrivals:
         return bool(order[action] != NONE)
-    if action == 1 and not room:
-        return False
-    return bool(action == 0 or order[action - 1] != NONE)
+    return bool(order[action - 1] != NONE and (room or action > 1))
 
 
 class Candidate(NamedTuple):

@@ -42,7 +42,8 @@ static inline double bufgym_logarithm(double ratio)
 /* Slots of the cheapest candidates in rising order of cost, s for the newcomer; then the head. */
 static inline void bufgym_find(struct bufgym_queue *q, const struct bufgym_message *arrival)
 {
-    const int s = q->occupancy, k = BUFGYM_CANDIDATES, last = q->evictions == 0 ? s : s - 1;
+    const int s = q->occupancy, k = BUFGYM_CANDIDATES;
+    const int last = q->evictions == 0 && (s > 0 || q->busy > 0) ? s : s - 1; /* none while the link is idle */
     const double mean_bytes = (double)(q->backlog_bytes + arrival->size_bytes) / (s + 1);
     double from_x = q->dequeued_x, head = 0.0;
     int j, place, found = 0;
@@ -163,7 +164,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     outputs = bufgym_forward(q);
     for (a = 0; a < BUFGYM_ACTIONS; a++) {
         const int place = a - BUFGYM_AT_ARRIVALS;
-        const int offered = place < 0 || (q->order[place] != BUFGYM_NONE && !(BUFGYM_AT_ARRIVALS && a == 1 && !room));
+        const int offered = a == 0 || (q->order[place] != BUFGYM_NONE && !(BUFGYM_AT_ARRIVALS && a == 1 && !room));
         if (outputs[a] > best && (offered || !BUFGYM_MASKS)) {
             best = outputs[a];
             action = a;
@@ -175,5 +176,7 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     slot = q->order[action > 0 ? action : 0];
     if (slot == BUFGYM_NONE) /* what is not there does what the cheapest does */
         slot = q->order[0];
+    if (slot == BUFGYM_NONE)
+        return room ? BUFGYM_ACCEPT : BUFGYM_REJECT;
     return slot == q->occupancy ? BUFGYM_REJECT : slot;
 }
