@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from agents.evaluation import Numbers, qoi_of
 from bufgym import policies
-from bufgym.benchmark.bootstrap import RESAMPLES, Interval, percentile_interval, times_drawn
+from bufgym.benchmark.bootstrap import RESAMPLES, Interval, interval, times_drawn
 from bufgym.benchmark.tasks import QueueTask
 from bufgym.policies import Policy
 from bufgym.scenario import suites
@@ -97,9 +97,10 @@ class Family:
 
     def against(self, policies: Sequence[Policy]) -> list[tuple[float, list[Interval]]]:
         """Each policy's share, and how far it lies above each other's, with an interval over links."""
-        weights = times_drawn(int(self._link.max()) + 1, RESAMPLES, np.random.default_rng(0))
+        links = int(self._link.max()) + 1
+        weights = times_drawn(links, RESAMPLES, np.random.default_rng(0))
         shares = [self.shares(self.play(policy), weights) for policy in policies]
-        return [(float(own[0]), [percentile_interval(own - other) for other in shares]) for own in shares]
+        return [(float(own[0]), [interval(own - other, links) for other in shares]) for own in shares]
 
 
 def divided(name: str, runs: Sequence[Run], n: int, parts: int, rng: np.random.Generator) -> list[Family]:

@@ -16,7 +16,7 @@ from agents.mixed_env import Cell
 from agents.settings import Settings
 from agents.tasks import Environment
 from bufgym import scenario as scenarios
-from bufgym.benchmark.bootstrap import RESAMPLES, SEED, percentile_interval, times_drawn
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, interval, times_drawn
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.tasks import QueueTask
@@ -110,6 +110,6 @@ def summarise(outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], ag
         entry = {"policy": name, "score": score, "score_95": [low, high], "regret": measured[name].regret.value}
         entry |= {field.name: known_mean([getattr(o, field.name) for o in results]) for field in fields(Outcome)}
         less = np.array([result.qoi for result in results]) - reference
-        minus, low, high = percentile_interval(weights @ less / len(less))
+        minus, low, high = interval(weights @ less / len(less), len(less))
         entries.append({**entry, "minus_agent": minus, "minus_agent_95": [low, high]})
     return sorted(entries, key=lambda entry: -entry["qoi"])

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream
+from bufgym.benchmark.bootstrap import Interval, interval, stream
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.table import NONE
 from bufgym.ground.tables import aligned
@@ -167,4 +167,4 @@ def spearman_over(a: NDArray[np.float64], b: NDArray[np.float64], group: NDArray
     for _ in range(RESAMPLES):
         drawn = np.concatenate([members[k] for k in rng.integers(0, len(members), len(members))])
         numbers.append(spearman(a[drawn], b[drawn]))
-    return percentile_interval(np.array(numbers))
+    return interval(np.array(numbers), len(members))

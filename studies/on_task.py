@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from agents.cma_es import Search, evaluation_here
 from agents.objectives.objective import Objective
 from bufgym import policies
-from bufgym.benchmark.bootstrap import percentile_interval, stream, times_drawn
+from bufgym.benchmark.bootstrap import interval, stream, times_drawn
 from bufgym.policies import Policy
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import Senders
@@ -135,7 +135,7 @@ def main(
         """Gain in tracking over the other policy, paired over episodes."""
         if name == base:
             return ""
-        more = percentile_interval(weights @ (tracked[name] - tracked[base]))
+        more = interval(weights @ (tracked[name] - tracked[base]), episodes)
         return f"{more.value:+.3f} [{more.low:+.3f}, {more.high:+.3f}]"
 
     bases = {"AFR's": RIVALS[0], "the agent's by information": f"agent by {next(iter(REWARDS))}"}

@@ -3,8 +3,8 @@
 A *cell* is a scenario with a capacity, and an *episode* of it is a trace with a seed. Every policy meets the same
 episodes at every capacity of the scenario, so policies are compared episode by episode.
 
-Every interval is a paired percentile bootstrap over links (Efron and Tibshirani 1993, chapter 13), and depends neither
-on the order of the rows nor on other policies (``bootstrap.links_drawn``). docs/guide/suites.md says what it describes,
+Every interval is a paired bootstrap over links, and depends neither on the order of the rows nor on other policies
+(``bootstrap.links_drawn``, ``bootstrap.interval``). docs/guide/suites.md says what it describes,
 and what *share of AFR's regret* and *mean ratio* are: each has one name everywhere.
 
 Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS 2021) and their library rliable.
@@ -22,11 +22,13 @@ from numpy.typing import NDArray
 
 from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import (
+    REALS,
     RESAMPLES,
     SEED,
     Interval,
+    interval,
     links_drawn,
-    percentile_interval,
+    links_in,
     ratio,
     stream,
     times_drawn,
@@ -117,7 +119,6 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     samples = {cell: _Sample.of(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
     discriminative = [cell for cell in table.cells if samples[cell].discriminative]
     compared = _resampled(table, REFERENCE) if REFERENCE in table.training_seeds else {}
-    interval = percentile_interval
     cell_scores: list[CellScore] = []
     overall: dict[str, dict[str, Numbers]] = {}
     for policy in table.training_seeds:
@@ -129,23 +130,24 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
                 none = {name: np.full_like(getattr(s, name), np.nan) for name in ("score", "regret", "by_trace")}
                 by_cell[cell] = s._replace(**none)
         for cell, s in by_cell.items():
-            cell_scores.append(
-                CellScore(
-                    *(*cell, policy, len(table.episodes[cell[0]])),
-                    *(interval(s.qoi), interval(s.score), interval(s.regret), interval(s.difference)),
-                    *(samples[cell].discriminative, table.exact[cell]),
-                )
-            )
+            met = {cell[0]: table.episodes[cell[0]]}
+            measured = (interval(numbers, links_in(met)) for numbers in (s.qoi, s.score, s.regret, s.difference))
+            counts = samples[cell].discriminative, table.exact[cell]
+            cell_scores.append(CellScore(*cell, policy, len(met[cell[0]]), *measured, *counts))
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
     for values in overall.values():
         lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
         values["share"] = ratio(values["regret"], lost, lost > NEGLIGIBLE)
     for values in overall.values() if against else ():
         values["against"] = values["share"] - overall[against]["share"]
-    standings = [
-        Standing(policy, unranked.get(policy, ""), {key: interval(numbers) for key, numbers in values.items()})
-        for policy, values in overall.items()
-    ]
+    links = links_in({scenario: table.episodes[scenario] for scenario, _ in discriminative})
+    standings = []
+    for policy, values in overall.items():
+        found = {
+            key: interval(numbers, links, within=(0, 1) if key == "improvement" else REALS)
+            for key, numbers in values.items()
+        }
+        standings.append(Standing(policy, unranked.get(policy, ""), found))
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
     standings.sort(key=lambda s: (not s.ranked, math.isnan(s["score"].value), -s["score"].value, s.policy))
     return Scores(standings, cell_scores)

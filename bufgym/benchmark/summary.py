@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym.benchmark import episodes
-from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, links_drawn, percentile_interval, written
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, interval, links_drawn, links_in, written
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
 from bufgym.benchmark.table import NOBODY, NONE, RunRows, Unranked, signed
@@ -121,15 +121,13 @@ def summarise(
                 numbers["against"] = numbers[rank_by] - other[cell]
 
     def standings(over: Sequence[Cell]) -> list[Standing]:
-        # Resamples of a single episode are all equal, so there is no interval.
-        alone = any(len(table.episodes[scenario]) == 1 for scenario, _ in over)
+        links = links_in({scenario: table.episodes[scenario] for scenario, _ in over})
         entries = []
         for policy, by_cell in by_policy.items():
             values = {}
             for quantity in quantities:
                 pooled = (np.sum if quantity.total else np.mean)([by_cell[cell][quantity.key] for cell in over], axis=0)
-                interval = percentile_interval(pooled)
-                values[quantity.key] = Interval(interval.value, math.nan, math.nan) if alone else interval
+                values[quantity.key] = interval(pooled, links)
             entries.append(Standing(policy, unranked.get(policy, ""), values))
         return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
 

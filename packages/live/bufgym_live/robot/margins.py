@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import Interval, percentile_interval, ratio, stream, times_drawn, written
+from bufgym.benchmark.bootstrap import Interval, interval, ratio, stream, times_drawn, written
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.table import percent
 from bufgym_live.robot.runs import LiveRun, by_policy
@@ -33,8 +33,8 @@ class Margin:
 def margins(runs: Sequence[LiveRun], reference: str = "afr") -> list[Margin]:
     """Of each other policy, the best in the simulator first; none without the reference or with a single episode.
 
-    Regret is on sums over the episodes. Intervals are paired percentile bootstraps over them (see ``score``): live and
-    simulated runs of an episode, and those over several transports, are drawn together.
+    Regret is on sums over the episodes. Intervals are paired bootstraps over them (see ``bootstrap.interval``): live
+    and simulated runs of an episode, and those over several transports, are drawn together.
     """
     policies = by_policy(runs)
     if reference not in policies:
@@ -48,7 +48,7 @@ def margins(runs: Sequence[LiveRun], reference: str = "afr") -> list[Margin]:
         live, simulated, best = (weights @ sums).T
         known = best > 0
         numbers = ratio(live, best, known), ratio(simulated, best, known), ratio(live, simulated, simulated > 0)
-        found.append(Margin(policy, reference, len(sums), *(percentile_interval(n) for n in numbers)))
+        found.append(Margin(policy, reference, len(sums), *(interval(n, len(sums)) for n in numbers)))
     return found
 
 

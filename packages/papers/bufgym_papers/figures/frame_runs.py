@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import traces
-from bufgym.benchmark.bootstrap import Interval, percentile_interval, stream, times_drawn
+from bufgym.benchmark.bootstrap import Interval, interval, stream, times_drawn
 from bufgym.benchmark.rows import Row
 from bufgym.ground.libraries import library
 from bufgym.scenario.afr_evaluation import LINK, PAPER_FRAMES, fade
@@ -150,7 +150,7 @@ def over_places(
     The interval comes from a paired bootstrap over places: a drawn one brings all its runs.
     """
     drawn = times_drawn(len(numbers), RESAMPLES, stream(0, label))
-    return percentile_interval(drawn @ np.asarray(numbers) / (drawn * units).sum(axis=1))
+    return interval(drawn @ np.asarray(numbers) / (drawn * units).sum(axis=1), len(numbers))
 
 
 def spearman(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
