@@ -27,8 +27,8 @@ def read_iperf3(path: StrPath, column: str | None = None) -> Knots:
     interval is an event on a line of its own. Intervals that iperf3 omitted from its own result are left out. The note
     says on which side it was measured: the sender counts what went into its socket, the receiver what came out.
 
-    ``column`` chooses one of `DIRECTIONS` in a test of both, by default the upload. Over UDP the sender counts also what
-    was lost. So its numbers are read only where nothing was, else those of the receiver if they are in the file.
+    ``column`` chooses one of `DIRECTIONS` in a test of both, by default the upload. Over UDP the sender counts what was
+    lost, too. So its numbers are read only where nothing was, else those of the receiver if they are in the file.
     """
     report = _report(path)
     if not isinstance(report, dict) or not isinstance(report.get("intervals"), list):
