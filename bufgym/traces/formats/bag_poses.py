@@ -1,22 +1,22 @@
 """Poses from the messages of one topic of a recording: odometry, poses, or one transform of tf."""
 
-import functools
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
+from bufgym.traces.formats.definitions import TF_TYPES, check_definition, check_form
+from bufgym.traces.formats.definitions import BagTopic as BagTopic
+from bufgym.traces.formats.definitions import typestore as typestore
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE
 from bufgym.traces.poses import Poses, unit
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 _POSE_TYPES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-_TF_TYPES: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 # Names of topics on which a pose is where a robot shall go, or what a person says. The page's frames.js has them too.
 _GOAL: Final = re.compile(
     r"(^|[/_])(goals?|targets?|(way|set)_?points?|clicked|desired|cmd|command|(goal|target|set|initial)_?pose)"
@@ -29,18 +29,9 @@ Frames = tuple[str, str]
 """The frame in which a pose is, and the frame whose pose it is (empty where the message does not say)."""
 
 
-@dataclass(frozen=True)
-class BagTopic:
-    """What the messages of one topic are."""
-
-    topic: str  # its name
-    type: str  # the ROS message type, such as "nav_msgs/msg/Odometry"; the schema's name elsewhere
-    encoding: str  # "cdr", "ros1" or what the MCAP file says
-
-
 def carries_poses(topic: str, type: str) -> bool:
     """Whether the messages of this topic say where a robot is; a goal does not."""
-    return type in _TF_TYPES or type == ODOMETRY or (type in _POSE_TYPES and not is_goal(topic))
+    return type in TF_TYPES or type == ODOMETRY or (type in _POSE_TYPES and not is_goal(topic))
 
 
 def is_goal(topic: str) -> bool:
@@ -81,10 +72,13 @@ class PoseCollector:
         """Take the recording, for error messages, and what ``named_source`` splits."""
         self.path, self._spec = path, spec
         self.topic, self._frames = named_source(spec)
+        self._checked: set[BagTopic] = set()
+        self._count = 0
         self._poses: dict[Frames, list[tuple[int, tuple[float, ...]]]] = {}
 
     def add(self, channel: BagTopic, time_ns: int, data: bytes) -> None:
         """Keep the poses of a message that was logged at `time_ns`."""
+        self._count += 1
         for _, frames, position, orientation in placed(self._decoded(channel, data)):
             self._keep(frames, time_ns, position, orientation)
 
@@ -109,13 +103,23 @@ class PoseCollector:
 
     def _decoded(self, channel: BagTopic, data: bytes) -> Any:
         if not carries_poses(channel.topic, channel.type):
-            rule = f"must be one of {', '.join(_POSE_TYPES)}, {', '.join(_TF_TYPES)}"
+            rule = f"must be one of {', '.join(_POSE_TYPES)}, {', '.join(TF_TYPES)}"
             raise BufgymError(f"{self.path}: {self.topic} carries {channel.type or 'no known type'}: {rule}")
         if channel.encoding not in ("cdr", "ros1"):
             raise BufgymError(f"{self.path}: {self.topic} is encoded in {channel.encoding!r}: must be cdr or ros1")
+        if channel not in self._checked:
+            check_definition(self.path, channel)
+            self._checked.add(channel)
+        if channel.encoding == "cdr":
+            check_form(self.path, f"message {self._count} on {self.topic}", data)
         store = typestore(channel.encoding)
         decode = store.deserialize_cdr if channel.encoding == "cdr" else store.deserialize_ros1
-        return decode(data, channel.type)
+        try:
+            return decode(data, channel.type)
+        except Exception as error:
+            words = " ".join(str(error).split())[:160] or "no more data"
+            rule = f"cut off or damaged, or of another definition than {channel.type} has in ROS"
+            raise fault(self.path, f"message {self._count} on {self.topic} is {rule}: {words}") from error
 
     def _keep(self, frames: Frames, time_ns: int, position: Any, quaternion: Any) -> None:
         poses = self._poses.setdefault(frames, [])
@@ -129,15 +133,3 @@ class PoseCollector:
         if not abs(norm - 1) <= NORM_TOLERANCE:
             raise fault(self.path, "must be 1 within 1 %", value=f"{norm:.6g}", field=f"{field}, norm")
         poses.append((time_ns, values))
-
-
-@functools.cache
-def typestore(encoding: str) -> Any:
-    """The types of ROS 2 (``cdr``) or ROS 1 (``ros1``), with those of tf in both."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY if encoding == "cdr" else Stores.ROS1_NOETIC)
-    for name in _TF_TYPES:
-        if name not in store.fielddefs:
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
-    return store

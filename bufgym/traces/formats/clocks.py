@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.traces.formats.bag_poses import BagTopic, typestore
+from bufgym.traces.formats.definitions import BagTopic, is_plain_cdr, typestore
 from bufgym.traces.formats.faults import StrPath, fault, warn
 from bufgym.traces.trace import MAX_DURATION_S, Int64Array, first_true
 
@@ -172,6 +172,8 @@ def _has_stamp(type: str, encoding: str) -> bool:
 def _stamp_ns(channel: BagTopic, data: bytes) -> int | None:
     """The header stamp of a message, ns; None where it has none, or none above 0."""
     if len(data) < 12 or not _has_stamp(channel.type, channel.encoding):
+        return None
+    if channel.encoding == "cdr" and not is_plain_cdr(data):
         return None
     # Before it stand 4 bytes: of CDR its encoding, of ROS 1 a sequence number.
     seconds, ns = _HEADER[channel.encoding == "ros1" or bool(data[1] & 1)].unpack_from(data)
