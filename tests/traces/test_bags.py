@@ -133,7 +133,11 @@ def test_odometry_that_is_none(tmp_path: Path) -> None:
         (drive, "/goal_pose", "odom = '/goal_pose': /goal_pose is a goal, no place where the robot is"),
         (odometry(good, cases.odometry(0, 0, scale=0.5)), "/odom", "/odom, pose 2, norm = 0.5: must be 1 within 1 %"),
         (odometry(good, cases.odometry(math.nan, 0)), "/odom", "pose 2, position = .*nan.*: must be finite and wit"),
-        (odometry(good, good[:40]), "/odom", "cut off or damaged: "),
+        (
+            odometry(good, good[:40]),
+            "/odom",
+            "message 2 on /odom is cut off or damaged, or of another definition than nav",
+        ),
         (odometry(good, good, encoding="json"), "/odom", "/odom is encoded in 'json': must be cdr or ros1"),
     ):
         refuse(says, read_bag, path, odom)

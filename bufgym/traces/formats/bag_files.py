@@ -12,7 +12,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -208,8 +208,10 @@ def _definitions(base: sqlite3.Connection) -> Iterator[tuple[str, tuple[str, str
     """Each type that a SQLite file defines, as since ROS 2 Iron, with the text and its language."""
     if base.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'message_definitions'").fetchone():
         query = "SELECT topic_type, encoded_message_definition, encoding FROM message_definitions"
-        for type, definition, language in base.execute(f"{query} LIMIT {MAX_TOPICS}"):
-            yield str(type), (str(definition), str(language))
+        # A text over the limit of a message is no definition.
+        with suppress(sqlite3.DataError):
+            for type, definition, language in base.execute(f"{query} LIMIT {MAX_TOPICS}"):
+                yield str(type), (str(definition), str(language))
 
 
 def journals(path: Path) -> list[str]:

@@ -59,7 +59,7 @@ def check_definition(path: StrPath, channel: BagTopic) -> None:
     known = typestore(channel.encoding).fielddefs
     for name, defined in _parsed(channel.definition, channel.language, channel.type).items():
         own, must = _fields(defined), _fields(known[name]) if name in known else []
-        if not must or own == must:
+        if not own or not must or own == must:  # recorders also write a comment, or nothing
             continue
         k = next(k for k in range(max(len(own), len(must))) if own[k : k + 1] != must[k : k + 1])
         has, wants = ("nothing" if k >= len(fields) else " ".join(fields[k]) for fields in (own, must))
