@@ -17,8 +17,8 @@ from bufgym.traces.formats.bag_files import MAX_TOPICS, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.clocks import LogTimes
 from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.splits import damage_errors, split_messages, splits
-from bufgym.traces.formats.trajectories import warn_of_jumps
 from bufgym.traces.poses import Poses
 from bufgym.traces.trace import Int64Array
 
@@ -87,7 +87,7 @@ def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], ob
     if collector is None:
         return bag
     from_ns, poses = collector.poses(topics)
-    warn_of_jumps(path, poses)
+    warn_of_leaps(path, poses)
     return replace(bag, poses=poses, poses_from_ns=from_ns)
 
 
