@@ -37,7 +37,6 @@ UPRIGHT = [0.0, 0, 0, 1]
 PATHS = [("tum", TUM), ("tum", REPEATED), ("euroc", EUROC), ("euroc", EUROC_CSV), ("kitti", KITTI)]
 
 
-@pytest.mark.filterwarnings("ignore:.*left out 1 of 4 poses:bufgym.ground.errors.TraceWarning")
 @pytest.mark.parametrize(("format", "text"), PATHS)
 def test_one_path_in_each_format(tmp_path: Path, format: str, text: str) -> None:
     path = written(tmp_path, text, "path.txt")

@@ -116,7 +116,7 @@ def test_a_block_of_numbers_and_its_lines_are_the_same(tmp_path: Path, monkeypat
     monkeypatch.setattr("bufgym.traces.formats.text._BLOCK_BYTES", 512)
     for unit, separator in (("s", " "), ("s", ","), ("ns", ","), ("ms", " ")):
         lines, time_us = [], 1_700_000_000_000_000
-        for k in range(300):
+        for _ in range(300):
             time_us += int(rng.integers(0, 3)) * 16_667
             time = f"{time_us / 1e6:.6f}" if unit == "s" else str(time_us * PER_S[unit] // 10**6)
             turn = rng.normal(size=4)

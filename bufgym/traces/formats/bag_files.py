@@ -83,7 +83,8 @@ def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
             name, definition, language = schemas.get(record.schema_id, ("", "", ""))
             type = ros_type(name)
             _add(types, record.topic, type)
-            channels[record.id] = BagTopic(record.topic, type, record.message_encoding, definition, language)
+            publisher, encoding = record.metadata.get("callerid", ""), record.message_encoding
+            channels[record.id] = BagTopic(record.topic, type, encoding, definition, language, record.id, publisher)
 
     with _Bounded(path) as file:
         unpacked = Unpacked(file.size)
@@ -197,7 +198,7 @@ def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
             definition, language = definitions.get(type, ("", ""))
             type = ros_type(type)
             _add(types, topic, type)
-            channels[number] = BagTopic(topic, type, "cdr", definition, language)
+            channels[number] = BagTopic(topic, type, "cdr", definition, language, number)
         for number, logged_ns, data in base.execute("SELECT topic_id, timestamp, data FROM messages"):
             if not isinstance(logged_ns, int) or not isinstance(data, bytes):
                 raise RefusedError("a message's time must be a whole number, and its data bytes")
@@ -238,8 +239,8 @@ def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
         channels: dict[int, BagTopic] = {}
         for connection in reader.connections:
             _add(types, connection.topic, connection.msgtype)
-            definition = connection.msgdef.data
-            channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1", definition, "ros1msg")
+            about = connection.msgdef.data, "ros1msg", connection.id, connection.ext.callerid or ""
+            channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1", *about)
         # The reader merges by time. In order of the file, a clock that went back shows.
         reader.indexes = {number: sorted(map(_InFile._make, index)) for number, index in reader.indexes.items()}
         for connection, logged_ns, data in reader.messages(list(reader.connections)):

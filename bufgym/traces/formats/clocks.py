@@ -6,6 +6,7 @@ and units", says what is refused and what is warned of.
 
 import struct
 from array import array
+from collections.abc import Sequence
 from functools import cache
 from typing import Final
 
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.traces.formats.definitions import BagTopic, is_plain_cdr, typestore
-from bufgym.traces.formats.faults import StrPath, fault, warn
+from bufgym.traces.formats.faults import LeftOut, StrPath, fault, warn
 from bufgym.traces.trace import MAX_DURATION_S, Int64Array, first_true
 
 NS_PER_S: Final = 10**9
@@ -131,6 +132,16 @@ class LogTimes:
         topic = list(self.topics)[self._topic[k]]
         seconds, ns = divmod(self._time_ns[k], NS_PER_S)
         return f"message {k + 1} ({topic}, logged at {seconds}.{ns // 10**6:03d} s)"
+
+
+def warn_of_shared_times(path: StrPath, time: Int64Array, topic: Int64Array, names: Sequence[str]) -> None:
+    """Warn of topics whose messages arrive several at a time, in any unit: a clock of coarse steps has logged them."""
+    by_topic = np.argsort(topic, kind="stable")
+    for places in np.split(by_topic, np.flatnonzero(np.diff(topic[by_topic])) + 1):
+        if len(places):
+            shared = LeftOut()
+            shared.add(time[places], places + 1)
+            shared.said(path, f"messages on {names[topic[places[0]]]}", "message", ": they arrive at once", verb="")
 
 
 def _goes_back(time_ns: Int64Array) -> npt.NDArray[np.bool_]:

@@ -32,6 +32,8 @@ class BagTopic:
     encoding: str  # "cdr", "ros1" or what the MCAP file says
     definition: str = ""  # of the type, as the recording has it; empty where it has none
     language: str = ""  # of the definition: "ros2msg", "ros2idl", ...
+    number: int = 0  # of the channel or connection: a topic may have several
+    publisher: str = ""  # name of the node that sends on it; empty where the recording does not say
 
 
 def ros_type(name: str) -> str:

@@ -62,12 +62,16 @@ class LeftOut:
         self._most = max(self._most, int(alike.max()))
         self._last, self._of_last, self._place = int(times[-1]), int(alike[-1]), int(places[-1])
 
-    def said(self, path: StrPath, what: str, place: str = "line", effect: str = "") -> str:
-        """Warn of them if they are many, or several of one time; otherwise return a note for the source's text."""
+    def said(self, path: StrPath, what: str, place: str = "line", effect: str = "", verb: str = "left out ") -> str:
+        """Warn of them if they are many, or several of one time; otherwise return a note for the source's text.
+
+        ``verb`` says what was done with them: nothing, if it is empty.
+        """
         if not self._count:
             return ""
-        doubt = f"left out {self._count:,} of {self.total:,} {what} that share a time with a later one"
-        if self._count <= _FEW * self.total and self._most <= 2:
+        shared = "that share a time" if verb else "share a time"
+        doubt = f"{verb}{self._count:,} of {self.total:,} {what} {shared} with a later one"
+        if (self._count == 1 or self._count <= _FEW * self.total) and self._most <= 2:
             return f", {doubt}"
         warn(path, f"{doubt}, the first in {place} {self.first}, at most {self._most} of one time{effect}")
         return ""

@@ -86,7 +86,8 @@ def read_runs(path: StrPath, column: str = RUNS[0]) -> Knots:
         raise rates.error(len(cells), f"must be as many as times in the line above ({len(times)})", "samples")
     steps = "times as stated" if len(lines) > 1 else f"a sample each {RUN_STEP_S:g} s"
     note = f"{column} of {len(runs)}, {steps}" + (f", the first of {len(lines) // 2} pairs" if len(lines) > 2 else "")
-    return held_rates(path, _rates(lines[0], times, rates, cells))._replace(note=note)
+    knots = held_rates(path, _rates(lines[0], times, rates, cells))
+    return knots._replace(note=", ".join(filter(None, (note, knots.note))))
 
 
 def runs_of(path: StrPath) -> dict[str, list[Line]]:

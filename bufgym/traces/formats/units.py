@@ -23,6 +23,10 @@ _GAP_S: Final = 1.05  # From one pose to the next, with some jitter: longer ones
 _SHARED: Final = 0.1  # Where more samples share a time, the mean step counts
 _DECIMALS: Final = 4  # Clocks that count in ms have fewer
 _FRAMES: Final = 10  # Poses from which on whole numbers in a row look like frame numbers
+_LEAST_SAMPLE_S: Final = 1e-3  # No tool measures a link more often
+_SERIAL_DAYS: Final = (36_526, 58_074)  # Days since 1899-12-30, as spreadsheets count, from 2000 until 2058
+_FEW_S: Final = 50  # Steps of ms look like these seconds; of seconds, these are usual:
+_USUAL_S: Final = (60, 120, 180, 240, 300, 600, 900, 1200, 1800)
 _SAY: Final = "say format='tum' or 'kitti' (s) or 'euroc' (ns), or put '#timestamp [{0}]' above the first line"
 
 
@@ -105,3 +109,26 @@ def _is_running(first: float, step: float, unit: str) -> bool:
     """Whether a first time is at most a year after a start in this unit, and poses follow each other as usual."""
     unit_s = UNIT_S[unit]
     return first * unit_s <= _LONGEST_UPTIME_S and _USUAL_STEPS_S[0] <= step * unit_s <= _USUAL_STEPS_S[1]
+
+
+def check_seconds(path: StrPath, first_s: float, step_s: float) -> None:
+    """Check that the times of a link, given as numbers, can be seconds: the first, and the median step.
+
+    Refuses days, as spreadsheets write dates, and steps that no tool has; warns of steps that are usual in ms.
+    """
+    day_s = step_s * 86_400
+    is_day = _SERIAL_DAYS[0] <= first_s < _SERIAL_DAYS[1] and step_s < 0.5
+    if is_day and (step_s < _LEAST_SAMPLE_S or (_is_whole(day_s) and not _is_whole(step_s * 1000))):
+        rule = "looks like days, as a spreadsheet writes dates: must be in s, or a date as 2024-01-31 12:00:00"
+        raise fault(path, rule, value=f"{first_s:.10g}", field="time in s")
+    if step_s < _LEAST_SAMPLE_S:
+        rule = f"must be at least {_LEAST_SAMPLE_S:g} s (are the times in another unit?)"
+        raise fault(path, rule, value=f"{step_s:.3g} s", field="median step of the times")
+    is_usual = any(abs(step_s / usual - 1) < 0.01 for usual in _USUAL_S) or _is_whole(step_s / 3600)
+    if step_s >= _FEW_S and not is_usual and not _DATES_S[0] <= first_s < _DATES_S[1]:
+        warn(path, f"its times are {step_s:.6g} s apart (median): are they in ms? they are taken as seconds")
+
+
+def _is_whole(value: float) -> bool:
+    """Whether a number is about a whole number above 0: days in whole microseconds of a day are off by 0.04 s."""
+    return round(value) > 0 and abs(value - round(value)) < 0.05
