@@ -94,9 +94,9 @@ def test_poses_that_share_a_time_are_counted(tmp_path: Path) -> None:
     with pytest.warns(TraceWarning, match=says):
         read_motion(ODD_FILES / "tum_1s_rock.txt")
     refuse("line 1: 300 poses of one time: must have", read_motion, ODD_FILES / "tum_6digits.txt", kind=TraceError)
-    # One in a hundred is no more than a coarse digit: a note. Three of one time are more.
+    # One in a hundred is no more than a coarse digit: a note. Ten of one time are more.
     times = [0.1 * k for k in range(100)]
-    for repeated, warned in (([7], False), ([7, 7], True), ([7, 20, 33, 50, 61, 80], True)):
+    for repeated, warned in (([7], False), ([7, 7], False), ([7] * 9, True), ([7, 20, 33, 50, 61, 80], True)):
         at = sorted(times + [times[k] for k in repeated])
         text = "# t x y z\n" + "".join(f"{time:.1f} 0 0 0 0 0 0 1\n" for time in at)
         path = written(tmp_path, text, "path.txt")

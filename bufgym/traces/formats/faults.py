@@ -14,6 +14,7 @@ from bufgym.ground.errors import TraceError, TraceWarning, where
 StrPath = str | PathLike[str]
 
 _FEW: Final = 0.05  # A share of samples left out that is no more than a clock's coarse digits now and then
+_MANY: Final = 10  # Samples of one time that are more than a burst: sound recordings have up to seven
 
 
 def fault(
@@ -71,7 +72,7 @@ class LeftOut:
             return ""
         shared = "that share a time" if verb else "share a time"
         doubt = f"{verb}{self._count:,} of {self.total:,} {what} {shared} with a later one"
-        if (self._count == 1 or self._count <= _FEW * self.total) and self._most <= 2:
+        if (self._count == 1 or self._count <= _FEW * self.total) and self._most < _MANY:
             return f", {doubt}"
         warn(path, f"{doubt}, the first in {place} {self.first}, at most {self._most} of one time{effect}")
         return ""
