@@ -48,7 +48,7 @@ class LeftOut:
         """Line, or place, of the first that shares its time with a later one; 0 while there is none."""
         self._count = self._most = 0
         self._last: int | None = None
-        self._of_last = 0  # samples of the last time
+        self._of_last = self._place = 0  # samples of the last time; place of the last sample
 
     def add(self, times: npt.NDArray[np.int64], places: npt.NDArray[np.int64]) -> None:
         """Add samples in order of time, int64[m], m >= 1, with their lines or places."""
