@@ -239,7 +239,7 @@ def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
         channels: dict[int, BagTopic] = {}
         for connection in reader.connections:
             _add(types, connection.topic, connection.msgtype)
-            about = connection.msgdef.data, "ros1msg", connection.id, connection.ext.callerid or ""
+            about = connection.msgdef.data, "ros1msg", connection.id, getattr(connection.ext, "callerid", None) or ""
             channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1", *about)
         # The reader merges by time. In order of the file, a clock that went back shows.
         reader.indexes = {number: sorted(map(_InFile._make, index)) for number, index in reader.indexes.items()}

@@ -119,8 +119,8 @@ class _Kept:
         is_last = np.append(time_us[1:] != time_us[:-1], True)
         if not is_last.all():
             time_us, values = time_us[is_last], values[is_last]
-        self._times.frombytes(np.ascontiguousarray(time_us).view(np.uint8))
-        self._values.frombytes(np.ascontiguousarray(values).view(np.uint8))
+        self._times.frombytes(time_us.tobytes())
+        self._values.frombytes(values.tobytes())
 
     def rows(self) -> Rows:
         """All of them, checked."""
