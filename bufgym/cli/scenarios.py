@@ -242,7 +242,8 @@ def _motions(names: Sequence[str], measured: MotionOptions) -> tuple[Motion, ...
         if settings is None:
             motions.append(traces.load_motion(name))
             continue
-        motions.append(traces.read_motion(traces.shipped().get(name, name), settings))
+        with bar(None, True, "line") as advance:
+            motions.append(traces.read_motion(traces.shipped().get(name, name), settings, advance=advance))
         if motions[-1].source.endswith(f"({MOTION_HEADER})"):
             refuse(given(measured, *MOTION), f"cannot go with {name}, which holds finished coordinates")
     return tuple(motions)

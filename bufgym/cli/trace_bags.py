@@ -139,7 +139,8 @@ def from_poses(
     """
     from bufgym.traces import read_motion, write_motion_csv
 
-    motion = read_motion(file, measured.settings(), format=format, times=times)
+    with bar(None, True, "line") as advance:
+        motion = read_motion(file, measured.settings(), format=format, times=times, advance=advance)
     seconds = motion.duration_us / 1e6
     print(f"{printable(motion.name)}\n  source  {printable(motion.source)}")
     print(f"  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")

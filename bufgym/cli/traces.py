@@ -23,7 +23,12 @@ _MOST_DRAWN = 5_000  # most rates in a picture some 1300 pixels wide; more rates
 
 Files = Annotated[list[str], Parameter(help="A file, or a shipped name.")]
 Format = Annotated[str | None, Parameter(help="The files' format (default: detected).")]
-Column = Annotated[str | None, Parameter(help="Of UCC files (DL_bitrate, UL_bitrate), or which run of a list.")]
+Column = Annotated[
+    str | None,
+    Parameter(
+        help="Of UCC files (DL_bitrate, UL_bitrate), of iperf3 --bidir (upload, download), or which run of a list."
+    ),
+]
 
 
 def info(files: Files, /, *, format: Format = None, column: Column = None) -> int:

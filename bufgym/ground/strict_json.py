@@ -5,7 +5,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,8 +18,9 @@ MAX_JSON_BYTES = 64 * 2**20  # Size limit; a timeline of 100,000 messages has so
 class Decoder(json.JSONDecoder):
     """Raises ValueError for a number that is not finite."""
 
-    def __init__(self) -> None:
-        super().__init__(parse_constant=_refuse, parse_float=_finite)
+    def __init__(self, pairs: Callable[[list[tuple[str, Any]]], dict[str, Any]] | None = None) -> None:
+        """``pairs`` makes an object of its members, which may share a name; by default the last one counts."""
+        super().__init__(parse_constant=_refuse, parse_float=_finite, object_pairs_hook=pairs)
 
 
 def loads(text: str | bytes) -> Any:

@@ -132,12 +132,22 @@ def motion_from_poses(
     exactly of norm 1.
     """
     settings = settings or MotionSettings()
-    poses = replace(poses, quaternion=unit(poses.quaternion))
     gaps = gaps_between(poses.time_us, settings.max_gap_s)
     # A recording at just this rate jitters by some percent, and must not be resampled for that.
     if np.median(np.diff(poses.time_us)) < 0.9 * US_PER_S / settings.rate_hz:
         poses = poses.resampled(settings.rate_hz)
+    else:
+        poses = replace(poses, quaternion=unit(poses.quaternion))
+    return Motion(name, poses.time_us, np.append(0.0, np.cumsum(motion_steps(poses, settings))), source, gaps)
+
+
+def motion_steps(poses: Poses, settings: MotionSettings) -> Float64Array:
+    """Motion from each pose to the next, float64[n-1]: rotation / field of view + translation / scene scale."""
+    return np.concatenate([_steps(piece, settings) for piece in poses.pieces()])
+
+
+def _steps(poses: Poses, settings: MotionSettings) -> Float64Array:
     turned_rad = angles(poses.quaternion[:-1], poses.quaternion[1:])
     moved_m = np.linalg.norm(np.diff(poses.position_m, axis=0), axis=1)
-    steps = turned_rad / math.radians(settings.fov_deg) + moved_m / settings.scene_scale_m
-    return Motion(name, poses.time_us, np.append(0.0, np.cumsum(steps)), source, gaps)
+    steps: Float64Array = turned_rad / math.radians(settings.fov_deg) + moved_m / settings.scene_scale_m
+    return steps

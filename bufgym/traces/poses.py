@@ -6,11 +6,15 @@ Between two poses the position moves along a line and the orientation along the 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+
+_PIECE: Final = 2**17  # Poses that are worked on at once: a day of them would need several times their memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +38,28 @@ class Poses:
         return Poses(time_us, position, slerp(self.quaternion[k], self.quaternion[k + 1], share), self.format)
 
     def resampled(self, rate_hz: float) -> Poses:
-        """The poses at multiples of 1 / `rate_hz` and at the end."""
+        """The poses at multiples of 1 / `rate_hz` and at the end; quaternions need not be exactly of norm 1."""
         end_us = self.time_us[-1]
         grid_us = np.rint(np.arange(int(end_us * rate_hz / US_PER_S) + 1) * (US_PER_S / rate_hz)).astype(np.int64)
-        return self.at(np.append(grid_us[grid_us < end_us], end_us))
+        grid_us = np.append(grid_us[grid_us < end_us], end_us)
+        parts = [self._beside(part).at(part) for part in np.split(grid_us, range(_PIECE, len(grid_us), _PIECE))]
+        position_m, quaternion = (
+            np.concatenate(arrays) for arrays in zip(*((p.position_m, p.quaternion) for p in parts), strict=True)
+        )
+        return Poses(grid_us, position_m, quaternion, self.format)
+
+    def _beside(self, time_us: Int64Array) -> Poses:
+        """The poses from the one before the first of these times to the one after the last, of norm 1."""
+        start = min(int(np.searchsorted(self.time_us, time_us[0], side="right")) - 1, self.time_us.size - 2)
+        end = int(np.searchsorted(self.time_us, time_us[-1], side="right")) + 1
+        part = slice(start, end)
+        return Poses(self.time_us[part], self.position_m[part], unit(self.quaternion[part]), self.format)
+
+    def pieces(self) -> Iterator[Poses]:
+        """The poses in pieces that each begin with the last pose of the one before, so that work on one is small."""
+        for start in range(0, max(self.time_us.size - 1, 1), _PIECE):
+            part = slice(start, start + _PIECE + 1)
+            yield Poses(self.time_us[part], self.position_m[part], self.quaternion[part], self.format)
 
 
 def gaps_between(time_us: Int64Array, max_gap_s: float) -> tuple[tuple[int, int], ...]:
@@ -77,6 +99,12 @@ def angles(a: Float64Array, b: Float64Array) -> Float64Array:
 def unit(quaternion: Float64Array) -> Float64Array:
     """The rows of float64[m, 4], each divided by its norm."""
     return np.asarray(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), dtype=np.float64)
+
+
+def normalize(quaternion: Float64Array) -> None:
+    """As ``unit``, in place."""
+    for start in range(0, len(quaternion), _PIECE):
+        quaternion[start : start + _PIECE] = unit(quaternion[start : start + _PIECE])
 
 
 def quaternions(rotation: Float64Array) -> Float64Array:

@@ -57,16 +57,21 @@ def drive(store: Any = ROS2) -> list[Entry]:
 
 
 def write_mcap(
-    path: Path, entries: list[Entry], compression: CompressionType = CompressionType.ZSTD, encoding: str = "cdr"
+    path: Path,
+    entries: list[Entry],
+    compression: CompressionType = CompressionType.ZSTD,
+    encoding: str = "cdr",
+    definition: str = "",
+    language: str = "ros2msg",
 ) -> Path:
-    """An MCAP file with the entries in the order given."""
+    """An MCAP file with the entries in the order given, all types of this definition."""
     with path.open("wb") as file:
         writer = McapWriter(file, compression=compression, chunk_size=2048)
         writer.start(profile="ros2" if encoding == "cdr" else "ros1")
         channels: dict[str, int] = {}
         for ms, topic, type, data in entries:
             if topic not in channels:
-                schema = writer.register_schema(type, "ros2msg", b"")
+                schema = writer.register_schema(type, language, definition.encode())
                 channels[topic] = writer.register_channel(topic, encoding, schema)
             time_ns = START_NS + ms * MS
             writer.add_message(channels[topic], log_time=time_ns, publish_time=time_ns, data=data)

@@ -85,7 +85,7 @@ def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
 def test_broken_files(tmp_path: Path) -> None:
     written(tmp_path, KITTI_TIMES, "path_times.txt")
     for text, says in (
-        ("0 0 0 0 0 0 0 1\n", "holds 1 samples: must hold at least 2"),
+        ("0 0 0 0 0 0 0 1\n", "must hold at least 2 poses of different times, has 1"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 0\n", "line 2: norm of the quaternion = 0: must be 1 within 1 %"),
         ("0 0 0 1e8 0 0 0 1\n", "line 1: tz = 1e8: must be from -1e\\+07 to 1e\\+07"),
         (

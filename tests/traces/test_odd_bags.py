@@ -181,7 +181,9 @@ def test_what_the_metadata_names_must_be_there(tmp_path: Path, storage: str) -> 
         r"d_2\.\w+: no such file, which metadata\.yaml names": Path.unlink,
         rf"d_2\.\w+: must be a file of {storage}, as metadata\.yaml says": lambda file: file.write_bytes(b""),
         r"d_2\.\w+: must be a regular file": lambda file: (file.unlink(), file.mkdir()),
-        r"metadata\.yaml: storage '': must be": lambda file: (file.parent / "metadata.yaml").write_text(""),
+        r"metadata\.yaml: must hold rosbag2_bagfile_information": lambda file: (
+            file.parent / "metadata.yaml"
+        ).write_text(""),
         r"d_0\.\w+: must be a file of": lambda file: describe(file.parent, other, [f"d_0.{ENDING[storage]}"]),
         r"metadata\.yaml: names no file": lambda file: describe(file.parent, storage, []),
     }

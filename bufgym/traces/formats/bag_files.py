@@ -12,12 +12,12 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import IO, Any, Final
 
 from bufgym.ground.files import unpacked_limit
-from bufgym.traces.formats.bag_poses import BagTopic
+from bufgym.traces.formats.definitions import BagTopic, ros_type
 
 # A chunk of a recording has some MB, a robot some hundred topics; more is a mistake, or a bomb.
 MAX_CHUNK_BYTES: Final = 2**28
@@ -73,16 +73,18 @@ def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
     from mcap.opcode import Opcode
     from mcap.stream_reader import StreamReader
 
-    schemas: dict[int, str] = {}
+    schemas: dict[int, tuple[str, str, str]] = {}  # name, definition and its language
     channels: dict[int, BagTopic] = {}
 
     def declared(record: Any) -> None:
         if isinstance(record, records.Schema):
-            schemas[record.id] = record.name
+            schemas[record.id] = record.name, record.data.decode("utf-8", "replace"), record.encoding
         elif isinstance(record, records.Channel):
-            type = _type(schemas.get(record.schema_id, ""))
+            name, definition, language = schemas.get(record.schema_id, ("", "", ""))
+            type = ros_type(name)
             _add(types, record.topic, type)
-            channels[record.id] = BagTopic(record.topic, type, record.message_encoding)
+            publisher, encoding = record.metadata.get("callerid", ""), record.message_encoding
+            channels[record.id] = BagTopic(record.topic, type, encoding, definition, language, record.id, publisher)
 
     with _Bounded(path) as file:
         unpacked = Unpacked(file.size)
@@ -177,12 +179,6 @@ def _add(types: dict[str, str], topic: str, type: str) -> None:
     types[topic] = BETWEEN_TYPES.join(known if type in known or not type else [*known, type])
 
 
-def _type(schema: str) -> str:
-    """A ROS 1 type name ("nav_msgs/Odometry") as in ROS 2; any other name unchanged."""
-    package, _, name = schema.partition("/")
-    return f"{package}/msg/{name}" if name and "/" not in name else schema
-
-
 def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
     """Every message of one of rosbag2's SQLite files; one with a journal must be a copy, because SQLite changes it."""
     mode = "mode=rw" if journals(path) else "mode=ro&immutable=1"
@@ -193,17 +189,30 @@ def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
         if base.execute(kinds).fetchone() != (2,):
             raise RefusedError("no table of messages and topics")
         channels: dict[int, BagTopic] = {}
+        definitions = dict(_definitions(base))
         for number, topic, type, encoding in base.execute("SELECT id, name, type, serialization_format FROM topics"):
             if encoding != "cdr" or not isinstance(topic, str) or not isinstance(type, str):
                 raise RefusedError(f"topic {topic!r} of type {type!r} in {encoding!r}: must be text, in cdr")
             if len(channels) > MAX_TOPICS:
                 break  # who reads on says so
+            definition, language = definitions.get(type, ("", ""))
+            type = ros_type(type)
             _add(types, topic, type)
-            channels[number] = BagTopic(topic, type, "cdr")
+            channels[number] = BagTopic(topic, type, "cdr", definition, language, number)
         for number, logged_ns, data in base.execute("SELECT topic_id, timestamp, data FROM messages"):
             if not isinstance(logged_ns, int) or not isinstance(data, bytes):
                 raise RefusedError("a message's time must be a whole number, and its data bytes")
             yield channels[number], logged_ns, data
+
+
+def _definitions(base: sqlite3.Connection) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Each type that a SQLite file defines, as since ROS 2 Iron, with the text and its language."""
+    if base.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'message_definitions'").fetchone():
+        query = "SELECT topic_type, encoded_message_definition, encoding FROM message_definitions"
+        # A text over the limit of a message is no definition.
+        with suppress(sqlite3.DataError):
+            for type, definition, language in base.execute(f"{query} LIMIT {MAX_TOPICS}"):
+                yield str(type), (str(definition), str(language))
 
 
 def journals(path: Path) -> list[str]:
@@ -230,7 +239,8 @@ def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
         channels: dict[int, BagTopic] = {}
         for connection in reader.connections:
             _add(types, connection.topic, connection.msgtype)
-            channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1")
+            about = connection.msgdef.data, "ros1msg", connection.id, getattr(connection.ext, "callerid", None) or ""
+            channels[connection.id] = BagTopic(connection.topic, connection.msgtype, "ros1", *about)
         # The reader merges by time. In order of the file, a clock that went back shows.
         reader.indexes = {number: sorted(map(_InFile._make, index)) for number, index in reader.indexes.items()}
         for connection, logged_ns, data in reader.messages(list(reader.connections)):

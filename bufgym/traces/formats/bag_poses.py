@@ -1,27 +1,31 @@
 """Poses from the messages of one topic of a recording: odometry, poses, or one transform of tf."""
 
-import functools
+import itertools
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.definitions import TF_TYPES, check_definition, check_form
+from bufgym.traces.formats.definitions import BagTopic as BagTopic
+from bufgym.traces.formats.definitions import typestore as typestore
+from bufgym.traces.formats.faults import LeftOut, StrPath, fault
 from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE
 from bufgym.traces.poses import Poses, unit
+from bufgym.traces.trace import Float64Array, Int64Array
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 _POSE_TYPES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-_TF_TYPES: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 # Names of topics on which a pose is where a robot shall go, or what a person says. The page's frames.js has them too.
 _GOAL: Final = re.compile(
     r"(^|[/_])(goals?|targets?|(way|set)_?points?|clicked|desired|cmd|command|(goal|target|set|initial)_?pose)"
     r"([^a-z/][^/]*)?(/(pose|local|global))?$"
 )
+_PUBLISHER: Final = re.compile(r"([^:@]+)@([0-9]{1,4})(|:.*)")
 # Robots have dozens of transforms; an error message lists no more than these.
 _LISTED_FRAMES: Final = 8
 
@@ -29,18 +33,9 @@ Frames = tuple[str, str]
 """The frame in which a pose is, and the frame whose pose it is (empty where the message does not say)."""
 
 
-@dataclass(frozen=True)
-class BagTopic:
-    """What the messages of one topic are."""
-
-    topic: str  # its name
-    type: str  # the ROS message type, such as "nav_msgs/msg/Odometry"; the schema's name elsewhere
-    encoding: str  # "cdr", "ros1" or what the MCAP file says
-
-
 def carries_poses(topic: str, type: str) -> bool:
     """Whether the messages of this topic say where a robot is; a goal does not."""
-    return type in _TF_TYPES or type == ODOMETRY or (type in _POSE_TYPES and not is_goal(topic))
+    return type in TF_TYPES or type == ODOMETRY or (type in _POSE_TYPES and not is_goal(topic))
 
 
 def is_goal(topic: str) -> bool:
@@ -78,47 +73,100 @@ class PoseCollector:
     """Decodes the messages of one topic and keeps their poses."""
 
     def __init__(self, path: StrPath, spec: str) -> None:
-        """Take the recording, for error messages, and what ``named_source`` splits."""
-        self.path, self._spec = path, spec
-        self.topic, self._frames = named_source(spec)
-        self._poses: dict[Frames, list[tuple[int, tuple[float, ...]]]] = {}
+        """Take the recording, for error messages, and what ``named_source`` splits, the topic also as ``TOPIC@2``.
 
-    def add(self, channel: BagTopic, time_ns: int, data: bytes) -> None:
-        """Keep the poses of a message that was logged at `time_ns`."""
+        The number after ``@`` chooses one of several publishers of the topic, in order of their first messages.
+        """
+        self.path, self._spec = path, spec
+        match = _PUBLISHER.fullmatch(spec)
+        self._publisher = int(match[2]) if match else None
+        self.topic, self._frames = named_source(match[1] + match[3] if match else spec)
+        self._checked: set[BagTopic] = set()
+        self._count = 0
+        self._file: Path | None = None
+        self._numbers: dict[int, int] = {}  # of a channel in this file -> publisher, from 1 in order of first messages
+        self._publishers: dict[int, str] = {}  # their names
+        self._poses: dict[tuple[Frames, int], list[tuple[int, tuple[float, ...]]]] = {}
+
+    def add(self, file: Path, channel: BagTopic, time_ns: int, data: bytes) -> None:
+        """Keep the poses of a message in this file that was logged at `time_ns`."""
+        self._count += 1
+        if file != self._file:
+            self._file, self._numbers = file, {}
+        number = self._numbers.setdefault(channel.number, len(self._numbers) + 1)
+        self._publishers.setdefault(number, channel.publisher)
+        if self._publisher not in (None, number):
+            return
         for _, frames, position, orientation in placed(self._decoded(channel, data)):
-            self._keep(frames, time_ns, position, orientation)
+            self._keep((frames, number), time_ns, position, orientation)
 
     def poses(self, topics: dict[str, str]) -> tuple[int, Poses]:
         """Time of the first (ns), and the poses with times from there; of poses at the same time the last counts."""
         if self.topic not in topics:
             raise BufgymError(f"{self.path}: no topic {self.topic!r}; it has: {', '.join(topics) or 'none'}")
-        fitting = [frames for frames in self._poses if frames[: len(self._frames)] == self._frames]
+        known = sorted({frames for frames, _ in self._poses})
+        fitting = [frames for frames in known if frames[: len(self._frames)] == self._frames]
         if len(fitting) != 1:
-            known = [f"{self.topic}:{':'.join(filter(None, frames))}" for frames in sorted(self._poses)]
-            more = f" and {len(known) - _LISTED_FRAMES} more" if len(known) > _LISTED_FRAMES else ""
-            what = "has no pose" if not known else f"say which frames: {', '.join(known[:_LISTED_FRAMES])}{more}"
+            names = [f"{self.topic}:{':'.join(filter(None, frames))}" for frames in known]
+            more = f" and {len(names) - _LISTED_FRAMES} more" if len(names) > _LISTED_FRAMES else ""
+            what = "has no pose" if not names else f"say which frames: {', '.join(names[:_LISTED_FRAMES])}{more}"
             raise BufgymError(f"{self.path}: odom = {self._spec!r}: {what}")
-        by_ns = dict(sorted(self._poses[fitting[0]], key=lambda pose: pose[0]))
-        from_ns = min(by_ns)
-        # Two within a microsecond are one.
-        by_us = {(time_ns - from_ns) // 1000: values for time_ns, values in by_ns.items()}
-        if len(by_us) < 2:
-            raise BufgymError(f"{self.path}: odom = {self.topic!r} has {len(by_us)} pose: needs at least 2")
-        values = np.array(list(by_us.values()))
-        return from_ns, Poses(np.array(list(by_us), np.int64), values[:, :3], unit(values[:, 3:]), self.topic)
+        times_ns, values = self._of_one_publisher(fitting[0])
+        from_ns = int(times_ns[0])
+        time_us = (times_ns - from_ns) // 1000
+        left_out = LeftOut()
+        left_out.add(time_us, np.arange(1, len(time_us) + 1))
+        last = np.append(time_us[1:] != time_us[:-1], True)  # two within a microsecond are one
+        if np.count_nonzero(last) < 2:
+            count = f", {len(time_us)} poses of one time" if len(time_us) > 1 else ""
+            raise BufgymError(f"{self.path}: odom = {self.topic!r} has 1 pose{count}: needs at least 2")
+        note = left_out.said(self.path, f"poses on {self.topic}", "pose")
+        positions, quaternions = values[last, :3], unit(values[last, 3:])
+        return from_ns, Poses(time_us[last], positions, quaternions, f"{self.topic}{note}")
+
+    def _of_one_publisher(self, frames: Frames) -> tuple[Int64Array, Float64Array]:
+        """Times in ns and values of the poses in these frames, in order of time.
+
+        Publishers that follow each other, as when a node was started again, count as one.
+        """
+        by_number = {number: poses for (other, number), poses in self._poses.items() if other == frames}
+        spans = sorted((min(poses)[0], max(poses)[0]) for poses in by_number.values())
+        if any(begin <= end for (_, end), (begin, _) in itertools.pairwise(spans)):
+            names = self._publishers
+            listed = [
+                f"{self.topic}@{number} ({len(poses):,} poses{names[number] and f' by {names[number]}'})"
+                for number, poses in sorted(by_number.items())
+            ]
+            more = f" and {len(listed) - _LISTED_FRAMES} more" if len(listed) > _LISTED_FRAMES else ""
+            what = f"{len(listed)} publishers send at once: say which: {', '.join(listed[:_LISTED_FRAMES])}{more}"
+            raise BufgymError(f"{self.path}: odom = {self._spec!r}: {what}")
+        poses = [pose for poses in by_number.values() for pose in poses]
+        times_ns = np.array([time_ns for time_ns, _ in poses], np.int64)
+        order = np.argsort(times_ns, kind="stable")
+        return times_ns[order], np.array([values for _, values in poses])[order]
 
     def _decoded(self, channel: BagTopic, data: bytes) -> Any:
         if not carries_poses(channel.topic, channel.type):
-            rule = f"must be one of {', '.join(_POSE_TYPES)}, {', '.join(_TF_TYPES)}"
+            rule = f"must be one of {', '.join(_POSE_TYPES)}, {', '.join(TF_TYPES)}"
             raise BufgymError(f"{self.path}: {self.topic} carries {channel.type or 'no known type'}: {rule}")
         if channel.encoding not in ("cdr", "ros1"):
             raise BufgymError(f"{self.path}: {self.topic} is encoded in {channel.encoding!r}: must be cdr or ros1")
+        if channel not in self._checked:
+            check_definition(self.path, channel)
+            self._checked.add(channel)
+        if channel.encoding == "cdr":
+            check_form(self.path, f"message {self._count} on {self.topic}", data)
         store = typestore(channel.encoding)
         decode = store.deserialize_cdr if channel.encoding == "cdr" else store.deserialize_ros1
-        return decode(data, channel.type)
+        try:
+            return decode(data, channel.type)
+        except Exception as error:
+            words = " ".join(str(error).split())[:160] or "no more data"
+            rule = f"cut off or damaged, or of another definition than {channel.type} has in ROS"
+            raise fault(self.path, f"message {self._count} on {self.topic} is {rule}: {words}") from error
 
-    def _keep(self, frames: Frames, time_ns: int, position: Any, quaternion: Any) -> None:
-        poses = self._poses.setdefault(frames, [])
+    def _keep(self, source: tuple[Frames, int], time_ns: int, position: Any, quaternion: Any) -> None:
+        poses = self._poses.setdefault(source, [])
         field = f"{self.topic}, pose {len(poses) + 1}"
         values = (position.x, position.y, position.z, quaternion.x, quaternion.y, quaternion.z, quaternion.w)
         # Written so that NaN fails.
@@ -129,15 +177,3 @@ class PoseCollector:
         if not abs(norm - 1) <= NORM_TOLERANCE:
             raise fault(self.path, "must be 1 within 1 %", value=f"{norm:.6g}", field=f"{field}, norm")
         poses.append((time_ns, values))
-
-
-@functools.cache
-def typestore(encoding: str) -> Any:
-    """The types of ROS 2 (``cdr``) or ROS 1 (``ros1``), with those of tf in both."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY if encoding == "cdr" else Stores.ROS1_NOETIC)
-    for name in _TF_TYPES:
-        if name not in store.fielddefs:
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
-    return store

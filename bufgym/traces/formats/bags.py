@@ -15,10 +15,10 @@ import numpy as np
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.bag_files import MAX_TOPICS, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
-from bufgym.traces.formats.clocks import LogTimes
+from bufgym.traces.formats.clocks import LogTimes, warn_of_shared_times
 from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.splits import damage_errors, split_messages, splits
-from bufgym.traces.formats.trajectories import warn_of_jumps
 from bufgym.traces.poses import Poses
 from bufgym.traces.trace import Int64Array
 
@@ -55,7 +55,8 @@ def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], ob
 
     Args:
         path: an MCAP file, a ROS 1 bag, a rosbag2 folder or ``.db3`` file (see `splits`).
-        odom: topic to take poses from, of one frame alone (``TOPIC:FRAME``; for tf, ``TOPIC:PARENT:CHILD``).
+        odom: topic to take poses from, of one frame alone (``TOPIC:FRAME``; for tf, ``TOPIC:PARENT:CHILD``), of one
+            publisher alone (``TOPIC@2``).
         advance: called with 1 for each message read, as a progress bar's update.
 
     Raises:
@@ -76,18 +77,19 @@ def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], ob
             times.add(channel, logged_ns, data)
             sizes.append(max(1, len(data)))
             if collector is not None and channel.topic == collector.topic:
-                collector.add(channel, logged_ns, data)
+                collector.add(file, channel, logged_ns, data)
         advance(1)
     order, size_bytes = times.order(), np.array(sizes, np.int64)
     topics = {name: types.get(name, "") for name in sorted({*types, *times.topics})}
     places = {name: k for k, name in enumerate(topics)}
     place = np.array([places[name] for name in times.topics], np.int64)
     topic = place[times.topic[order]]
+    warn_of_shared_times(path, times.time_ns[order], topic, list(topics))
     bag = Bag(str(path), files[0].kind, topics, times.time_ns[order], size_bytes[order], topic, order)
     if collector is None:
         return bag
     from_ns, poses = collector.poses(topics)
-    warn_of_jumps(path, poses)
+    warn_of_leaps(path, poses)
     return replace(bag, poses=poses, poses_from_ns=from_ns)
 
 

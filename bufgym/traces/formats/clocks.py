@@ -6,14 +6,15 @@ and units", says what is refused and what is warned of.
 
 import struct
 from array import array
+from collections.abc import Sequence
 from functools import cache
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.traces.formats.bag_poses import BagTopic, typestore
-from bufgym.traces.formats.faults import StrPath, fault, warn
+from bufgym.traces.formats.definitions import BagTopic, is_plain_cdr, typestore
+from bufgym.traces.formats.faults import LeftOut, StrPath, fault, warn
 from bufgym.traces.trace import MAX_DURATION_S, Int64Array, first_true
 
 NS_PER_S: Final = 10**9
@@ -133,6 +134,16 @@ class LogTimes:
         return f"message {k + 1} ({topic}, logged at {seconds}.{ns // 10**6:03d} s)"
 
 
+def warn_of_shared_times(path: StrPath, time: Int64Array, topic: Int64Array, names: Sequence[str]) -> None:
+    """Warn of topics whose messages arrive several at a time, in any unit: a clock of coarse steps has logged them."""
+    by_topic = np.argsort(topic, kind="stable")
+    for places in np.split(by_topic, np.flatnonzero(np.diff(topic[by_topic])) + 1):
+        if len(places):
+            shared = LeftOut()
+            shared.add(time[places], places + 1)
+            shared.said(path, f"messages on {names[topic[places[0]]]}", "message", ": they arrive at once", verb="")
+
+
 def _goes_back(time_ns: Int64Array) -> npt.NDArray[np.bool_]:
     """Whether the clock went back before each message of a topic but the first, bool[n-1].
 
@@ -172,6 +183,8 @@ def _has_stamp(type: str, encoding: str) -> bool:
 def _stamp_ns(channel: BagTopic, data: bytes) -> int | None:
     """The header stamp of a message, ns; None where it has none, or none above 0."""
     if len(data) < 12 or not _has_stamp(channel.type, channel.encoding):
+        return None
+    if channel.encoding == "cdr" and not is_plain_cdr(data):
         return None
     # Before it stand 4 bytes: of CDR its encoding, of ROS 1 a sequence number.
     seconds, ns = _HEADER[channel.encoding == "ros1" or bool(data[1] & 1)].unpack_from(data)

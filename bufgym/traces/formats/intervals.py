@@ -1,13 +1,15 @@
 """Intervals that follow each other, each with its length and its bytes: what the readers of measurements share."""
 
+import re
 from array import array
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from bufgym.traces.formats.faults import StrPath, fault, warn
-from bufgym.traces.formats.text import Line
+from bufgym.traces.formats.faults import LeftOut, StrPath, fault, warn
+from bufgym.traces.formats.text import NUMBER, Line
+from bufgym.traces.formats.units import check_seconds
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array
 
 MAX_INTERVAL_BYTES: Final = 10**12
@@ -88,12 +90,14 @@ class Rate(NamedTuple):
 def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     """The capacity when each rate holds until the next line's time, and the last one for the median interval.
 
-    The first time becomes 0. If several lines have the same time, as in 30 of the Lumos5G files, the last counts. Each
-    interval's bytes are rounded to a whole number, so the total is off by at most half a byte a line.
+    The first time becomes 0. If several lines have the same time, as in 30 of the Lumos5G files, the last counts, and
+    the note or a warning says how many are left out. Each interval's bytes are rounded to a whole number, so the total
+    is off by at most half a byte a line.
     """
     intervals = Intervals()
     previous = again = None
     steps: list[Rate] = []  # the rate at the end of each interval
+    starts_us, lines, total_bytes_per_us = array("q"), array("q"), 0.0
     for rate in rates:
         if previous is not None:
             length_us = rate.start_us - previous.start_us
@@ -108,20 +112,33 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
                 intervals.add(length_us, round(previous.bytes_per_us * length_us))
                 steps.append(rate)
         previous = rate
+        starts_us.append(rate.start_us)
+        lines.append(rate.line.number)
+        total_bytes_per_us += rate.bytes_per_us
     if previous is None:
         raise fault(path, "is empty: must hold a line for each sample")
     if not len(intervals):
-        line = previous.line
+        line, count = previous.line, len(starts_us)
+        if count > 1:
+            raise line.error(previous.time, f"must differ from the times above, {count} samples of one time", "time")
         raise line.error(line.text, "must have a second line: how long a single rate holds is unknown")
     length_us = round(float(np.median(np.asarray(intervals.us))))
+    if re.fullmatch(NUMBER, previous.time):
+        check_seconds(path, starts_us[0] / US_PER_S, length_us / US_PER_S)
+    note = ""
     if again is not None and length_us > HOLE_S * US_PER_S:
         doubt = (
             f"{again.time} is the time of the line above, where {length_us / US_PER_S:g} s is usual: this one counts"
         )
         warn(path, doubt, line=again.line.number)
+    else:
+        left_out = LeftOut()
+        left_out.add(np.asarray(starts_us, np.int64), np.asarray(lines, np.int64))
+        mean = f": the mean of all lines is {total_bytes_per_us / len(starts_us) * 1000:,.6g} KB/s"
+        note = left_out.said(path, "lines", effect=mean).removeprefix(", ")
     _warn_of_holes(path, np.array(intervals.us, np.int64), length_us, steps)
     intervals.add(length_us, round(previous.bytes_per_us * length_us))
-    return intervals.knots(path)
+    return intervals.knots(path, note)
 
 
 def _warn_of_holes(path: StrPath, lengths_us: Int64Array, usual_us: int, steps: list[Rate]) -> None:

@@ -18,9 +18,10 @@ from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces.formats import tables
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
+from bufgym.traces.formats.iperf3 import DIRECTIONS, read_iperf3
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
-from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_iperf3, read_nuttcp, read_runs
+from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_nuttcp, read_runs
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace
@@ -57,7 +58,7 @@ FORMATS: Final[dict[str, Format]] = {
     ),
     "sabre": Format("JSON list", _cells(r"\["), read_sabre),
     "nuttcp": Format("nuttcp's log", lambda text: INTERVAL.fullmatch(text) or REMARK.fullmatch(text), read_nuttcp),
-    "iperf3": Format("JSON objects", _cells(r"\{"), read_iperf3),
+    "iperf3": Format("JSON objects", _cells(r"\{"), read_iperf3, DIRECTIONS),
     "runs": Format("Run 1, or ###", lambda text: RUN.fullmatch(text) or RULER.fullmatch(text), read_runs, RUNS),
 }
 
@@ -70,7 +71,7 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         format: one of `FORMATS`; by default it is detected from the content.
         after: as in `Trace`.
         column: the one to read, where a format has several (`ucc`: DL_bitrate, the default, or UL_bitrate; `runs`:
-            run 1, the default, run 2, ...).
+            run 1, the default, run 2, ...; `iperf3 --bidir`: upload, the default, or download).
 
     Returns:
         The trace, named after the file; `source` states the file, the format, and anything notable about the reading.

@@ -7,7 +7,7 @@ Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import datetime
 from typing import Any, Final
 
@@ -114,11 +114,20 @@ def read_json(path: StrPath) -> Any:
     return values[0]
 
 
-def read_json_values(path: StrPath) -> list[Any]:
-    """The values of JSON that follow each other in the file, whose numbers are finite."""
+def _once(members: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The object with these members, each of which has a name of its own."""
+    item = dict(members)
+    if len(item) < len(members):
+        twice = next(name for k, (name, _) in enumerate(members) if name in dict(members[:k]))
+        raise ValueError(f"an object holds {twice!r} twice: must hold it once")
+    return item
+
+
+def read_json_values(path: StrPath, pairs: Callable[[list[tuple[str, Any]]], dict[str, Any]] = _once) -> list[Any]:
+    """The values of JSON that follow each other in the file, whose numbers are finite; see `strict_json.Decoder`."""
     with open_text(path) as file:
         text = file.text()
-    decoder, values = strict_json.Decoder(), []
+    decoder, values = strict_json.Decoder(pairs), []
     at = len(text) - len(text.lstrip())
     try:
         while at < len(text):

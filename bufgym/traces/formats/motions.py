@@ -1,12 +1,14 @@
 """Motion from files: camera trajectories (see `trajectories`), or CSV of finished coordinates, header `t_s,motion`."""
 
+from collections.abc import Callable
 from typing import Final
 
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.links import trace_name
+from bufgym.traces.formats.rows import read_rows
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import Line, decimals, is_header, open_text, write_text
-from bufgym.traces.formats.trajectories import read_poses, read_rows, seconds
+from bufgym.traces.formats.trajectories import read_poses, seconds
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
 
 MOTION_HEADER: Final = "t_s,motion"
@@ -15,22 +17,29 @@ MAX_COORDINATE: Final = 1e9
 
 
 def read_motion(
-    path: StrPath, settings: MotionSettings | None = None, *, format: str | None = None, times: StrPath | None = None
+    path: StrPath,
+    settings: MotionSettings | None = None,
+    *,
+    format: str | None = None,
+    times: StrPath | None = None,
+    advance: Callable[[int], object] = int,
 ) -> Motion:
     """Read a trajectory (TUM, EuRoC, KITTI) or a `t_s,motion` CSV, plain or gzip'd, recognised by the first line.
 
     The first time becomes 0. A CSV holds finished coordinates, which are used as they are, minus the first. Stretches
     without a pose are bridged and listed in `Motion.gaps`.
 
-    A trajectory is read as by `trajectories.read_poses`, and its motion measured by `motion_from_poses`.
+    A trajectory is read as by `trajectories.read_poses`, and its motion measured by `motion_from_poses`. ``advance`` is
+    called with the number of lines just read.
     """
     refuse_recording(path, "must be a trajectory (motion in it is taken with --odom)")
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
     if first is not None and format is None and times is None and is_header(first.text, MOTION_HEADER):
-        time_us, values = read_rows(path, _motion_row, skip=first.number)
-        return Motion(trace_name(path), time_us, values[:, 0] - values[0, 0], f"{path} ({MOTION_HEADER})")
-    poses = read_poses(path, format=format, times=times)
+        rows = read_rows(path, _motion_row, skip=first.number, advance=advance)
+        moved, source = rows.values[:, 0] - rows.values[0, 0], f"{path} ({MOTION_HEADER}{rows.note})"
+        return Motion(trace_name(path), rows.time_us, moved, source)
+    poses = read_poses(path, format=format, times=times, advance=advance)
     source = f"{path} (trajectory, format {poses.format})"
     return motion_from_poses(poses, settings, name=trace_name(path), source=source)
 

@@ -4,13 +4,15 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats import bags
-from bufgym.traces.formats.faults import StrPath
+from bufgym.traces.formats.clocks import NS_PER_S
+from bufgym.traces.formats.faults import StrPath, warn
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.splits import is_recording
 from bufgym.traces.formats.workloads import read_workload_csv
@@ -18,6 +20,9 @@ from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import gaps_between, longest_s
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym.traces.workload import Workload
+
+_FAR_S: Final = 60  # From a few first or last messages to all others
+_FEW: Final = 0.1  # Of all messages
 
 
 def read_workload(
@@ -65,7 +70,10 @@ def workload_from_bag(
     if not chosen.any():
         raise BufgymError(f"{bag.path}: no message on {', '.join(names) or 'any topic'}")
     time_ns = bag.time_ns[chosen]
-    x, gaps = _motion_at(time_ns, bag, settings, bridge_gaps)
+    distant = _distant(time_ns, [names[number] for number in topic])
+    if distant and (bag.poses is None or bridge_gaps):
+        warn(bag.path, distant)
+    x, gaps = _motion_at(time_ns, bag, settings, bridge_gaps, distant)
     measured = ""
     if bag.poses is not None:
         view = f"{settings.fov_deg:g} degrees, {settings.scene_scale_m:g} m"
@@ -79,7 +87,7 @@ def workload_from_bag(
 
 
 def _motion_at(
-    time_ns: Int64Array, bag: bags.Bag, settings: MotionSettings, bridge_gaps: bool
+    time_ns: Int64Array, bag: bags.Bag, settings: MotionSettings, bridge_gaps: bool, distant: str
 ) -> tuple[Float64Array | None, tuple[tuple[int, int], ...]]:
     """x of messages at these times, from 0, and the gaps in the poses between them; None without poses."""
     if bag.poses is None:
@@ -88,6 +96,8 @@ def _motion_at(
     time_us = (time_ns - bag.poses_from_ns) // 1000
     gaps = _gaps(time_us, bag.poses.time_us, settings.max_gap_s)
     if gaps and not bridge_gaps:
+        if distant and len(gaps) == 1:
+            raise BufgymError(f"{bag.path}: {distant}: choose other topics, or say --bridge-gaps (bridge_gaps=True)")
         start, _ = max(gaps, key=lambda gap: gap[1] - gap[0])
         count = f"{len(gaps)} gaps" if len(gaps) > 1 else "a gap"
         raise BufgymError(
@@ -98,6 +108,27 @@ def _motion_at(
     # Before the first pose and after the last no motion is known: np.interp holds its ends.
     x = np.interp(time_us, motion.time_us, motion.coordinate)
     return x - x[0], gaps
+
+
+def _distant(time_ns: Int64Array, topics: Sequence[str]) -> str:
+    """Says of a few first or last messages that they are far from all others, as a map is that was latched; or "".
+
+    Far is more than a minute, and longer than the others take.
+    """
+    if len(time_ns) < 2:
+        return ""
+    steps_ns = np.diff(time_ns)
+    k = int(np.argmax(steps_ns))
+    hole_s, first = steps_ns[k] / NS_PER_S, k + 1 <= len(steps_ns) - k
+    count = min(k + 1, len(steps_ns) - k)
+    others = time_ns[k + 1 :] if first else time_ns[: k + 1]
+    others_s = (others[-1] - others[0]) / NS_PER_S
+    if hole_s <= _FAR_S or hole_s <= others_s or count > max(1, _FEW * len(time_ns)):
+        return ""
+    place, side = ("first", "before") if first else ("last", "after")
+    on = ", ".join(sorted(set(topics[: k + 1] if first else topics[k + 1 :])))
+    which = f"the {place} {count} messages ({on}) are" if count > 1 else f"the {place} message ({on}) is"
+    return f"{which} logged {hole_s:.1f} s {side} the other {len(others):,}, which take {others_s:.3f} s"
 
 
 def _gaps(arrival_us: Int64Array, pose_us: Int64Array, max_gap_s: float) -> tuple[tuple[int, int], ...]:

@@ -1,18 +1,16 @@
-"""Readers of speed tests: logs of nuttcp, JSON of iperf3, and lists of runs.
+"""Readers of speed tests: logs of nuttcp, and lists of runs. `iperf3` reads the JSON of iperf3.
 
 Sources of the recordings that they were checked on: M. Ghoshal et al., "A First Large-Scale Study of Operational 5G
-Standalone Networks", CoNEXT 2025 (nuttcp); the WiFi measurements of an industrial robot in a shipyard,
-github.com/minarady1/wifi_for_industrial_robotics (iperf3); M. Ghoshal et al., "An In-Depth Study of Uplink Performance
-of 5G mmWave Networks", 5G-MeMU 2022 (lists).
+Standalone Networks", CoNEXT 2025 (nuttcp); M. Ghoshal et al., "An In-Depth Study of Uplink Performance of 5G mmWave
+Networks", 5G-MeMU 2022 (lists).
 """
 
 import re
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.logs import json_items, json_number, read_json_values
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
@@ -20,9 +18,10 @@ from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 MAX_INTERVAL_S: Final = 3600  # Longest interval of a speed test, s; a longer one does not measure a changing link
 
 _STAMP: Final = r"(?:\[[0-9T:.+ -]+\] *)?"
-INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%)(.*)")
+INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%TX)(.*)")
 REMARK: Final = re.compile(_STAMP + r"(?:nuttcp(?:-[tr])?:.*|[0-9.]+ +MB +/.*%.*|(?:Start|End) time: *[0-9]+|)")
 _MBIT_PER_MB: Final = 2**20 * 8e-6
+_LOSS: Final = re.compile(r"(-?[0-9]+) +/ +([0-9]+) +~?drop/pkt")  # of a UDP test, packets lost and packets sent
 # The interval's length is printed with two decimals.
 _LENGTH_ERROR: Final = 0.02
 
@@ -32,8 +31,9 @@ def read_nuttcp(path: StrPath) -> Knots:
 
     Intervals follow each other with the length that each line states: the stamps say when lines were printed, which
     they are in bursts. A failed run ("error") is no recording, and is refused, as are rates that the bytes contradict.
+    Over UDP the bytes are those that the receiver got, and the note says how many packets were lost.
     """
-    intervals = Intervals()
+    intervals, lost, sent = Intervals(), 0, 0
     with open_text(path) as file:
         for line in file.lines():
             match = INTERVAL.fullmatch(line.text)
@@ -50,55 +50,10 @@ def read_nuttcp(path: StrPath) -> Knots:
             if abs(stated - computed) > _LENGTH_ERROR * computed + 0.01:
                 raise line.error(match[3], f"must be MB / sec, {computed:.4g}", "Mbps")
             intervals.add(round(length_s * US_PER_S), round(megabytes * 2**20))
-    return intervals.knots(path, f"{len(intervals)} intervals")
-
-
-# Of one interval to the next; both are the same clock, written with six decimals.
-_MAX_STEP_S: Final = 1e-3
-
-
-def read_iperf3(path: StrPath) -> Knots:
-    """The JSON of `iperf3 --json`: `intervals[].sum` with `start`, `end`, `bytes`; or of `--json-stream`, where each
-    interval is an event on a line of its own. Intervals that iperf3 omitted from its own result are left out. The note
-    says on which side it was measured: the sender counts what went into its socket, the receiver what came out.
-    """
-    report = _report(path)
-    if not isinstance(report, dict) or not isinstance(report.get("intervals"), list):
-        raise fault(path, "must be an object with a list of intervals, as iperf3 --json writes it")
-    if report.get("error"):
-        raise fault(path, "must be a run that succeeded", value=str(report["error"])[:60], field="error")
-    intervals, sides, previous_s = Intervals(), set[str](), None
-    for line, item in json_items(path, report["intervals"]):
-        measured = item.get("sum") if isinstance(item, dict) else None
-        if not isinstance(measured, dict):
-            raise line.error(line.text, "must hold sum, an object")
-        if measured.get("omitted"):
-            continue
-        start_s, end_s = (float(json_number(line, measured, name, MAX_DURATION_S)) for name in ("start", "end"))
-        count = json_number(line, measured, "bytes", MAX_INTERVAL_BYTES)
-        if not isinstance(count, int):
-            raise line.error(count, "must be a whole number", "bytes")
-        if previous_s is not None and abs(start_s - previous_s) > _MAX_STEP_S:
-            raise line.error(start_s, f"must begin where the interval above ended ({previous_s:g} s)", "start")
-        length_us = round(end_s * US_PER_S) - round((start_s if previous_s is None else previous_s) * US_PER_S)
-        if length_us <= 0:
-            raise line.error(end_s, f"must be after its start ({start_s:g} s)", "end")
-        intervals.add(length_us, count)
-        sides.add("sender" if measured.get("sender") else "receiver")
-        previous_s = end_s
-    return intervals.knots(path, f"measured by the {' and the '.join(sorted(sides)) or 'nobody'}")
-
-
-def _report(path: StrPath) -> Any:
-    """The object that `iperf3 --json` writes, also from the events of `--json-stream`."""
-    values = read_json_values(path)
-    if not any(isinstance(value, dict) and "event" in value for value in values):
-        return values[0] if len(values) == 1 else values
-    by_event: dict[Any, list[Any]] = {}
-    for value in values:
-        if isinstance(value, dict):
-            by_event.setdefault(str(value.get("event")), []).append(value.get("data"))
-    return {"intervals": by_event.get("interval", []), "error": (by_event.get("error") or [None])[0]}
+            if (loss := _LOSS.search(match[4])) is not None:
+                lost, sent = lost + int(loss[1]), sent + int(loss[2])
+    udp = f", UDP, {lost:,} of {sent:,} packets lost" if sent else ""
+    return intervals.knots(path, f"{len(intervals)} intervals{udp}")
 
 
 MAX_RUNS: Final = 16
@@ -131,7 +86,8 @@ def read_runs(path: StrPath, column: str = RUNS[0]) -> Knots:
         raise rates.error(len(cells), f"must be as many as times in the line above ({len(times)})", "samples")
     steps = "times as stated" if len(lines) > 1 else f"a sample each {RUN_STEP_S:g} s"
     note = f"{column} of {len(runs)}, {steps}" + (f", the first of {len(lines) // 2} pairs" if len(lines) > 2 else "")
-    return held_rates(path, _rates(lines[0], times, rates, cells))._replace(note=note)
+    knots = held_rates(path, _rates(lines[0], times, rates, cells))
+    return knots._replace(note=", ".join(filter(None, (note, knots.note))))
 
 
 def runs_of(path: StrPath) -> dict[str, list[Line]]:

@@ -2,7 +2,8 @@
 
 A recording is one file, or a rosbag2 folder. A folder has the files that its ``metadata.yaml`` names, in that order,
 and no others. A folder without it, as a recorder leaves it that was killed, has all its ``.mcap`` and ``.db3`` files in
-order of time, which a warning says. A stranger's YAML can be endless, so four of its entries are read line by line.
+order of time, which a warning says. A stranger's YAML can be nested so deep that its parser crashes, so its depth is
+measured first.
 
 What a file holds is told from its first bytes. One that zstd packed as a whole (``.zstd``) is read from an unpacked
 copy. A SQLite file with a journal beside it (``-wal``, ``-journal``) is read from a copy of both, because SQLite
@@ -10,7 +11,6 @@ changes both when it reads them, and without the journal messages would be missi
 """
 
 import filecmp
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterator
@@ -21,7 +21,7 @@ from typing import Final
 
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_utf8
-from bufgym.ground.libraries import missing
+from bufgym.ground.libraries import library, missing
 from bufgym.traces.formats import bag_files
 from bufgym.traces.formats.bag_files import SOURCES, Message, RefusedError, Unpacked, journals, unzstd, unzstd_pieces
 from bufgym.traces.formats.faults import StrPath, fault, os_errors, warn
@@ -32,9 +32,11 @@ _RULE: Final = "must be an MCAP file, a ROS 1 bag, or a rosbag2 folder or .db3 f
 _MAGICS: Final = {b"\x89MCAP0\r\n": "mcap", b"#ROSBAG V": "ros1", b"SQLite format 3\0": "rosbag2"}
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _METADATA: Final = "metadata.yaml"
+_INFORMATION: Final = "rosbag2_bagfile_information"
 _ENDINGS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _STORAGES: Final = {"sqlite3": "rosbag2", "mcap": "mcap"}
-_STORAGE: Final = re.compile(r"\s*(storage_identifier|compression_format|compression_mode):(.*)")
+_NONE: Final = ("", "none", "null", "~")  # of a compression, in small letters
+_MOST_NESTED: Final = 50  # ROS 2 writes six levels
 _LISTED_FILES: Final = 20  # A warning names no more
 _MENDS: Final = {
     "mcap": "`mcap recover {0} -o sound.mcap`",
@@ -179,7 +181,7 @@ def _listed(folder: Path) -> list[Split]:
     """The files that the folder's metadata names."""
     storage, names = _metadata(folder / _METADATA)
     mode, form = storage.get("compression_mode", "").lower(), storage.get("compression_format", "")
-    if mode not in ("", "none") and form != "zstd":
+    if mode not in _NONE and form != "zstd":
         raise fault(folder / _METADATA, f"compression {form!r}: must be zstd")
     identifier = storage.get("storage_identifier", "")
     if identifier not in _STORAGES:
@@ -232,23 +234,25 @@ def _begins_ns(split: Split) -> int:
 
 
 def _metadata(path: Path) -> tuple[dict[str, str], list[str]]:
-    """How the files are stored, and their names, as ROS 2 writes them: a line each."""
-    storage: dict[str, str] = {}
-    names: list[str] = []
-    listing = False
-    for line in read_utf8(path, MAX_METADATA_BYTES).splitlines():
-        text = line.strip()
-        if listing and text.startswith("- "):
-            names.append(Path(_scalar(text[2:])).name)
-            continue
-        listing = text == "relative_file_paths:"
-        if (match := _STORAGE.fullmatch(line)) is not None:
-            storage.setdefault(match[1], _scalar(match[2]))
-    return storage, list(dict.fromkeys(names))
-
-
-def _scalar(text: str) -> str:
-    """A YAML scalar of one line, without its quotes."""
-    text = text.strip()
-    quoted = len(text) >= 2 and text[0] == text[-1] and text[0] in "'\""
-    return text[1:-1] if quoted else text
+    """How the files are stored, and their names."""
+    yaml = library("yaml", "ros", f"{path}: reading recordings")
+    loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # all scalars are text; libyaml's is ten times as fast
+    text, depth = read_utf8(path, MAX_METADATA_BYTES), 0
+    try:
+        for event in yaml.parse(text, loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MOST_NESTED:
+                raise fault(path, f"nested more than {_MOST_NESTED} deep: must be as ROS 2 writes it")
+        content = yaml.load(text, loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = " ".join(str(getattr(error, "problem", None) or error).split())[:160]
+        raise fault(path, f"must be YAML ({problem})", line=mark and mark.line + 1) from error
+    about = content.get(_INFORMATION) if isinstance(content, dict) else None
+    if not isinstance(about, dict):
+        raise fault(path, f"must hold {_INFORMATION}, as ROS 2 writes it")
+    names = about.get("relative_file_paths") or []
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise fault(path, "relative_file_paths must be a list of names")
+    storage = {key: value if isinstance(value, str) else str(value) for key, value in about.items()}
+    return storage, list(dict.fromkeys(Path(name).name for name in names))

@@ -1,8 +1,8 @@
 """Text files, written completely or not at all, and read with bounds: plain or gzip'd.
 
 Every reader gets its lines from here, so that a directory, a truncated download, a binary file or a compression bomb
-ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of text after decompression, 10**7 lines,
-4096 characters a line, and for what is held as a whole 16 MiB of JSON and 128 MiB of Mahimahi's numbers.
+ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of text after decompression, 2 * 10**7
+lines, 4096 characters a line, and for what is held as a whole 16 MiB of JSON and 128 MiB of Mahimahi's numbers.
 """
 
 import gzip
@@ -23,8 +23,10 @@ from bufgym.traces.formats.faults import StrPath, fault, os_errors
 # Text after decompression; reading stops as soon as there is more.
 MAX_TEXT_BYTES: Final = 4 * 2**30
 MAX_LINE_CHARACTERS: Final = 4096
-MAX_LINES: Final = 10**7
+MAX_LINES: Final = 2 * 10**7  # 24 h of poses at 200 Hz are 17 million
 MAX_JSON_BYTES: Final = 16 * 2**20
+
+_BLOCK_BYTES: Final = 2**22
 
 _GZIP_MAGIC = b"\x1f\x8b"
 _ZIP_MAGIC = b"PK\x03\x04"
@@ -147,6 +149,36 @@ class TextFile:
             if line.text:
                 yield line
 
+    def blocks(self) -> Iterator[tuple[int, bytes]]:
+        """All lines in blocks of some MB, each with the number of its first line; see `block_lines`.
+
+        Raises TraceError as `lines`, a block at a time.
+        """
+        number, rest = 1, b""
+        while data := self._take(_BLOCK_BYTES, number, whole_line=False):
+            cut = data.rfind(b"\n") + 1
+            if cut:
+                yield number, rest + data[:cut]
+                number += (rest + data[:cut]).count(b"\n")
+            rest = data[cut:] if cut else rest + data
+            if len(rest) > MAX_LINE_CHARACTERS + 2:
+                raise _too_long(_parsed_line(self.path, number, rest[: MAX_LINE_CHARACTERS + 2]))
+            self._count(number - 1)
+        if rest:
+            self._count(number)
+            yield number, rest
+
+    def block_lines(self, number: int, block: bytes) -> Iterator[Line]:
+        """The lines of a block that are not blank; `number` is that of its first line."""
+        for k, raw in enumerate(block.split(b"\n"), number):
+            line = _parsed_line(self.path, k, raw)
+            if line.text:
+                yield line
+
+    def _count(self, number: int) -> None:
+        if number > MAX_LINES:
+            raise fault(self.path, f"more than {MAX_LINES} lines: must be fewer", line=number)
+
     def below_header(self, header: str, fits: Callable[[str], object]) -> tuple[str, Iterator[Line]]:
         """The first line, which must be that ``header`` (in words), and the lines below it."""
         lines = self.lines()
@@ -195,8 +227,7 @@ class TextFile:
             raw = self._take(MAX_LINE_CHARACTERS + 2, number, whole_line=True)
             if not raw:
                 return
-            if number > MAX_LINES:
-                raise fault(self.path, f"more than {MAX_LINES} lines: must be fewer", line=number)
+            self._count(number)
             yield number, raw
 
     def _take(self, count: int, line: int, whole_line: bool) -> bytes:

@@ -7,15 +7,14 @@
 | `kitti` | a 3x4 matrix row by row, m; the times (one a line) in another file | KITTI [geiger2012kitti] |
 
 Columns of TUM and EuRoC are separated by blanks or commas. The format is recognised by the first lines: 12 numbers are
-KITTI's; a header such as `#timestamp [ns]`, or more than 8 columns, EuRoC's. Without such a header `_unit` finds the
+KITTI's; a header such as `#timestamp [ns]`, or more than 8 columns, EuRoC's. Without such a header `units` finds the
 unit of the times. Then 8 columns in seconds, or between blanks, are TUM's, and other 8 are EuRoC's. x does not depend
 on the order of a quaternion's four.
 """
 
 import math
 import re
-from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from decimal import Decimal
 from pathlib import Path
 from typing import Final
@@ -23,11 +22,13 @@ from typing import Final
 import numpy as np
 
 from bufgym.ground.errors import BufgymError
-from bufgym.traces.formats.faults import StrPath, fault, warn
-from bufgym.traces.formats.text import NUMBER, Line, open_text, split_cells
-from bufgym.traces.poses import Poses, quaternions
-from bufgym.traces.poses import unit as normalized
-from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.leaps import warn_of_leaps
+from bufgym.traces.formats.rows import BlockReader, RowReader, read_rows
+from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_text, split_cells
+from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
+from bufgym.traces.poses import Poses, normalize, quaternions
+from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 POSE_FORMATS: Final = ("tum", "euroc", "kitti")
 
@@ -35,33 +36,26 @@ MAX_POSITION_M: Final = 1e7
 NORM_TOLERANCE: Final = 0.01
 # Seconds since 1970 until the year 5138; a time in ns exceeds it.
 _MAX_EPOCH_S: Final = 1e11
-_MIN_EPOCH_S: Final = 6e8  # A clock that counts from 1970 shows more, and less than the next
-_NEAR_EPOCH_S: Final = 4.2e9
 _EUROC_HEADER: Final = re.compile(r"#\s*timestamp\s*\[(s|ms|us|ns)\]")
 # State estimates continue with the velocity, those of EuRoC's own CSV files also with biases.
 _COLUMNS: Final = {"tum": (8,), "euroc": (8, 11, 17)}
 _NAMES: Final = {"tum": ("tx", "ty", "tz", "qx", "qy", "qz", "qw"), "euroc": ("px", "py", "pz", "qw", "qx", "qy", "qz")}
 _OWN_UNIT: Final = {"tum": "s", "euroc": "ns"}
-_UNIT_S: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_USUAL_STEPS_S: Final = (0.9e-3, 10.0)  # From one pose to the next, where only the steps tell the unit
-_LONGEST_STEP_S: Final = 3600  # The same where the times count from 1970
-_LEAST_STEP_S: Final = 1e-4  # No camera or robot tells its pose more often
 _TIMES_READ: Final = 1000  # Lines by which the unit is found
-MAX_SPEED_M_PER_S: Final = 50
-_STANDS_M: Final = 1.0  # Shorter ways are no jump at any speed: two poses may be logged within microseconds
-_MOST_USUAL_S: Final = 0.1  # So may a car's of a usual step each, which came in a burst; but a slow topic jumps, too
-
-RowReader = Callable[[Line, list[float] | None], tuple[str, int, list[float]]]
-"""Parses a line, given the values of the previous one, into the time as it is written, the time in us, and values."""
+_SURE_NORM: Final = NORM_TOLERANCE - 1e-9  # Whatever the rounding of the norm
+_PLAIN: Final = b"0123456789+-.eE, \t\r\n"  # A block of other bytes is read line by line
 
 
-def read_poses(path: StrPath, *, format: str | None = None, times: StrPath | None = None) -> Poses:
+def read_poses(
+    path: StrPath, *, format: str | None = None, times: StrPath | None = None, advance: Callable[[int], object] = int
+) -> Poses:
     """Read a trajectory, plain or gzip'd; the first time becomes 0.
 
     Args:
         path: the file.
         format: one of `POSE_FORMATS`, with times in its own unit; by default both are found (see above).
         times: KITTI's file of times; by default the file of the same name with ``_times`` beside it.
+        advance: called with the number of lines just read, as a progress bar's update.
 
     Raises:
         TraceError: the file cannot be read, or a line breaks a rule: as many finite numbers as the format has,
@@ -75,44 +69,28 @@ def read_poses(path: StrPath, *, format: str | None = None, times: StrPath | Non
     if format not in POSE_FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(POSE_FORMATS)}")
     if format == "kitti":
-        poses = _read_kitti(path, times, unit)
+        poses = _read_kitti(path, times, unit, advance)
     elif times is not None:
         raise BufgymError(f"times = {str(times)!r}: goes with KITTI matrices only, and {path} is in format {format}")
     else:
-        time_us, values = read_rows(path, _pose_row(format, unit))
+        rows = read_rows(
+            path, _pose_row(format, unit), read_block=_pose_block(format, unit), what="poses", advance=advance
+        )
         note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
-        poses = Poses(time_us, values[:, :3], normalized(values[:, 3:]), f"{format}{note}")
-    warn_of_jumps(path, poses)
+        normalize(rows.values[:, 3:])
+        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}")
+    warn_of_leaps(path, poses)
     return poses
-
-
-def warn_of_jumps(path: StrPath, poses: Poses) -> None:
-    """Warn of poses that no robot can reach from the pose before: localisation was lost, or numbers are wrong."""
-    moved_m = np.linalg.norm(np.diff(poses.position_m, axis=0), axis=1)
-    step_s = np.diff(poses.time_us) / US_PER_S
-    usual_s = min(float(step_s.mean()), _MOST_USUAL_S)
-    jumps = np.flatnonzero((moved_m > _STANDS_M) & (moved_m > MAX_SPEED_M_PER_S * np.maximum(step_s, usual_s)))
-    if not len(jumps):
-        return
-    k = int(jumps[0])
-    more = f", the first of {len(jumps)} jumps" if len(jumps) > 1 else ""
-    warn(
-        path,
-        f"pose {k + 2} of {len(poses.time_us)} ({poses.format}), {poses.time_us[k + 1] / US_PER_S:.3f} s after the "
-        f"first, is {moved_m[k]:.6g} m from the one {step_s[k]:.6g} s before{more}: no robot is faster than "
-        f"{MAX_SPEED_M_PER_S} m/s, and x counts it as motion",
-    )
 
 
 def _detected(path: StrPath) -> tuple[str, str]:
     """The format and the unit of the times that the file's first lines fit."""
     times: list[float] = []
-    columns, blanks = 0, False
+    columns, blanks, named, decimals = 0, False, None, 0
     with open_text(path) as file:
         for line in file.lines():
             if line.text.startswith("#"):
-                if not columns and (header := _EUROC_HEADER.match(line.text)):
-                    return "euroc", header[1]
+                named = named or (None if columns else _EUROC_HEADER.match(line.text))
                 continue
             cells = _cells(line)
             if not columns:
@@ -120,76 +98,18 @@ def _detected(path: StrPath) -> tuple[str, str]:
             if (columns == 12 and blanks) or len(times) == _TIMES_READ or not re.fullmatch(NUMBER, cells[0]):
                 break
             times.append(float(cells[0]))
+            decimals = max(decimals, len(cells[0].partition(".")[2]))
+    if named:
+        warn_of_unit(path, np.array(times), named[1], named=True)
+        return "euroc", named[1]
     if not columns:
         raise fault(path, "is empty: must hold a trajectory or a motion recording")
     if columns == 12 and blanks:
         return "kitti", ""
     likely = "tum" if blanks and columns <= 8 else "euroc"
-    unit = _unit(path, np.array(times), _OWN_UNIT[likely])
+    unit = unit_of(path, np.array(times), _OWN_UNIT[likely], decimals)
+    warn_of_unit(path, np.array(times), unit, named=False)
     return ("tum" if unit == "s" and columns <= 8 else likely), unit
-
-
-def _unit(path: StrPath, times: Float64Array, own: str) -> str:
-    """The unit of a trajectory's times: that in which they are dates, else that in which poses follow each other.
-
-    ``own``, the unit of the format that the columns suggest, goes before another that is as likely.
-    """
-    with np.errstate(invalid="ignore"):
-        steps = np.diff(times)
-    steps = steps[(steps > 0) & np.isfinite(steps)]
-    if not len(steps):
-        return own
-    step = float(np.median(steps))
-    for unit, unit_s in _UNIT_S.items():
-        if _MIN_EPOCH_S <= times[0] * unit_s < _NEAR_EPOCH_S and _LEAST_STEP_S <= step * unit_s <= _LONGEST_STEP_S:
-            return unit
-    least_s, most_s = _USUAL_STEPS_S
-    likely = [unit for unit, unit_s in _UNIT_S.items() if least_s <= step * unit_s <= most_s]
-    # Whole steps of 10 are rather ms than one pose in 10 s.
-    if not likely or (own in likely and (step * _UNIT_S[own] <= 1 or bool((times % 1).any()))):
-        return own
-    if len(likely) > 1:
-        rule = (
-            f"may be {' or '.join(likely)}: say format='tum' or 'kitti' (s) or 'euroc' (ns), and write others in these"
-        )
-        raise fault(path, rule, value=f"{step:g}", field="median step of the times")
-    return likely[0]
-
-
-def read_rows(path: StrPath, read_row: RowReader, skip: int = 0) -> tuple[Int64Array, Float64Array]:
-    """Times int64[n] in microseconds from 0, and values float64[n, columns], of the lines after number `skip`.
-
-    If several lines have the same time, as in freiburg2_desk, the last counts.
-    """
-    times = array("q")
-    rows: list[list[float]] = []
-    with open_text(path) as file:
-        for line in file.lines():
-            if line.number <= skip or line.text.startswith("#"):
-                continue
-            text, time_us, row = read_row(line, rows[-1] if rows else None)
-            check_order(line, "time in s", text, time_us, times)
-            if times and time_us == times[-1]:
-                rows[-1] = row
-                continue
-            times.append(time_us)
-            rows.append(row)
-    if len(times) < 2:
-        raise fault(path, f"holds {len(times)} samples: must hold at least 2 of different times")
-    time_array = np.asarray(times, np.int64)
-    step_s = float(np.median(np.diff(time_array))) / US_PER_S
-    if step_s < _LEAST_STEP_S:
-        rule = f"must be at least {_LEAST_STEP_S:g} s (are the times in another unit?)"
-        raise fault(path, rule, value=f"{step_s:g} s", field="median step of the times")
-    return time_array - time_array[0], np.array(rows, np.float64)
-
-
-def check_order(line: Line, field: str, text: str, time_us: int, times: Sequence[int]) -> None:
-    """Check that a time, written as ``text``, is not before the latest of ``times``, nor too far from the first, us."""
-    if times and time_us < times[-1]:
-        raise line.error(text, f"must not be before the line above ({times[-1] / US_PER_S:.6f})", field)
-    if times and time_us - times[0] > MAX_DURATION_S * US_PER_S:
-        raise line.error(text, f"must be at most {MAX_DURATION_S} s after the first", field)
 
 
 def seconds(line: Line, text: str) -> int:
@@ -211,13 +131,44 @@ def _pose_row(format: str, unit: str) -> RowReader:
     return row
 
 
+def _pose_block(format: str, unit: str) -> BlockReader:
+    """The reader of a block of such lines, as `_pose_row` reads each."""
+    time_type, most = ("f8", _MAX_EPOCH_S) if unit == "s" else ("i8", _MAX_EPOCH_S / UNIT_S[unit])
+    ticks = round(1 / (UNIT_S[unit] * US_PER_S))  # in a microsecond; 0 where the unit is longer
+
+    def block(text: bytes) -> tuple[Int64Array, Float64Array] | None:
+        if text.translate(None, _PLAIN):
+            return None
+        lines = text.decode("ascii").split("\n")
+        columns = len(_cells(Line("", 0, lines[0].strip())))
+        if columns not in _COLUMNS[format] or max(map(len, lines)) > MAX_LINE_CHARACTERS:
+            return None
+        row = np.dtype([("time", time_type), ("values", "f8", (columns - 1,))])
+        try:
+            content = np.loadtxt(
+                lines, row, comments=None, delimiter="," if "," in text[:4096].decode() else None, ndmin=1
+            )
+        except ValueError:
+            return None
+        time, values = content["time"], content["values"][:, :7]
+        norm = np.linalg.norm(values[:, 3:], axis=1)
+        sound = (np.abs(values[:, :3]) <= MAX_POSITION_M).all() and (np.abs(norm - 1) < _SURE_NORM).all()
+        if not (sound and time.min() >= 0 and time.max() <= most):
+            return None
+        if unit == "s":
+            return np.rint(time * US_PER_S).astype(np.int64), values
+        return (time // ticks if ticks else time * round(UNIT_S[unit] * US_PER_S)), values
+
+    return block
+
+
 def _time_us(line: Line, text: str, unit: str) -> int:
     """A time in this unit, as microseconds."""
     if unit == "s":
         return seconds(line, text)
-    line.decimal(f"time in {unit}", text, 0, _MAX_EPOCH_S / _UNIT_S[unit])
+    line.decimal(f"time in {unit}", text, 0, _MAX_EPOCH_S / UNIT_S[unit])
     # A float holds such a time to 256 ns only.
-    return int(Decimal(text) * Decimal(str(_UNIT_S[unit])) * US_PER_S)
+    return int(Decimal(text) * Decimal(str(UNIT_S[unit])) * US_PER_S)
 
 
 def _cells(line: Line) -> list[str]:
@@ -236,7 +187,7 @@ def _pose(line: Line, cells: list[str], names: tuple[str, ...]) -> list[float]:
     return values
 
 
-def _read_kitti(path: StrPath, times: StrPath | None, unit: str) -> Poses:
+def _read_kitti(path: StrPath, times: StrPath | None, unit: str, advance: Callable[[int], object]) -> Poses:
     times = _times_beside(path) if times is None else times
     stamps = _read_times(times, unit or _detected(times)[1])
 
@@ -251,11 +202,12 @@ def _read_kitti(path: StrPath, times: StrPath | None, unit: str) -> Poses:
             raise line.error(None, f"must have a time, but {times} has no more")
         return text, time_us, values
 
-    time_us, values = read_rows(path, row)
+    rows = read_rows(path, row, what="poses", advance=advance)
     if next(stamps, None) is not None:
         raise fault(times, f"holds more times than {path} has poses")
-    matrices = values.reshape(-1, 3, 4)
-    return Poses(time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), f"kitti, times from {Path(times).name}")
+    matrices = rows.values.reshape(-1, 3, 4)
+    format = f"kitti, times from {Path(times).name}{rows.note}"
+    return Poses(rows.time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), format)
 
 
 def _read_times(path: StrPath, unit: str) -> Iterator[tuple[str, int]]:

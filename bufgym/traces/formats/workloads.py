@@ -13,8 +13,9 @@ from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.motions import coordinate
+from bufgym.traces.formats.rows import check_order
 from bufgym.traces.formats.text import open_text, split_cells, write_text
-from bufgym.traces.formats.trajectories import check_order, seconds
+from bufgym.traces.formats.trajectories import seconds
 from bufgym.traces.trace import US_PER_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES, MAX_MESSAGES, Workload
 
