@@ -15,10 +15,12 @@ from websockets.frames import Frame, Opcode
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
+from bufgym_live.relay.clock import ServerClock
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.drive import Drivers
 from bufgym_live.relay.held import Settled, StoredSession
+from bufgym_live.relay.orders import Orders, is_stop
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quotas
 from bufgym_live.relay.recorder import Recorder, Tape
@@ -95,6 +97,8 @@ class Hub:
     def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
         self.config = config
         self.clock = clock
+        self.now_us = ServerClock(clock).now_us
+        self.orders = Orders()
         if config.folder is not None:
             config.folder.mkdir(parents=True, exist_ok=True)
         self.audit = Audit(config.folder, config.audit)
@@ -107,7 +111,7 @@ class Hub:
         self.disks = [one for one in (self.store.disk, disk, self.audit.disk) if one is not None]
         self.holding = Tasks()  # orders that wait for the disk, also of connections that have ended
         self.drivers = Drivers(self.audit, clock)
-        self.roster = Roster(self.store, lambda message: self.publish(None, message), clock)
+        self.roster = Roster(self.store, lambda message: self.publish(None, message), clock, self.now_us)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
         self.replaying = asyncio.Lock()  # whose turn it is to read a recording
@@ -187,7 +191,7 @@ class Hub:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
         frame = Outgoing(message)
-        if is_last(message.topic) or _any_whole(self.config.latched, message.topic):
+        if is_last(message.topic) or is_stop(message.topic) or _any_whole(self.config.latched, message.topic):
             self._latch(frame)
         for member, subscription in self._route(message.topic):
             if member is not sender:
@@ -202,7 +206,8 @@ class Hub:
         self._latched[frame.message.topic] = frame
         self._latched_bytes += frame.size_bytes
         while self._latched_bytes > MAX_LATCHED_BYTES:
-            self._latched_bytes -= self._latched.pop(next(iter(self._latched))).size_bytes
+            oldest = next(topic for topic in self._latched if not is_stop(topic))
+            self._latched_bytes -= self._latched.pop(oldest).size_bytes
 
     def _show(self, message: wire.Message) -> None:
         """Count a message, and show it to the relay's own parts."""
@@ -304,7 +309,8 @@ class Hub:
     def tick(self) -> None:
         """Publish the relay's state once a second, and forget what has expired."""
         payload = json.dumps(self.status()).encode()
-        self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=time.time_ns() // 1000))
+        now_us = self.now_us()
+        self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=now_us, at_us=now_us))
         for who, long_s in self.turns.take().items():
             self.audit("slow", who=who, longest_ms=round(1e3 * max(long_s), 1), times=len(long_s))
         self.audit.flush()

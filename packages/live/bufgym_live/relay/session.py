@@ -21,15 +21,17 @@ from urllib.parse import SplitResult
 
 from bufgym_live.relay import address, wire
 from bufgym_live.relay.backoff import Backoff
+from bufgym_live.relay.deadlines import Deadlines
 from bufgym_live.relay.inbox import Inbox
+from bufgym_live.relay.orders import is_stop
 from bufgym_live.relay.patterns import for_client
+from bufgym_live.relay.stops import Stops
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import unsent_bytes
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
-CLOSE_S: Final = 1.0  # Time for the relay to answer that the connection is closed
 _FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting mends
 
 OnMessage = Callable[[wire.Message], Awaitable[None] | None]
@@ -82,10 +84,16 @@ class Session:
         """The last 100 refusals and reasons for a connection's end."""
         self.round_trip_s: float | None = None
         """Round trip to the relay as ``ping`` last measured it, including messages on their way."""
+        self.deadlines = Deadlines()
+        self.late: Callable[[wire.Message], None] = lambda message: self.note(f"{message.topic}: came too late")
+        """Called with a command that came after its deadline, in place of ``on_message``."""
+        self.reads_on = False
+        """Whether messages are read on while the program is at work on one, so that a stop overtakes them."""
         self._token, self._tls, self._report = token, tls, say
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
         self._no_drop: tuple[re.Pattern[str], ...] = ()
-        self._unanswered = Unanswered()
+        self._unanswered = Unanswered(self.deadlines.dated)
+        self._stops = Stops(self.deadlines.dated)
         self._inbox = Inbox()
         self._wanted = asyncio.Event()
         self._received = [0, 0]
@@ -108,8 +116,8 @@ class Session:
     async def command(self, topic: str, data: Any, type: str = "") -> None:
         """Send ``data`` on a no_drop topic and wait until the relay holds it; it arrives exactly once.
 
-        With a ROS ``type``, such as ``geometry_msgs/msg/Twist``, data are bytes in CDR; otherwise they are sent as
-        JSON.
+        A command to a robot has the deadline of the relay's rule (``command_s``), counted from this call. With a ROS
+        ``type``, such as ``geometry_msgs/msg/Twist``, data are bytes in CDR; otherwise they are sent as JSON.
 
         Raises:
             BufgymError: the relay refused it, or it is no JSON; the error says why.
@@ -122,6 +130,25 @@ class Session:
         self._wanted.set()
         self._inbox.look()
         await answered
+
+    async def stop(self, robot: str) -> str:
+        """Stop a robot, return once the relay has it; the returned id releases it.
+
+        A stop overtakes and withdraws all commands that wait for the robot. It has no deadline, and holds.
+        """
+        self._unanswered.withdraw(robot, "withdrawn by a stop")
+        return await self._order(robot, command="stop")
+
+    async def release(self, robot: str, of: str) -> None:
+        """Release a robot from the stop with the id ``of``, which its status says, too; this has a deadline."""
+        await self._order(robot, command="release", of=of)
+
+    async def _order(self, robot: str, **said: str) -> str:
+        id, answered = self._stops.put(robot, **said)
+        if self.connected.is_set():
+            await self._stops.send(self._connection.send)
+        await answered
+        return id
 
     def subscribe(
         self,
@@ -174,7 +201,8 @@ class Session:
                 if not self.stands_in:
                     await asyncio.sleep(backoff.delay_s(away))
         finally:
-            self._unanswered.give_up(f"{self.name}: the client has ended")
+            for waiting in (self._unanswered, self._stops):
+                waiting.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
 
     async def _serve_one_connection(self, backoff: Backoff) -> None:
@@ -213,27 +241,9 @@ class Session:
         self.faults.append(fault)
 
     async def _connect(self) -> Any:
-        from websockets.asyncio.client import connect
-        from websockets.typing import Subprotocol
+        from bufgym_live.relay.client_connection import connected  # not at start-up
 
-        from bufgym_live.relay.client_connection import WatchedConnection  # not at start-up
-
-        secure = self.address.scheme == "wss"
-        return await connect(
-            f"{self.address.scheme}://{self.address.netloc}{self.address.path.rstrip('/')}{wire.PATH}",
-            sock=await address.reached(self.address),
-            subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
-            ssl=(self._tls or ssl.create_default_context()) if secure else None,
-            server_hostname=self.address.hostname if secure else None,
-            compression=None,
-            create_connection=WatchedConnection,
-            ping_interval=wire.PING_S,
-            ping_timeout=wire.PONG_S,
-            close_timeout=CLOSE_S,
-            proxy=None,
-            max_size=wire.MAX_FRAME_BYTES,
-            write_limit=(1, 0),
-        )
+        return await connected(self.address, self._tls)
 
     async def _say_it(self, op: str, **fields: Any) -> None:
         await self._connection.send(wire.say(op, **fields))
@@ -246,6 +256,7 @@ class Session:
             self._received[1] = 0
         else:
             hello |= {"session": self._session, "received": self._received[0], "acked": self._unanswered.acked}
+        self.deadlines.begin()
         await self._say_it("hello", **hello)
         said = wire.heard(await self._connection.recv())
         if said["op"] == "refused":
@@ -253,6 +264,8 @@ class Session:
         if said["op"] != "welcome":
             raise wire.WireError(f"op {said['op']!r}: must be welcome")
         self.welcome = said
+        self.deadlines.welcomed(said)
+        await self._stops.send(self._connection.send)
         self._no_drop = tuple(map(for_client, said.get("no_drop", ())))
         if not self.stands_in:
             self._unanswered.resume(said["received"], max(1, said["window"]), self.check_size)
@@ -272,8 +285,9 @@ class Session:
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         """List the tasks that run while there is a connection."""
-        self._inbox = Inbox(lambda: self._unanswered.awaited and not self.stands_in)
-        return [self._until_home() if self.stands_in else self._send_no_drop(), self._hear_all(), self._take_all()]
+        self._inbox = Inbox(lambda: self.reads_on or (self._unanswered.awaited and not self.stands_in))
+        first = self._until_home() if self.stands_in else self._send_no_drop()
+        return [first, self._hear_all(), self._take_all(), self.deadlines.ask(self._say_it)]
 
     async def _until_home(self) -> None:
         while True:
@@ -306,7 +320,13 @@ class Session:
     async def _hear_all(self) -> None:
         async for frame in self._connection:
             if isinstance(frame, bytes):
-                await self._inbox.put(wire.decode(frame))
+                message = wire.decode(frame)
+                if message.at_us:
+                    self.deadlines.clock.heard(message.at_us)
+                if is_stop(message.topic):
+                    await self._take(message)  # it waits behind nothing
+                else:
+                    await self._inbox.put(message)
             else:
                 self._answer(wire.heard(frame))
         raise ConnectionResetError("the relay has closed the connection")
@@ -318,17 +338,11 @@ class Session:
     async def _take(self, message: wire.Message) -> None:
         if message.no_drop and message.seq <= self._received[self.stands_in]:
             return  # it came before the connection broke
+        if late := self.deadlines.is_late(message):
+            self.late(message)
         for subscription in list(self._subscriptions.values()):
-            if subscription.pattern.search(message.topic):
-                try:
-                    done = subscription.on_message(message)
-                    if inspect.isawaitable(done):
-                        await done
-                except (Exception, asyncio.CancelledError) as error:  # the program's fault, which nothing here mends
-                    if asyncio.current_task().cancelling():  # type: ignore[union-attr]
-                        raise
-                    about = {"message": f"on_message of {message.topic}", "exception": error}
-                    asyncio.get_running_loop().call_exception_handler(about)
+            if not late and subscription.pattern.search(message.topic):
+                await _called(subscription.on_message, message)
         if message.no_drop:
             self._received[self.stands_in] = message.seq
             await self._say_it("ack", seq=message.seq)
@@ -336,14 +350,34 @@ class Session:
     def _answer(self, said: dict[str, Any]) -> None:
         if said["op"] == "ack":
             self._unanswered.ack(said["seq"])
+        elif said["op"] == "clock":
+            self.deadlines.answered(said)
+        elif said["op"] == "stopped":
+            self._stops.confirm(said["topic"], said["id"])
         elif said["op"] == "subscribed":
             self._confirmed.add(said["id"])
             self._confirm()
         elif said["op"] == "refused":
-            if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
+            error = RefusedError(said["code"], f"topic {said.get('topic')}: refused: {said['code']}: {said['why']}")
+            if is_stop(str(said.get("topic"))) and self._stops.refuse(said.get("seq", 0), error):
+                pass
+            elif said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])
             elif said["what"] == "subscribe" and said["code"] not in _FOR_GOOD:
                 raise ConnectionResetError(f"subscribe refused: {said['code']}: {said['why']}")  # and once more
             else:
                 self.note(f"{said['what']} refused: {said['code']}: {said['why']}")
         self._wanted.set()
+
+
+async def _called(on_message: OnMessage, message: wire.Message) -> None:
+    """Call a program's function; its fault, which nothing here mends, goes to the event loop."""
+    try:
+        done = on_message(message)
+        if inspect.isawaitable(done):
+            await done
+    except (Exception, asyncio.CancelledError) as error:
+        if asyncio.current_task().cancelling():  # type: ignore[union-attr]
+            raise
+        about = {"message": f"on_message of {message.topic}", "exception": error}
+        asyncio.get_running_loop().call_exception_handler(about)

@@ -68,9 +68,9 @@ def test_who_is_let_in_and_welcomed() -> None:
     admitted = protocol.admit(said, ANNA, RULES, "fresh")
     assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2)
     assert protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")[1:] == ("n", "fresh", True, "json", 0, 0)
-    welcome = protocol.welcome(CONFIG, admitted, ANNA, 5)
+    welcome = protocol.welcome(CONFIG, admitted, ANNA, 5, 7)
     assert wire.heard(wire.say("welcome", **welcome))["received"] == 5 and welcome["session"] == "a"
-    assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*"}]
+    assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*", "command_s": 3.0}]
     refuse("no rule allows anything", protocol.admit, said, Identity("11.0.0.1"), RULES, "fresh", kind=RefusedError)
 
 
@@ -156,7 +156,17 @@ NO_JSON = (
 )
 whole, stamps = st.integers(0, 2**53), st.integers(-(2**53), 2**53)
 messages = st.builds(
-    Message, names.map("/{}".format), st.binary(max_size=50), st.just("raw"), names, names, whole, stamps, st.booleans()
+    Message,
+    names.map("/{}".format),
+    st.binary(max_size=50),
+    st.just("raw"),
+    names,
+    names,
+    whole,
+    stamps,
+    st.booleans(),
+    whole,
+    whole,
 )
 
 
