@@ -4,7 +4,7 @@ import asyncio
 import itertools
 import secrets
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -14,15 +14,17 @@ from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import outbox, policies, protocol, replay, wire
 from bufgym_live.relay.admission import POLICY_VIOLATION
 from bufgym_live.relay.caller import Caller
+from bufgym_live.relay.config import Rule
 from bufgym_live.relay.held import StoredSession
-from bufgym_live.relay.hub import Outgoing
 from bufgym_live.relay.orders import is_stop, order
 from bufgym_live.relay.outbox import Outbox
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
+from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
@@ -248,6 +250,12 @@ class Connection:
         self._outbox.wake()
         if len(self._caller.answers) > outbox.MAX_ANSWERS:
             self.end("reads none of the answers")
+
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules; end the connection if none is for it."""
+        self.permissions = Permissions(rules, self._caller.identity)
+        if not self.permissions.rules:
+            self.end("no rule allows anything to this identity any more")
 
     def end(self, why: str) -> None:
         """Close it."""

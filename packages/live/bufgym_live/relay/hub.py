@@ -6,21 +6,19 @@ import asyncio
 import functools
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
-
-from websockets.frames import Frame, Opcode
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.clock import ServerClock
-from bufgym_live.relay.config import Config
+from bufgym_live.relay.config import Config, Rule
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.drive import Drivers
 from bufgym_live.relay.held import Settled, StoredSession
 from bufgym_live.relay.orders import Orders, is_stop
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quotas
 from bufgym_live.relay.recorder import Recorder, Tape
@@ -38,35 +36,9 @@ if TYPE_CHECKING:
 
 STATUS: Final = f"/{wire.OWN}/status"
 CONNECTED: Final = "connected"  # State of the connection to the other relays
-ROBOFLEET: Final = "robofleet"
-"""Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
 MOST_IN_TURN: Final = 256  # Latched topics that are offered in a turn of the event loop
 MAX_LATCHED_BYTES: Final = 2**26  # Limit on the last messages of latched topics; beyond, the oldest are forgotten
-
-
-@dataclass(eq=False)
-class Outgoing:
-    """An outgoing message; its WebSocket frame in each form is made once for all receivers."""
-
-    message: wire.Message
-    _frames: dict[str, bytes] = field(init=False, default_factory=dict)
-
-    def frame(self, form: str) -> bytes:
-        """Give the whole frame in the form that a client asked for."""
-        if form not in self._frames:
-            if form == "json":
-                whole = Frame(Opcode.TEXT, wire.to_json(self.message).encode())
-            elif form == ROBOFLEET:
-                whole = Frame(Opcode.BINARY, bytes(self.message.payload))
-            else:
-                whole = Frame(Opcode.BINARY, wire.encode(self.message))
-            self._frames[form] = whole.serialize(mask=False)
-        return self._frames[form]
-
-    @property
-    def size_bytes(self) -> int:
-        return wire.HEADER_BYTES + len(self.message.payload)
 
 
 class Member(Protocol):
@@ -80,6 +52,9 @@ class Member(Protocol):
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message to its queues."""
+
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules; end the connection if none is for it."""
 
     def wake(self) -> None:
         """Say that the store has something for it."""
@@ -139,6 +114,16 @@ class Hub:
     def join(self, member: Member) -> None:
         """Add a member that has said hello."""
         self.members[member.session] = member
+
+    def reruled(self, config: Config) -> None:
+        """Take another configuration's rules, for all that are here, too."""
+        self.config = config
+        for member in list(self.members.values()):
+            member.reruled(config.rules)
+        for part in self.own:
+            if not isinstance(part, Roster):
+                part.reruled(config.rules)
+        self._routes.clear()
 
     def leave(self, member: Member) -> None:
         """Remove a member whose connection has ended."""

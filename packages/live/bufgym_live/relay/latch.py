@@ -15,6 +15,7 @@ class Latch:
         self._id = self._by = ""
         self._at_us = 0  # when the relay took the stop
         self._came = asyncio.Event()
+        self._work: asyncio.Task[Any] | None = None
 
     @property
     def told(self) -> dict[str, str] | None:
@@ -28,6 +29,8 @@ class Latch:
         self.is_set, self._id, self._by, self._at_us = True, id, by, at_us
         came, self._came = self._came, asyncio.Event()
         came.set()
+        if self._work is not None:
+            self._work.cancel()  # now, not in a later turn of the event loop: until then it could go on
         return True
 
     def release(self, of: str) -> str:
@@ -47,14 +50,17 @@ class Latch:
 
     async def unless_stopped(self, work: "asyncio.Task[Any]") -> str:
         """Wait for the work on a command; a stop cancels it, and does not wait. Return why it did not end, if so."""
-        stopped = asyncio.ensure_future(self._came.wait())
+        self._work, came = work, self._came
+        stopped = asyncio.ensure_future(came.wait())
         try:
             await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
+        except asyncio.CancelledError:  # the connection has ended: the command comes again
+            work.cancel()
+            raise
         finally:
             stopped.cancel()
-            if not work.done():
-                work.cancel()
-        if work.done():
-            await work
-            return ""
-        return f"withdrawn: stopped by {self._by}"
+            self._work = None
+        if came.is_set():
+            return f"withdrawn: stopped by {self._by}"
+        await work
+        return ""

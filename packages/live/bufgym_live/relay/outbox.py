@@ -12,7 +12,8 @@ from websockets.exceptions import WebSocketException
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.caller import Caller
-from bufgym_live.relay.hub import Member, Outgoing
+from bufgym_live.relay.hub import Member
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.subscriber import make_one, next_lane
 from bufgym_live.relay.wire import WireError
 

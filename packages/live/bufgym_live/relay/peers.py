@@ -13,14 +13,14 @@ import math
 import re
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import policies, protocol, wire
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
-from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats
+from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats, Rule
 from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.hub import CONNECTED, Hub, Outgoing
 from bufgym_live.relay.patterns import pattern
@@ -117,6 +117,10 @@ class Peers:
         """Leave the others."""
         await self._tasks.end()
         self._hub.leave(self)
+
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules."""
+        self.permissions = Permissions(rules, NATS)
 
     def _note(self, why: object) -> None:
         self._hub.audit.repeated(what="nats", code="wrong", why=str(why))

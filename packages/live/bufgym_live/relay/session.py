@@ -9,14 +9,13 @@ wait for home, which alone knows what has arrived.
 
 import asyncio
 import contextlib
-import inspect
 import os
 import re
 import ssl
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
 from urllib.parse import SplitResult
 
 from bufgym_live.relay import address, wire
@@ -27,6 +26,7 @@ from bufgym_live.relay.orders import is_stop
 from bufgym_live.relay.patterns import for_client
 from bufgym_live.relay.stops import Stops
 from bufgym_live.relay.unanswered import Unanswered
+from bufgym_live.relay.wanted import OnMessage, Wanted
 from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import unsent_bytes
 from bufgym_live.robot.tasks import Tasks, until_one_ends
@@ -34,19 +34,9 @@ from bufgym_live.robot.tasks import Tasks, until_one_ends
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
 _FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting mends
 
-OnMessage = Callable[[wire.Message], Awaitable[None] | None]
-
 
 class HomeIsBack(Exception):  # noqa: N818  (nothing is wrong)
     """The first relay is back, and this connection is to another."""
-
-
-class SubscriptionRequest(NamedTuple):
-    """A subscription that is asked of the relay."""
-
-    pattern: re.Pattern[str]
-    on_message: OnMessage
-    fields: dict[str, Any]
 
 
 class Session:
@@ -98,8 +88,7 @@ class Session:
         self._wanted = asyncio.Event()
         self._received = [0, 0]
         """Number of the last no_drop message received from home and from the relay that stands in."""
-        self._subscriptions: dict[str, SubscriptionRequest] = {}
-        self._confirmed: set[str] = set()
+        self._subscriptions = Wanted()
         self._connection: Any = None
         self._tasks = Tasks()
 
@@ -132,15 +121,12 @@ class Session:
         await answered
 
     async def stop(self, robot: str) -> str:
-        """Stop a robot, return once the relay has it; the returned id releases it.
-
-        A stop overtakes and withdraws all commands that wait for the robot. It has no deadline, and holds.
-        """
+        """Stop a robot and return once the relay has it; ``release`` needs the returned id. The stop holds."""
         self._unanswered.withdraw(robot, "withdrawn by a stop")
         return await self._order(robot, command="stop")
 
     async def release(self, robot: str, of: str) -> None:
-        """Release a robot from the stop with the id ``of``, which its status says, too; this has a deadline."""
+        """Release a robot from the stop with this id, which its status says, too; this has a deadline."""
         await self._order(robot, command="release", of=of)
 
     async def _order(self, robot: str, **said: str) -> str:
@@ -164,10 +150,8 @@ class Session:
         ``policy`` and ``capacity`` describe the relay's queue for this subscription. With ``durable`` the relay holds
         no_drop messages while this client is away.
         """
-        id = str(len(self._subscriptions))
         chosen = {"policy": policy, "capacity": capacity, "durable": durable or None}
-        fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
-        self._subscriptions[id] = SubscriptionRequest(for_client(pattern), on_message, fields)
+        fields = self._subscriptions.add(pattern, on_message, **chosen)
         self.ready.clear()
         if self.connected.is_set() and not (self.stands_in and durable):
             self._tasks.begin(self._say_it("subscribe", **fields))
@@ -218,7 +202,7 @@ class Session:
         finally:
             self.connected.clear()
             self.ready.clear()
-            self._confirmed.clear()
+            self._subscriptions.confirmed.clear()
             connection, self._connection = self._connection, None
             with contextlib.suppress(AttributeError):  # there is none; or asyncio's of 3.11, if it has ended already
                 connection.transport.abort()
@@ -269,18 +253,13 @@ class Session:
         self._no_drop = tuple(map(for_client, said.get("no_drop", ())))
         if not self.stands_in:
             self._unanswered.resume(said["received"], max(1, said["window"]), self.check_size)
-        for subscription in self._asked:
+        for subscription in self._subscriptions.asked(self.stands_in):
             await self._say_it("subscribe", **subscription.fields)
         self.connected.set()
         self._confirm()
 
-    @property
-    def _asked(self) -> list[SubscriptionRequest]:
-        """The subscriptions that this relay is asked for."""
-        return [one for one in self._subscriptions.values() if not (self.stands_in and "durable" in one.fields)]
-
     def _confirm(self) -> None:
-        if self._confirmed.issuperset(one.fields["id"] for one in self._asked):
+        if self._subscriptions.are_confirmed(self.stands_in):
             self.ready.set()
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
@@ -338,11 +317,10 @@ class Session:
     async def _take(self, message: wire.Message) -> None:
         if message.no_drop and message.seq <= self._received[self.stands_in]:
             return  # it came before the connection broke
-        if late := self.deadlines.is_late(message):
+        if self.deadlines.is_late(message):
             self.late(message)
-        for subscription in list(self._subscriptions.values()):
-            if not late and subscription.pattern.search(message.topic):
-                await _called(subscription.on_message, message)
+        else:
+            await self._subscriptions.call(message)
         if message.no_drop:
             self._received[self.stands_in] = message.seq
             await self._say_it("ack", seq=message.seq)
@@ -355,12 +333,12 @@ class Session:
         elif said["op"] == "stopped":
             self._stops.confirm(said["topic"], said["id"])
         elif said["op"] == "subscribed":
-            self._confirmed.add(said["id"])
+            self._subscriptions.confirmed.add(said["id"])
             self._confirm()
         elif said["op"] == "refused":
             error = RefusedError(said["code"], f"topic {said.get('topic')}: refused: {said['code']}: {said['why']}")
-            if is_stop(str(said.get("topic"))) and self._stops.refuse(said.get("seq", 0), error):
-                pass
+            if is_stop(str(said.get("topic"))):
+                self._stops.refuse(said.get("seq", 0), error)
             elif said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])
             elif said["what"] == "subscribe" and said["code"] not in _FOR_GOOD:
@@ -368,16 +346,3 @@ class Session:
             else:
                 self.note(f"{said['what']} refused: {said['code']}: {said['why']}")
         self._wanted.set()
-
-
-async def _called(on_message: OnMessage, message: wire.Message) -> None:
-    """Call a program's function; its fault, which nothing here mends, goes to the event loop."""
-    try:
-        done = on_message(message)
-        if inspect.isawaitable(done):
-            await done
-    except (Exception, asyncio.CancelledError) as error:
-        if asyncio.current_task().cancelling():  # type: ignore[union-attr]
-            raise
-        about = {"message": f"on_message of {message.topic}", "exception": error}
-        asyncio.get_running_loop().call_exception_handler(about)

@@ -179,6 +179,8 @@ def test_byte_by_byte() -> None:
         b"\xff\xff\xff\xff\xff\xff\xff\xff"
         b"/a/bTjpegme\x01\x02"
     )
+    timed = wire.encode(message._replace(at_us=259, until_us=260))
+    assert timed[4] == 3 and timed[32:] == b"\0\0\0\0\0\0\x01\x03\0\0\0\0\0\0\x01\x04" + wire.encode(message)[32:]
 
 
 def published(text: str) -> Message:
@@ -188,7 +190,7 @@ def published(text: str) -> Message:
 @given(messages)
 def test_what_is_written_is_read(message: Message) -> None:
     assert wire.decode(wire.encode(message)) == message
-    assert published(wire.to_json(message)) == message._replace(sender="")
+    assert published(wire.to_json(message)) == message._replace(sender="", at_us=0)
 
 
 @pytest.mark.parametrize("payload", NO_JSON, ids=len)
@@ -207,7 +209,7 @@ def test_json_payloads_are_values() -> None:
 
 
 GOOD = wire.encode(Message("/a", b"12"))
-TWO = {2: "version 1", 3: "kind 1", 4: "a known flag"}
+TWO = {2: "version 1", 3: "kind 1", 4: "frame of 40 bytes: must be at least 48"}
 """What a 2 at this place breaks."""
 
 
@@ -219,6 +221,7 @@ TWO = {2: "version 1", 3: "kind 1", 4: "a known flag"}
         (wire.decode, GOOD + b"1", "frame of 41 bytes: must be 40"),
         *((wire.decode, data, "header") for data in (b"bX" + GOOD[2:], GOOD[:9] + b"\x01" + GOOD[10:])),
         *((wire.decode, GOOD[:k] + b"\x02" + GOOD[k + 1 :], says) for k, says in TWO.items()),
+        (wire.decode, GOOD[:4] + b"\x04" + GOOD[5:], "a known flag"),
         (wire.decode, GOOD[:16] + b"\xff" * 8 + GOOD[24:], "seq"),
         (wire.decode, GOOD[:24] + b"\x7f" + GOOD[25:], "stamp_us"),
         (wire.decode, GOOD.replace(b"/a", b"aa"), "must begin with '/'"),
