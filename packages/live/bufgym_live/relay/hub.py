@@ -311,7 +311,7 @@ class Hub:
     @property
     def ills(self) -> list[str]:
         """What is wrong with the relay's files, as far as it knows."""
-        gone = [] if self.store.there else ["the store's file was deleted"]
+        gone = [self.store.fault] * bool(self.store.fault) if self.store.there else ["the store's file was deleted"]
         return gone + [f"the disk stalls: {disk.part}" for disk in self.disks if disk.stalls]
 
     def close(self) -> None:

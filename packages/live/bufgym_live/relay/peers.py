@@ -22,7 +22,8 @@ from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats, Rule
 from bufgym_live.relay.held import StoredSession
-from bufgym_live.relay.hub import CONNECTED, Hub, Outgoing
+from bufgym_live.relay.hub import CONNECTED, Hub
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import NATS, Permissions
 from bufgym_live.relay.subscriber import Subscription, make_one, next_lane

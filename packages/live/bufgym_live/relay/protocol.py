@@ -71,6 +71,8 @@ def admit(said: Mapping[str, Any], identity: Identity, rules: Sequence[Rule], fr
     if not name or name == wire.OWN:
         raise WireError(f"hello: name = {name!r}: must be a name, not the relay's")
     numbers = int(said.get("received", 0)), int(said.get("acked", 0))
+    if max(numbers) >= wire.MAX_SEQ:
+        raise WireError(f"hello: received, acked = {numbers}: must be less than {wire.MAX_SEQ}, for a next one")
     return Admitted(permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers)
 
 

@@ -58,6 +58,7 @@ def test_a_hello_that_is_refused() -> None:
         (1, {"form": "xml"}, "must be of version 1, of form binary or json"),
         (1, {"session": "a b"}, "session = 'a b': must be 1 to 64 letters"),
         (1, {"name": "relay"}, "name = 'relay': must be a name, not the relay's"),
+        (1, {"received": 2**53}, r"received, acked = \(9007199254740992, 0\): must be less than 9007199254740992"),
         (1, {"name": "\n"}, "name '\\\\n': must be printable"),
     ):
         refuse(f"hello: {error}", begin, wire.say("hello", version=version, **more), kind=WireError)
