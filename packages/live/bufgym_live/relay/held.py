@@ -92,7 +92,7 @@ class Held:
             self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
             (state,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
             if state != "ok":
-                raise sqlite3.DatabaseError(state)
+                raise sqlite3.DatabaseError(" ".join(state.split()))
         except sqlite3.Error as error:
             way = "a damaged one must be moved away, with what it holds, or be replaced by a backup"
             rule = f"must be a relay's own, of one relay at a time; {way}"

@@ -77,8 +77,7 @@ export class Drive {
     if (!this.robot || this.timer) return;
     if (this.robot.status?.stop) return;
     this.timer = setInterval(() => this.send(), PERIOD_MS);
-    this.still();                                   // after a stop, a robot moves only for who says zeros first
-    this.send();
+    this.still();                                   // after a stop, a robot moves only for who says zeros first; a queue may keep the newest alone
   }
 
   send() {
