@@ -65,4 +65,4 @@ def test_a_damaged_store_ends_the_start_in_a_sentence(tmp_path: Path) -> None:
     file = tmp_path / FILE
     data = file.read_bytes()
     file.write_bytes(data[:4096] + bytes(4096) + data[8192:])
-    refuse("held.sqlite: .*: a damaged one must be moved away, .* or be replaced by a backup", Store, *given)
+    refuse("held.sqlite: .*; a damaged one must be moved away, .* or be replaced by a backup", Store, *given)
