@@ -26,6 +26,7 @@ from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
 
 POLICY_VIOLATION: Final = 1008
+_OTHER_METHODS: Final = frozenset(b"HEAD POST PUT DELETE CONNECT OPTIONS TRACE PATCH".split())
 _CLOSE_S: Final = 1.0  # time for a client to answer that its connection is closed
 _FRAME_BYTES: Final = 256  # memory of a frame beside its bytes
 _SLICE_BYTES: Final = 4_096  # bytes behind a frame that are read without a look at the clock; they may be 680 frames
@@ -184,10 +185,23 @@ class Accepted(ServerConnection):
         self._count()
 
     def data_received(self, data: bytes) -> None:
+        if self.request is None and not self.ended and data.partition(b" ")[0] in _OTHER_METHODS:
+            self._not_allowed(data.partition(b" ")[0].decode())
         under_way = bool(self._unread)
         self._unread += b"" if self.ended else data
         if not under_way:
             self._read(_TURN_S)
+
+    def _not_allowed(self, method: str) -> None:
+        """Answer a request that is no GET; the library knows no other, and would end the connection without a word."""
+        self.ended = True
+        self.refused("wrong", f"method {method}: must be GET")
+        body = b"" if method == "HEAD" else b"only GET\n"
+        head = (
+            f"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n"
+        )
+        self.transport.write(head.encode() + body)
+        self.loop.call_later(_CLOSE_S, self.transport.close)  # a body that is on its way would reset the connection
 
     def eof_received(self) -> None:
         self._read(float("inf"))

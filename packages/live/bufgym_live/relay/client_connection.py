@@ -1,10 +1,17 @@
 """A client's connection that ends by itself where the relay has gone silent."""
 
 import asyncio
+import ssl
+from typing import Any
+from urllib.parse import SplitResult
 
-from websockets.asyncio.client import ClientConnection
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
+from bufgym_live.relay import address, wire
 from bufgym_live.relay.wire import PING_S, PONG_S
+
+CLOSE_S = 1.0  # Time for the relay to answer that the connection is closed
 
 
 class WatchedConnection(ClientConnection):
@@ -34,3 +41,23 @@ class WatchedConnection(ClientConnection):
         while (left_s := self.heard_s + most_s - self.loop.time()) > 0:
             await asyncio.sleep(left_s)
         self.transport.abort()
+
+
+async def connected(to: SplitResult, tls: ssl.SSLContext | None) -> Any:
+    """Connect to the relay at this address."""
+    secure = to.scheme == "wss"
+    return await connect(
+        f"{to.scheme}://{to.netloc}{to.path.rstrip('/')}{wire.PATH}",
+        sock=await address.reached(to),
+        subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
+        ssl=(tls or ssl.create_default_context()) if secure else None,
+        server_hostname=to.hostname if secure else None,
+        compression=None,
+        create_connection=WatchedConnection,
+        ping_interval=wire.PING_S,
+        ping_timeout=wire.PONG_S,
+        close_timeout=CLOSE_S,
+        proxy=None,
+        max_size=wire.MAX_FRAME_BYTES,
+        write_limit=(1, 0),
+    )

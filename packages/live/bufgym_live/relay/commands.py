@@ -42,7 +42,7 @@ def _needs_the_extra() -> None:
 
 
 async def serve(*, config: str, check: bool = False) -> None:
-    """Run the server under a configuration; Ctrl-C ends it.
+    """Run the server under a configuration; Ctrl-C ends it, SIGHUP rereads rules, keys and certificate.
 
     Args:
         config: As examples/relay.toml.
@@ -58,7 +58,7 @@ async def serve(*, config: str, check: bool = False) -> None:
             policies.policy(name)  # raises an error if there is none
         print(f"{config}: {len(settings.rules)} rules, {settings.host}:{settings.port}")
         return
-    await server.serve_forever(settings, live.say)
+    await server.serve_forever(settings, live.say, partial(configurations.load, config))
 
 
 async def robot(

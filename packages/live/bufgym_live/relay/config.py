@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.files import read_toml
 from bufgym.model.checks import MAX_WINDOW
+from bufgym_live.relay.orders import COMMAND_S
 from bufgym_live.relay.patterns import pattern
 
 PORT: Final = 7420
@@ -53,6 +54,8 @@ class Rule(Section, frozen=True, kw_only=True):
     send: bool = False
     receive: bool = False
     topic: str = ".*"
+    command_s: Seconds = COMMAND_S
+    """Time after which a robot does not execute a command sent under this rule; its sender may say less."""
 
     def __post_init__(self) -> None:
         if sum(map(bool, (self.address, self.email, self.recorder, self.foxglove, self.nats))) != 1:

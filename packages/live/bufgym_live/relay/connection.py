@@ -4,7 +4,7 @@ import asyncio
 import itertools
 import secrets
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -14,14 +14,17 @@ from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import outbox, policies, protocol, replay, wire
 from bufgym_live.relay.admission import POLICY_VIOLATION
 from bufgym_live.relay.caller import Caller
+from bufgym_live.relay.config import Rule
 from bufgym_live.relay.held import StoredSession
-from bufgym_live.relay.hub import Outgoing
+from bufgym_live.relay.orders import is_stop, order
 from bufgym_live.relay.outbox import Outbox
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
+from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
@@ -65,7 +68,8 @@ class Connection:
         hub.join(self)
         self._socket.protocol.max_message_size = hub.config.limits.message_bytes
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
-        self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, self.session.received))
+        numbers = self.session.received, hub.now_us()
+        self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, *numbers))
         greeted()
         works = self._outbox.run, self._carry_out
         tasks = [asyncio.create_task(hub.turns.of(caller.identity.key, work)) for work in works]
@@ -95,6 +99,7 @@ class Connection:
                 await asyncio.sleep(0)
             match protocol.asked(await self._caller.heard(), self._hub.config.limits.message_bytes):
                 case wire.Message() as message:
+                    message = message._replace(at_us=self._hub.now_us())  # what waits for the disk grows old, too
                     if message.encoding == "json":
                         await self._caller.pace(len(message.payload))
                     if message.no_drop:
@@ -109,6 +114,8 @@ class Connection:
                 case {"op": "ack", "seq": number}:
                     self._outbox.acked(number)
                     self._hub.store.acked(self.session, number)
+                case {"op": "clock"}:
+                    self.tell("clock", clock_us=self._hub.now_us())
                 case {"op": "recordings"}:
                     folder = self._recordings if self.permissions.receives else None
                     self.tell("recordings", files=await asyncio.to_thread(replay.recordings, folder))
@@ -178,10 +185,14 @@ class Connection:
             hub.drivers.note(message.topic, self.session.name, address=who.address, email=who.email)
             if is_last(message.topic):
                 hub.audit("removed", topic=message.topic, session=self.session.name, **who.as_json())
-            stamp_us = message.stamp_us or time.time_ns() // 1000
-            message = message._replace(sender=self._admitted.name, stamp_us=stamp_us)
+            at_us = message.at_us or hub.now_us()
+            message = message._replace(sender=self._admitted.name, stamp_us=message.stamp_us or at_us, at_us=at_us)
+            most_s, by = self.permissions.command_s(message.topic), who.email or self._admitted.name
+            message = hub.orders.dated(message, most_s, hub.now_us(), by)
             if not message.no_drop:
                 hub.publish(self, message)
+                if is_stop(message.topic):
+                    self.tell("stopped", topic=message.topic, id=order(message)["id"])
             elif not new or await self._hold(message):
                 self.tell("ack", seq=message.seq)
         except RefusedError as refused:
@@ -190,7 +201,7 @@ class Connection:
     def _refused(self, refused: RefusedError, topic: str, seq: int, no_drop: bool) -> None:
         about = {"code": refused.code, "topic": topic, "session": self.session.name}
         first = self._hub.audit.repeated(what="publish", **about, **self._caller.identity.as_json())
-        if no_drop or first:
+        if no_drop or first or refused.code in ("too_late", "stopped") or is_stop(topic):
             self._caller.refuse("publish", refused, topic=topic, seq=seq)
 
     async def _hold(self, message: wire.Message) -> bool:
@@ -229,13 +240,22 @@ class Connection:
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """A message that its queues decide on."""
-        subscription.offer(frame.message.topic, frame, frame.size_bytes)
+        if is_stop(frame.message.topic):
+            self._outbox.urgent[frame.message.topic] = frame
+        else:
+            subscription.offer(frame.message.topic, frame, frame.size_bytes)
         self._outbox.wake()
 
     def _told(self) -> None:
         self._outbox.wake()
         if len(self._caller.answers) > outbox.MAX_ANSWERS:
             self.end("reads none of the answers")
+
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules; end the connection if none is for it."""
+        self.permissions = Permissions(rules, self._caller.identity)
+        if not self.permissions.rules:
+            self.end("no rule allows anything to this identity any more")
 
     def end(self, why: str) -> None:
         """Close it."""

@@ -55,6 +55,8 @@ class Drive:
         self._came = asyncio.Event()
         self._velocity, self._until_s = STILL, -math.inf
         self._sender, self._stamp_us = "", 0
+        self._stopped = False
+        self._let_go: set[str] | None = None  # who has said zeros since the last stop; None before the first
         self._behind_s, self._heard_s = math.inf, 0.0  # own clock minus the sender's, and when that was last measured
 
     @property
@@ -73,6 +75,13 @@ class Drive:
         Raises BufgymError: it is none that drives.
         """
         velocity, for_s = _read(message)
+        if self._let_go is not None:
+            if velocity == STILL:
+                self._let_go.add(message.sender)
+            elif self._stopped:
+                self._let_go.discard(message.sender)
+            if self._stopped or message.sender not in self._let_go:
+                return
         now_s, stamp_s = self._clock(), message.stamp_us / 1e6
         if message.sender != self._sender:
             if self.driver:
@@ -85,6 +94,15 @@ class Drive:
         self._heard_s = now_s
         self._velocity, self._until_s = velocity, stamp_s + self._behind_s + for_s
         self._came.set()
+
+    def stop(self) -> None:
+        """Stand still until ``go``; whoever holds a key then must let go, and say zeros, before a velocity counts."""
+        self._velocity, self._let_go, self._stopped = STILL, set(), True
+        self._came.set()
+
+    def go(self) -> None:
+        """Take velocities again."""
+        self._stopped = False
 
     async def run(self) -> None:
         """Move as the messages say, until cancelled; then stop."""

@@ -13,7 +13,7 @@ from bufgym.ground.errors import BufgymError
 from bufgym.ground.libraries import needs
 from bufgym.traces.formats.bag_poses import Frames
 from bufgym_live.relay import ros_messages, wire
-from bufgym_live.relay.config import Config, Foxglove
+from bufgym_live.relay.config import Config, Foxglove, Rule
 from bufgym_live.relay.gate import Gate, hidden_host
 from bufgym_live.relay.place import Place
 from bufgym_live.relay.recorder import SCHEMAS
@@ -129,7 +129,11 @@ class Window(Screen):
 
     def __init__(self, settings: Foxglove, config: Config) -> None:
         super().__init__(settings.host, settings.port, config.origins)
-        self._permissions = Permissions(config.rules, FOXGLOVE)
+        self.reruled(config.rules)
+
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules."""
+        self._permissions = Permissions(rules, FOXGLOVE)
 
     def __call__(self, message: wire.Message) -> None:
         """Show a message if a rule allows it."""

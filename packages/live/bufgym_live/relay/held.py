@@ -90,11 +90,18 @@ class Held:
                 self._db.execute(f"PRAGMA {pragma}")
             self._db.executescript(_SCHEMA)
             self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
+            (state,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
+            if state != "ok":
+                raise sqlite3.DatabaseError(" ".join(state.split()))
         except sqlite3.Error as error:
-            raise BufgymError(f"{path}: {error}: must be a relay's own, of one relay at a time") from None
+            way = "a damaged one must be moved away, with what it holds, or be replaced by a backup"
+            rule = f"must be a relay's own, of one relay at a time; {way}"
+            raise BufgymError(f"{path}: {error}: {rule}") from None
         self._file = None if config.folder is None else (path, os.stat(path).st_ino)
         self.there = True
         """Whether the file was where a relay that starts anew looks for it, when it was last looked for."""
+        self.fault = ""
+        """Why the file could not be written at the last try; empty if it could."""
         self.bytes = 0
         self._by_id: dict[int | None, StoredSession] = {}
 
@@ -269,11 +276,13 @@ class Held:
             self._db.execute("BEGIN IMMEDIATE")
             yield
             self._db.execute("COMMIT")
+            self.fault = ""
         except BaseException as error:
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             if isinstance(error, sqlite3.Error):
-                raise RefusedError("store_full", f"the store cannot be written: {error}") from None
+                self.fault = f"the store cannot be written: {error}"
+                raise RefusedError("store_full", self.fault) from None
             raise
 
     @contextmanager

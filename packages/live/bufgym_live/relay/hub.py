@@ -6,19 +6,19 @@ import asyncio
 import functools
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
-
-from websockets.frames import Frame, Opcode
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
-from bufgym_live.relay.config import Config
+from bufgym_live.relay.clock import ServerClock
+from bufgym_live.relay.config import Config, Rule
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.drive import Drivers
 from bufgym_live.relay.held import Settled, StoredSession
+from bufgym_live.relay.orders import Orders, is_stop
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quotas
 from bufgym_live.relay.recorder import Recorder, Tape
@@ -36,35 +36,9 @@ if TYPE_CHECKING:
 
 STATUS: Final = f"/{wire.OWN}/status"
 CONNECTED: Final = "connected"  # State of the connection to the other relays
-ROBOFLEET: Final = "robofleet"
-"""Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""
 MAX_ROUTES: Final = 10_000
 MOST_IN_TURN: Final = 256  # Latched topics that are offered in a turn of the event loop
 MAX_LATCHED_BYTES: Final = 2**26  # Limit on the last messages of latched topics; beyond, the oldest are forgotten
-
-
-@dataclass(eq=False)
-class Outgoing:
-    """An outgoing message; its WebSocket frame in each form is made once for all receivers."""
-
-    message: wire.Message
-    _frames: dict[str, bytes] = field(init=False, default_factory=dict)
-
-    def frame(self, form: str) -> bytes:
-        """Give the whole frame in the form that a client asked for."""
-        if form not in self._frames:
-            if form == "json":
-                whole = Frame(Opcode.TEXT, wire.to_json(self.message).encode())
-            elif form == ROBOFLEET:
-                whole = Frame(Opcode.BINARY, bytes(self.message.payload))
-            else:
-                whole = Frame(Opcode.BINARY, wire.encode(self.message))
-            self._frames[form] = whole.serialize(mask=False)
-        return self._frames[form]
-
-    @property
-    def size_bytes(self) -> int:
-        return wire.HEADER_BYTES + len(self.message.payload)
 
 
 class Member(Protocol):
@@ -78,6 +52,9 @@ class Member(Protocol):
 
     def offer(self, subscription: Subscription, frame: Outgoing) -> None:
         """Offer a message to its queues."""
+
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules; end the connection if none is for it."""
 
     def wake(self) -> None:
         """Say that the store has something for it."""
@@ -95,6 +72,8 @@ class Hub:
     def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
         self.config = config
         self.clock = clock
+        self.now_us = ServerClock(clock).now_us
+        self.orders = Orders()
         if config.folder is not None:
             config.folder.mkdir(parents=True, exist_ok=True)
         self.audit = Audit(config.folder, config.audit)
@@ -107,7 +86,7 @@ class Hub:
         self.disks = [one for one in (self.store.disk, disk, self.audit.disk) if one is not None]
         self.holding = Tasks()  # orders that wait for the disk, also of connections that have ended
         self.drivers = Drivers(self.audit, clock)
-        self.roster = Roster(self.store, lambda message: self.publish(None, message), clock)
+        self.roster = Roster(self.store, lambda message: self.publish(None, message), clock, self.now_us)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
         self.replaying = asyncio.Lock()  # whose turn it is to read a recording
@@ -135,6 +114,16 @@ class Hub:
     def join(self, member: Member) -> None:
         """Add a member that has said hello."""
         self.members[member.session] = member
+
+    def reruled(self, config: Config) -> None:
+        """Take another configuration's rules, for all that are here, too."""
+        self.config = config
+        for member in list(self.members.values()):
+            member.reruled(config.rules)
+        for part in self.own:
+            if not isinstance(part, Roster):
+                part.reruled(config.rules)
+        self._routes.clear()
 
     def leave(self, member: Member) -> None:
         """Remove a member whose connection has ended."""
@@ -187,7 +176,7 @@ class Hub:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
         frame = Outgoing(message)
-        if is_last(message.topic) or _any_whole(self.config.latched, message.topic):
+        if is_last(message.topic) or is_stop(message.topic) or _any_whole(self.config.latched, message.topic):
             self._latch(frame)
         for member, subscription in self._route(message.topic):
             if member is not sender:
@@ -202,7 +191,8 @@ class Hub:
         self._latched[frame.message.topic] = frame
         self._latched_bytes += frame.size_bytes
         while self._latched_bytes > MAX_LATCHED_BYTES:
-            self._latched_bytes -= self._latched.pop(next(iter(self._latched))).size_bytes
+            oldest = next(topic for topic in self._latched if not is_stop(topic))
+            self._latched_bytes -= self._latched.pop(oldest).size_bytes
 
     def _show(self, message: wire.Message) -> None:
         """Count a message, and show it to the relay's own parts."""
@@ -304,7 +294,8 @@ class Hub:
     def tick(self) -> None:
         """Publish the relay's state once a second, and forget what has expired."""
         payload = json.dumps(self.status()).encode()
-        self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=time.time_ns() // 1000))
+        now_us = self.now_us()
+        self.publish(None, wire.Message(STATUS, payload, sender=wire.OWN, stamp_us=now_us, at_us=now_us))
         for who, long_s in self.turns.take().items():
             self.audit("slow", who=who, longest_ms=round(1e3 * max(long_s), 1), times=len(long_s))
         self.audit.flush()
@@ -320,7 +311,7 @@ class Hub:
     @property
     def ills(self) -> list[str]:
         """What is wrong with the relay's files, as far as it knows."""
-        gone = [] if self.store.there else ["the store's file was deleted"]
+        gone = [self.store.fault] * bool(self.store.fault) if self.store.there else ["the store's file was deleted"]
         return gone + [f"the disk stalls: {disk.part}" for disk in self.disks if disk.stalls]
 
     def close(self) -> None:

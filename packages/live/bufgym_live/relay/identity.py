@@ -99,14 +99,20 @@ class Verifier:
 def server_context(tls: Tls) -> ssl.SSLContext:
     """Set up TLS for the relay; clients are asked for certificates if an authority for them is given."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    renew(context, tls)
+    return context
+
+
+def renew(context: ssl.SSLContext, tls: Tls) -> None:
+    """Read the files again, for connections from now on; if they cannot be read, all stays as it is."""
     try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(tls.certificate, tls.key)
         context.load_cert_chain(tls.certificate, tls.key)
         if tls.clients:
             context.load_verify_locations(tls.clients)
             context.verify_mode = ssl.CERT_OPTIONAL  # else a token or an address may do
     except (OSError, ssl.SSLError) as error:
         raise BufgymError(f"tls: {tls.certificate}, {tls.key}, {tls.clients}: {error}") from None
-    return context
 
 
 def certificate_email(certificate: Mapping[str, Any] | None) -> str:

@@ -1,6 +1,7 @@
 """Messages to one client, the most urgent first.
 
-The relay's answers go first, then no_drop messages while fewer than n_T are unacked, then messages from the queues.
+Stops go first, then the relay's answers, then no_drop messages while fewer than n_T are unacked, then messages from the
+queues.
 """
 
 import asyncio
@@ -11,7 +12,8 @@ from websockets.exceptions import WebSocketException
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.caller import Caller
-from bufgym_live.relay.hub import Member, Outgoing
+from bufgym_live.relay.hub import Member
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.subscriber import make_one, next_lane
 from bufgym_live.relay.wire import WireError
 
@@ -28,6 +30,8 @@ class Outbox:
         self._member, self._form = member, form
         self._sent_number = received
         self._in_flight: deque[int] = deque()
+        self.urgent: dict[str, Outgoing] = {}
+        """Topic -> its last stop, which waits for nothing."""
         self._fetching: asyncio.Future[tuple[int, str, bytes]] | None = None
 
     def wake(self) -> None:
@@ -58,6 +62,8 @@ class Outbox:
 
     async def one(self) -> bool:
         """Send the next message; return whether there was one."""
+        while self.urgent:
+            await self._send(self.urgent.pop(next(iter(self.urgent))))
         if self._caller.answers:
             await self._caller.send_answers()
         member = self._member
@@ -69,7 +75,8 @@ class Outbox:
         item = None if lane is None else lane.take(now_s)
         if lane is None or item is None:
             return made
-        await self._send(item.message)
+        if not self._hub.orders.is_over(item.message.message, self._hub.now_us()):
+            await self._send(item.message)
         lane.gone()
         return True
 
@@ -85,11 +92,14 @@ class Outbox:
         (self._sent_number, topic, frame), self._fetching = self._fetching.result(), None
         if not frame:
             pass  # all up to this number have gone
-        elif member.permissions.allow("receive", topic):
-            self._in_flight.append(self._sent_number)
-            await self._send(Outgoing(wire.decode(frame, len(frame))._replace(seq=self._sent_number)))
         else:
-            self._hub.store.denied(member.session, self._sent_number)
+            message = wire.decode(frame, len(frame))._replace(seq=self._sent_number)
+            over = self._hub.orders.is_over(message, self._hub.now_us())
+            if member.permissions.allow("receive", topic) and not over:
+                self._in_flight.append(self._sent_number)
+                await self._send(Outgoing(message))
+            else:
+                self._hub.store.denied(member.session, self._sent_number)
         return True
 
     async def _send(self, frame: Outgoing) -> None:

@@ -13,16 +13,17 @@ import math
 import re
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import policies, protocol, wire
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
-from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats
+from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats, Rule
 from bufgym_live.relay.held import StoredSession
-from bufgym_live.relay.hub import CONNECTED, Hub, Outgoing
+from bufgym_live.relay.hub import CONNECTED, Hub
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import NATS, Permissions
 from bufgym_live.relay.subscriber import Subscription, make_one, next_lane
@@ -118,6 +119,10 @@ class Peers:
         await self._tasks.end()
         self._hub.leave(self)
 
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules."""
+        self.permissions = Permissions(rules, NATS)
+
     def _note(self, why: object) -> None:
         self._hub.audit.repeated(what="nats", code="wrong", why=str(why))
 
@@ -141,9 +146,9 @@ class Peers:
                 item = lane.take(self._hub.clock())
                 if item is not None:
                     frame, put_us = item.message
-                    headers = {"Relay": self._settings.name, "Put": str(put_us)}
+                    headers = {"Relay": self._settings.name, "Put": str(put_us), **self._left(frame.message)}
                     try:
-                        await bus.publish(frame.message.topic, wire.encode(frame.message), headers)
+                        await bus.publish(frame.message.topic, wire.encode(_undated(frame.message)), headers)
                         self.sent += 1
                     except wire.RefusedError as refused:
                         self._note(refused)
@@ -163,7 +168,8 @@ class Peers:
         if extra_s > late_s:
             self._note(f"relay {relay}: a message later than late_s = {late_s:g}")
         elif (message := self._read(heard)) is not None and not self._hub.is_no_drop(message.topic):
-            self._hub.publish(self, message._replace(no_drop=False))
+            if (dated := self._dated(message, headers, extra_s)) is not None:
+                self._hub.publish(self, dated._replace(no_drop=False))
         in_turns = self._bus is not None and self._bus.most
         return extra_s > (_SLOW_SHARE * late_s if in_turns else late_s)
 
@@ -177,6 +183,21 @@ class Peers:
             return None
         return message if self._goes("send", message.topic) else None
 
+    def _left(self, message: wire.Message) -> dict[str, str]:
+        """Give the header with the time that a command has left, us: other relays have other clocks."""
+        return {"Left": str(max(0, message.until_us - self._hub.now_us()))} if message.until_us else {}
+
+    def _dated(self, message: wire.Message, headers: Mapping[str, str], extra_s: float) -> wire.Message | None:
+        """Give a message of another relay its times by this relay's clock; None if it may not go on."""
+        now_us, left = self._hub.now_us(), headers.get("Left", "")
+        until_us = max(1, now_us + int(left) - round(extra_s * 1e6)) if re.fullmatch("[0-9]{1,15}", left) else 0
+        here = message._replace(at_us=now_us, until_us=until_us)
+        try:
+            return self._hub.orders.dated(here, self.permissions.command_s(message.topic), now_us, None)
+        except wire.RefusedError as refused:
+            self._note(refused)
+            return None
+
     async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
         """Give a no_drop message to the other relays.
 
@@ -186,10 +207,11 @@ class Peers:
         """
         if self._bus is None or not self._goes("receive", message.topic):
             return False
-        frame = wire.encode(message)
+        frame = wire.encode(_undated(message))
         origin = f"{self._settings.name}\n{sender.identity.key}\n{sender.name}\n".encode()
         id = hashlib.blake2b(origin + frame, digest_size=16).hexdigest()  # the same when it is sent again
-        headers = {"Nats-Msg-Id": id, "Relay": self._settings.name}
+        put_us = str(time.time_ns() // 1000)
+        headers = {"Nats-Msg-Id": id, "Relay": self._settings.name, "Put": put_us, **self._left(message)}
         return await self._bus.hold(message.topic, frame, headers) or None
 
     async def _take_all(self, bus: Bus) -> None:
@@ -206,6 +228,9 @@ class Peers:
             return
         number = int(hashlib.blake2b(id.encode(errors="replace"), digest_size=6).hexdigest(), 16)
         message = None if relay == self._settings.name else self._read(heard)
+        if message is not None and re.fullmatch("[0-9]{1,17}", put := headers.get("Put", "")):
+            extra_s = self._delays[relay].extra_s(time.time() - int(put) / 1e6, self._hub.clock())
+            message = self._dated(message, headers, extra_s)
         if message is not None and self._hub.is_no_drop(message.topic) and number != self.session.received:
             try:
                 await self._hub.hold(self, message, taken=number)
@@ -221,3 +246,8 @@ class Peers:
         """Do nothing: the others are told nothing, no message is held for them, and they end with the relay."""
 
     wake = tell = end = _ignore
+
+
+def _undated(message: wire.Message) -> wire.Message:
+    """Take a message's times off, which are by this relay's clock."""
+    return message._replace(at_us=0, until_us=0)

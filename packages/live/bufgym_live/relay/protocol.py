@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 MAX_PRIORITY: Final = 1e6
 MAX_CAPACITY: Final = 1_000  # Largest L of a subscriber's queue
-ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "recordings", "replay")
+ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "clock", "recordings", "replay")
+_TOLD: Final = ("send", "receive", "topic", "command_s")  # of a rule, to its client
 _DIGITS: Final = bytes.maketrans(b"123456789E", b"000000000e")
 _LARGE: Final = (b"e000", b"e+000", 200 * b"0")  # parts of numbers that may not be finite, with all digits made zeros
 _SESSION: Final = re.compile(r"[\w.-]{1,64}", re.ASCII)
@@ -70,10 +71,12 @@ def admit(said: Mapping[str, Any], identity: Identity, rules: Sequence[Rule], fr
     if not name or name == wire.OWN:
         raise WireError(f"hello: name = {name!r}: must be a name, not the relay's")
     numbers = int(said.get("received", 0)), int(said.get("acked", 0))
+    if max(numbers) >= wire.MAX_SEQ:
+        raise WireError(f"hello: received, acked = {numbers}: must be less than {wire.MAX_SEQ}, for a next one")
     return Admitted(permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers)
 
 
-def welcome(config: Config, admitted: Admitted, identity: Identity, received: int) -> dict[str, Any]:
+def welcome(config: Config, admitted: Admitted, identity: Identity, received: int, clock_us: int) -> dict[str, Any]:
     """The fields of the answer to a hello."""
     rules = admitted.permissions.rules
     return {
@@ -82,6 +85,7 @@ def welcome(config: Config, admitted: Admitted, identity: Identity, received: in
         "session": admitted.session,
         "identity": identity.as_json(),
         "received": received,
+        "clock_us": clock_us,
         "no_drop": config.no_drop,
         "latched": config.latched,
         "window": config.store.window,
@@ -90,7 +94,7 @@ def welcome(config: Config, admitted: Admitted, identity: Identity, received: in
         "policies": config.policies,
         "default_policy": config.policies[0],
         "default_capacity": DEFAULT_CAPACITY,
-        "rules": [{"send": rule.send, "receive": rule.receive, "topic": rule.topic} for rule in rules],
+        "rules": [{name: getattr(rule, name) for name in _TOLD} for rule in rules],
     }
 
 

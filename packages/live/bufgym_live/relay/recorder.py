@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from bufgym_live.relay import ros_messages, wire
-from bufgym_live.relay.config import Config, Rotation
+from bufgym_live.relay.config import Config, Rotation, Rule
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.rules import RECORDER, Permissions
 from bufgym_live.robot.mcap_file import McapFile
@@ -28,7 +28,7 @@ class Recorder:
 
     def __init__(self, folder: Path, rotation: Rotation, permissions: Permissions, audit: Callable[..., None]) -> None:
         self.folder = folder
-        self._rotation, self._permissions, self._audit = rotation, permissions, audit
+        self._rotation, self.permissions, self._audit = rotation, permissions, audit
         self._file: McapFile | None = None
         self._full = False  # whether it was said of this file
         self._again_s = 0.0  # end of the pause after a failure, 0 if there was none
@@ -43,7 +43,7 @@ class Recorder:
 
     def wants(self, topic: str) -> bool:
         """Whether a rule allows messages of the topic."""
-        return self._permissions.allow("receive", topic)
+        return self.permissions.allow("receive", topic)
 
     def __call__(self, message: wire.Message, came_ns: int | None = None) -> None:
         """Write a message, which has come then or now, if a rule allows it."""
@@ -119,6 +119,10 @@ class Tape:
         """Have a message written."""
         if self._recorder.wants(message.topic):
             self.disk.soon(len(message.payload), self._recorder, message, time.time_ns())
+
+    def reruled(self, rules: Sequence[Rule]) -> None:
+        """Take new rules."""
+        self._recorder.permissions = Permissions(rules, RECORDER)
 
     def tick(self) -> None:
         """Have the file flushed."""

@@ -17,7 +17,7 @@ from bufgym_live.relay import protocol, wire
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.config import SKIP_PENDING
 from bufgym_live.relay.connection import Connection
-from bufgym_live.relay.hub import ROBOFLEET, Outgoing
+from bufgym_live.relay.outgoing import ROBOFLEET, Outgoing
 from bufgym_live.relay.protocol import Admitted
 from bufgym_live.relay.rules import Permissions
 from bufgym_live.relay.subscriber import Subscription

@@ -4,7 +4,8 @@ A robot's topics lie under ``/robots/NAME/``. Besides its source's topics it pub
 ``status`` once a second, with battery, location, network, queue and the list of topics. The command ``{"command":
 "policy", "policy": "afr"}`` on its topic ``command`` changes its queue's policy. Its status answers the latest command
 by the command's ``id``, with the reason ``why`` if it was refused. Messages on its topic ``drive`` move it as
-``bufgym_live.relay.drive`` says.
+``bufgym_live.relay.drive`` says. A command later than its deadline is refused. A stop on its topic ``stop`` holds as
+``bufgym_live.relay.latch`` says.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import asyncio
 import json
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from operator import methodcaller
 from typing import Any, Final, Protocol
@@ -27,9 +29,11 @@ from bufgym.scenario import Stream
 from bufgym_live.relay import wire
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.drive import TOPIC, Drive, Velocity
+from bufgym_live.relay.latch import Latch
 from bufgym_live.relay.monitor import Monitor
+from bufgym_live.relay.orders import STOP, order
 from bufgym_live.relay.place import Place
-from bufgym_live.robot.tasks import until_one_ends
+from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
@@ -54,6 +58,9 @@ class Source(Protocol):
 
     async def on_command(self, command: Any) -> None:
         """Take a command that is not the robot's own, or raise a BufgymError that says why not.
+
+        After ``{"command": "stop"}`` the robot hands on nothing that moves it, until it is released. A command at which
+        this is at work when a stop comes is cancelled.
 
         A source that takes ``{"command": "drive", "linear": m/s, "angular": rad/s}`` lists ``drive`` in ``commands`` of
         its status. Zeros follow as soon as the person who drives is silent for too long.
@@ -96,7 +103,11 @@ class Robot:
         settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
         self.client = RobotClient(url, name, **settings)
         self.client.subscribe(f"^{self.topic('command')}$", self._command)
+        self.client.subscribe(f"^{self.topic(STOP)}$", self._ordered)
+        self.client.late, self.client.reads_on = self._late, True
         self._drive = Drive(self._move)
+        self.latch = Latch()
+        self._tasks = Tasks()
         self.client.subscribe(f"^{self.topic(TOPIC)}$", self._driven)
 
     def topic(self, name: str) -> str:
@@ -126,7 +137,7 @@ class Robot:
     def status(self) -> dict[str, Any]:
         """Return the robot's state."""
         queue = self.monitor.state()
-        round_trip_s = self.client.round_trip_s
+        round_trip_s, own = self.client.round_trip_s, self.source.status()
         return {
             "battery": None,
             "location": self.place.location,
@@ -139,7 +150,9 @@ class Robot:
             "policies": self._policies,
             "answer": self._answer,
             "driver": self._drive.driver,
-            **self.source.status(),
+            "stop": self.latch.told,
+            **own,
+            "commands": sorted({*own.get("commands", ()), "stop", "release"}),
         }
 
     async def run(self) -> None:
@@ -153,7 +166,10 @@ class Robot:
 
         own = [(STATUS_S, status), (STATUS_S, self.client.ping), (QUEUE_S, queue)]
         every = [self._every(period_s, work) for period_s, work in own]
-        await until_one_ends(self._drive.run(), self.source.run(self), self.client.run(), *every)
+        try:
+            await until_one_ends(self._drive.run(), self.source.run(self), self.client.run(), *every)
+        finally:
+            await self._tasks.end()
 
     async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         await self.client.connected.wait()
@@ -176,20 +192,72 @@ class Robot:
         except BufgymError as error:
             self.client.note(str(error))
 
+    def refusal(self, message: wire.Message) -> str:
+        """Say why a command must not be executed now, or nothing. Sources ask this of what goes past ``on_command``."""
+        return "its deadline is over" if self.client.deadlines.is_late(message) else self.latch.refusal(message)
+
+    def _late(self, message: wire.Message) -> None:
+        if message.topic != self.topic(TOPIC):
+            self._answered(message, "came too late")
+
     async def _command(self, message: wire.Message) -> None:
         try:
             command = json.loads(bytes(message.payload))
         except ValueError:
             return  # a sender's mistake is no reason for a robot to stop
-        why = ""
+        kind, why = command.get("command") if isinstance(command, dict) else None, self.refusal(message)
         try:
-            if isinstance(command, dict) and command.get("command") == "policy":
+            if why:
+                pass
+            elif kind == STOP:
+                self._stop(message, str(command.get("id", "")), message.sender)
+                return
+            elif kind == "policy":
                 if command.get("policy") not in self._policies:
                     raise BufgymError(f"policy {command.get('policy')!r}: must be one of {', '.join(self._policies)}")
                 await asyncio.to_thread(self.client.change, command["policy"])
             else:
-                await self.source.on_command(command)
+                why = await self.latch.unless_stopped(self._tasks.begin(self._done(command)))
         except BufgymError as error:
             why = str(error)
-        self._answer = {"id": str(command.get("id"))[:64] if isinstance(command, dict) else "", "why": why[:300]}
+        self._answered(message, why)
+
+    async def _done(self, command: Any) -> None:
+        await self.source.on_command(command)
+
+    def _answered(self, message: wire.Message, why: str) -> None:
+        """Have the status say how a command went."""
+        with suppress(ValueError):
+            command = json.loads(bytes(message.payload))
+            self._answer = {"id": str(command.get("id"))[:64] if isinstance(command, dict) else "", "why": why[:300]}
         self.say("status", self.status())
+
+    def _ordered(self, message: wire.Message) -> None:
+        """Take a stop or a release; the relay says the last one again on each connection."""
+        try:
+            said = order(message)
+        except wire.RefusedError as error:
+            self.client.note(str(error))
+            return
+        if said["command"] == STOP:
+            self._stop(message, said["id"], said["by"])
+        elif self.latch.is_set:
+            late = message.until_us > 0 and self.client.deadlines.clock.is_past(message.until_us)
+            why = "came too late" if late else self.latch.release(said["of"])
+            if not why:
+                self._drive.go()
+            self._answered(message, why)
+
+    def _stop(self, message: wire.Message, id: str, by: str) -> None:
+        """Stand, at once: nothing that is under way is waited for."""
+        if self.latch.stop(id, by, message.at_us):
+            self._drive.stop()
+            self._tasks.begin(self._stopped(message))
+
+    async def _stopped(self, message: wire.Message) -> None:
+        why = ""
+        try:
+            await self.source.on_command({"command": STOP})
+        except BufgymError as error:
+            why = str(error)
+        self._answered(message, why)

@@ -61,6 +61,9 @@ class _RosSource:
             name = message.topic.removeprefix(before)
             if name not in self._receive or message.encoding != "cdr":
                 return
+            if why := robot.refusal(message):
+                robot.client.note(f"{message.topic}: not published: {why}")
+                return
             try:
                 await self._publish(Published(name, message.type), bytes(message.payload))
             except Exception as error:  # messages are untrusted, and ROS has its own error types
@@ -83,8 +86,11 @@ class _RosSource:
         return {"receives": self._receive, "commands": ["drive"] if TWIST.name in self._receive else []}
 
     async def on_command(self, command: Any) -> None:
-        """Publish a velocity as a Twist; refuse other commands, because ROS takes them on topics."""
+        """Publish a velocity as a Twist, zeros at a stop; refuse other commands, because ROS takes them on topics."""
         match command:
+            case {"command": "stop"} if TWIST.name in self._receive:
+                await self._publish(TWIST, b"\0\1\0\0" + bytes(48))
+                return
             case {"command": "drive", "linear": linear, "angular": angular} if TWIST.name in self._receive:
                 await self._publish(TWIST, b"\0\1\0\0" + struct.pack("<6d", linear, 0, 0, 0, 0, angular))
                 return

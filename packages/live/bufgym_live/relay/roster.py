@@ -7,7 +7,6 @@ removes the robot by the payload ``null``. Nobody may publish anything else.
 
 import json
 import re
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import lru_cache
@@ -56,8 +55,14 @@ class _Heard(NamedTuple):
 class Roster:
     """Give it each message; ``publish`` is called with what a robot that is away said last."""
 
-    def __init__(self, store: Store, publish: Callable[[wire.Message], None], clock: Callable[[], float]) -> None:
-        self._store, self._publish, self._clock = store, publish, clock
+    def __init__(
+        self,
+        store: Store,
+        publish: Callable[[wire.Message], None],
+        clock: Callable[[], float],
+        now_us: Callable[[], int],
+    ) -> None:
+        self._store, self._publish, self._clock, self._now_us = store, publish, clock, now_us
         self._here: dict[str, _Heard] = {}
         """Robots by their names, the one that was heard longest ago first."""
         self._saved_s = clock()
@@ -71,7 +76,7 @@ class Roster:
         if topic == "status":
             payload = bytes(message.payload) if len(message.payload) <= _READ_BYTES else b""
             self._here.pop(name, None)
-            self._here[name] = _Heard(self._clock(), time.time_ns() // 1000, payload)
+            self._here[name] = _Heard(self._clock(), self._now_us(), payload)
             if len(self._here) > MOST_ROBOTS:
                 del self._here[next(iter(self._here))]
         elif message.payload == GONE:
@@ -81,7 +86,9 @@ class Roster:
     def away(self) -> Iterator[wire.Message]:
         """Give what the robots that the store has said last."""
         for name, at_us, said in self._store.robots():
-            yield wire.Message(f"/robots/{name}/last", said.encode(), sender=wire.OWN, stamp_us=at_us)
+            yield wire.Message(
+                f"/robots/{name}/last", said.encode(), sender=wire.OWN, stamp_us=at_us, at_us=max(0, at_us)
+            )
 
     def tick(self) -> None:
         """Publish what robots said last that have gone silent, and save all now and then."""
@@ -93,7 +100,7 @@ class Roster:
         for name in gone:
             _, at_us, payload = self._here.pop(name)
             said = _said(payload).encode()
-            self._publish(wire.Message(f"/robots/{name}/last", said, sender=wire.OWN, stamp_us=at_us))
+            self._publish(wire.Message(f"/robots/{name}/last", said, sender=wire.OWN, stamp_us=at_us, at_us=at_us))
 
     def close(self) -> None:
         """Save all robots."""

@@ -7,16 +7,26 @@ denied
 
 import ipaddress
 import math
+import string
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from bufgym_live.relay.config import Rule
+from bufgym_live.relay.orders import COMMAND_S, right
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.wire import RefusedError
 
 Verb = Literal["send", "receive"]
 _REMEMBERED: Final = 4_096  # answers cached for one identity
+
+
+_CAPITALS: Final = str.maketrans(string.ascii_uppercase, string.ascii_lowercase)
+
+
+def folded(email: str) -> str:
+    """Fold the letters of ASCII; others stay, as ``lower`` would make a k of the sign of Kelvin."""
+    return email.translate(_CAPITALS)
 
 
 @dataclass(frozen=True)
@@ -31,7 +41,7 @@ class Identity:
     @property
     def key(self) -> str:
         """Key under which limits are counted."""
-        return f"<{self.email.lower()}>" if self.email else self.address  # no address reads so
+        return f"<{folded(self.email)}>" if self.email else self.address  # no address reads so
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields that others may see."""
@@ -58,7 +68,7 @@ def means(rule: Rule, identity: Identity) -> bool:
     if rule.own or identity.own:
         return rule.own == identity.own
     if rule.email:
-        return rule.email.lower() == identity.email.lower()
+        return folded(rule.email) == folded(identity.email)
     return ipaddress.ip_address(identity.address) in ipaddress.ip_network(
         "127.0.0.1" if rule.address == "::1" else rule.address
     )
@@ -73,6 +83,7 @@ class Permissions:
 
     def allow(self, verb: Verb, topic: str) -> bool:
         """Whether a rule allows this on the topic."""
+        topic = right(topic)
         answer = self._answers.get((verb, topic))
         if answer is None:
             answer = any(getattr(rule, verb) and pattern(rule.topic).whole(topic) for rule in self.rules)
@@ -80,6 +91,12 @@ class Permissions:
                 self._answers.clear()
             self._answers[verb, topic] = answer
         return answer
+
+    def command_s(self, topic: str) -> float:
+        """Give the time for which a command on this topic may be executed, by the first rule that lets it be sent."""
+        topic = right(topic)
+        found = (rule.command_s for rule in self.rules if rule.send and pattern(rule.topic).whole(topic))
+        return next(found, COMMAND_S)
 
     @property
     def receives(self) -> bool:

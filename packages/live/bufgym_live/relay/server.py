@@ -9,7 +9,7 @@ import logging
 import signal
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -29,7 +29,7 @@ from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.config import POLICIES, Config
 from bufgym_live.relay.connection import HELLO_BYTES, Connection
 from bufgym_live.relay.hub import CONNECTED, STATUS, Hub
-from bufgym_live.relay.identity import Verifier, server_context
+from bufgym_live.relay.identity import Verifier, renew, server_context
 from bufgym_live.relay.robofleet import RobofleetConnection
 from bufgym_live.relay.rules import Identity, Permissions
 from bufgym_live.robot.sockets import free_port
@@ -140,6 +140,31 @@ class Server:
         """
         await asyncio.shield(self._warming)
 
+    def reread(self, config: Config) -> list[str]:
+        """Take the rules, the issuer's keys and the certificate of a configuration; return what else it changes.
+
+        Connections go on; one ends if no rule is for it any more.
+
+        Raises BufgymError: the certificate cannot be read; then nothing has changed.
+        """
+        if self._tls is not None and config.tls is not None:
+            renew(self._tls, config.tls)
+        if self.config.tokens is not None and config.tokens is not None:
+            self._verifier = Verifier(config.tokens)
+        kept = {"tls": config.tls, "tokens": config.tokens}
+        taken = {name: new for name, new in kept.items() if new and getattr(self.config, name)}
+        self.config = replace(self.config, rules=config.rules, **taken)
+        self.hub.reruled(self.config)
+        self.hub.audit("reread", rules=len(config.rules))
+        same = (
+            ("host", "port", "limits") if self.config.port == 0 else ("limits",)
+        )  # ``_fitted`` may have changed these
+        return [
+            one
+            for one in Config.__struct_fields__
+            if one not in same and getattr(config, one) != getattr(self.config, one)
+        ]
+
     async def close(self) -> None:
         """Close all connections; held messages stay on disk."""
         if self._ticking is not None:
@@ -230,8 +255,8 @@ def _fitted(config: Config, say: Any) -> Config:
     return config
 
 
-async def serve_forever(config: Config, say: Any = print) -> None:
-    """Run a relay until cancelled, or until the process gets SIGTERM."""
+async def serve_forever(config: Config, say: Any = print, load: Callable[[], Config] | None = None) -> None:
+    """Run a relay until cancelled, or until the process gets SIGTERM; at SIGHUP it rereads what ``load`` gives."""
     sys.setswitchinterval(SWITCH_S)
     server = Server(_fitted(config, say))
     port = await server.start()
@@ -242,10 +267,21 @@ async def serve_forever(config: Config, say: Any = print) -> None:
     if server.window is not None:
         say(f"ws://{server.window.address}: Foxglove, Lichtblick")
     told = asyncio.Event()
+
+    def reread() -> None:
+        try:
+            others = server.reread(config if load is None else load())
+        except BufgymError as error:
+            say(f"not reread, all stays as it was: {error}")
+        else:
+            more = f"; a restart is needed for: {', '.join(others)}" if others else ""
+            say(f"reread: {len(server.config.rules)} rules, keys and certificate{more}")
+
     with contextlib.suppress(
-        NotImplementedError, RuntimeError, ValueError
+        AttributeError, NotImplementedError, RuntimeError, ValueError
     ):  # Windows; a thread other than the main one
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reread)
 
     async def works() -> None:
         await server.warm()

@@ -9,42 +9,34 @@ wait for home, which alone knows what has arrived.
 
 import asyncio
 import contextlib
-import inspect
 import os
 import re
 import ssl
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
 from urllib.parse import SplitResult
 
 from bufgym_live.relay import address, wire
 from bufgym_live.relay.backoff import Backoff
+from bufgym_live.relay.deadlines import Deadlines
 from bufgym_live.relay.inbox import Inbox
+from bufgym_live.relay.orders import is_stop
 from bufgym_live.relay.patterns import for_client
+from bufgym_live.relay.stops import Stops
 from bufgym_live.relay.unanswered import Unanswered
+from bufgym_live.relay.wanted import OnMessage, Wanted
 from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import unsent_bytes
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
-CLOSE_S: Final = 1.0  # Time for the relay to answer that the connection is closed
 _FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting mends
-
-OnMessage = Callable[[wire.Message], Awaitable[None] | None]
 
 
 class HomeIsBack(Exception):  # noqa: N818  (nothing is wrong)
     """The first relay is back, and this connection is to another."""
-
-
-class SubscriptionRequest(NamedTuple):
-    """A subscription that is asked of the relay."""
-
-    pattern: re.Pattern[str]
-    on_message: OnMessage
-    fields: dict[str, Any]
 
 
 class Session:
@@ -82,16 +74,21 @@ class Session:
         """The last 100 refusals and reasons for a connection's end."""
         self.round_trip_s: float | None = None
         """Round trip to the relay as ``ping`` last measured it, including messages on their way."""
+        self.deadlines = Deadlines()
+        self.late: Callable[[wire.Message], None] = lambda message: self.note(f"{message.topic}: came too late")
+        """Called with a command that came after its deadline, in place of ``on_message``."""
+        self.reads_on = False
+        """Whether messages are read on while the program is at work on one, so that a stop overtakes them."""
         self._token, self._tls, self._report = token, tls, say
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
         self._no_drop: tuple[re.Pattern[str], ...] = ()
-        self._unanswered = Unanswered()
+        self._unanswered = Unanswered(self.deadlines.dated)
+        self._stops = Stops(self.deadlines.dated)
         self._inbox = Inbox()
         self._wanted = asyncio.Event()
         self._received = [0, 0]
         """Number of the last no_drop message received from home and from the relay that stands in."""
-        self._subscriptions: dict[str, SubscriptionRequest] = {}
-        self._confirmed: set[str] = set()
+        self._subscriptions = Wanted()
         self._connection: Any = None
         self._tasks = Tasks()
 
@@ -108,8 +105,8 @@ class Session:
     async def command(self, topic: str, data: Any, type: str = "") -> None:
         """Send ``data`` on a no_drop topic and wait until the relay holds it; it arrives exactly once.
 
-        With a ROS ``type``, such as ``geometry_msgs/msg/Twist``, data are bytes in CDR; otherwise they are sent as
-        JSON.
+        A command to a robot has the deadline of the relay's rule (``command_s``), counted from this call. With a ROS
+        ``type``, such as ``geometry_msgs/msg/Twist``, data are bytes in CDR; otherwise they are sent as JSON.
 
         Raises:
             BufgymError: the relay refused it, or it is no JSON; the error says why.
@@ -122,6 +119,22 @@ class Session:
         self._wanted.set()
         self._inbox.look()
         await answered
+
+    async def stop(self, robot: str) -> str:
+        """Stop a robot and return once the relay has it; ``release`` needs the returned id. The stop holds."""
+        self._unanswered.withdraw(robot, "withdrawn by a stop")
+        return await self._order(robot, command="stop")
+
+    async def release(self, robot: str, of: str) -> None:
+        """Release a robot from the stop with this id, which its status says, too; this has a deadline."""
+        await self._order(robot, command="release", of=of)
+
+    async def _order(self, robot: str, **said: str) -> str:
+        id, answered = self._stops.put(robot, **said)
+        if self.connected.is_set():
+            await self._stops.send(self._connection.send)
+        await answered
+        return id
 
     def subscribe(
         self,
@@ -137,10 +150,8 @@ class Session:
         ``policy`` and ``capacity`` describe the relay's queue for this subscription. With ``durable`` the relay holds
         no_drop messages while this client is away.
         """
-        id = str(len(self._subscriptions))
         chosen = {"policy": policy, "capacity": capacity, "durable": durable or None}
-        fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
-        self._subscriptions[id] = SubscriptionRequest(for_client(pattern), on_message, fields)
+        fields = self._subscriptions.add(pattern, on_message, **chosen)
         self.ready.clear()
         if self.connected.is_set() and not (self.stands_in and durable):
             self._tasks.begin(self._say_it("subscribe", **fields))
@@ -174,7 +185,8 @@ class Session:
                 if not self.stands_in:
                     await asyncio.sleep(backoff.delay_s(away))
         finally:
-            self._unanswered.give_up(f"{self.name}: the client has ended")
+            for waiting in (self._unanswered, self._stops):
+                waiting.give_up(f"{self.name}: the client has ended")
             await self._tasks.end()
 
     async def _serve_one_connection(self, backoff: Backoff) -> None:
@@ -190,7 +202,7 @@ class Session:
         finally:
             self.connected.clear()
             self.ready.clear()
-            self._confirmed.clear()
+            self._subscriptions.confirmed.clear()
             connection, self._connection = self._connection, None
             with contextlib.suppress(AttributeError):  # there is none; or asyncio's of 3.11, if it has ended already
                 connection.transport.abort()
@@ -213,27 +225,9 @@ class Session:
         self.faults.append(fault)
 
     async def _connect(self) -> Any:
-        from websockets.asyncio.client import connect
-        from websockets.typing import Subprotocol
+        from bufgym_live.relay.client_connection import connected  # not at start-up
 
-        from bufgym_live.relay.client_connection import WatchedConnection  # not at start-up
-
-        secure = self.address.scheme == "wss"
-        return await connect(
-            f"{self.address.scheme}://{self.address.netloc}{self.address.path.rstrip('/')}{wire.PATH}",
-            sock=await address.reached(self.address),
-            subprotocols=[Subprotocol(wire.SUBPROTOCOL)],
-            ssl=(self._tls or ssl.create_default_context()) if secure else None,
-            server_hostname=self.address.hostname if secure else None,
-            compression=None,
-            create_connection=WatchedConnection,
-            ping_interval=wire.PING_S,
-            ping_timeout=wire.PONG_S,
-            close_timeout=CLOSE_S,
-            proxy=None,
-            max_size=wire.MAX_FRAME_BYTES,
-            write_limit=(1, 0),
-        )
+        return await connected(self.address, self._tls)
 
     async def _say_it(self, op: str, **fields: Any) -> None:
         await self._connection.send(wire.say(op, **fields))
@@ -246,6 +240,7 @@ class Session:
             self._received[1] = 0
         else:
             hello |= {"session": self._session, "received": self._received[0], "acked": self._unanswered.acked}
+        self.deadlines.begin()
         await self._say_it("hello", **hello)
         said = wire.heard(await self._connection.recv())
         if said["op"] == "refused":
@@ -253,27 +248,25 @@ class Session:
         if said["op"] != "welcome":
             raise wire.WireError(f"op {said['op']!r}: must be welcome")
         self.welcome = said
+        self.deadlines.welcomed(said)
+        await self._stops.send(self._connection.send)
         self._no_drop = tuple(map(for_client, said.get("no_drop", ())))
         if not self.stands_in:
             self._unanswered.resume(said["received"], max(1, said["window"]), self.check_size)
-        for subscription in self._asked:
+        for subscription in self._subscriptions.asked(self.stands_in):
             await self._say_it("subscribe", **subscription.fields)
         self.connected.set()
         self._confirm()
 
-    @property
-    def _asked(self) -> list[SubscriptionRequest]:
-        """The subscriptions that this relay is asked for."""
-        return [one for one in self._subscriptions.values() if not (self.stands_in and "durable" in one.fields)]
-
     def _confirm(self) -> None:
-        if self._confirmed.issuperset(one.fields["id"] for one in self._asked):
+        if self._subscriptions.are_confirmed(self.stands_in):
             self.ready.set()
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         """List the tasks that run while there is a connection."""
-        self._inbox = Inbox(lambda: self._unanswered.awaited and not self.stands_in)
-        return [self._until_home() if self.stands_in else self._send_no_drop(), self._hear_all(), self._take_all()]
+        self._inbox = Inbox(lambda: self.reads_on or (self._unanswered.awaited and not self.stands_in))
+        first = self._until_home() if self.stands_in else self._send_no_drop()
+        return [first, self._hear_all(), self._take_all(), self.deadlines.ask(self._say_it)]
 
     async def _until_home(self) -> None:
         while True:
@@ -306,7 +299,13 @@ class Session:
     async def _hear_all(self) -> None:
         async for frame in self._connection:
             if isinstance(frame, bytes):
-                await self._inbox.put(wire.decode(frame))
+                message = wire.decode(frame)
+                if message.at_us:
+                    self.deadlines.clock.heard(message.at_us)
+                if is_stop(message.topic):
+                    await self._take(message)  # it waits behind nothing
+                else:
+                    await self._inbox.put(message)
             else:
                 self._answer(wire.heard(frame))
         raise ConnectionResetError("the relay has closed the connection")
@@ -318,17 +317,10 @@ class Session:
     async def _take(self, message: wire.Message) -> None:
         if message.no_drop and message.seq <= self._received[self.stands_in]:
             return  # it came before the connection broke
-        for subscription in list(self._subscriptions.values()):
-            if subscription.pattern.search(message.topic):
-                try:
-                    done = subscription.on_message(message)
-                    if inspect.isawaitable(done):
-                        await done
-                except (Exception, asyncio.CancelledError) as error:  # the program's fault, which nothing here mends
-                    if asyncio.current_task().cancelling():  # type: ignore[union-attr]
-                        raise
-                    about = {"message": f"on_message of {message.topic}", "exception": error}
-                    asyncio.get_running_loop().call_exception_handler(about)
+        if self.deadlines.is_late(message):
+            self.late(message)
+        else:
+            await self._subscriptions.call(message)
         if message.no_drop:
             self._received[self.stands_in] = message.seq
             await self._say_it("ack", seq=message.seq)
@@ -336,11 +328,18 @@ class Session:
     def _answer(self, said: dict[str, Any]) -> None:
         if said["op"] == "ack":
             self._unanswered.ack(said["seq"])
+        elif said["op"] == "clock":
+            self.deadlines.answered(said)
+        elif said["op"] == "stopped":
+            self._stops.confirm(said["topic"], said["id"])
         elif said["op"] == "subscribed":
-            self._confirmed.add(said["id"])
+            self._subscriptions.confirmed.add(said["id"])
             self._confirm()
         elif said["op"] == "refused":
-            if said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
+            error = RefusedError(said["code"], f"topic {said.get('topic')}: refused: {said['code']}: {said['why']}")
+            if is_stop(str(said.get("topic"))):
+                self._stops.refuse(said.get("seq", 0), error)
+            elif said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])
             elif said["what"] == "subscribe" and said["code"] not in _FOR_GOOD:
                 raise ConnectionResetError(f"subscribe refused: {said['code']}: {said['why']}")  # and once more

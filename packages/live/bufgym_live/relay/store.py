@@ -46,6 +46,11 @@ class Store:
         return self._held.there
 
     @property
+    def fault(self) -> str:
+        """Why the file could not be written at the last try; empty if it could."""
+        return self._held.fault
+
+    @property
     def held_bytes(self) -> int:
         """Bytes held in total."""
         return self._held.bytes

@@ -5,12 +5,14 @@ messages under way are answered, the messages behind the refused one are sent ag
 """
 
 import asyncio
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from bufgym.ground.errors import BufgymError
 from bufgym_live.relay import wire
+from bufgym_live.relay.orders import robot_of
 
 AGAIN = ("out_of_order", "busy")
 """Codes of refusals after which a message is sent again: it is behind a refused one, or the relay's disk stalls."""
@@ -22,12 +24,20 @@ class Pending:
 
     message: wire.Message
     answered: asyncio.Future[None]  # done when the relay holds the message; a BufgymError if it was refused
+    put_s: float = 0.0  # when it was put, by the client's clock
+    withdrawn: bool = False  # whether a stop has withdrawn it
 
 
 class Unanswered:
     """The messages of one session, in order."""
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        dated: Callable[[wire.Message, float], wire.Message] = lambda message, put_s: message,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``dated`` gives a message its deadline by when it was put, or raises a BufgymError where that is over."""
+        self._dated, self._clock = dated, clock
         self.acked = 0  # highest number that the relay holds
         self.window = 1  # n_T, the most messages unanswered at a time
         self._waiting: deque[Pending] = deque()
@@ -43,7 +53,7 @@ class Unanswered:
 
     def put(self, message: wire.Message) -> asyncio.Future[None]:
         """Add a message; the future is done once the relay holds it."""
-        pending = Pending(message, asyncio.get_running_loop().create_future())
+        pending = Pending(message, asyncio.get_running_loop().create_future(), self._clock())
         self._waiting.append(pending)
         return pending.answered
 
@@ -54,13 +64,15 @@ class Unanswered:
         """
         while self._waiting and not self._refused and len(self._sent) < self.window:
             pending = self._waiting.popleft()
+            if pending.withdrawn:
+                continue
             try:
-                self._check(pending.message)
+                self._check(message := self._dated(pending.message, pending.put_s))
             except BufgymError as error:
                 _settle(pending, error)
             else:
                 self._sent.append(pending)
-                return pending.message._replace(seq=self.acked + len(self._sent))
+                return message._replace(seq=self.acked + len(self._sent))
         return None
 
     def ack(self, seq: int) -> None:
@@ -104,6 +116,13 @@ class Unanswered:
         self._sent.clear()
         self._refused = 0
         self.acked = received
+
+    def withdraw(self, robot: str, why: str) -> None:
+        """Withdraw the commands to a robot: none is sent from now on, and those that wait have failed."""
+        for pending in (*self._again, *self._sent, *self._waiting):
+            if robot_of(pending.message.topic) == robot:
+                pending.withdrawn = True
+                _settle(pending, BufgymError(f"topic {pending.message.topic}: {why}"))
 
     def give_up(self, why: str) -> None:
         """Fail all messages, because no answer will come."""

@@ -28,6 +28,7 @@ MAX_ORDER_CHARACTERS: Final = 2**16  # Size limit of a client's text frame that 
 VERSION: Final = 1
 MESSAGE: Final = 1  # The one kind of binary frame
 NO_DROP: Final = 1  # A flag
+TIMES: Final = 2  # A flag: two times by the relay's clock follow the header
 MAX_NAME_BYTES: Final = 255  # Of a topic, a type, an encoding, a sender
 MAX_SEQ: Final = 2**53  # Numbers are exact in JavaScript up to this
 MAX_STAMP_US: Final = 2**53
@@ -35,6 +36,7 @@ MAX_STAMP_US: Final = 2**53
 _HEADER: Final = struct.Struct("!2s7B3sIQq")
 """Magic; version, kind, flags, bytes of topic, type, encoding and sender; zeros; bytes of the payload; seq; stamp."""
 HEADER_BYTES: Final = _HEADER.size
+_TIMES: Final = struct.Struct("!QQ")
 _MAGIC: Final = b"bR"
 
 
@@ -66,6 +68,10 @@ class Message(NamedTuple):
     stamp_us: int = 0
     """When it was put, us since 1970, by its sender's clock."""
     no_drop: bool = False
+    at_us: int = 0
+    """When the relay took it, us by the relay's clock. The relay fills it in."""
+    until_us: int = 0
+    """Deadline, us by the relay's clock: later it is not executed. 0: none."""
 
 
 def encode(message: Message) -> bytes:
@@ -73,8 +79,10 @@ def encode(message: Message) -> bytes:
     _check(message)
     names = [name.encode() for name in (message.topic, message.type, message.encoding, message.sender)]
     numbers = len(message.payload), message.seq, message.stamp_us
-    header = _HEADER.pack(_MAGIC, VERSION, MESSAGE, int(message.no_drop), *map(len, names), b"\0\0\0", *numbers)
-    return b"".join((header, *names, message.payload))
+    times = _TIMES.pack(message.at_us, message.until_us) if message.at_us or message.until_us else b""
+    flags = NO_DROP * message.no_drop | TIMES * bool(times)
+    header = _HEADER.pack(_MAGIC, VERSION, MESSAGE, flags, *map(len, names), b"\0\0\0", *numbers)
+    return b"".join((header, times, *names, message.payload))
 
 
 def decode(data: bytes, max_bytes: int = MAX_FRAME_BYTES) -> Message:
@@ -85,9 +93,14 @@ def decode(data: bytes, max_bytes: int = MAX_FRAME_BYTES) -> Message:
     if not HEADER_BYTES <= len(data) <= max_bytes:
         raise WireError(f"frame of {len(data)} bytes: must be from {HEADER_BYTES} to {max_bytes}")
     magic, version, kind, flags, *lengths, zeros, payload_bytes, seq, stamp_us = _HEADER.unpack_from(data)
-    if (magic, version, kind, zeros) != (_MAGIC, VERSION, MESSAGE, b"\0\0\0") or flags > NO_DROP:
+    if (magic, version, kind, zeros) != (_MAGIC, VERSION, MESSAGE, b"\0\0\0") or flags > NO_DROP | TIMES:
         raise WireError(f"header {data[:12]!r}: must be {_MAGIC!r}, version {VERSION}, kind {MESSAGE}, a known flag")
-    names, at = [], HEADER_BYTES
+    names, at, at_us, until_us = [], HEADER_BYTES, 0, 0
+    if flags & TIMES:
+        if len(data) < at + _TIMES.size:
+            raise WireError(f"frame of {len(data)} bytes: must be at least {at + _TIMES.size}, as its header says")
+        at_us, until_us = _TIMES.unpack_from(data, at)
+        at += _TIMES.size
     for length in lengths:
         try:
             names.append(data[at : at + length].decode())
@@ -98,7 +111,7 @@ def decode(data: bytes, max_bytes: int = MAX_FRAME_BYTES) -> Message:
         raise WireError(f"frame of {len(data)} bytes: must be {at + payload_bytes}, as its header says")
     topic, kind_name, encoding, sender = names
     payload, no_drop = memoryview(data)[at:], bool(flags & NO_DROP)
-    message = Message(topic, payload, encoding, kind_name, sender, seq, stamp_us, no_drop)
+    message = Message(topic, payload, encoding, kind_name, sender, seq, stamp_us, no_drop, at_us, until_us)
     _check(message)
     return message
 
@@ -113,6 +126,8 @@ def _check(message: Message) -> None:
         raise WireError(f"seq = {message.seq}: must be from 0 to {MAX_SEQ}")
     if abs(message.stamp_us) > MAX_STAMP_US:
         raise WireError(f"stamp_us = {message.stamp_us}: must be at most {MAX_STAMP_US}")
+    if not 0 <= message.at_us <= MAX_STAMP_US or not 0 <= message.until_us <= MAX_STAMP_US:
+        raise WireError(f"at_us = {message.at_us}, until_us = {message.until_us}: must be from 0 to {MAX_STAMP_US}")
 
 
 def check_topic(topic: str) -> None:
@@ -137,6 +152,7 @@ _MESSAGE: Final = {
     "seq?": Number,
     "stamp_us?": Annotated[int, Meta(ge=-MAX_STAMP_US, le=MAX_STAMP_US)],
     "no_drop?": bool,
+    "until_us?": Number,
 }
 FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
     "hello": {
@@ -150,7 +166,9 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
         "window": Number,
         "rules": list[Any],
         "max_message_bytes?": Number,
+        "clock_us?": Number,
     },
+    "clock": {"clock_us?": Number},
     "subscribe": {
         "id": str,
         "topic": str,
@@ -162,12 +180,13 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
     "subscribed": {"id": str},
     "unsubscribe": {"id": str},
     "publish": {**_MESSAGE, "data": msgspec.Raw},
-    "message": {**_MESSAGE, "sender": str},
+    "message": {**_MESSAGE, "sender": str, "at_us?": Number},
     "ack": {"seq": Number},
     "recordings": {"files?": list[Any]},
     "replay": {"id": str, "file": str, "from_us": Number, "most_bytes": Number},
     "replayed": {"id": str, "messages": list[Any]},
     "delivered": {"seq": Number, "receivers": Number, "lost": Number},
+    "stopped": {"topic": str, "id": str},
     "refused": {"what": str, "code": str, "why": str},
 }
 """op -> field -> its type; "?" follows the name of a field that may be left out. A later version may have more."""

@@ -26,7 +26,7 @@ from bufgym_live.relay.wire import Message  # noqa: E402
 
 PATIENCE_S = 120.0
 """Ends a wait that hangs. No test waits for it."""
-ALL = Rule(address="127.0.0.0/8", send=True, receive=True)
+ALL = Rule(address="127.0.0.0/8", send=True, receive=True, command_s=86_400)
 
 
 def settings(**changed: Any) -> Config:
@@ -185,7 +185,7 @@ def full_disk() -> Iterator[None]:
 async def process(port: int, folder: Path, table: str = "") -> AsyncIterator[Any]:
     """A relay in a process of its own; it is killed in the end, without warning."""
     config = folder / "relay.toml"
-    rule = '[[rules]]\naddress = "127.0.0.1"\nsend = true\nreceive = true\n'
+    rule = '[[rules]]\naddress = "127.0.0.1"\nsend = true\nreceive = true\ncommand_s = 86400\n'
     config.write_text(f'port = {port}\nfolder = "held"\npolicies = ["drop-oldest"]\n{rule}{table}')
     words = ["-um", "bufgym", "relay", "serve", "--config", str(config)]
     one = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)

@@ -233,6 +233,7 @@ async def test_a_full_disk_stops_no_message(tmp_path: Path, monkeypatch: pytest.
                 assert (await viewer.next()).payload == b"12"
                 await robot.command(2, "/robots/a/command")
                 assert (await robot.next())["code"] == "store_full"
+                assert server.hub.ills[0].startswith("the store cannot be written: ")
                 await viewer.say("ack", seq=1)
                 assert (await viewer.subscribe("b", "b", durable=True))["code"] == "store_full"
                 await until("its log", lambda: "recording_failed" in events())
@@ -243,7 +244,7 @@ async def test_a_full_disk_stops_no_message(tmp_path: Path, monkeypatch: pytest.
             assert (await viewer.subscribe("b", "b", durable=True))["op"] == "subscribed"
             await viewer.say("ack", seq=2)
             assert await nothing(viewer)
-            assert server.hub.status()["held"] == 0
+            assert server.hub.status()["held"] == 0 and server.hub.ills == []
             async with within("the recorder"):
                 while "recording_resumed" not in events():
                     await robot.put("/robots/b/odom")

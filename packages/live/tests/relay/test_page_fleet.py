@@ -315,7 +315,8 @@ def test_driving_by_hand(opened: tuple[Any, Fleet]) -> None:
     box = page.locator("#pad").bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 3)
     page.mouse.down()
-    (ahead, *_) = driven(lambda said: len(said) >= 3)
+    (zeros, ahead, *_) = driven(lambda said: len(said) >= 3)
+    assert zeros == still
     assert ahead["linear"] == pytest.approx(0.2, abs=0.01) and ahead["angular"] == pytest.approx(0, abs=0.01)
     assert ahead["for_ms"] == 400
     page.mouse.up()

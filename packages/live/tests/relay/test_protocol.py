@@ -58,6 +58,7 @@ def test_a_hello_that_is_refused() -> None:
         (1, {"form": "xml"}, "must be of version 1, of form binary or json"),
         (1, {"session": "a b"}, "session = 'a b': must be 1 to 64 letters"),
         (1, {"name": "relay"}, "name = 'relay': must be a name, not the relay's"),
+        (1, {"received": 2**53}, r"received, acked = \(9007199254740992, 0\): must be less than 9007199254740992"),
         (1, {"name": "\n"}, "name '\\\\n': must be printable"),
     ):
         refuse(f"hello: {error}", begin, wire.say("hello", version=version, **more), kind=WireError)
@@ -68,9 +69,9 @@ def test_who_is_let_in_and_welcomed() -> None:
     admitted = protocol.admit(said, ANNA, RULES, "fresh")
     assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2)
     assert protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")[1:] == ("n", "fresh", True, "json", 0, 0)
-    welcome = protocol.welcome(CONFIG, admitted, ANNA, 5)
+    welcome = protocol.welcome(CONFIG, admitted, ANNA, 5, 7)
     assert wire.heard(wire.say("welcome", **welcome))["received"] == 5 and welcome["session"] == "a"
-    assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*"}]
+    assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*", "command_s": 3.0}]
     refuse("no rule allows anything", protocol.admit, said, Identity("11.0.0.1"), RULES, "fresh", kind=RefusedError)
 
 
@@ -156,7 +157,17 @@ NO_JSON = (
 )
 whole, stamps = st.integers(0, 2**53), st.integers(-(2**53), 2**53)
 messages = st.builds(
-    Message, names.map("/{}".format), st.binary(max_size=50), st.just("raw"), names, names, whole, stamps, st.booleans()
+    Message,
+    names.map("/{}".format),
+    st.binary(max_size=50),
+    st.just("raw"),
+    names,
+    names,
+    whole,
+    stamps,
+    st.booleans(),
+    whole,
+    whole,
 )
 
 
@@ -169,6 +180,8 @@ def test_byte_by_byte() -> None:
         b"\xff\xff\xff\xff\xff\xff\xff\xff"
         b"/a/bTjpegme\x01\x02"
     )
+    timed = wire.encode(message._replace(at_us=259, until_us=260))
+    assert timed[4] == 3 and timed[32:] == b"\0\0\0\0\0\0\x01\x03\0\0\0\0\0\0\x01\x04" + wire.encode(message)[32:]
 
 
 def published(text: str) -> Message:
@@ -178,7 +191,7 @@ def published(text: str) -> Message:
 @given(messages)
 def test_what_is_written_is_read(message: Message) -> None:
     assert wire.decode(wire.encode(message)) == message
-    assert published(wire.to_json(message)) == message._replace(sender="")
+    assert published(wire.to_json(message)) == message._replace(sender="", at_us=0)
 
 
 @pytest.mark.parametrize("payload", NO_JSON, ids=len)
@@ -197,7 +210,7 @@ def test_json_payloads_are_values() -> None:
 
 
 GOOD = wire.encode(Message("/a", b"12"))
-TWO = {2: "version 1", 3: "kind 1", 4: "a known flag"}
+TWO = {2: "version 1", 3: "kind 1", 4: "frame of 40 bytes: must be at least 48"}
 """What a 2 at this place breaks."""
 
 
@@ -209,6 +222,7 @@ TWO = {2: "version 1", 3: "kind 1", 4: "a known flag"}
         (wire.decode, GOOD + b"1", "frame of 41 bytes: must be 40"),
         *((wire.decode, data, "header") for data in (b"bX" + GOOD[2:], GOOD[:9] + b"\x01" + GOOD[10:])),
         *((wire.decode, GOOD[:k] + b"\x02" + GOOD[k + 1 :], says) for k, says in TWO.items()),
+        (wire.decode, GOOD[:4] + b"\x04" + GOOD[5:], "a known flag"),
         (wire.decode, GOOD[:16] + b"\xff" * 8 + GOOD[24:], "seq"),
         (wire.decode, GOOD[:24] + b"\x7f" + GOOD[25:], "stamp_us"),
         (wire.decode, GOOD.replace(b"/a", b"aa"), "must begin with '/'"),

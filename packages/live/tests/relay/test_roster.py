@@ -1,6 +1,7 @@
 """Robots that were here: the relay keeps what they said last over a restart, until somebody removes them."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def roster(folder: Path, clock: Any) -> tuple[Roster, list[Message]]:
     """A roster over a store in a folder, and what it publishes."""
     config, published = settings(folder=folder), list[Message]()
     store = Store(config, lambda *_, **__: None, lambda _: None, clock)  # type: ignore[arg-type]
-    return Roster(store, published.append, clock), published
+    return Roster(store, published.append, clock, lambda: time.time_ns() // 1000), published
 
 
 def kept(one: Roster, folder: Path) -> list[Message]:

@@ -25,7 +25,8 @@ from bufgym.model.topics import Topic
 from bufgym_live.relay import policies
 from bufgym_live.relay.config import Config, Foxglove, Limits, Rotation, Rule, load
 from bufgym_live.relay.held import StoredSession
-from bufgym_live.relay.hub import Hub, Outgoing
+from bufgym_live.relay.hub import Hub
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import MAX_CHARACTERS, pattern
 from bufgym_live.relay.plain import Latest
 from bufgym_live.relay.quota import Bucket, Quotas

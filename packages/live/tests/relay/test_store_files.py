@@ -56,3 +56,13 @@ def test_a_store_of_a_later_release_is_refused(tmp_path: Path) -> None:
     database.close()
     given = settings(folder=tmp_path), Audit(None, Rotation()), print, time.monotonic
     refuse("held.sqlite: no such column: .*: must be a relay's own", Store, *given)
+
+
+def test_a_damaged_store_ends_the_start_in_a_sentence(tmp_path: Path) -> None:
+    """The second page of 4,096 bytes, the root of a table, is zeros."""
+    given = settings(folder=tmp_path), Audit(None, Rotation()), print, time.monotonic
+    Store(*given).close()
+    file = tmp_path / FILE
+    data = file.read_bytes()
+    file.write_bytes(data[:4096] + bytes(4096) + data[8192:])
+    refuse("held.sqlite: .*; a damaged one must be moved away, .* or be replaced by a backup", Store, *given)

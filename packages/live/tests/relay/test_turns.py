@@ -15,7 +15,8 @@ from relay_cases import client, relay, settings, until
 
 from bufgym_live.relay import caller, replay, server, turns, wire
 from bufgym_live.relay.connection import Connection
-from bufgym_live.relay.hub import MOST_IN_TURN, Outgoing
+from bufgym_live.relay.hub import MOST_IN_TURN
+from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.subscriber import Subscription
 
 

@@ -27,7 +27,7 @@ const escaped = text => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 
 let chosen = null, tab = TABS[0], textMs = -Infinity, texts = false, stale = false, wants = false, space = null, onMs = null, awayMs = performance.now();
 
-const nowMs = () => player.replay ? player.nowMs : Date.now();
+const nowMs = () => player.replay ? player.nowMs : relay.clock.now();
 const isReplay = () => player.replay !== null;
 const robot = () => fleet.get(chosen);
 
@@ -53,6 +53,7 @@ const fleet = new Fleet({
     hand.answered(one);
     hand.offerPolicies();
   },
+  stopped(one) { hand.stopped(one); },
   reframed(one) { if (one.name === chosen) map.forget(); },
   scanned(one, pose, scan) { map.addScan(pose, scan); },
   moved(isLayer = false) {
@@ -72,7 +73,7 @@ const cameras = new Cameras($("first"), $("cameras"), $("large"));
 const relay = new Relay({
   state(text, isOn) {
     if (!isOn && onMs !== null) awayMs = performance.now();
-    onMs = isOn ? Date.now() : null;
+    onMs = isOn ? performance.now() : null;
     sayState(text);
   },
   welcome() {
@@ -111,6 +112,7 @@ const hand = new Hand($, relay, map, notices, {robot, isReplay, nowMs, frame: ()
 function begin() {
   relay.subscribe("status", `${ALL}status$`);
   relay.subscribe("last", "^/robots/[^/]+/last$");
+  relay.subscribe("stops", "^/robots/[^/]+/stop$");
   relay.subscribe("relay", "^/relay/status$");
   subscribe();
 }
@@ -201,7 +203,7 @@ function sayAbsence() {
   const silentMs = performance.now() - awayMs, isAway = onMs === null && silentMs > GRACE_MS && !$("ask").open;
   $("cover").hidden = !isAway;
   $("main").inert = isAway;
-  if (isAway) say($("cover-says"), `for ${seconds(silentMs / 1000)}. What is below is that old or older, and no command gets through. It tries again by itself.`);
+  if (isAway) say($("cover-says"), `for ${seconds(silentMs / 1000)}. What is below is that old or older, and no command gets through. X stops the chosen robot as soon as it can be reached. It tries again by itself.`);
 }
 
 function sayRobots() {
@@ -209,7 +211,7 @@ function sayRobots() {
     one.away = nowMs() - one.heardMs > AWAY_MS;
     one.troubles = troubles(one, nowMs());
     // Who was not heard while there was no connection is not known to be silent.
-    if (!isReplay() && onMs !== null && Date.now() - onMs > AWAY_MS) notices.troubles(one, nowMs());
+    if (!isReplay() && onMs !== null && performance.now() - onMs > AWAY_MS) notices.troubles(one, nowMs());
   }
   list.update(fleet.all(), chosen, tab, nowMs());
   notices.draw(nowMs());

@@ -23,9 +23,9 @@ class Writer {
   base64() { return btoa(String.fromCharCode(...this.bytes)); }
 }
 
-// A PoseStamped, or a PoseWithCovarianceStamped as sure as RViz says it.
-export function stamped(isEstimate, {x, y, yaw, frame}) {
-  const writer = new Writer(), ms = Date.now();
+// A PoseStamped, or a PoseWithCovarianceStamped as sure as RViz says it, of this time.
+export function stamped(isEstimate, {x, y, yaw, frame}, ms) {
+  const writer = new Writer();
   writer.put("Int32", 4, Math.floor(ms / 1000));
   writer.put("Uint32", 4, ms % 1000 * 1e6);
   writer.text(frame || "map");

@@ -51,15 +51,17 @@ export class Drive {
 
   get topic() { return `/robots/${this.robot.name}/drive`; }
 
-  // The robot that may be driven now, or null; another one ends it.
+  // The robot that may be driven now, or null; another one ends it. A stop takes the keys out of the hand: they count when they are pressed anew.
   offer(robot) {
     if (robot !== this.robot) {
       this.open(false);
       this.robot = robot;
     }
     this.$("drive").hidden = robot === null;
+    const stop = robot?.status?.stop;
+    if (stop) this.release();
     const driver = robot?.status?.driver ?? "";
-    say(this.$("driver"), driver && driver !== this.relay.name ? "somebody else drives it" : "hold, or arrows");
+    say(this.$("driver"), stop ? `stopped by ${stop.by}: release it first` : driver && driver !== this.relay.name ? "somebody else drives it" : "hold, or arrows");
   }
 
   open(isOpen) {
@@ -73,8 +75,9 @@ export class Drive {
   hold() {
     if (!this.pointer && !this.keys.size) return this.release();
     if (!this.robot || this.timer) return;
+    if (this.robot.status?.stop) return;
     this.timer = setInterval(() => this.send(), PERIOD_MS);
-    this.send();
+    this.still();                                   // after a stop, a robot moves only for who says zeros first; a queue may keep the newest alone
   }
 
   send() {
@@ -84,7 +87,7 @@ export class Drive {
       sum[1] += left;
     }
     const most = Number(this.$("speed-most").value), [ahead, left] = sum.map(within);
-    this.relay.sayNow(this.topic, {linear: most * ahead, angular: most * TURN * left, for_ms: FOR_MS}, false);
+    this.relay.sayNow(this.topic, {linear: most * ahead, angular: most * TURN * left, for_ms: FOR_MS}, false, FOR_MS);
   }
 
   release() {
@@ -93,6 +96,8 @@ export class Drive {
     if (!this.timer) return;
     clearInterval(this.timer);
     this.timer = 0;
-    this.relay.sayNow(this.topic, {linear: 0, angular: 0, for_ms: 0}, true);
+    this.still();
   }
+
+  still() { this.relay.sayNow(this.topic, {linear: 0, angular: 0, for_ms: 0}, true, FOR_MS); }
 }

@@ -1,5 +1,6 @@
 // What the robots have said: a state for each, which messages change and others draw.
 
+import {Stamps} from "./clock.js";
 import {colourOf} from "./draw.js";
 import {layer} from "./drawings.js";
 import {unpacked} from "./flat.js";
@@ -9,6 +10,7 @@ import {charge, diagnostics, DRAWN, flag, json, kindOf, queue, scan, status} fro
 export const AWAY_MS = 5000, LOW = 0.25;
 const GONE_MS = 600_000;                            // who was not here for so long needs nobody now
 const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, POSES = 100, NEAR_MS = 20, GAP_MS = 400, PARTS = 500, LAYERS = 64, EARLY = 1000;
+const JUMPED_MS = 60_000;                           // a jump of a robot's clock is told for so long
 const LATELY_MS = 10_000, MANY = 0.3;               // a robot that drops so many of its messages lately is in trouble
 const ROBOT = /^\/(?:robots\/([^/]+)|(ut\/[^/]+))\/(.+)$/;  // ours, and Robofleet's
 
@@ -19,7 +21,7 @@ export function split(topic) {
 }
 
 export class Fleet {
-  // on: {nowMs(), drawn(robot), added(robot), here(robot), removed(name), status(robot), reframed(robot), scanned(robot, pose, scan), moved()}
+  // on: {nowMs(), drawn(robot), added(robot), here(robot), removed(name), status(robot), stopped(robot), reframed(robot), scanned(robot, pose, scan), moved()}
   constructor(on) {
     this.on = on;
     this.robots = new Map();
@@ -75,7 +77,7 @@ export class Fleet {
 
   // As it was before its first message; what its topics are is known still.
   blank(robot) {
-    Object.assign(robot, {trail: [], poses: [], history: [], skewMs: Infinity, unplaced: null, poseMs: 0, queueMs: 0, estop: new Map(),
+    Object.assign(robot, {trail: [], poses: [], history: [], stamps: new Stamps(), unplaced: null, poseMs: 0, queueMs: 0, estop: new Map(),
       cameras: new Map(), layers: new Map(), parts: new Map()});
     robot.place.forget();
   }
@@ -85,17 +87,20 @@ export class Fleet {
     const {name, topic} = split(message.topic);
     if (name && message.encoding === "robofleet") message = unpacked(message);
     if (!name || !message) return;
-    if (topic === "last") return this.takeLast(name, json(message), message.stampMs);
+    if (topic === "stop") {                         // a stop says nothing of whether its robot is there
+      const known = this.robots.get(name);
+      if (known && json(message)?.command === "stop") this.on.stopped(known);
+      return;
+    }
+    if (topic === "last") return this.takeLast(name, json(message), message.atMs ?? message.stampMs);
     if (isLatched && !this.robots.get(name)?.isHere) {
       if (this.early.size < EARLY) this.early.set(message.topic, message);
       return;
     }
-    const robot = this.of(name), nowMs = this.on.nowMs();
-    if (!isLatched) robot.heardMs = nowMs;
+    const robot = this.of(name), atMs = message.atMs ?? this.on.nowMs();  // a recording has no time of the relay
+    if (!isLatched) robot.heardMs = Math.max(robot.heardMs, atMs);
     if (!robot.isHere) this.enter(robot);
-    // A robot's clock may be wrong; how late a message is shows beside the promptest of them.
-    robot.skewMs = Math.min(robot.skewMs, nowMs - message.stampMs);
-    const ms = message.stampMs + robot.skewMs;
+    const ms = isLatched ? atMs : robot.stamps.made(message.stampMs, atMs);
     if (topic === "status") return this.takeStatus(robot, status(json(message)), ms);
     if (topic === "queue") return this.takeQueue(robot, queue(json(message)), ms);
     const kind = robot.kinds[topic] ??= message.kind ?? kindOf(topic, message);
@@ -199,18 +204,21 @@ function dropping(robot) {
   return last && last.put > first.put ? (last.dropped - first.dropped) / (last.put - first.put) : 0;
 }
 
-// What is wrong with a robot, the worst first: {kind, rank, level, text}; kinds are fault, silent, battery, dropping and warning.
+// What is wrong with a robot, the worst first: {kind, rank, level, text}; kinds are fault, silent, stopped, battery, clock, dropping and warning.
 export function troubles(robot, nowMs) {
   const {status = {}} = robot, silentMs = nowMs - robot.heardMs, charged = battery(robot), part = dropping(robot), found = [];
   if (!robot.isHere && silentMs > GONE_MS) return [];
-  const say = (kind, rank, level, text) => found.push({kind, rank, level, text});
+  const say = (kind, rank, level, text, sinceMs = nowMs) => found.push({kind, rank, level, text, sinceMs});
   const parts = [...robot.parts.values()].filter(part => part.level > 0).sort((one, other) => other.level % 3 - one.level % 3);
   if (status.estop || [...robot.estop.values()].includes(true)) say("emergency stop", 0, "error", "emergency stop");
   if (status.ok === false) say("fault", 0, "error", status.text || "not OK");
   const broken = parts.find(part => part.level === 2), doubtful = parts.find(part => part.level !== 2);
   if (broken) say("diagnostics", 0, "error", `${broken.name}: ${broken.says}`);
-  if (silentMs > AWAY_MS) say("silent", 1, "error", "silent");
+  if (silentMs > AWAY_MS) say("silent", 1, "error", "silent", robot.heardMs);
+  if (status.stop) say("stopped", 2, "warn", `stopped by ${status.stop.by}`);
   if (charged < LOW) say("battery", 2, "error", "low battery");
+  const {jump} = robot.stamps;
+  if (jump && nowMs - jump.ms < JUMPED_MS) say("clock", 3, "warn", `its clock jumped by ${Math.round(jump.byMs / 1000)} s`);
   if (part > MANY) say("dropping", 3, "warn", `drops ${Math.round(100 * part)} %`);
   if (doubtful) say("warning", 3, "warn", `${doubtful.name}: ${doubtful.says}`);
   return found;

@@ -30,8 +30,9 @@ export class Hand {
     };
     $("stop").onclick = () => {
       this.drive.release();
-      this.send("stop");
+      this.stop();
     };
+    $("release").onclick = () => this.release();
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
     addEventListener("keydown", event => {
@@ -85,21 +86,40 @@ export class Hand {
     say(this.$("told"), text);
   }
 
-  async send(kind, fields = {}) {
-    const robot = this.asks.robot(), way = robot && this.way(robot, kind);
+  // A robot that knows stops hears this as soon as it can be reached, before all else, and stands until somebody releases it.
+  stop() {
+    const robot = this.asks.robot();
+    if (!robot || this.asks.isReplay()) return;
+    if (!robot.status?.commands.includes("release")) return this.send("stop");
+    if (!this.way(robot, "stop")) return;
+    this.take(null);
+    this.sent = {id: this.relay.stop(robot.name), kind: "stop", robot, state: "on its way"};
+    this.draw();
+  }
+
+  release() {
+    const robot = this.asks.robot(), stop = robot?.status?.stop;
+    if (!stop) return;
+    this.sent = {id: this.relay.release(robot.name, stop.id), kind: "release", robot, state: "on its way"};
+    this.draw();
+  }
+
+  async send(kind, fields = {}, robot = this.asks.robot()) {
+    const way = robot && this.way(robot, kind);
     if (!way) return;
-    const id = `${this.relay.name}-${++this.number}`, sent = this.sent = {id, kind, robot, ms: Date.now(), state: "not sent yet"};
+    const id = `${this.relay.name}-${++this.number}`, sent = this.sent = {id, kind, robot, state: "not sent yet"};
     this.draw();
     try {
       if (way.type) {
-        await this.relay.command(way.topic, kind === "stop" ? still() : stamped(way.type === ESTIMATE, /** @type {any} */ (fields)), {type: way.type, encoding: "cdr"});
+        await this.relay.command(way.topic, kind === "stop" ? still() : stamped(way.type === ESTIMATE, /** @type {any} */ (fields), this.relay.clock.now()), {type: way.type, encoding: "cdr"});
         sent.state = "sent to its ROS, which does not answer";
       } else {
         await this.relay.command(way.topic, {command: kind, id, ...fields});
         if (sent.state === "not sent yet") sent.state = "held by the relay, until the robot answers";
       }
     } catch (error) {
-      this.notices.refused(robot.name, `${kind}: ${error.message}`, this.asks.nowMs());
+      const isOpen = error.message.startsWith("not ");  // not sent, or not confirmed: nobody knows whether it is wanted still
+      this.notices.refused(robot.name, `${kind}: ${error.message}`, this.asks.nowMs(), isOpen ? () => this.send(kind, fields, robot) : null);
       if (this.sent === sent) this.sent = null;
     }
     this.draw();
@@ -107,30 +127,42 @@ export class Hand {
 
   // A robot's status: it may answer.
   answered(robot) {
-    const {id, why} = robot.status.answer, {sent} = this;
+    const {answer: {id, why}, stop} = robot.status, {sent} = this;
+    if (this.relay.stops.has(robot.name) && [id, stop?.id].includes(this.relay.stops.get(robot.name))) this.relay.stops.delete(robot.name);
     const isPolicy = sent?.kind === "policy" && robot.queue?.policy === this.$("policy").value;
-    if (!sent || sent.doneMs || sent.robot !== robot || (id !== sent.id && !isPolicy)) return;
-    if (why) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
-    sent.state = why ? "refused" : "done";
-    sent.doneMs = Date.now();
+    if (!sent || sent.doneMs || sent.robot !== robot || (id !== sent.id && stop?.id !== sent.id && !isPolicy)) return;
+    if (why && id === sent.id) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
+    sent.state = why && id === sent.id ? "refused" : "done";
+    sent.doneMs = performance.now();
     this.draw();
   }
 
   // What is offered, and how far the last command is.
   draw() {
-    const robot = this.asks.robot(), isOff = !robot || this.asks.isReplay(), ways = Object.fromEntries(KINDS.map(kind => [kind, !isOff && this.way(robot, kind) !== undefined]));
+    const robot = this.asks.robot(), isOff = !robot || this.asks.isReplay(), isLive = this.relay.isLive, ways = Object.fromEntries(KINDS.map(kind => [kind, !isOff && this.way(robot, kind) !== undefined]));
     const may = !isOff && this.relay.mayCommand(`/robots/${robot.name}/command`);
     this.$("stop").hidden = !may && !ways.stop;
     this.$("stop").disabled = !ways.stop;
     say(this.$("stop"), ways.stop ? `Stop ${robot.name}` : `${robot?.name ?? ""} takes no stop`);
-    for (const kind of ["goal", "pose", "cancel"]) this.$(kind).hidden = !ways[kind];
-    this.drive.offer(ways.drive && !robot.away ? robot : null);
+    this.$("release").hidden = isOff || !isLive || !robot.status?.stop || !may;
+    say(this.$("release"), `Release ${robot?.name ?? ""}`);
+    for (const kind of ["goal", "pose", "cancel"]) this.$(kind).hidden = !ways[kind] || !isLive;
+    this.drive.offer(ways.drive && isLive && !robot.away ? robot : null);
     this.$("remove").hidden = isOff || !robot.away || !this.relay.mayCommand(`/robots/${robot.name}/last`);
-    if (this.map.tool && !ways[this.map.tool.kind]) this.take(null);
+    if (this.map.tool && !(ways[this.map.tool.kind] && isLive)) this.take(null);
     if (this.told === "aim") return;
     const {sent} = this;
-    this.tell(sent && sent.robot === robot ? `${sent.kind}: ${sent.doneMs ? `${robot.name} answers: ${sent.state}` : sent.state}` : "", "sent");
+    this.tell(sent && sent.robot === robot ? `${sent.kind}: ${sent.doneMs ? `${robot.name} answers: ${sent.state}` : this.waits(robot) ?? sent.state}` : "", "sent");
   }
+
+  // Why a stop has not reached its robot yet.
+  waits(robot) {
+    if (this.sent.kind === "stop" && this.relay.stops.has(robot.name) && (robot.away || !this.relay.isLive))
+      return `kept: ${robot.name} stops as soon as it can be reached`;
+  }
+
+  // A stop that anybody said: keys that are held count no more.
+  stopped(robot) { if (robot === this.drive.robot) this.drive.release(); }
 
   offerPolicies() {
     const robot = this.asks.robot(), policies = robot?.status?.policies ?? [], now = robot?.queue?.policy ?? "", select = this.$("policy");

@@ -5,11 +5,12 @@ import {Cdr, FAR_M, number, numbers, object} from "./cdr.js";
 const text = new TextDecoder();
 const MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64, MOST_TRANSFORMS = 1000, MOST_PARTS = 500;
 
-// A message of a binary frame: {topic, type, encoding, sender, seq, stampMs, noDrop, payload}.
+// A message of a binary frame: {topic, type, encoding, sender, seq, stampMs, atMs, noDrop, payload}.
 export function decode(buffer) {
   const view = new DataView(buffer), names = [];
   if (view.getUint16(0) !== 0x6252 || view.getUint8(2) !== 1 || view.getUint8(3) !== 1) throw new Error("no frame of this relay");
-  let at = 32;
+  const isTimed = (view.getUint8(4) & 2) !== 0;
+  let at = isTimed ? 48 : 32;
   for (let k = 0; k < 4; k++) {
     const length = view.getUint8(5 + k);
     names.push(text.decode(new Uint8Array(buffer, at, length)));
@@ -17,14 +18,14 @@ export function decode(buffer) {
   }
   return {
     topic: names[0], type: names[1], encoding: names[2], sender: names[3],
-    seq: Number(view.getBigUint64(16)), stampMs: Number(view.getBigInt64(24)) / 1000,
+    seq: Number(view.getBigUint64(16)), stampMs: Number(view.getBigInt64(24)) / 1000, atMs: isTimed ? Number(view.getBigUint64(32)) / 1000 : undefined,
     noDrop: (view.getUint8(4) & 1) === 1, payload: new Uint8Array(buffer, at, view.getUint32(12)),
   };
 }
 
 // The same of a JSON object: what a replay consists of.
 export function fromJson(said) {
-  const message = {...said, stampMs: said.stamp_us / 1000, noDrop: said.no_drop};
+  const message = {...said, stampMs: said.stamp_us / 1000, atMs: said.at_us ? said.at_us / 1000 : undefined, noDrop: said.no_drop};
   if (said.encoding === "json") message.value = said.data;
   else message.payload = Uint8Array.from(atob(said.data), letter => letter.charCodeAt(0));
   return message;
@@ -112,10 +113,11 @@ export function queue(said) {
 const texts = said => (Array.isArray(said) ? said : []).slice(0, MOST_TOPICS).map(String);
 
 export function status(said) {
-  const {answer, commands, driver, estop, location, network, ok, policies, publishes, receives, recording, text, queue: its} = object(said);
+  const {answer, commands, driver, estop, location, network, ok, policies, publishes, receives, recording, stop, text, queue: its} = object(said);
   return {
     ...numbers(said, "battery"), network: numbers(network, "rtt_ms"), location: place(location), recording: String(recording ?? ""),
     driver: String(driver ?? "").slice(0, 300),
+    stop: stop ? {id: String(object(stop).id ?? ""), by: String(object(stop).by ?? "").slice(0, 100)} : null,
     ok: typeof ok === "boolean" ? ok : undefined, estop: estop === true, text: String(text ?? "").slice(0, 300),
     commands: texts(commands), receives: texts(receives), policies: texts(policies), queue: its && queue(its),
     answer: {id: String(object(answer).id ?? ""), why: String(object(answer).why ?? "").slice(0, 300)},

@@ -1,8 +1,11 @@
 // The connection to the relay: says hello, subscribes, sends commands, and connects again by itself.
 
+import {Clock} from "./clock.js";
 import {decode, fromJson} from "./messages.js";
 
 const FIRST_MS = 200, AWAY_MS = 1000, MOST_MS = 8000, HELD_MS = 5000;  // as in backoff.py
+const ASK_MS = 500, SILENT_MS = 2000, LOST_MS = 6000;  // the relay is asked so often; without an answer for so long it is not live, then given up
+const COMMAND_S = 3;
 
 // Whether a whole topic matches; true for a pattern that only the relay's engine knows: the relay will say.
 function matches(pattern, topic) {
@@ -18,6 +21,12 @@ export class Relay {
   constructor(on) {
     this.on = on;
     this.welcome = null;
+    this.clock = new Clock();
+    this.rules = [];                                // of the last welcome
+    this.askedMs = null;                            // since when an answer is awaited
+    this.isLive = false;
+    this.stops = new Map();                         // robot -> id of a stop that it has not confirmed
+    this.number = 0;
     this.received = 0;                              // the highest no_drop message that came
     this.acked = 0;                                 // and the highest of ours that the relay holds
     this.subscriptions = new Map();
@@ -31,6 +40,7 @@ export class Relay {
     }
     this.mostMs = FIRST_MS;                         // the longest delay until the next try
     this.connect();
+    setInterval(() => this.watch(), ASK_MS);
   }
 
   connect() {
@@ -39,22 +49,44 @@ export class Relay {
     address.hash = address.search = "";
     this.socket = new WebSocket(address, ["bufgym.relay.v1"]);
     this.socket.binaryType = "arraybuffer";
+    this.isClosed = false;
     let isAway = true;
     this.socket.onopen = () => {
       isAway = false;
-      // Without a session: it ends with the connection. A command that it leaves goes again, and says the same twice.
+      // Without a session: it ends with the connection. Who sent a command that it leaves is asked whether it goes again.
       this.received = 0;
       this.shown = this.token;
       this.say("hello", {version: 1, name: this.name, form: "binary", ...(this.token ? {token: this.token} : {})});
     };
-    this.socket.onmessage = event => this.hear(event.data);
-    this.socket.onclose = () => {
+    const {socket} = this;
+    socket.onmessage = event => { if (socket === this.socket) this.hear(event.data); };
+    socket.onclose = () => {
+      if (socket !== this.socket || this.isClosed) return;
+      this.isClosed = true;
       if (this.welcome && performance.now() - this.since >= HELD_MS) this.mostMs = FIRST_MS;
       this.welcome = null;
+      this.isLive = false;
+      for (const {failed} of this.commands.splice(0)) failed(new Error("not confirmed before the link broke"));
       this.on.state("not connected", false);
       if (!this.refused) setTimeout(() => this.connect(), Math.min(this.mostMs, isAway ? AWAY_MS : MOST_MS) * Math.random());
       this.mostMs = Math.min(2 * this.mostMs, MOST_MS);
     };
+  }
+
+  // Ask the relay for its time: its answers say that the link is alive, both ways.
+  watch() {
+    const ms = performance.now(), silentMs = this.welcome && this.askedMs !== null ? ms - this.askedMs : 0;
+    if (!this.welcome) return;
+    if (silentMs > LOST_MS) {
+      const {socket} = this;
+      socket.close();
+      socket.onclose(null);                         // its own end may come a minute later
+    } else if (silentMs > SILENT_MS) {
+      if (this.isLive) this.on.state("no answer", this.isLive = false);
+    } else if (this.askedMs === null) {
+      this.askedMs = ms;
+      this.say("clock", {});
+    }
   }
 
   // Connect with this token: now, or ``later``, when the relay ends the connection because the token before is over.
@@ -87,20 +119,48 @@ export class Relay {
   holds(topic) { return (this.welcome?.no_drop ?? []).some(pattern => matches(pattern, topic)); }
 
   // Say what is worth nothing later: not while the relay is away, and behind what still waits only if it must.
-  sayNow(topic, data, must) {
-    if (this.welcome && (must || this.socket.bufferedAmount === 0))
-      this.say("publish", {topic, data, encoding: "json", stamp_us: Math.round(1000 * (performance.timeOrigin + performance.now()))});
+  sayNow(topic, data, must, forMs) {
+    if (this.isLive && (must || this.socket.bufferedAmount === 0))
+      this.say("publish", {topic, data, encoding: "json", stamp_us: Math.round(1000 * (performance.timeOrigin + performance.now())), until_us: this.until(forMs)});
+  }
+
+  // The relay's time in so many ms.
+  until(ms) { return Math.floor(1000 * (this.clock.now() + ms)); }
+
+  // The deadline of a command on a topic, by the relay's rule.
+  deadline(topic) { return this.until(1000 * (this.rules.find(rule => rule.send && matches(rule.topic, topic))?.command_s ?? COMMAND_S)); }
+
+  // Stop a robot, said on each connection until the robot confirms it. What waits for it is withdrawn.
+  stop(robot) {
+    const id = `${this.name}-s${++this.number}`, own = `/robots/${robot}/`;
+    for (const command of this.commands) if (command.topic.startsWith(own)) command.failed(new Error("withdrawn by a stop"));
+    this.stops.set(robot, id);
+    if (this.welcome) this.sayStops();
+    return id;
+  }
+
+  sayStops() {
+    for (const [robot, id] of this.stops) this.say("publish", {topic: `/robots/${robot}/stop`, data: {command: "stop", id}});
+  }
+
+  release(robot, of) {
+    const id = `${this.name}-s${++this.number}`;
+    this.stops.delete(robot);
+    this.say("publish", {topic: `/robots/${robot}/stop`, data: {command: "release", id, of}, until_us: this.deadline(`/robots/${robot}/command`)});
+    return id;
   }
 
   // Done when the relay holds it, true; an error says why it does not. What it does not hold goes at once, false.
   command(topic, data, fields = {encoding: "json"}) {
-    if (this.welcome && !this.holds(topic)) {
+    if (!this.isLive) return Promise.reject(new Error("not sent: the relay does not answer"));
+    fields = {...fields, until_us: this.deadline(topic)};
+    if (!this.holds(topic)) {
       this.say("publish", {topic, data, ...fields});
       return Promise.resolve(false);
     }
     return new Promise((done, failed) => {
       this.commands.push({topic, data, fields, done, failed});
-      if (this.commands.length === 1 && this.welcome) this.sendCommand();
+      if (this.commands.length === 1) this.sendCommand();
     });
   }
 
@@ -109,7 +169,7 @@ export class Relay {
     if (command) this.say("publish", {topic: command.topic, data: command.data, ...command.fields, no_drop: true, seq: this.acked + 1});
   }
 
-  mayCommand(topic) { return (this.welcome?.rules ?? []).some(rule => rule.send && matches(rule.topic, topic)); }
+  mayCommand(topic) { return this.rules.some(rule => rule.send && matches(rule.topic, topic)); }
 
   // Whether the relay keeps a topic's last message for who subscribes later: what comes may be old.
   isLatched(topic) { return (this.welcome?.latched ?? []).some(pattern => matches(pattern, topic)); }
@@ -121,11 +181,19 @@ export class Relay {
     else if (said.op === "welcome") {
       this.welcome = said;
       this.since = performance.now();
+      this.rules = said.rules;
+      this.clock.begin(said.clock_us / 1000);
+      this.askedMs = null;
+      this.isLive = true;
+      this.sayStops();
       this.acked = said.received;
       for (const subscription of this.subscriptions.values()) this.say("subscribe", subscription);
-      this.sendCommand();
       this.on.state("live", true);
       this.on.welcome();
+    } else if (said.op === "clock") {
+      this.clock.heard(said.clock_us / 1000);
+      this.askedMs = null;
+      if (!this.isLive) this.on.state("live", this.isLive = true);
     } else if (said.op === "ack") this.answered(said.seq);
     else if (said.op === "refused") this.refuse(said);
     else this.on.said(said);
@@ -151,6 +219,7 @@ export class Relay {
   }
 
   take(message) {
+    this.clock.heard(message.atMs);
     if (message.noDrop) {
       if (message.seq <= this.received) return;
       this.received = message.seq;

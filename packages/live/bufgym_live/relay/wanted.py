@@ -1,0 +1,63 @@
+"""A session's subscriptions, and the program's functions that they call."""
+
+import asyncio
+import inspect
+import re
+from collections.abc import Awaitable, Callable
+from typing import Any, NamedTuple
+
+from bufgym_live.relay.patterns import for_client
+from bufgym_live.relay.wire import Message
+
+OnMessage = Callable[[Message], Awaitable[None] | None]
+
+
+class SubscriptionRequest(NamedTuple):
+    """A subscription that is asked of the relay."""
+
+    pattern: re.Pattern[str]
+    on_message: OnMessage
+    fields: dict[str, Any]
+
+
+class Wanted:
+    """Subscriptions of one session, over all its connections."""
+
+    def __init__(self) -> None:
+        self._requests: dict[str, SubscriptionRequest] = {}
+        self.confirmed: set[str] = set()
+        """Ids of the subscriptions that this connection's relay has accepted."""
+
+    def add(self, pattern: str, on_message: OnMessage, **chosen: Any) -> dict[str, Any]:
+        """Add a subscription; return the fields of its request, without those that are None."""
+        id = str(len(self._requests))
+        fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
+        self._requests[id] = SubscriptionRequest(for_client(pattern), on_message, fields)
+        return fields
+
+    def asked(self, stands_in: bool) -> list[SubscriptionRequest]:
+        """Give the subscriptions that a relay is asked for; one that stands in holds nothing for who is away."""
+        return [one for one in self._requests.values() if not (stands_in and "durable" in one.fields)]
+
+    def are_confirmed(self, stands_in: bool) -> bool:
+        """Whether the relay has accepted all that it was asked for."""
+        return self.confirmed.issuperset(one.fields["id"] for one in self.asked(stands_in))
+
+    async def call(self, message: Message) -> None:
+        """Call the functions of all subscriptions that a message matches."""
+        for one in list(self._requests.values()):
+            if one.pattern.search(message.topic):
+                await _called(one.on_message, message)
+
+
+async def _called(on_message: OnMessage, message: Message) -> None:
+    """Call a program's function; its fault, which nothing here mends, goes to the event loop."""
+    try:
+        done = on_message(message)
+        if inspect.isawaitable(done):
+            await done
+    except (Exception, asyncio.CancelledError) as error:
+        if asyncio.current_task().cancelling():  # type: ignore[union-attr]
+            raise
+        about = {"message": f"on_message of {message.topic}", "exception": error}
+        asyncio.get_running_loop().call_exception_handler(about)

@@ -1,0 +1,286 @@
+"""Commands on links that break: none is executed after its deadline, and a stop comes first, alone, and holds."""
+
+import asyncio
+import contextlib
+import json
+import random
+import time
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from cut_cases import Cuttable, cuttable
+from loop_cases import beside, compiled
+from relay_cases import client, relay, settings, until, wait
+
+from bufgym.ground.errors import BufgymError
+from bufgym_live.relay import backoff
+from bufgym_live.relay.clock import RelayClock
+from bufgym_live.relay.config import Rule
+from bufgym_live.relay.drive import STILL, Drive, Velocity
+from bufgym_live.relay.orders import Orders, moves
+from bufgym_live.relay.robot import Robot
+from bufgym_live.relay.session import Session
+from bufgym_live.relay.wire import Message, RefusedError
+
+COMMAND, STOP = "/robots/r/command", "/robots/r/stop"
+
+
+def test_a_client_knows_bounds_of_the_relays_clock() -> None:
+    """Asked at 10 s, answered at 12 s with 1,000 s: between 998 (the answer took all of it) and 1,000 s at 12 s.
+
+    100 s later clocks may have drifted apart by .05 s.
+    """
+    now_s = 12.0
+    clock = RelayClock(lambda: now_s)
+    assert not clock.known
+    clock.heard(1_000_000_000, asked_s=10.0)
+    assert clock.earliest_us(12.0) == 1_000_000_000
+    assert not clock.is_past(1_002_000_001) and clock.is_past(1_001_999_999)
+    now_s = 112.0
+    assert clock.earliest_us(112.0) == 1_099_950_000
+    assert not clock.is_past(1_102_060_000) and clock.is_past(1_102_040_000)
+    clock.heard(1_100_500_000)  # a message that was quicker than the answer: the clock is at least that far
+    assert clock.earliest_us(112.0) == 1_100_500_000
+
+
+def said(what: dict[str, Any], at_us: int, until_us: int = 0, topic: str = COMMAND) -> Message:
+    return Message(topic, json.dumps(what).encode(), at_us=at_us, until_us=until_us)
+
+
+def test_deadlines_by_hand() -> None:
+    """3 s from when the relay took it, or what its sender says, if that is less."""
+    orders = Orders()
+    goal = {"command": "goal", "id": "1"}
+    assert orders.dated(said(goal, 1_000_000), 3.0, 1_000_000, "ann").until_us == 4_000_000
+    assert orders.dated(said(goal, 1_000_000, 2_500_000), 3.0, 1_000_000, "ann").until_us == 2_500_000
+    assert orders.dated(said(goal, 1_000_000, 9_000_000), 3.0, 1_000_000, "ann").until_us == 4_000_000
+    with pytest.raises(RefusedError, match=r"0\.5 s after its deadline"):
+        orders.dated(said(goal, 1_000_000, 500_000), 3.0, 1_000_000, "ann")
+    with pytest.raises(RefusedError, match="waited longer than the 3 s"):  # for the disk
+        orders.dated(said(goal, 1_000_000), 3.0, 4_000_001, "ann")
+    late = said(goal, 1_000_000, 4_000_000)
+    assert not orders.is_over(late, 4_000_000) and orders.is_over(late, 4_000_001)
+    other = said({}, 1_000_000, topic="/robots/r/camera")
+    assert orders.dated(other, 3.0, 9_000_000, "ann") == other and not orders.is_over(other, 9_000_000)
+
+
+def test_a_stop_withdraws_what_the_relay_took_before_it() -> None:
+    orders = Orders()
+    goal, stop = {"command": "goal", "id": "1"}, {"command": "stop", "id": "s1"}
+    before = orders.dated(said(goal, 1_000_000), 3.0, 1_000_000, "ann")
+    told = orders.dated(said(stop, 2_000_000, 1, STOP)._replace(until_us=0), 3.0, 2_000_000, "bob@x.org")
+    assert (json.loads(bytes(told.payload))["by"], told.until_us) == ("bob@x.org", 0)
+    assert orders.is_over(before, 2_000_000)
+    assert not orders.is_over(before._replace(topic="/robots/other/command"), 2_000_000)
+    with pytest.raises(RefusedError, match=r"r was stopped by bob@x\.org: release it first"):
+        orders.dated(said(goal, 2_100_000), 3.0, 2_100_000, "ann")
+    cancel = said({"command": "cancel"}, 2_100_000)
+    assert orders.dated(cancel, 3.0, 2_100_000, "ann").until_us == 5_100_000
+    with pytest.raises(RefusedError, match=r"stopped again, by bob@x\.org"):
+        orders.dated(said({"command": "release", "id": "x", "of": "s0"}, 2_200_000, topic=STOP), 3.0, 2_200_000, "ann")
+    free = orders.dated(said({"command": "release", "id": "x", "of": "s1"}, 2_300_000, topic=STOP), 3.0, 2_300_000, "a")
+    assert free.until_us == 5_300_000
+    after = orders.dated(said(goal, 2_400_000), 3.0, 2_400_000, "ann")
+    assert not orders.is_over(after, 2_400_000) and orders.is_over(before, 2_400_000)
+    with pytest.raises(RefusedError, match=r"topic /robots/r/stop: b'\{.*must be"):
+        orders.dated(said({"command": "goal", "id": "x"}, 1, topic=STOP), 3.0, 1, "ann")
+
+
+def test_what_moves_a_robot() -> None:
+    twist = Message("/robots/r/to/cmd_vel", b"\0\1\0\0" + bytes(48), "cdr", "geometry_msgs/msg/Twist")
+    assert not moves(twist) and moves(twist._replace(payload=b"\0\1\0\0" + bytes(47) + b"\1"))
+    assert moves(twist._replace(type="geometry_msgs/msg/PoseStamped"))
+    assert moves(said({"command": "goal"}, 1)) and moves(Message(COMMAND, b"["))
+    assert not moves(said({"command": "policy"}, 1))
+
+
+def test_a_held_key_moves_nothing_until_it_was_let_go_and_the_robot_released() -> None:
+    async def nowhere(velocity: Velocity) -> None:
+        """Drive nobody."""
+
+    drive, stamps = Drive(nowhere, lambda: 100.0), iter(range(1, 100))
+
+    def press(linear: float, sender: str = "ann") -> Velocity:
+        payload = json.dumps({"linear": linear, "angular": 0.0, "for_ms": 400}).encode()
+        drive.take(Message("/robots/r/drive", payload, sender=sender, stamp_us=next(stamps)))
+        return drive.velocity
+
+    assert press(0.5) == (0.5, 0.0)
+    drive.stop()
+    assert drive.velocity == STILL and press(0.5) == STILL
+    press(0.0)
+    assert press(0.5) == STILL  # let go, and pressed again while the stop holds
+    drive.go()
+    assert press(0.5) == STILL and press(0.5, "bob") == STILL
+    press(0.0)
+    assert press(0.5) == (0.5, 0.0)
+
+
+class Program:
+    """A robot's program: what it executed, and when by the test's clock; a goal may keep it at work."""
+
+    streams = ()
+
+    def __init__(self) -> None:
+        self.done: list[tuple[str, float]] = []
+        self.works = asyncio.Event()
+        self.works.set()
+
+    async def run(self, robot: Robot) -> None:
+        await asyncio.Event().wait()
+
+    def status(self) -> dict[str, Any]:
+        return {"commands": ["stop", "goal", "drive"]}
+
+    async def on_command(self, command: Any) -> None:
+        if command["command"] == "goal":
+            await self.works.wait()
+        self.done.append((command.get("id", command["command"]), time.monotonic()))
+
+    @property
+    def names(self) -> list[str]:
+        return [name for name, _ in self.done]
+
+
+RULE = Rule(address="127.0.0.0/8", send=True, receive=True, command_s=0.5)
+
+
+class Scene:
+    """A relay, a robot behind one link and an operator behind another."""
+
+    def __init__(self, program: Program, robot: Robot, operator: Session, links: tuple[Cuttable, Cuttable]) -> None:
+        self.program, self.robot, self.operator = program, robot, operator
+        self.near, self.far = links
+        """Links of the operator and of the robot."""
+
+    async def goal(self, id: str) -> str:
+        """Send a goal; return why it was refused."""
+        try:
+            await self.operator.command(COMMAND, {"command": "goal", "id": id})
+        except BufgymError as error:
+            return str(error)
+        return ""
+
+
+@contextlib.asynccontextmanager
+async def scene(rule: Rule = RULE) -> AsyncIterator[Scene]:
+    async with relay(settings(rules=(rule,))) as server, cuttable(server.port) as near, cuttable(server.port) as far:
+        program = Program()
+        robot = Robot(f"ws://127.0.0.1:{far.port}", "r", program, policy="drop-oldest")
+        operator = Session(f"ws://127.0.0.1:{near.port}", "operator")
+        async with beside(robot.run(), operator.run()):
+            await wait("the robot", robot.client.ready.wait())
+            await wait("the operator", operator.ready.wait())
+            yield Scene(program, robot, operator, (near, far))
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backoff, "MOST_S", 0.05)
+
+
+@compiled
+async def test_a_goal_that_waited_on_a_link_is_refused_and_the_stop_comes_first() -> None:
+    """Either link freezes for longer than the .5 s of a goal. The goal is never executed; the stop is, once."""
+    for which in ("near", "far"):
+        async with scene() as one:
+            assert await one.goal("first") == ""
+            await until("the first goal", lambda: one.program.names == ["first"])
+            link = getattr(one, which)
+            link.freeze()
+            goal = asyncio.ensure_future(one.goal("late"))
+            stop = asyncio.ensure_future(one.operator.stop("r"))
+            await asyncio.sleep(0.7)
+            link.thaw()
+            id = await wait("the stop", stop)
+            await wait("the goal", goal)
+            await until("it stands", lambda id=id: one.robot.latch.told == {"id": id, "by": "operator"})
+            await until("the program", lambda: one.program.names[1:2] == ["stop"])
+            assert "was stopped by operator" in await one.goal("while it holds")
+            await one.operator.release("r", id)
+            await until("it is free", lambda: one.robot.latch.told is None)
+            assert await one.goal("next") == ""
+            await until("the next goal", lambda: one.program.names[-1] == "next")
+            assert one.program.names == ["first", "stop", "next"]
+
+
+@compiled
+async def test_a_stop_does_not_wait_for_a_program_at_work() -> None:
+    async with scene() as one:
+        one.program.works.clear()
+        assert await one.goal("long") == "" and await one.goal("behind it") == ""
+        await wait("the stop", one.operator.stop("r"))
+        await until("it stands", lambda: one.program.names == ["stop"])
+        one.program.works.set()
+        await until("an answer", lambda: "stopped by operator" in one.robot.status()["answer"]["why"])
+        assert one.program.names == ["stop"]
+
+
+@compiled
+async def test_a_robot_that_was_away_hears_the_stop_before_all_else() -> None:
+    """The stop waits at the relay for a robot whose link is cut. A release of an earlier stop changes nothing."""
+    async with scene(RULE) as one:
+        one.far.cut()
+        await until("the relay knows", lambda: not one.robot.client.connected.is_set())
+        first = await wait("a stop", one.operator.stop("r"))
+        second = await wait("another", one.operator.stop("r"))
+        with pytest.raises(BufgymError, match="stopped again, by operator"):
+            await one.operator.release("r", first)
+        one.far.mend()
+        await until("it stands", lambda: one.robot.latch.told == {"id": second, "by": "operator"})
+        await until("the program", lambda: one.program.names == ["stop"])
+
+
+@compiled
+@pytest.mark.parametrize("seed", range(4))
+async def test_cuts_at_random_moments(seed: int) -> None:
+    """Goals and stops go on while links freeze and are cut. Each executed goal is younger than .5 s, and none came
+    between a stop and its release."""
+    chance = random.Random(seed)
+    async with scene() as one:
+        sent = dict[str, float]()
+        waiting = list[asyncio.Future[Any]]()
+        for k in range(25):
+            link = chance.choice((one.near, one.far))
+            chance.choice((link.freeze, link.cut))()
+            for j in range(chance.randrange(3)):
+                sent[f"{k}.{j}"] = time.monotonic()
+                waiting.append(asyncio.ensure_future(one.goal(f"{k}.{j}")))
+                await asyncio.sleep(chance.uniform(0, 0.05))
+            stops = k % 5 == 4
+            stop = asyncio.ensure_future(one.operator.stop("r")) if stops else None
+            await asyncio.sleep(chance.uniform(0, 0.8) if chance.random() < 0.3 else chance.uniform(0, 0.1))
+            link.mend()
+            if stop is not None:
+                id = await wait("the stop", stop)
+                await until("it stands", lambda id=id: (one.robot.latch.told or {}).get("id") == id)
+                before = len(one.program.done)
+                await until("the program stops", lambda: "stop" in one.program.names)
+                while one.robot.latch.told is not None:
+                    with contextlib.suppress(BufgymError):
+                        await wait("the release", one.operator.release("r", id))
+                    await asyncio.sleep(0.02)
+                assert set(one.program.names[before:]) <= {"stop"}
+            await until("both", lambda: one.operator.connected.is_set() and one.robot.client.connected.is_set())
+        await wait("all goals", asyncio.gather(*waiting))
+        assert await one.goal("last") == ""
+        await until("the last goal", lambda: one.program.names[-1] == "last")
+        ages = {name: at_s - sent[name] for name, at_s in one.program.done if name in sent}
+        assert max(ages.values(), default=0.0) < 0.5, ages
+
+
+@compiled
+async def test_wrong_clocks_of_clients_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A goal stamped an hour ago or ahead is executed; one that the relay could not be told in time is not."""
+    async with scene() as one, client(one.near._target, name="odd") as odd:
+        for number, stamp_s in enumerate((time.time() - 3600, time.time() + 3600), 1):
+            goal = json.dumps({"command": "goal", "id": f"g{number}"}).encode()
+            about = {"encoding": "json", "seq": number, "no_drop": True, "stamp_us": round(stamp_s * 1e6)}
+            await odd.put(COMMAND, goal, **about)
+            assert await odd.next() == {"op": "ack", "seq": number}
+        await until("both", lambda: one.program.names == ["g1", "g2"])
+        past_us = odd.welcome["clock_us"] - 1
+        await odd.put(COMMAND, b'{"command": "goal"}', encoding="json", seq=3, no_drop=True, until_us=past_us)
+        refused = next(one for one in await odd.rest() if one["op"] == "refused")
+        assert (refused["code"], refused["seq"]) == ("too_late", 3)
