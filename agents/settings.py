@@ -255,18 +255,18 @@ class Hindsight(Settings):
     algo = "hindsight"
     learner = "agents.hindsight:HindsightLearner"
     kinds = ("environment", "queue", "families")
-    steps: Natural = 200_000
+    steps: Natural = 300_000
     """Decisions to learn from, for each seed."""
     sets: Annotated[Families, FLAT] = Families()
     candidates: Natural = 0
     """k: how many of the cheapest candidates the agent chooses among, beside the head and accepting; 0: 2 in an
-    environment, 3 on several scenarios."""
+    environment, else 3."""
     width: Natural = 0
-    """Hidden units of both layers; 0: 64 in an environment, 96 on several scenarios."""
+    """Hidden units of both layers; 0: 64 in an environment, else 96."""
     num_envs: Natural = 0
-    """Environments side by side, a sixth of which the rule plays; 0: 256 in an environment, 384 on several scenarios."""
+    """Environments side by side, a sixth of which the rule plays; 0: 256 in an environment, else 384."""
     batch_size: Natural = 0
-    """Decisions of one gradient step; 0: 1024 in an environment, 2560 on several scenarios."""
+    """Decisions of one gradient step; 0: 1024 in an environment, else 2560."""
     gradient_steps: Count = 2
     """Gradient steps after each decision of all environments."""
     learning_rate: Positive = 2e-3
@@ -275,7 +275,7 @@ class Hindsight(Settings):
     """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time."""
     room: Count = 400_000
     """Decisions kept to learn from; they take about 100 MB."""
-    checkpoint_every: Count = 50_000
+    checkpoint_every: Count = 100_000
     """Steps."""
 
     def __post_init__(self) -> None:

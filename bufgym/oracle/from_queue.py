@@ -73,7 +73,7 @@ def find_values(batch: Batch, ahead: Ahead, work: Work, decisions: Ints, values:
 
 @kernel
 def find_most(batch: Batch, ahead: Ahead, work: Work, rows: Ints, most: NDArray[Any]) -> None:
-    """Fill ``most``, float64[n], at ``rows``: the largest of ``find_values``, of all decisions; 0 where no decision is due.
+    """Fill ``most``, float64[n], at ``rows``: the best H with any decision; 0 where no decision is due.
 
     The present decision may drop a message of the queue, just as that of any later arrival may.
     """
