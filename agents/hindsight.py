@@ -63,7 +63,8 @@ class School:
         self.settings, self.longest = settings, seconds
         self.student = Student(settings.candidates, settings.width)
         """The latest weights."""
-        self.mean = AveragedModel(self.student, multi_avg_fn=get_ema_multi_avg_fn(MEAN))
+        average = get_ema_multi_avg_fn(MEAN)  # type: ignore[no-untyped-call]
+        self.mean = AveragedModel(self.student, multi_avg_fn=average)
         """Their running mean, which plays."""
         self.optimizer = torch.optim.Adam(self.student.parameters(), settings.learning_rate, fused=True)
         self.steps, self.seconds = 0, 0.0
@@ -79,7 +80,8 @@ class School:
         """The running mean's best actions."""
         with torch.inference_mode():
             outputs = self.mean(torch.from_numpy(seen)).numpy()
-        return np.asarray(np.where(offered, outputs, -np.inf).argmax(axis=1))
+        best: NDArray[np.int64] = np.where(offered, outputs, -np.inf).argmax(axis=1)
+        return best
 
     def sizes(self) -> NDArray[np.int64]:
         """int64[families]: states of each in a batch; families that lose more have more."""
@@ -105,8 +107,9 @@ class School:
 
     def weights(self) -> CandidateWeights:
         """The running mean, as in a file."""
-        student: Student = self.mean.module
-        return student.weights()
+        averaged: Any = self.mean.module
+        found: CandidateWeights = averaged.weights()
+        return found
 
     def save(self, path: Path) -> None:
         """Write the state, whole or not at all."""

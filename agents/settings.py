@@ -67,7 +67,7 @@ class Settings:
             raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind ({self.kind})")
 
     @property
-    def on(self) -> Environment | Suites | Families:
+    def on(self) -> Environment | Suites:
         """What it trains on."""
         return self.suites if self.suites.suite else self.environment
 
@@ -274,7 +274,7 @@ class Hindsight(Settings):
     entropy: Least0 = 0.3
     """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time."""
     room: Count = 400_000
-    """Decisions kept to learn from; they take about 100 MB."""
+    """Decisions kept to learn from; they take about 60 MB."""
     checkpoint_every: Count = 100_000
     """Steps."""
 
@@ -284,14 +284,14 @@ class Hindsight(Settings):
             raise BufgymError("--families: they have links of their own, so no suite and no setting of an environment")
 
     @property
-    def on(self) -> Environment | Suites | Families:
-        """What it trains on."""
-        return self.sets if self.sets.families else super().on
+    def kind(self) -> Kind:
+        """The task of the run."""
+        return self.sets.kind if self.sets.families else super().kind
 
     @property
     def resolved(self) -> "Hindsight":
         """The same without zeros that stand for numbers by the task."""
-        usual = {"candidates": 2, "width": 64, "num_envs": 256, "batch_size": 1024}
+        usual: dict[str, Any] = {"candidates": 2, "width": 64, "num_envs": 256, "batch_size": 1024}
         if self.kind != "environment":
             usual = {"candidates": 3, "width": 96, "num_envs": 384, "batch_size": 2560}
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})

@@ -11,7 +11,7 @@ from agents.families import Family
 from agents.objectives.objective import Objective
 from agents.ready_families import runs_of
 from agents.report import Report, Trained, agent_name
-from agents.settings import Settings
+from agents.settings import Hindsight, Settings
 from bufgym import policies
 from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.ground.tables import aligned
@@ -36,7 +36,8 @@ class FamiliesObjective(Objective):
 
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         super().__init__(settings, folder, seed)
-        self.names: tuple[str, ...] = settings.on.names  # type: ignore[union-attr]
+        assert isinstance(settings, Hindsight)
+        self.names = settings.sets.names
         self.columns = (*self.names, "mean")
         self.message = f"{{{len(self.names)}:.3f}} of AFR's regret on validation"
 
@@ -56,7 +57,8 @@ class FamiliesObjective(Objective):
 
     def report(self, trained: Trained) -> Report:
         """A table of every seed's agent beside rules on the test runs of each family."""
-        agents = [replace(agent, name=agent_name(run)) for run, agent in zip(trained.runs, trained.agents, strict=True)]
+        kept = zip(trained.runs, trained.agents, strict=True)
+        agents = [replace(agent, name=agent_name(run)) for run, agent in kept if isinstance(agent, Policy)]
         rivals = [policies.get(name) for name in RIVALS]
         lines = [["family", "runs", *(p.name for p in (*agents, *rivals)), *(f"best - {n} [95 %]" for n in RIVALS)]]
         chosen = [run.seed for run in trained.runs].index(trained.best.seed)
