@@ -79,9 +79,8 @@ class School:
     def choose(self, seen: NDArray[np.float32], offered: NDArray[np.bool_]) -> NDArray[np.int64]:
         """The running mean's best actions."""
         with torch.inference_mode():
-            outputs = self.mean(torch.from_numpy(seen)).numpy()
-        best: NDArray[np.int64] = np.where(offered, outputs, -np.inf).argmax(axis=1)
-        return best
+            outputs: NDArray[np.float32] = self.mean(torch.from_numpy(seen)).numpy()
+        return np.asarray(np.argmax(np.where(offered, outputs, -np.inf), axis=1), np.int64)
 
     def sizes(self) -> NDArray[np.int64]:
         """int64[families]: states of each in a batch; families that lose more have more."""

@@ -188,7 +188,7 @@ TINY = Hindsight(
 TASKS = {
     "environment": {},
     "suite": {"environment": Environment(), "suites": Suites(("interruption-v1",), capacities=(3, 5))},
-    "families": {"environment": Environment(), "sets": Families(("interruption", "heavy"))},
+    "families": {"environment": Environment(), "sets": Families(("task", "heavy"))},
 }
 
 
