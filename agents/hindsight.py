@@ -86,7 +86,7 @@ class School:
         """int64[families]: states of each in a batch; families that lose more have more."""
         lost = np.array(self.lost)
         shares = EQUAL / len(lost) + (1 - EQUAL) * lost / lost.sum()
-        return np.maximum(1, np.round(shares * self.settings.batch_size)).astype(np.int64)
+        return np.asarray(np.maximum(1, np.round(shares * self.settings.batch_size)), np.int64)
 
     def learn(self, seen: Tensor, cost: Tensor, sizes: NDArray[np.int64]) -> float:
         """Make one gradient step on states of families of these ``sizes``; return the mean loss of the families."""
