@@ -82,11 +82,11 @@ def _train(folder: Path, settings: Settings, others: Sequence[Settings]) -> None
 
 
 def others_of(settings: Settings) -> list[Settings]:
-    """The other ways to an agent, with the settings that evolution has too, each for about a minute of one core."""
+    """The other ways to an agent, with the settings that evolution has too, each for at most a minute of one core."""
     shared = {name: getattr(settings, name) for name in ("validation_episodes", "name", "resume", "seeds", "seed")}
     slots = SlotEnvironment(**vars(settings.environment))
     return [
-        Hindsight(steps=min(settings.steps, 110_000), environment=settings.environment, **shared),
+        Hindsight(steps=min(settings.steps, 300_000), environment=settings.environment, **shared),
         PPO(steps=min(settings.steps, 450_000), environment=slots, **shared),
     ]
 

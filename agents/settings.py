@@ -3,12 +3,12 @@
 The types hold the limits of single options, which are read from text once, and each class the rules of its own.
 """
 
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 from cyclopts import Parameter
 
-from agents.tasks import Environment, FullBuffer, Kind, SlotEnvironment, Suites
+from agents.tasks import Environment, Families, FullBuffer, Kind, SlotEnvironment, Suites
 from bufgym.cli.options import Count, Least0, Natural, Positive, checked, command_line
 from bufgym.ground.errors import BufgymError
 from bufgym.policies.weights import MAX_WIDTH
@@ -250,31 +250,51 @@ class DQN(OnSlots):
 
 @dataclass(frozen=True)
 class Hindsight(Settings):
-    """Learn from the clairvoyant what each decision costs, on the slots of the buffer; messages of equal size."""
+    """Learn from the clairvoyant what each decision costs, among ordered candidates; messages of equal size."""
 
     algo = "hindsight"
     learner = "agents.hindsight:HindsightLearner"
-    kinds = ("environment", "queue")
-    steps: Natural = 200_000
+    kinds = ("environment", "queue", "families")
+    steps: Natural = 300_000
     """Decisions to learn from, for each seed."""
-    width: Count = 32
-    """Hidden units a layer."""
-    num_envs: Count = 64
-    """Environments side by side."""
-    rule_share: Share = 0.125
-    """Share of the environments that the rule plays."""
-    leader_share: Share = 0.4
-    """Share of the others that the best student so far plays."""
-    batch_size: Batch = 2048
-    """Decisions of one gradient step."""
+    sets: Annotated[Families, FLAT] = Families()
+    candidates: Natural = 0
+    """k: how many of the cheapest candidates the agent chooses among, beside the head and accepting; 0: 2 in an
+    environment, else 3."""
+    width: Natural = 0
+    """Hidden units of both layers; 0: 64 in an environment, else 96."""
+    num_envs: Natural = 0
+    """Environments side by side, a sixth of which the rule plays; 0: 256 in an environment, else 384."""
+    batch_size: Natural = 0
+    """Decisions of one gradient step; 0: 1024 in an environment, else 2560."""
     gradient_steps: Count = 2
     """Gradient steps after each decision of all environments."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = 2e-3
     """At the start; falls linearly to a twentieth."""
+    entropy: Least0 = 0.3
+    """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time."""
     room: Count = 400_000
-    """Decisions kept to learn from; at 8 slots they take about 200 MB."""
-    checkpoint_every: Count = 50_000
+    """Decisions kept to learn from; they take about 60 MB."""
+    checkpoint_every: Count = 100_000
     """Steps."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sets.families and (self.suites.suite or self.environment != type(self.environment)()):
+            raise BufgymError("--families: they have links of their own, so no suite and no setting of an environment")
+
+    @property
+    def kind(self) -> Kind:
+        """The task of the run."""
+        return self.sets.kind if self.sets.families else super().kind
+
+    @property
+    def resolved(self) -> "Hindsight":
+        """The same without zeros that stand for numbers by the task."""
+        usual: dict[str, Any] = {"candidates": 2, "width": 64, "num_envs": 256, "batch_size": 1024}
+        if self.kind != "environment":
+            usual = {"candidates": 3, "width": 96, "num_envs": 384, "batch_size": 2560}
+        return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
 
 
 ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, GuidedPPO, Hindsight)

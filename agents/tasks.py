@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from bufgym.cli.options import Capacities, Count, Positive, checked
-from bufgym.ground.errors import BufgymError
+from bufgym.ground.errors import BufgymError, unknown
 from bufgym.scenario import Uplink, suites
 from bufgym.scenario.uplink import RGBD_BYTES
 
-Kind = Literal["environment", "queue", "topics", "fleet"]
-"""The task of a run: one environment, suites of one queue, a suite of many topics, or one of many robots."""
+Kind = Literal["environment", "queue", "families", "topics", "fleet"]
+"""The task of a run: one environment, suites of one queue, families of links, a suite of many topics, or of robots."""
 
 _KINDS: dict[str, Kind] = {"topics": "topics", "fleet": "fleet"}
 TestSeeds = Annotated[int, checked(int, lambda number: 0 <= number <= 1000, "a whole number from 0 to 1000")]
@@ -97,3 +97,27 @@ class Suites:
     def slots(self) -> int:
         """Slots that one agent of all suites observes."""
         return max(L for suite in self.suite for L in self.capacities_of(suite))
+
+
+FAMILY_NAMES = ("task", "frames", "lte", "generated", "outage", "heavy", "light", "interruption", "steady", "random")
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Families:
+    """Families of links to train on instead of an environment."""
+
+    kind: ClassVar[Kind] = "families"
+    families: Names = ()
+    """Train on these families of links and streams side by side instead (agents/ready_families.py), as in task,lte;
+    all: on all of them. What is best on their validation links is kept, and the report has their test links."""
+
+    def __post_init__(self) -> None:
+        for name in self.families:
+            if name not in (ALL, *FAMILY_NAMES):
+                raise unknown("family", name, (ALL, *FAMILY_NAMES))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The families, each once."""
+        return FAMILY_NAMES if ALL in self.families else tuple(dict.fromkeys(self.families))

@@ -91,6 +91,7 @@ class CausalPlanner:
         self._ahead = Ahead(c, between, idle, np.zeros((n, 3), np.int64), begin, stop, lead, *pool)
         self._rivals = new_rivals(STEPS)
         self._work, self._values = new_work(capacity, messages), np.zeros((n, capacity + 2))
+        self._decisions = np.tile(np.arange(capacity + 2), (n, 1))
         self._mask = np.zeros((n, capacity + 2), np.int8)
         self._first = -1  # sequence number of the arrival at which the futures begin
         self._rule = policies.get("target-gap")
@@ -156,7 +157,7 @@ class CausalPlanner:
         shift = batch.arrivals["x"][:, k] - arrival.x
         batch.slots["x"][:, 0] = buffer.dequeued_x + shift
         batch.slots["x"][:, 1 : 1 + s] = buffer.slots["x"] + shift[:, None]
-        find_values(batch, self._ahead, self._work, self._values)
+        find_values(batch, self._ahead, self._work, self._decisions, self._values)
         return np.asarray(self._values.mean(axis=0))
 
 

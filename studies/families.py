@@ -7,21 +7,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from agents.families import Run, merged, of_suite, run_of
+from agents.ready_families import FIRST_SEED, frames_over, random_stream
 from bufgym.ground.files import replaced
-from bufgym.model import qoi
-from bufgym.scenario import Uplink
 from bufgym.scenario.numbered import by_trace
 from bufgym.scenario.uplink import uplink_over_lte
-from bufgym.traces import Trace, drive_motion, markov_link, synthetic_lte
 
-MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
 UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
 """Suites over recorded uplinks."""
-FIRST_SEED = {"train": 20_000, "validation": 21_000, "test": 22_000}
-"""Seeds of links made here count up from these."""
 
 
 def task(split: str) -> list[Run]:
@@ -34,54 +27,15 @@ def task(split: str) -> list[Run]:
 
 def default_frames(split: str, count: int = 48) -> list[Run]:
     """Generated links of six ways of moving at the default frames of 4.6 MB."""
-    runs = []
-    for seed in range(FIRST_SEED[split], FIRST_SEED[split] + count):
-        links = (markov_link(MOVING[seed % 6], seed),)
-        scenario = replace(uplink_over_lte(), traces=links, motion=(drive_motion(seed),))
-        runs += [run_of(links[0].name, scenario, 0, L) for L in (5, 8, 16)]
-    return runs
-
-
-def random_link(rng: np.random.Generator, seed: int, mean_bytes_per_s: float) -> Trace:
-    """A link of one of four kinds: LTE, generated like recordings, switching, steady."""
-    kind = rng.integers(4)
-    if kind == 0:
-        return synthetic_lte(seed, mean_bytes_per_s=mean_bytes_per_s)
-    if kind == 1:
-        link = markov_link(MOVING[rng.integers(6)], seed)
-        return link.scaled(mean_bytes_per_s * link.duration_us / 1e6 / int(link.cumulative_bytes[-1]))
-    if kind == 2:
-        lengths_s = 0.2 + rng.exponential(3, 40)
-        steps = [(float(s), mean_bytes_per_s * float(rng.choice([0, 0.3, 1, 2.2]))) for s in lengths_s]
-        return Trace.steps([*steps, (2.0, mean_bytes_per_s)], name=f"switching-{seed}")
-    return Trace.constant(mean_bytes_per_s, 300.0, name=f"constant-{seed}")
+    seeds = range(FIRST_SEED[split], FIRST_SEED[split] + count)
+    parts = [by_trace(frames_over([seed]))[0] for seed in seeds]
+    return [run_of(trace, scenario, 0, L) for trace, scenario in parts for L in (5, 8, 16)]
 
 
 def random_streams(split: str, count: int = 120) -> list[Run]:
     """Rates, sizes, loads, links, L, V and laws of sizes, all at random."""
-    runs = []
-    for seed in range(FIRST_SEED[split], FIRST_SEED[split] + count):
-        rng = np.random.default_rng([seed, 5])
-        rate_hz, size = float(rng.choice([5, 10, 30, 60])), int(np.exp(rng.uniform(np.log(2e4), np.log(5e6))))
-        load = np.exp(rng.uniform(np.log(0.04), np.log(1.1)))
-        L = round(float(np.exp(rng.uniform(np.log(2), np.log(48)))))
-        link, moves = random_link(rng, seed, float(load * rate_hz * size)), rng.random() < 0.6
-        by_time = (
-            qoi.exponential(rng.choice([0.3, 0.618, 0.9]))
-            if rng.random() < 0.75
-            else qoi.saturating(rng.choice([4, 8, 16]))
-        )
-        scenario = Uplink(
-            traces=(link,),
-            motion=(drive_motion(seed),) if moves else (),
-            rate_hz=rate_hz,
-            size_bytes=size,
-            sizes=str(rng.choice(["equal", "equal", "jpeg", "gop"])),
-            duration_s=min(600 / rate_hz, 60.0),
-            value=qoi.exponential(float(np.exp(-rng.choice([0.3, 1, 3])))) if moves else by_time,
-        )
-        runs.append(run_of(link.name, scenario, 0, L))
-    return runs
+    cells = map(random_stream, range(FIRST_SEED[split], FIRST_SEED[split] + count))
+    return [run_of(cell.label, cell.scenario, 0, cell.capacity) for cell in cells]
 
 
 def families(split: str, folder: Path, data: str | None = None) -> dict[str, list[Run]]:

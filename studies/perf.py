@@ -203,7 +203,7 @@ def _rollouts(meter: _Meter) -> Iterator[Measurement]:
 
 
 def _labels(meter: _Meter) -> Measurement:
-    """Decisions of the rule gap-price, each with the regrets of all actions, as ``train.py hindsight`` needs them."""
+    """Decisions of the rule gap-price, each with the regrets of all actions, as imitation needs them."""
     n, steps = LABELLED, meter.sizes.single_steps // 20
     envs = SenderVectorEnv(n, capacity=8, autoreset_mode="SameStep", info="none", actions="slots")
     rule, clairvoyant = expert.policy(envs, "gap-price"), expert.clairvoyant(envs)

@@ -1,202 +1,266 @@
-"""Learning from the clairvoyant: the student begins as the rule, its mean regret falls, and no bad student leads."""
+"""Learning from the clairvoyant: the student begins as a rule, its costs are the clairvoyant's, and they fall."""
 
 import dataclasses
 import math
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from agents import ready_families
 from agents.held_out import split_scenario
-from agents.hindsight import HindsightLearner, Lesson, Lessons, Rows, School, padded
-from agents.hindsight_network import CONTEXT, SLOT, Student, mean_regret
+from agents.hindsight import HindsightLearner, School
+from agents.hindsight_network import Student, expected
+from agents.hindsight_rows import Lesson, Lessons, Part, TaughtRows
 from agents.mixed_env import Cell
+from agents.objectives import families
+from agents.runs import MODEL
 from agents.settings import Hindsight
-from agents.tasks import Environment, Suites
+from agents.tasks import FAMILY_NAMES, Environment, Families, Suites
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.expert import clairvoyant
-from bufgym.envs.expert.player import Player
-from bufgym.model.buffer import ACCEPT
-from bufgym.policies import learned, weights
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
-from bufgym.scenario.numbered import draw
+from bufgym.ground.errors import BufgymError
+from bufgym.policies import weights
+from bufgym.policies.candidate_network import inputs
+from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 
 L = 4
 SHORT = dataclasses.replace(split_scenario(Environment())[0], duration_s=4.0)
-CELL = Cell("", SHORT, L)
 
 
-def random_student(seed: int, size: float = 0.3) -> Student:
-    """A student whose networks are no longer zero."""
+def rows_at(*capacities: int, n: int = 6, candidates: int = 2, seed: int = 0) -> TaughtRows:
+    """``n`` rows at each L, a family for each."""
+    parts = [Part(f"L = {c}", Cell("", SHORT, c), n) for c in capacities]
+    return TaughtRows(parts, candidates, np.random.default_rng(seed))
+
+
+def wild_student(seed: int, candidates: int = 2) -> Student:
+    """A student whose outputs are no longer those of the rule."""
     torch.manual_seed(seed)
-    student = Student(7)
-    for scorer in (student.drop, student.accept):
-        torch.nn.init.normal_(scorer.out.weight, 0, size)
+    student = Student(candidates, 16)
+    for layer in (student[0], student[-1]):
+        torch.nn.init.normal_(layer.weight)
+    torch.nn.init.zeros_(student[-1].bias)
     return student
 
 
-def test_mean_regret_by_hand() -> None:
-    """Two valid actions, e^0 : e^log(3), regrets 1 and 0.2; an invalid one counts nothing, whatever its score."""
-    scores = torch.tensor([[0.0, math.log(3.0), 50.0]])
-    regret = torch.tensor([[1.0, 0.2, math.inf]])
-    assert float(mean_regret(scores, regret)) == pytest.approx(0.25 * 1.0 + 0.75 * 0.2)
+def test_expected_cost_and_entropy_by_hand() -> None:
+    """Two offered actions, e^0 : e^log(3), costs 1 and 0.2; one that is not offered counts nothing."""
+    outputs = torch.tensor([[0.0, math.log(3.0), 50.0]])
+    costs, entropy = expected(outputs, torch.tensor([[1.0, 0.2, math.inf]]))
+    assert costs.tolist() == pytest.approx([0.25 * 1.0 + 0.75 * 0.2])
+    assert entropy.tolist() == pytest.approx([-0.25 * math.log(0.25) - 0.75 * math.log(0.75)])
 
 
-@pytest.mark.kernels
-def test_an_untrained_student_is_the_rule() -> None:
-    """Row by row the outcomes of gap-price, with equal sizes and with a spread of them."""
-    student = Student(8).weights().policy("student")
-    for scenario in (SHORT, dataclasses.replace(SHORT, size_cv=0.5)):
-        episodes = [draw(scenario, seed) for seed in range(6)]
-        plain, rule = dataclasses.replace(student, compile=False), policies.get("gap-price")
-        rows = [run(policy, episodes, L, scenario.value) for policy in (student, plain, rule)]
-        ours, in_python, theirs = ([outcome(row, i) for i in range(6)] for row in rows)
-        assert ours == in_python == theirs
+@pytest.mark.parametrize("candidates", [2, 3])
+def test_an_untrained_student_is_the_rule(candidates: int) -> None:
+    """It accepts where there is room and else drops the cheapest, as min-motion-gap does, at every L."""
+    student = Student(candidates, 8).weights().policy("student")
+    episodes = [draw(SHORT, seed) for seed in range(6)]
+    for capacity in (1, L, 9):
+        ours, theirs = (run(p, episodes, capacity, SHORT.value) for p in (student, policies.get("min-motion-gap")))
+        assert [outcome(ours, i) for i in range(6)] == [outcome(theirs, i) for i in range(6)]
 
 
-def test_fields_show_the_rule_and_keep_their_limits() -> None:
-    """At every decision of a random student the fields name what gap-price does there."""
-    env = SenderVectorEnv(
-        16, dataclasses.replace(SHORT, size_cv=0.5), L, decide_at="arrival", info="mask", actions="slots"
-    )
-    env.reset(seed=1)
-    senders, wild = env.rows.senders, random_student(0).weights()
-    student, rule = Player(wild.policy("wild"), 16), Player(policies.get("gap-price"), 16)
-    low, high = (np.array([getattr(f, end) for f in RULE_FIELDS]) for end in ("low", "high"))
-    slot_low, slot_high = (np.array([getattr(f, end) for f in RULE_SLOT_FIELDS]) for end in ("low", "high"))
-    differ = 0
-    for _ in range(80):
-        actions, asked = student.actions(senders), rule.actions(senders)
-        context, slots = learned.seen(student.memory, wild, L)
-        assert ((low <= context) & (context <= high)).all()
-        assert ((slot_low <= slots) & (slots <= slot_high)).all()
-        drops = np.where(
-            slots[:, -1, SLOT.index("rule_drops")] > 0, L, slots[:, :-1, SLOT.index("rule_drops")].argmax(1)
-        )
-        shown = np.where(context[:, CONTEXT.index("rule_accepts")] > 0, L + 1, drops)
-        np.testing.assert_array_equal(shown, asked)
-        assert (np.delete(slots, -1, 1).any(2).sum(1) == senders.batch.senders["occupancy"]).all()
-        differ += int((actions != asked).sum())
-        env.step(actions)
-    assert differ > 0
-
-
-def test_torch_and_compiled_scores_choose_alike() -> None:
-    """The compiled policy of random weights takes torch's best valid action, at every decision that it reaches."""
-    student = random_student(2)
-    rows = Rows(CELL, 12, student.weights(), (0.0, 0.0), np.random.default_rng(0))
-    chosen = []
-    for _ in range(60):
-        actions, seen = rows._observe(student.weights(), student.weights())
-        valid = torch.isfinite(torch.from_numpy(padded(rows.step(student.weights(), student.weights()), L).regret))
-        scores = student(torch.from_numpy(seen.slots), torch.from_numpy(seen.context)).detach()
-        best = scores.masked_fill(~valid, -math.inf)
-        top = best.max(dim=1).values
-        assert (best[torch.arange(12), torch.from_numpy(actions)] >= top - 1e-3).all()
-        chosen += actions.tolist()
-    assert len(set(chosen)) > 3
+@pytest.mark.parametrize("candidates", [2, 3])
+def test_torch_and_the_file_choose_alike(candidates: int, tmp_path: Path) -> None:
+    """Episodes of a wild student, played by its outputs in torch and by the compiled policy of its file."""
+    student = wild_student(1, candidates)
+    agent = policies.load(weights.save(tmp_path / MODEL, student.weights(), {"name": "wild"}))
+    episodes = [draw(SHORT, seed) for seed in range(4)]
+    env = SenderVectorEnv(4, SHORT, L, decide_at="arrival", candidates=candidates, autoreset_mode="Disabled")
+    seen, info = env.reset(options={"episodes": episodes})
+    over, chosen = np.zeros(4, np.bool_), set()
+    while not over.any():  # all have 120 arrivals, and ask at each of them
+        outputs = student(torch.from_numpy(np.asarray(seen))).detach().numpy()
+        actions = np.where(info["action_mask"] != 0, outputs, -np.inf).argmax(axis=1)
+        chosen |= set(actions.tolist())
+        seen, _, over, _, info = env.step(actions)
+    senders = run(agent, episodes, L, SHORT.value)
+    assert over.all() and info["qoi"].tolist() == [outcome(senders, i).qoi for i in range(4)]
+    assert len(chosen) > 2
 
 
 def test_a_lesson_has_the_regrets_of_the_states_that_rows_reach() -> None:
-    """They are the clairvoyant's; the row of the rule is played by the rule, the others by the student."""
-    wild = random_student(3).weights()
-    rows = Rows(CELL, 8, Student(7).weights(), (0.25, 0.25), np.random.default_rng(4))
-    rule = Player(policies.get("gap-price"), 8)
-    for _ in range(20):
-        regrets = clairvoyant(rows.env).regrets()
-        asked = rule.actions(rows.env.rows.senders)
-        before = rows.env.rows.senders.batch.senders["occupancy"].copy()
-        actions, _ = rows._observe(Student(7).weights(), wild)
-        lesson = rows.step(Student(7).weights(), wild)
-        np.testing.assert_allclose(np.where(np.isfinite(lesson.regret), lesson.regret, np.nan), regrets, atol=1e-6)
-        ruled = rows._ruled
-        np.testing.assert_array_equal(actions[ruled], asked[ruled])
-        assert ruled.sum() == 2 and (before <= L).all()
+    """They are the clairvoyant's in an environment of the same episodes, which takes the same actions at random."""
+    rows = rows_at(L, n=12)
+    taught, rng = rows.groups[0], np.random.default_rng(1)
+    env = SenderVectorEnv(12, SHORT, L, decide_at="arrival", autoreset_mode="SameStep")
+    seen, info = env.reset(seed=0, options={"episodes": list(taught.senders.episodes)})
+    regrets, played = clairvoyant(env), []
+
+    def choose(now: Any, offered: Any) -> Any:
+        actions = np.where(offered, rng.random(offered.shape), -np.inf).argmax(axis=1)
+        played.append(actions)
+        return actions
+
+    for _ in range(30):
+        asked = regrets.regrets()
+        lesson = rows.step(choose)
+        np.testing.assert_array_equal(lesson.seen, seen)
+        np.testing.assert_allclose(lesson.cost, np.where(np.isnan(asked), np.inf, asked), rtol=1e-6, atol=1e-7)
+        assert (np.isfinite(lesson.cost) == (info["action_mask"] != 0)).all() and (lesson.cost.min(axis=1) == 0).all()
+        assert not played[-1][:2].any()  # the rule plays 12 / 6 rows
+        seen, *_, info = env.step(played[-1])
+    assert len(set(np.concatenate(played).tolist())) > 2
+
+
+def test_rows_of_several_l_are_spread_and_begin_anew() -> None:
+    """120 arrivals an episode: after 300 steps each row has ended at least once, and rows are at different moments."""
+    rows = rows_at(3, 9, n=8, candidates=3)
+    assert rows.families == ["L = 3", "L = 9"] and rows.family.tolist() == [0] * 8 + [1] * 8
+    assert rows.seen.shape == (16, inputs(3))
+    rows.scatter(np.random.default_rng(1))
+    moments = [int(next) for group in rows.groups for next in group.senders.batch.senders["next"]]
+    assert len(set(moments)) > 6
+    begun = [group.senders.begun.copy() for group in rows.groups]
+    for _ in range(300):
+        rows.step(lambda seen, offered: np.zeros(16, np.int64))
+    for group, before in zip(rows.groups, begun, strict=True):
+        assert (group.senders.begun > before).all()
+
+
+def lesson(n: int, mark: float, *cost: float) -> Lesson:
+    """``n`` states that all show ``mark``, with the same costs."""
+    return Lesson(np.full((n, inputs(2)), mark, np.float32), np.tile(np.array(cost, np.float32), (n, 1)))
+
+
+def test_lessons_count_costs_in_units_of_action_0_by_family() -> None:
+    """Action 0 costs (2 + 4) / 2 = 3 in the first family and 0.5 in the second; 200 / 3 is more than 60."""
+    rng, lessons = np.random.default_rng(0), Lessons(2, 10, 2)
+    inf = math.inf
+    lessons.add(lesson(4, 1.0, 2.0, 0.0, 200.0, inf), np.array([0, 0, 0, 0]), rng)
+    lessons.add(lesson(4, 2.0, 4.0, inf, 0.0, 6.0), np.array([0, 0, 0, 0]), rng)
+    lessons.add(lesson(3, 3.0, 0.5, 0.0, 0.25, inf), np.array([1, 1, 1]), rng)
+    lessons.add(lesson(2, 9.0, 0.0, inf, inf, inf), np.array([0, 1]), rng)  # no choice, no lesson
+    assert lessons.counts.tolist() == [8, 3] and lessons.units.tolist() == pytest.approx([3.0, 0.5])
+    seen, cost = lessons.draw(np.array([100, 50]), rng)
+    found = {(float(s[0]), *(round(float(x), 4) for x in c)) for s, c in zip(seen, cost, strict=True)}
+    assert found == {(1, 0.6667, 0, 60, inf), (2, 1.3333, inf, 0, 2), (3, 1, 0, 0.5, inf)}
+    assert (seen[:100, 0] < 3).all() and (seen[100:, 0] == 3).all()
 
 
 def test_lessons_keep_all_until_their_room_is_full() -> None:
-    rng = np.random.default_rng(0)
-    lessons = Lessons(10, L)
-
-    def lesson(n: int, mark: float) -> Lesson:
-        shapes = (n, L + 1, len(SLOT)), (n, len(CONTEXT)), (n, L + 2)
-        return Lesson(*(np.full(shape, mark, np.float32) for shape in shapes))
-
+    rng, lessons = np.random.default_rng(0), Lessons(1, 10, 2)
     for mark in (1.0, 2.0):
-        lessons.add(lesson(4, mark), rng)
-    assert lessons.count == 8 and sorted(set(lessons.draw(200, rng)[1][:, 0].tolist())) == [1.0, 2.0]
+        lessons.add(lesson(4, mark, 1.0, 0.0, 0.0, 0.0), np.zeros(4, np.int64), rng)
+    assert set(lessons.draw(np.array([200]), rng)[0][:, 0].tolist()) == {1.0, 2.0}
     for _ in range(30):
-        lessons.add(lesson(4, 3.0), rng)
-    slots, context, regret = lessons.draw(200, rng)
-    assert lessons.count == 10 and (context == 3).all() and (slots == 3).all() and (regret == 3).all()
+        lessons.add(lesson(4, 3.0, 1.0, 0.0, 0.0, 0.0), np.zeros(4, np.int64), rng)
+    assert lessons.counts.tolist() == [10] and (lessons.draw(np.array([200]), rng)[0] == 3).all()
 
 
-def test_padding_leaves_the_newcomer_and_its_actions_last() -> None:
-    slots = np.arange(3 * len(SLOT), dtype=np.float32).reshape(1, 3, len(SLOT))
-    wide = padded(Lesson(slots, np.zeros((1, len(CONTEXT)), np.float32), np.array([[1, 2, 3, 4]], np.float32)), 4)
-    assert wide.regret[0].tolist() == [1, 2, math.inf, math.inf, 3, 4]
-    np.testing.assert_array_equal(wide.slots[0, [0, 1, 4]], slots[0])
-    assert not wide.slots[0, 2:4].any()
+def test_families_that_lose_more_are_drawn_more() -> None:
+    """Half of 1,000 states in equal parts, half by 3 : 1."""
+    school = School(Hindsight(batch_size=1000).resolved, 2, math.inf)
+    school.lost = [0.9, 0.3]
+    assert school.sizes().tolist() == [250 + 375, 250 + 125]
 
 
-def test_the_best_so_far_leads() -> None:
-    """Fitness, the less the better: the rule has 5, then 3, 4 and 3 come."""
-    school, led = School(Hindsight(width=4), math.inf), []
-    for mark, fitness in enumerate((5.0, 3.0, 4.0, 3.0)):
-        torch.nn.init.constant_(school.mean.drop.out.bias, float(mark))
-        school.compare(lambda agent, fitness=fitness: fitness)
-        led.append((float(school.leader.drop.out.bias.detach()), school.best))
-    assert led == [(0, 5), (1, 3), (1, 3), (3, 3)]
-
-
-def test_gradient_steps_lower_the_regret_of_what_was_seen() -> None:
-    """On fixed lessons the loss falls to less than that of the rule."""
-    rng = np.random.default_rng(0)
-    rows, lessons = Rows(CELL, 32, Student(16).weights(), (0.0, 0.0), rng), Lessons(4000, L)
-    rows.scatter(40, rng)
-    start = Student(16).weights()
-    for _ in range(60):
-        lessons.add(rows.step(start, start), rng)
-    school = School(Hindsight(width=16), math.inf)
-    batch = lessons.draw(1000, rng)
-    losses = [school.learn(batch) for _ in range(60)]
-    assert losses[-1] < 0.8 * losses[0]
+def test_gradient_steps_find_the_cheap_actions() -> None:
+    """What is best depends on what is seen: after 200 steps almost all weight is there, and the mean follows."""
+    rng, lessons = np.random.default_rng(0), Lessons(1, 1000, 2)
+    family = np.zeros(300, np.int64)
+    lessons.add(lesson(300, 1.0, 1.0, 0.0, 2.0, 2.0), family, rng)
+    lessons.add(lesson(300, -1.0, 1.0, 2.0, 2.0, 0.0), family, rng)
+    school = School(Hindsight(width=16, batch_size=256, steps=1000, learning_rate=1e-2).resolved, 1, math.inf)
+    seen, offered = np.array([[1.0], [-1.0]], np.float32).repeat(inputs(2), axis=1), np.ones((2, 4), np.bool_)
+    assert school.choose(seen, offered).tolist() == [0, 0]
+    sizes, losses = school.sizes(), []
+    for step in range(600):
+        school.steps = step
+        losses.append(school.learn(*lessons.draw(sizes, rng), sizes))
+    assert losses[0] > 0.9 and losses[-1] < 0.05 and school.lost[0] < 0.1
+    assert school.choose(seen, offered).tolist() == [1, 3]
+    assert school.choose(seen, ~np.eye(4, dtype=np.bool_)[[1, 3]]).tolist() != [1, 3]
+    assert school.optimizer.param_groups[0]["lr"] == pytest.approx(1e-2 * (1 - 599 / 1000))
 
 
 TINY = Hindsight(
-    steps=640, num_envs=16, batch_size=32, width=4, room=64, checkpoint_every=320, validate_every=320,
+    steps=640, num_envs=16, batch_size=32, width=4, room=2_000, checkpoint_every=320, validate_every=320,
     validation_episodes=2, environment=Environment(capacity=L, duration_s=2.0, episodes=2),
 )  # fmt: skip
+TASKS = {
+    "environment": {},
+    "suite": {"environment": Environment(), "suites": Suites(("interruption-v1",), capacities=(3, 5))},
+    "families": {"environment": Environment(), "sets": Families(("task", "heavy"))},
+}
 
 
-@pytest.mark.parametrize("task", ["environment", "suite"])
-def test_training_keeps_an_agent_and_goes_on(task: str, tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+@pytest.mark.parametrize("task", TASKS)
+def test_training_keeps_an_agent_and_goes_on(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The kept file is a policy of the benchmark; a resumed run adds to the curve and to the steps."""
-    monkeypatch.setattr("agents.objectives.environment.PARTS", 1)
-    monkeypatch.setattr("agents.objectives.environment.EPISODES", 4)
-    settings = TINY
-    if task == "suite":
-        on = Suites(("interruption-v1",), capacities=(3, 5))
-        settings = dataclasses.replace(TINY, environment=Environment(), suites=on)
+    monkeypatch.setattr("agents.hindsight.FIRST", 64)
+    monkeypatch.setattr("agents.hindsight_rows.LONGEST", 5)
+    settings = dataclasses.replace(TINY, **TASKS[task])
     first = HindsightLearner(settings).train_seed(tmp_path, 1)
     saved = torch.load(first.folder / "hindsight.pt", weights_only=True)
-    assert saved["steps"] >= 640 and saved["best"] < math.inf
+    assert saved["steps"] >= 640 and saved["mean"]["n_averaged"] > 0
     agent = weights.load(first.model)
-    assert agent.name == "hindsight" and first.model.stat().st_size <= 40_000
-    episodes = [draw(SHORT, seed) for seed in range(2)]
-    assert outcome(run(agent, episodes, 6, SHORT.value), 0).delivered > 0
+    assert agent.name == "hindsight"
+    for capacity in (3, 6):
+        assert outcome(run(agent, [draw(SHORT, 0)], capacity, SHORT.value), 0).delivered > 0
     longer = dataclasses.replace(settings, steps=960)
     second = HindsightLearner(longer).train_seed(tmp_path, 1)
     assert second.validation[: len(first.validation)] == first.validation
     assert second.validation[-1][0] > first.validation[-1][0]
 
 
-def test_accepting_at_an_idle_socket_is_never_unlearned() -> None:
-    """A student of any usual size sends when the socket is idle and the queue empty, so that it is never silent."""
-    env = SenderVectorEnv(8, SHORT, L, decide_at="arrival", info="mask", actions="slots")
-    env.reset(seed=3)
-    player = Player(random_student(5, size=0.02).weights().policy("wild"), 8)
-    assert (player.actions(env.rows.senders) == L + 1).all() and ACCEPT < 0
+def test_the_largest_network_of_families_fits_its_file(tmp_path: Path) -> None:
+    """33 x 96 + 96 + 96 x 96 + 96 + 96 x 5 + 5 = 13,061 numbers of 4 bytes and a header, at most 60 kB."""
+    settings = Hindsight(sets=Families(("all",))).resolved
+    assert (settings.candidates, settings.width, inputs(3)) == (3, 96, 33)
+    path = weights.save(tmp_path / MODEL, Student(3, 96).weights(), {"name": "families"})
+    assert 4 * 13_061 < path.stat().st_size <= 60_000
+
+
+def test_every_family_has_links_of_its_own_in_each_split() -> None:
+    """No trace of a family is in two splits, but the task is validated on its training links; all sizes are equal."""
+    assert tuple(ready_families.FAMILIES) == FAMILY_NAMES == Families(("all",)).names
+    for name, made in ready_families.FAMILIES.items():
+        links = {}
+        for split in ("train", "validation", "test"):
+            cells = made(split)
+            assert all(getattr(cell.scenario, "sizes", "equal") == "equal" and cell.capacity >= 2 for cell in cells)
+            scenarios = [cell.scenario for cell in cells if getattr(cell.scenario, "traces", ())]
+            links[split] = {id_of(trace) for scenario in scenarios for trace in scenario.traces}
+        assert not links["train"] & links["test"] and not links["validation"] & links["test"]
+        assert name == "task" or not links["train"] & links["validation"]
+    assert {cell.capacity for cell in ready_families.FAMILIES["frames"]("test")} >= {3, 8, 48}
+
+
+def id_of(trace: Any) -> tuple[str, int]:
+    return trace.name, int(trace.cumulative_bytes[-1])
+
+
+def test_runs_of_a_family_are_of_many_links_and_l() -> None:
+    """Ten of 24 links at 9 L each; eight runs on two links at one L are four episodes on each."""
+    runs = ready_families.runs_of("frames", "validation", 10)
+    assert len(runs) == 10 and len({run["link"] for run in runs}) > 5 and len({run["capacity"] for run in runs}) > 3
+    alone = ready_families.runs_of("task", "test", 8)
+    assert len({(run["link"], run["best"]) for run in alone}) == 8 and {run["capacity"] for run in alone} == {8}
+    assert {run["link"] for run in alone} == {name for name, _ in by_trace(split_scenario(Environment())[1])}
+
+
+def test_families_are_asked_for_by_name_and_alone() -> None:
+    with pytest.raises(BufgymError, match="unknown family 'wifi'"):
+        Families(("task", "wifi"))
+    for more in ({"suites": Suites(("lte-v1",))}, {"environment": Environment(capacity=5)}):
+        with pytest.raises(BufgymError, match="--families: they have links of their own"):
+            Hindsight(sets=Families(("task",)), **more)
+    assert Families(("lte", "task", "lte")).names == ("lte", "task")
+
+
+def test_the_report_has_a_line_for_each_family(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Validation and report count shares of AFR's regret; AFR has 1 on every family."""
+    monkeypatch.setattr(families, "TEST_RUNS", 4)
+    settings = dataclasses.replace(TINY, environment=Environment(), sets=Families(("outage", "task")))
+    objective = families.FamiliesObjective(settings, tmp_path, 0)
+    assert objective.columns == ("outage", "task", "mean")
+    assert objective.validate(policies.get("afr")) == pytest.approx((1.0, 1.0, 1.0))
+    assert objective.validate(policies.get("clairvoyant"))[-1] == pytest.approx(0, abs=1e-6)

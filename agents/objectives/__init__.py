@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from agents.objectives.environment import EnvironmentObjective
+from agents.objectives.families import FamiliesObjective
 from agents.objectives.fleet import FleetObjective
 from agents.objectives.objective import Objective
 from agents.objectives.suites import SuitesObjective
@@ -11,6 +12,7 @@ from agents.objectives.topics import TopicsObjective
 OBJECTIVES: dict[str, type[Objective]] = {
     "environment": EnvironmentObjective,
     "queue": SuitesObjective,
+    "families": FamiliesObjective,
     "topics": TopicsObjective,
     "fleet": FleetObjective,
 }

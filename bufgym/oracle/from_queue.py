@@ -54,21 +54,26 @@ def new_work(capacity: int, messages: int) -> Work:
 
 
 @kernel
-def find_values(batch: Batch, ahead: Ahead, work: Work, values: NDArray[Any]) -> None:
-    """Fill ``values``, float64[n, L + 2]: the best H attainable in hindsight with each decision; NaN if invalid."""
+def find_values(batch: Batch, ahead: Ahead, work: Work, decisions: Ints, values: NDArray[Any]) -> None:
+    """Fill ``values``, float64[n, m]: the best H attainable in hindsight with each of the ``decisions``, int64[n, m].
+
+    A decision is 0..L-1 to evict that slot, L to reject, L + 1 to accept. NaN for any other and for invalid ones.
+    """
     for i in range(len(batch.senders)):
         sender = batch.senders[i]
         values[i, :] = np.nan
         if sender.waiting == ARRIVAL_WAITS:
             h, e = reach(batch, ahead, work, i)
-            for action in range(sender.capacity + 1 + has_room(batch, i)):
-                if action < sender.occupancy or action >= sender.capacity:
-                    values[i, action] = h + best_without(batch, ahead, work, i, e, action)
+            for k in range(decisions.shape[1]):
+                decision = decisions[i, k]
+                evicts = 0 <= decision < sender.occupancy
+                if evicts or sender.capacity <= decision <= sender.capacity + has_room(batch, i):
+                    values[i, k] = h + best_without(batch, ahead, work, i, e, decision)
 
 
 @kernel
 def find_most(batch: Batch, ahead: Ahead, work: Work, rows: Ints, most: NDArray[Any]) -> None:
-    """Fill ``most``, float64[n], at ``rows``: the largest of ``find_values``; 0 where no decision is due.
+    """Fill ``most``, float64[n], at ``rows``: the best H with any decision; 0 where no decision is due.
 
     The present decision may drop a message of the queue, just as that of any later arrival may.
     """

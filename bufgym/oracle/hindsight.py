@@ -40,16 +40,21 @@ class Hindsight:
         self._end = 0
         self._begun = np.zeros(n, np.int64)
         self._work = new_work(senders.capacity, messages)
-        self._values = np.empty((n, senders.capacity + 2))
+        self._every = np.tile(np.arange(senders.capacity + 2), (n, 1))
+        self._values = np.empty(self._every.shape)
         self._most = np.zeros(n)
 
-    def values(self) -> NDArray[np.float64]:
-        """float64[n, L + 2]: the best H attainable in hindsight after each decision: evict a slot, reject, accept.
+    def values(self, decisions: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+        """float64[n, m]: the best H attainable in hindsight after each of the ``decisions``, int64[n, m].
 
-        NaN for invalid decisions, and where no decision is due. The next call writes the array again.
+        A decision is a slot to evict, L to reject, L + 1 to accept; by default each of these. NaN for invalid and other
+        decisions, and where no decision is due. The next call may write the array again.
         """
         self._load_begun()
-        find_values(self.senders.batch, self._ahead, self._work, self._values)
+        decisions = self._every if decisions is None else decisions
+        if self._values.shape != decisions.shape:
+            self._values = np.empty(decisions.shape)
+        find_values(self.senders.batch, self._ahead, self._work, decisions, self._values)
         return self._values
 
     def most(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -200,17 +200,3 @@ class Weights:
     ) -> "Weights":
         """Make the weights of these fields and ``tensors``."""
         return cls(tuple(fields), *(Network.of(tensors, f"{n}.") for n in cls.NETWORKS))
-
-
-def seen(memory: Memory, weights: Weights, capacity: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What policies that know the rule saw at their last decision with L = ``capacity``, from their memory.
-
-    Returns:
-        (float64[n, context fields], float64[n, L + 1, slot fields]), fields in the order of ``weights.fields``.
-    """
-    first, second = weights.widths
-    begin = RULE_SCRATCH + chains.COLUMNS * (capacity + 1) + 2 * len(weights.fields) - len(weights.context)
-    begin += 2 * first + second
-    context = [begin + weights.CONTEXT_NAMES.index(name) for name in weights.context]
-    slots = begin + ALL_CONTEXT + (capacity + 1) * np.array([weights.SLOT_NAMES.index(name) for name in weights.slot])
-    return memory[:, context], memory[:, np.arange(capacity + 1)[:, None] + slots]

@@ -34,10 +34,10 @@ class Clairvoyant:
 
         NaN for invalid actions and missing candidates, and where no decision is due.
         """
-        values, rows = self._hindsight.values(), self.rows
+        rows, shown = self.rows, self.rows.output.action_mask != 0
         if rows.choices is not None:
-            values = np.take_along_axis(values, rows.output.slot_actions, axis=1)
-        return np.where(rows.output.action_mask == 0, np.nan, values)
+            return self._hindsight.values(np.where(shown, rows.output.slot_actions, -1)).copy()
+        return np.where(shown, self._hindsight.values(), np.nan)
 
     def regrets(self) -> NDArray[np.float64]:
         """float64[n, actions]: the part of H that each action gives up for good, 0 for the best; NaN as ``values``."""

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from bufgym.ground.errors import BufgymError
 from bufgym.ground.kernel import compile_for, entry, located, named
 from bufgym.model.buffer import ACCEPT, HOLD
-from bufgym.model.checks import constants
 from bufgym.policies import Policy
 from bufgym.policies.registry import signatures
 from bufgym.sim import Senders
@@ -38,10 +37,6 @@ class Player:
         self.memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)
-
-    def rewrite(self, numbers: NDArray[np.float64]) -> None:
-        """Give the policy other parameters or weights, as many as it has."""
-        self._parameters = constants(numbers)
 
     def action(self, senders: Senders, i: int = 0) -> int:
         """The action for sender ``i``, whose decision is due: 0..L-1 evict, L reject, L + 1 accept.

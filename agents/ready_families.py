@@ -1,0 +1,130 @@
+"""Ten families of links and streams with messages of equal size, which one agent learns side by side.
+
+``train.py hindsight --families all`` learns from their train splits, chooses by their validation splits, and reports on
+their test splits. The splits share no link, but for ``task``: its validation has other episodes on the training links.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from agents.families import Run, run_of
+from agents.held_out import split_scenario
+from agents.mixed_env import Cell
+from agents.tasks import Environment
+from bufgym.model import qoi
+from bufgym.scenario import Uplink, suites
+from bufgym.scenario.numbered import by_trace
+from bufgym.scenario.uplink import uplink_over_lte
+from bufgym.traces import Trace, drive_motion, markov_link, synthetic_lte
+
+MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
+FIRST_SEED = {"train": 20_000, "validation": 21_000, "test": 22_000}
+"""Seeds of links made here count up from these."""
+FRAMES = {"train": 96, "validation": 24, "test": 48}
+"""Generated links at the default frames."""
+STREAMS = {"train": 48, "validation": 48, "test": 96}
+"""Streams of random conditions; three in four have messages of equal size."""
+TASK_EPISODES = {"validation": 1500, "test": 1800}
+"""First seed of episodes on the links of the task."""
+
+
+def frames_over(seeds: Iterable[int]) -> Uplink:
+    """The default frames of 4.6 MB over generated links of six ways of moving."""
+    seeds = list(seeds)
+    links = tuple(markov_link(MOVING[seed % 6], seed) for seed in seeds)
+    return replace(uplink_over_lte(), traces=links, motion=tuple(drive_motion(seed) for seed in seeds))
+
+
+def random_link(rng: np.random.Generator, seed: int, mean_bytes_per_s: float) -> Trace:
+    """A link of one of four kinds: LTE, generated like recordings, switching, steady."""
+    kind = rng.integers(4)
+    if kind == 0:
+        return synthetic_lte(seed, mean_bytes_per_s=mean_bytes_per_s)
+    if kind == 1:
+        link = markov_link(MOVING[rng.integers(6)], seed)
+        return link.scaled(mean_bytes_per_s * link.duration_us / 1e6 / int(link.cumulative_bytes[-1]))
+    if kind == 2:
+        lengths_s = 0.2 + rng.exponential(3, 40)
+        steps = [(float(s), mean_bytes_per_s * float(rng.choice([0, 0.3, 1, 2.2]))) for s in lengths_s]
+        return Trace.steps([*steps, (2.0, mean_bytes_per_s)], name=f"switching-{seed}")
+    return Trace.constant(mean_bytes_per_s, 300.0, name=f"constant-{seed}")
+
+
+def random_stream(seed: int) -> Cell:
+    """Rate, size, load, link, L, V and law of sizes, all at random; the label is the link's name."""
+    rng = np.random.default_rng([seed, 5])
+    rate_hz, size = float(rng.choice([5, 10, 30, 60])), int(np.exp(rng.uniform(np.log(2e4), np.log(5e6))))
+    load = np.exp(rng.uniform(np.log(0.04), np.log(1.1)))
+    L = round(float(np.exp(rng.uniform(np.log(2), np.log(48)))))
+    link, moves = random_link(rng, seed, float(load * rate_hz * size)), rng.random() < 0.6
+    by_time = (
+        qoi.exponential(rng.choice([0.3, 0.618, 0.9]))
+        if rng.random() < 0.75
+        else qoi.saturating(rng.choice([4, 8, 16]))
+    )
+    scenario = Uplink(
+        traces=(link,),
+        motion=(drive_motion(seed),) if moves else (),
+        rate_hz=rate_hz,
+        size_bytes=size,
+        sizes=str(rng.choice(["equal", "equal", "jpeg", "gop"])),
+        duration_s=min(600 / rate_hz, 60.0),
+        value=qoi.exponential(float(np.exp(-rng.choice([0.3, 1, 3])))) if moves else by_time,
+    )
+    return Cell(link.name, scenario, L)
+
+
+def _task(split: str) -> list[Cell]:
+    on = Environment()
+    return [Cell("", split_scenario(on)[split == "test"], on.capacity)]
+
+
+def _frames(split: str) -> list[Cell]:
+    first = FIRST_SEED[split]
+    scenario = frames_over(range(first, first + FRAMES[split]))
+    return [Cell("", scenario, L) for L in (3, 4, 5, 8, 12, 16, 24, 32, 48)]
+
+
+def _random(split: str) -> list[Cell]:
+    found = map(random_stream, range(FIRST_SEED[split], FIRST_SEED[split] + STREAMS[split]))
+    return [cell for cell in found if cell.scenario.sizes == "equal"]  # type: ignore[attr-defined]
+
+
+def _of_suite(suite: str, capacities: Sequence[int], label: str = "") -> Callable[[str], list[Cell]]:
+    """Cells of a suite whose label has this in it, without a limit on bytes."""
+
+    def made(split: str) -> list[Cell]:
+        found = {name: s for name, s in suites.get(suite).settings(split).items() if label in name}
+        kept = {name: s.scenario for name, s in found.items() if s.max_bytes is None}
+        equal = {name: s for name, s in kept.items() if getattr(s, "sizes", "equal") == "equal"}
+        return [Cell(name, scenario, L) for name, scenario in equal.items() for L in capacities]
+
+    return made
+
+
+FAMILIES: dict[str, Callable[[str], list[Cell]]] = {
+    "task": _task,
+    "frames": _frames,
+    "lte": _of_suite("lte-v2", (5, 8, 15)),
+    "generated": _of_suite("generated-v2", (5, 15)),
+    "outage": _of_suite("outage-v1", (5, 15)),
+    "heavy": _of_suite("jpeg-v1", (5, 10, 25), "heavy"),
+    "light": _of_suite("jpeg-v1", (5, 10, 25), "light"),
+    "interruption": _of_suite("interruption-v1", (5, 8, 16, 32)),
+    "steady": _of_suite("sustained-v1", (5, 8, 15)),
+    "random": _random,
+}
+"""Name -> cells of a split."""
+
+
+def runs_of(family: str, split: str, most: int) -> list[Run]:
+    """So many runs of a family with their bounds: links and L in a random order, with new episodes once all had one."""
+    cells = [Cell(trace, part, c.capacity) for c in FAMILIES[family](split) for trace, part in by_trace(c.scenario)]
+    first = TASK_EPISODES[split] if family == "task" else 0
+    order = np.random.default_rng(0).permutation(len(cells))
+    found = [(cells[order[k % len(cells)]], first + k // len(cells)) for k in range(most)]
+    return [run_of(cell.label, cell.scenario, seed, cell.capacity) for cell, seed in found]
