@@ -118,7 +118,8 @@ def interval(
 
     It is the wider of two, both made for few ``links``. One is the bootstrap's standard error times a quantile of
     Student's t, which holds for few links. The other is the percentile bootstrap at a widened level, which holds for
-    skewed ratios (Hesterberg 2015, "What teachers should know about the bootstrap", The American Statistician 69). No bound leaves ``within``, and a single link has no interval.
+    skewed ratios (Hesterberg 2015, "What teachers should know about the bootstrap", The American Statistician 69). No
+    bound leaves ``within``, and a single link has no interval.
     """
     numbers = np.where(np.abs(numbers) < ROUNDING, 0.0, numbers)
     value, drawn = float(numbers[0]), numbers[1:][~np.isnan(numbers[1:])]

@@ -130,10 +130,13 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
                 none = {name: np.full_like(getattr(s, name), np.nan) for name in ("score", "regret", "by_trace")}
                 by_cell[cell] = s._replace(**none)
         for cell, s in by_cell.items():
-            met = {cell[0]: table.episodes[cell[0]]}
-            measured = (interval(numbers, links_in(met)) for numbers in (s.qoi, s.score, s.regret, s.difference))
-            counts = samples[cell].discriminative, table.exact[cell]
-            cell_scores.append(CellScore(*cell, policy, len(met[cell[0]]), *measured, *counts))
+            episodes_of = {cell[0]: table.episodes[cell[0]]}
+            qoi, score, lost, more = (
+                interval(numbers, links_in(episodes_of)) for numbers in (s.qoi, s.score, s.regret, s.difference)
+            )
+            counts, exact = samples[cell].discriminative, table.exact[cell]
+            met = len(episodes_of[cell[0]])
+            cell_scores.append(CellScore(*cell, policy, met, qoi, score, lost, more, counts, exact))
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
     for values in overall.values():
         lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
