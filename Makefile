@@ -19,7 +19,7 @@ STAGES := $(BIN)/python .ci/stages.py
 
 help:
 	@echo "make train    set up if needed, then train an agent        (ARGS=... go to train.py)"
-	@echo "make check    set up if needed, then check format, lint, types, layers, weight and workflows"
+	@echo "make check    set up if needed, then check format, lint, types, layers, sizes of files and workflows"
 	@echo "make test     the same, then the tests that protect a commit: compiled, and kernels as plain Python"
 	@echo "                                                           (PYTEST_ARGS=... go to pytest)"
 	@echo "make everything    install what the tests that make test skipped need, as far as this machine can, and run them"

@@ -23,9 +23,9 @@ from needs import needs
 from recording_cases import recorded_data
 from registries import forgotten, restored
 
-from bufgym.ground import kernel
+from bufgym import jit
 
-kernel.compile_silently()  # tests count lines on stderr
+jit.compile_silently()  # tests count lines on stderr
 
 REPO = Path(__file__).resolve().parent
 COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")

@@ -16,8 +16,8 @@ from agents.runs import prepare
 from agents.settings import ALGORITHMS, FLAT, PPO, Evolve, Hindsight, Settings
 from agents.tasks import SlotEnvironment
 from bufgym.cli.options import OPTIONS
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import locked
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import locked
 
 app = App(
     "train.py",

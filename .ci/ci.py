@@ -1,4 +1,4 @@
-"""CI is a stranger: ``make test`` in a fresh clone that sees no program or Debian package that tests use besides.
+"""CI is a first user: ``make test`` in a fresh clone that sees no program or Debian package that tests use besides.
 
 With arguments it installs all of these for this checkout and runs ``make`` with them: ``.ci/run test``, and
 ``.ci/run nightly`` each night.
@@ -20,10 +20,10 @@ from needs import NEEDS  # noqa: E402
 
 FOLDERS = "/usr/lib/python3/dist-packages", "/opt/ros", "/usr/include/ros", "/usr/share/ros*"
 OURS = ("BUFGYM_", "ROS_", "AMENT_", "CMAKE_PREFIX", "PYTHONPATH")
-"""Beginnings of environment variables that a stranger does not have."""
+"""Beginnings of environment variables that a first user does not have."""
 
 
-def stranger(command: list[str]) -> list[str]:
+def as_first_user(command: list[str]) -> list[str]:
     """The command where folders of Debian's packages are empty and their programs cannot be executed."""
     folders = [path for pattern in FOLDERS for path in glob.glob(pattern) if os.path.isdir(path)]
     named = {shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin") for n in NEEDS.values() for name in n.programs}
@@ -45,7 +45,7 @@ def make(*words: str, folder: Path = REPO, hide: bool = False) -> int:
     """The exit code of make."""
     command = ["make", "--no-print-directory", *words]
     own = {name: value for name, value in os.environ.items() if not (hide and name.startswith(OURS))}
-    return subprocess.run(stranger(command) if hide else command, cwd=folder, env=own, check=False).returncode
+    return subprocess.run(as_first_user(command) if hide else command, cwd=folder, env=own, check=False).returncode
 
 
 def main(words: list[str]) -> int:

@@ -16,7 +16,7 @@ from pathlib import Path
 import coverage
 
 REPO = Path(__file__).resolve().parent.parent
-ROOMS = ("model", "sim", "policies", "oracle", "envs")
+FOLDERS = ("model", "sim", "policies", "oracle", "envs")
 """Rooms of the core. All kernels that decide what a sender does are in these."""
 LEAST = 0.95
 """Share of lines that must run."""
@@ -69,7 +69,7 @@ def main(data: str) -> int:
     with open(REPO / ".ci" / "kernel_lines.toml", "rb") as file:
         reasons: dict[str, dict[str, str]] = tomllib.load(file)
     total, ran, faults = 0, 0, []
-    for path in sorted(path for room in ROOMS for path in (REPO / "bufgym" / room).rglob("*.py")):
+    for path in sorted(path for folder in FOLDERS for path in (REPO / "bufgym" / folder).rglob("*.py")):
         name = path.relative_to(REPO / "bufgym").as_posix()
         text = path.read_text(encoding="utf-8")
         named = {line: function.name for function in kernels(text) for line in lines(function)}

@@ -37,8 +37,8 @@ DATA = Path(os.environ.get("BUFGYM_SHARED_DATA", REPO.parent / "shared" / "data"
 NO_TESTS = 5
 """Exit code of pytest where no test was chosen."""
 MINUTE = 60
-NIGHT_S = 120.0 * MINUTE
-"""A night is over after so long, whatever is left to do."""
+NIGHTLY_S = 120.0 * MINUTE
+"""The nightly run is over after so long, whatever is left to do."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def files_that_run_uncompiled() -> list[str]:
 
 
 def check() -> list[Stage]:
-    """Format, lint, types of Python and of the page, layers, weight, stale rows, workflows."""
+    """Format, lint, types of Python and of the page, layers, sizes of files, stale rows, workflows."""
     actionlint = BIN / "actionlint"
     no_tsc = "" if TSC.exists() else f"TypeScript is not here: {NEEDS['typescript'].command}"
     return [
@@ -103,7 +103,7 @@ def check() -> list[Stage]:
         Stage("types", [str(BIN / "mypy")]),
         Stage("page types", [str(TSC), "-p", ".ci/tsconfig.json"], unless=no_tsc),
         Stage("imports", [str(BIN / "lint-imports")]),
-        Stage("weight", [PYTHON, ".ci/weight.py"]),
+        Stage("file sizes", [PYTHON, ".ci/file_sizes.py"]),
         Stage("leaderboard", [PYTHON, ".ci/leaderboard.py", "stale"]),
         Stage("workflows", [str(actionlint)], unless="" if actionlint.exists() else "actionlint is not here"),
     ]
@@ -290,7 +290,7 @@ def main(tier: str, arguments: list[str]) -> int:
     begun = time.monotonic()
     for stage in stages:
         log = folder / f"{stage.name.replace(' ', '-')}.log" if goes_on else None
-        left_s = round(max(0.0, NIGHT_S - (time.monotonic() - begun)))
+        left_s = round(max(0.0, NIGHTLY_S - (time.monotonic() - begun)))
         result = carry_out(replace(stage, limit_s=min(stage.limit_s, left_s)), log)
         results.append(result)
         if goes_on:

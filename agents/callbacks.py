@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.runs import Numbers, Record, Validations, seed_bar
 from agents.settings import Settings
-from bufgym.ground.files import replaced
+from bufgym.utils.files import replaced
 
 
 def checkpoints(home: Path) -> list[Path]:

@@ -12,8 +12,8 @@ from typing import Any
 
 from agents.settings import Cluster
 from bufgym.benchmark.cluster import WorkerDiedError, connected_ray, dask_client
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
 
 Call = Callable[..., Any]
 CallEach = Callable[[Call, Sequence[tuple[Any, ...]]], list[Any]]

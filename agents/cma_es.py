@@ -29,9 +29,9 @@ from agents.objectives import OBJECTIVES
 from agents.objectives.objective import Objective, Vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Evolve
-from bufgym.ground.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.guided import GuidedWeights
+from bufgym.utils.files import replaced
 
 POPULATION = 16
 """Candidates per generation."""

@@ -22,7 +22,6 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run as run_policies
 from bufgym.benchmark.score import DISCRIMINATIVE, regret
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle import BASELINE, measure, normalised_score
 from bufgym.policies import Policy
 from bufgym.sb3 import takes_masks
@@ -30,6 +29,7 @@ from bufgym.scenario import Episode
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import Senders, run
 from bufgym.sim.metrics import Outcome, outcome
+from bufgym.utils.errors import BufgymError
 
 Numbers = NDArray[np.float64]
 

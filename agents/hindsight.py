@@ -38,9 +38,9 @@ from agents.mixed_env import Cell, cells
 from agents.ready_families import FAMILIES
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Hindsight
-from bufgym.ground.files import replaced
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights
+from bufgym.utils.files import replaced
 
 MEAN = 0.995
 """Weight of the past in the running mean of the weights, at each gradient step."""

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from bufgym.envs.options import Options
 from bufgym.envs.rows import Rows
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Episode, Scenario, suites
+from bufgym.utils.errors import BufgymError
 
 Observation = dict[str, NDArray[np.float32]]
 

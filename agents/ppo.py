@@ -14,8 +14,8 @@ from torch import nn
 
 from agents.decisions import SlotLearner
 from agents.settings import PPO, ActorCritic
-from bufgym.ground.errors import BufgymError
 from bufgym.sb3 import SlotPolicy, weights_of
+from bufgym.utils.errors import BufgymError
 
 
 class SlotPPO(SlotLearner[PPO]):

@@ -24,10 +24,10 @@ from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import decimal, equal_rows_notes, unranked_among, with_equal_rows
 from bufgym.benchmark.tasks import TASKS
-from bufgym.ground.files import shipped
-from bufgym.ground.tables import aligned
 from bufgym.oracle import BASELINE
 from bufgym.policies import Policy, registry
+from bufgym.utils.files import shipped
+from bufgym.utils.tables import aligned
 
 COLUMNS = (
     ("QoI", "qoi", 1, 3),
@@ -161,7 +161,7 @@ def report_environment(trained: Trained) -> Report:
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = trained.save(trained.folder, held_out=held_out, scores=entries)
     bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in unranked}
-    bars, twins = _drawn(bars, alike)
+    bars, equals = _drawn(bars, alike)
     draw(
         trained.folder / "figure.png",
         {name: np.array(run.validation)[:, [1, 2]] for name, run in names.items()},
@@ -169,7 +169,7 @@ def report_environment(trained: Trained) -> Report:
         bars,
         f"{len(test.episodes)} episodes on held-out links" if traces else f"{len(test.episodes)} held-out episodes",
         lines=trained.lines,
-        notes=twins,
+        notes=equals,
     )
     return [trained.best.seed], notes, "model, figure and numbers"
 
@@ -289,11 +289,11 @@ def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, An
     )
     # Without a discriminative cell, there are no scores to draw.
     ranked = {s.policy: s["score"] for s in result.standings if s.ranked and math.isfinite(s["score"].value)}
-    bars, twins = _drawn(ranked, with_equal_rows(rows))
+    bars, equals = _drawn(ranked, with_equal_rows(rows))
     # By the last column the agent was chosen.
     curves = {agent_name(run): np.array(run.validation)[:, [1, -1]] for run in runs}
     labels = ("training, s", "regret over AFR's, on validation")
-    draw(home / "figure.png", curves, labels, bars, "Test split", notes=twins)
+    draw(home / "figure.png", curves, labels, bars, "Test split", notes=equals)
     return notes, next(s["score"] for s in result.standings if s.policy == f"agent ({settings.algo})")
 
 

@@ -15,9 +15,9 @@ from typing import Any
 from tqdm import tqdm
 
 from agents.settings import Settings
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import locked, write_text
-from bufgym.ground.processes import end_with
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import locked, write_text
+from bufgym.utils.processes import end_with
 
 RUNS = Path("runs")
 MODEL = "model.safetensors"

@@ -10,8 +10,8 @@ from cyclopts import Parameter
 
 from agents.tasks import Environment, Families, FullBuffer, Kind, SlotEnvironment, Suites
 from bufgym.cli.options import Count, Least0, Natural, Positive, checked, command_line
-from bufgym.ground.errors import BufgymError
 from bufgym.policies.weights import MAX_WIDTH
+from bufgym.utils.errors import BufgymError
 
 FLAT = Parameter(name="*")
 VALIDATIONS = 300

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from bufgym.cli.options import Capacities, Count, Positive, checked
-from bufgym.ground.errors import BufgymError, unknown
 from bufgym.scenario import Uplink, suites
 from bufgym.scenario.uplink import RGBD_BYTES
+from bufgym.utils.errors import BufgymError, unknown
 
 Kind = Literal["environment", "queue", "families", "topics", "fleet"]
 """The task of a run: one environment, suites of one queue, families of links, a suite of many topics, or of robots."""

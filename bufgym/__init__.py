@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import gymnasium as _gym
 
-from bufgym.ground import __version__ as __version__
-from bufgym.ground.errors import BufgymError as BufgymError
-from bufgym.ground.modules import on_demand as _on_demand
-from bufgym.ground.packages import ENVIRONMENTS as _GROUP
-from bufgym.ground.packages import absent as _absent
+from bufgym.utils import __version__ as __version__
+from bufgym.utils.errors import BufgymError as BufgymError
+from bufgym.utils.modules import on_demand as _on_demand
+from bufgym.utils.packages import ENVIRONMENTS as _GROUP
+from bufgym.utils.packages import absent as _absent
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy
@@ -49,7 +49,7 @@ for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
             kwargs={"scenario": _scenario, **_options},
         )
 for _id, _told in _absent(_GROUP, _gym.registry).items():
-    _stand_in = "bufgym.ground.packages:raise_absent"
+    _stand_in = "bufgym.utils.packages:raise_absent"
     _gym.register(_id, _stand_in, vector_entry_point=_stand_in, kwargs={"told": f"{_id} {_told}"})
 
 __getattr__ = _on_demand(

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from bufgym import policies, sim
 from bufgym.benchmark.rows import Row
-from bufgym.ground.tables import aligned
 from bufgym.scenario import Uplink
 from bufgym.scenario.afr_evaluation import FRAME_BYTES
 from bufgym.scenario.numbered import draw
 from bufgym.scenario.suites import CAPACITIES, RATE_HZ, time_value
+from bufgym.utils.tables import aligned
 from bufgym_papers.figures.afr_fig6 import LinkFigure
 from bufgym_papers.figures.figure import COLOURS, finish
 from bufgym_papers.figures.rows import FigureRows, listed

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from bufgym.benchmark.bootstrap import Interval, interval, stream
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.table import NONE
-from bufgym.ground.tables import aligned
 from bufgym.scenario.suites import motion_value, time_value
+from bufgym.utils.tables import aligned
 from bufgym_papers.figures.figure import COLOURS, finish, legend_below
 from bufgym_papers.figures.frame_runs import POLICIES, RESAMPLES, FrameFigure, FrameRun, spearman
 from bufgym_papers.figures.rows import FigureRows, listed

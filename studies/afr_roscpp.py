@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model import Link
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import read_log, replay, tunnel
 from bufgym_live.robot.programs import running
 from bufgym_papers.figures.figure import COLOURS, Figure, at_least_0, finish, legend_below, several

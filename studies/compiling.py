@@ -22,9 +22,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from bufgym.cli.options import Count
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import PACKAGE
-from bufgym.ground.tables import Table
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import PACKAGE
+from bufgym.utils.tables import Table
 from studies.page import command
 
 ROWS = 64
@@ -89,7 +89,7 @@ def edited(folder: Path) -> Path:
 
 def lines() -> int:
     """Lines of the kernel's base."""
-    files = (PACKAGE / "ground" / "kernel").glob("*.py")
+    files = (PACKAGE / "jit").glob("*.py")
     return sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files)
 
 
@@ -107,7 +107,7 @@ def main(*, repeats: Count = 3) -> None:
         copy = edited(folder)
         compiled, plain = run(copy, folder, 0)[2], run(copy, folder, 0, NUMBA_DISABLE_JIT="1")[2]
     rows = [
-        ["lines of bufgym/ground/kernel", str(lines())],
+        ["lines of bufgym/jit", str(lines())],
         [f"first step of {ROWS} rows, nothing kept", f"{cold:.2f} s"],
         [f"first step of {ROWS} rows, code kept", f"{min(first_s for first_s, _, _ in warm):.2f} s"],
         ["a step of one of these rows", f"{min(step_ns for _, step_ns, _ in warm):.0f} ns"],

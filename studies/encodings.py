@@ -14,8 +14,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bufgym.ground.errors import unknown
-from bufgym.ground.libraries import library
+from bufgym.utils.errors import unknown
+from bufgym.utils.libraries import library
 
 Content = dict[str, Any]
 """Fields of a message by their ROS 2 names. Nested messages are Contents or lists of them; arrays are numpy's."""

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from agents.families import Run, merged, of_suite, run_of
 from agents.ready_families import FIRST_SEED, frames_over, random_stream
-from bufgym.ground.files import replaced
 from bufgym.scenario.numbered import by_trace
 from bufgym.scenario.uplink import uplink_over_lte
+from bufgym.utils.files import replaced
 
 UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
 """Suites over recorded uplinks."""

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.cli.options import columns
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.recordings import read_workload
 from bufgym.traces.formats.text import open_text
@@ -21,6 +20,7 @@ from bufgym.traces.formats.workloads import WORKLOAD_HEADERS
 from bufgym.traces.generate.sizes import FLOOR, WINDOW_US, read_sizes, recorded, recorded_sizes, speeds
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+from bufgym.utils.errors import BufgymError
 from studies.page import command
 
 LAGS: Final = 30

@@ -9,7 +9,7 @@ from cyclopts import App
 from bufgym.benchmark import bootstrap
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.cli.options import OPTIONS
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:

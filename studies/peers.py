@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from bufgym.envs.output import StepOutput, write_mask, write_observation
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.sim.state import NOTHING_WAITS, Batch
 from studies.perf import ENVIRONMENTS, NATIVE, SEED, TOPICS, Measurement, Sizes, best_s, measure, play, record, report
 

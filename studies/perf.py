@@ -3,7 +3,7 @@
 ``python -m studies.perf [--json FILE] [--history FILE] [--repeats N] [--quick]``
 
 Every figure is the best of several repeats in time of the processor, because other work on the machine can only slow a
-repeat down. Each repeat times the ``yardstick`` too: their ratio says more than either. Actions are drawn beforehand,
+repeat down. Each repeat times the ``microbenchmark`` too: their ratio says more than either. Actions are drawn before,
 uniform among the valid ones, by playing the same seeded episodes once. So the timed loop holds only the environment's
 own work and its resets.
 """
@@ -31,13 +31,13 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.cli.options import Count
 from bufgym.envs import SenderVectorEnv, expert
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import write_text
-from bufgym.ground.kernel import JIT
-from bufgym.ground.tables import Table
+from bufgym.jit import JIT
 from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
-from studies import yardstick
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import write_text
+from bufgym.utils.tables import Table
+from studies import microbenchmark
 from studies.page import command
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
@@ -55,7 +55,7 @@ FELL, BEFORE = 0.15, 5  # A ratio fell if it is lower by more than this share th
 class Measurement(NamedTuple):
     """One measured figure in ``unit``. ``definition`` says how it was measured.
 
-    ``ratio`` is to the yardstick's steps a second, in the same repeats.
+    ``ratio`` is to the microbenchmark's steps a second, in the same repeats.
     """
 
     name: str
@@ -124,13 +124,13 @@ def record(env: Any, steps: int, single: bool = False) -> tuple[list[Any], int]:
 
 
 class _Meter:
-    """Makes figures, each beside the yardstick, which runs between their repeats."""
+    """Makes figures, each beside the microbenchmark, which runs between their repeats."""
 
     def __init__(self, sizes: Sizes) -> None:
-        self.sizes, (self._work, self._steps) = sizes, yardstick.passes(max(sizes.batches), sizes.capacity)
-        told = f"steps a second of studies.yardstick, n = {max(sizes.batches)}, L = {sizes.capacity}"
+        self.sizes, (self._work, self._steps) = sizes, microbenchmark.passes(max(sizes.batches), sizes.capacity)
+        told = f"steps a second of studies.microbenchmark, n = {max(sizes.batches)}, L = {sizes.capacity}"
         self._work()  # compiled, or loaded from disk, before the clock starts
-        self.yardstick = self.figure("yardstick", told, self._steps, "steps", lambda: None, self._work)
+        self.microbenchmark = self.figure("microbenchmark", told, self._steps, "steps", lambda: None, self._work)
 
     def figure(
         self, name: str, told: str, count: int, unit: str, prepare: Work, work: Work, clock: Clock = time.process_time
@@ -152,9 +152,9 @@ class _Meter:
 
 
 def measure(sizes: Sizes | None = None) -> list[Measurement]:
-    """Speed of the yardstick, the batches, the single environments and of rollouts."""
+    """Speed of the microbenchmark, the batches, the single environments and of rollouts."""
     meter = _Meter(sizes or Sizes())
-    return [meter.yardstick, *_batches(meter), *_singles(meter), *_rollouts(meter), _labels(meter)]
+    return [meter.microbenchmark, *_batches(meter), *_singles(meter), *_rollouts(meter), _labels(meter)]
 
 
 def _batches(meter: _Meter) -> Iterator[Measurement]:
@@ -221,9 +221,9 @@ def _labels(meter: _Meter) -> Measurement:
 
 
 def report(figures: Sequence[Measurement], repeats: int) -> str:
-    """Figures beside their ratios to the yardstick, then their definitions."""
+    """Figures beside their ratios to the microbenchmark, then their definitions."""
     rows = [[f.name, f"{_human(f.value)} {f.unit}", f"{f.ratio:.3g}" if f.ratio else ""] for f in figures]
-    lines = [Table(["", "measured", "yardsticks"], [("", rows)]).plain()]
+    lines = [Table(["", "measured", "microbenchmarks"], [("", rows)]).plain()]
     lines += ["", f"Best of {repeats} repeats each, in time of the processor (2 threads: in time that passed)."]
     lines.append("Actions drawn beforehand among the valid ones.")
     if not JIT:

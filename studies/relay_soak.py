@@ -26,8 +26,8 @@ from studies import relay_load
 
 from nats_cases import nats_server  # isort: skip  (relay_load has made it known)
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.session import Session
 from bufgym_live.robot.sockets import free_port

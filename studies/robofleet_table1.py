@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.tables import aligned
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.tables import aligned
 from bufgym_papers.figures.figure import COLOURS, Figure, finish, legend_below, whole
 from bufgym_papers.figures.rows import FigureRows
 from studies.encodings import ENCODINGS, KINDS, Content, content, encode

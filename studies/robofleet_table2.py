@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import PACKAGE
-from bufgym.ground.libraries import library
-from bufgym.ground.tables import aligned
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import PACKAGE
+from bufgym.utils.libraries import library
+from bufgym.utils.tables import aligned
 from bufgym_papers.figures.figure import COLOURS, Figure, finish, whole
 from bufgym_papers.figures.robofleet_evaluation import POINTS
 from bufgym_papers.figures.rows import FigureRows

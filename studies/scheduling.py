@@ -11,7 +11,7 @@ from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.score import Standing
 from bufgym.benchmark.summary import Summary, table_of
 from bufgym.benchmark.tasks import TASKS
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from studies.page import command, publish, written
 
 PAGE = """# Learned scheduling on topics-v1

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
 from bufgym.traces.formats.text import write_text
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
 from bufgym_papers.perception import Sequence, open_sequence
 
 GROUP = 30

@@ -30,7 +30,7 @@ import psutil
 import torch
 
 import bufgym  # noqa: F401  (registers the environments)
-from bufgym.ground.errors import unknown
+from bufgym.utils.errors import unknown
 from studies.page import command
 from studies.sb3_defaults import Episodes, append
 

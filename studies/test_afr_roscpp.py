@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from needs import needs
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures import figure, run
 from bufgym_papers.figures.rows import FigureRows
 from studies import afr_roscpp

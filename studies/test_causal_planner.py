@@ -12,7 +12,7 @@ from needs import needs
 pytest.importorskip("sb3_contrib", reason=needs("extras", "sb3_contrib"))
 
 from bufgym.benchmark.tasks import QueueTask
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Uplink
 from bufgym.scenario.numbered import draw

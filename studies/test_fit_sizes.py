@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bufgym import traces
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate import sizes
 from bufgym.traces.generate.sizes import Moving, drawn, parsed
+from bufgym.utils.errors import BufgymError
 from studies.fit_sizes import fits, laws, main
 
 DRIVE = traces.load_motion("drive-0")

@@ -8,7 +8,7 @@ for extra in ("sb3_contrib", "cma", "cv2", "rvl"):
     pytest.importorskip(extra, reason=needs("extras", extra))
 
 from bufgym import policies, sim  # noqa: E402
-from bufgym.ground.kernel import JIT  # noqa: E402
+from bufgym.jit import JIT  # noqa: E402
 from bufgym_papers.perception import streams, worth  # noqa: E402
 from studies import on_task  # noqa: E402  (these need the extras)
 

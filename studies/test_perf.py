@@ -1,4 +1,4 @@
-"""The speed report at tiny sizes, its history, and the yardstick beside the environment."""
+"""The speed report at tiny sizes, its history, and the microbenchmark beside the environment."""
 
 import json
 import math
@@ -11,9 +11,9 @@ import pytest
 from refusal_cases import refuse
 
 import bufgym.envs  # noqa: F401  (registers)
-from bufgym.ground.kernel import named
+from bufgym.jit import named
 from bufgym.sim.rollout import python_arrival, python_view
-from studies import perf, yardstick
+from studies import microbenchmark, perf
 
 TINY = perf.Sizes(3, (2, 1), 24, 20, 1, 1)
 
@@ -25,7 +25,7 @@ def test_every_figure_is_a_number_with_its_ratio_and_definition(tmp_path: Path) 
         assert math.isfinite(figure.value) and figure.value > 0 and figure.definition, figure.name
         assert figure.ratio and math.isfinite(figure.ratio), figure.name
         assert figure.name in text and figure.definition in text, figure.name
-    assert figures[0].name == "yardstick" and len({figure.name for figure in figures}) == len(figures)
+    assert figures[0].name == "microbenchmark" and len({figure.name for figure in figures}) == len(figures)
     perf.write_json(figures, TINY, tmp_path / "perf.json")
     read = json.loads((tmp_path / "perf.json").read_text())
     assert [figure["name"] for figure in read["figures"]] == [figure.name for figure in figures]
@@ -57,7 +57,7 @@ def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:
         flat, _, ended, _, info = env.step(5 if info["action_mask"][5] else k % 4)
         assert not ended
     buffer, arrival = python_view(named(env.rows.senders.batch), 0), python_arrival(named(env.rows.senders.batch), 0)
-    bare, s = yardstick.Bare.new(1, 4), len(buffer.slots)
+    bare, s = microbenchmark.Bare.new(1, 4), len(buffer.slots)
     at_s, x, size, gain = bare.places[0]
     zero = buffer.dequeued_arrival_us
     rows = [*buffer.slots, arrival]
@@ -67,10 +67,10 @@ def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:
     bare.previous[0, :2] = (buffer.previous_us - zero) * 1e-6, buffer.previous_x
     at_s[s + 2] = 2 * at_s[s + 1] - bare.previous[0, 0]
     x[s + 2] = 2 * x[s + 1] - bare.previous[0, 1]
-    gain[1:] = 1 - np.exp(-yardstick.STEEP * np.diff(x))
-    bare.state[0, yardstick.QUEUED] = s
+    gain[1:] = 1 - np.exp(-microbenchmark.STEEP * np.diff(x))
+    bare.state[0, microbenchmark.QUEUED] = s
     mine, mask = np.zeros((1, 56), np.float32), np.zeros((1, 6), np.int8)
-    yardstick.observe(bare, 0, mine, mask)
+    microbenchmark.observe(bare, 0, mine, mask)
     assert s >= 2 and mask[0].tolist() == info["action_mask"].tolist()
     of_v = {*range(30, 35), *range(40, 45)}  # losses: this V is another
     places = [k for k in range(49) if k not in of_v]

@@ -19,7 +19,7 @@ from flatbuffers.number_types import Float32Flags
 from flatbuffers.table import Table
 from rosbags.typesys import get_types_from_msg
 
-from bufgym.ground.errors import install
+from bufgym.utils.errors import install
 from studies import encodings
 from studies.encodings import KINDS, Kind, content, encode, stores
 from studies.robofleet_table1 import PAPER, Reproduction, fitted

@@ -5,7 +5,7 @@ import sys
 import pytest
 from needs import needs
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures import figure
 from bufgym_papers.figures.rows import FigureRows
 from studies import robofleet_table2, table2_programs

@@ -13,9 +13,9 @@ from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.tasks import TASKS
 from bufgym.cli.options import OPTIONS
-from bufgym.ground.strict_json import read_object
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, suites
+from bufgym.utils.strict_json import read_object
 from studies import tune
 from studies.tune import Choice
 

@@ -30,13 +30,13 @@ from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import decimal
 from bufgym.cli.options import Seeds, Whole, command_line, policy_specs
-from bufgym.ground import __version__
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import write_text
-from bufgym.ground.strict_json import read_object
-from bufgym.ground.tables import Table
 from bufgym.oracle.measure import BASELINE, TIE
 from bufgym.scenario import suites
+from bufgym.utils import __version__
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import write_text
+from bufgym.utils.strict_json import read_object
+from bufgym.utils.tables import Table
 from studies.page import command
 
 

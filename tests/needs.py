@@ -26,7 +26,7 @@ class Need:
     by_hand: str = ""
     """What to do where nothing above is enough; nobody does it by himself."""
     programs: tuple[str, ...] = ()
-    """Commands that CI hides, to see what a stranger sees."""
+    """Commands that CI hides, to see what a first user sees."""
 
     @property
     def command(self) -> str:

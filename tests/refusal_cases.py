@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 
 def refuse(says: str, use: Any, *given: Any, kind: type[Exception] = BufgymError, **named: Any) -> None:

@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground import modules
 from bufgym.policies.registry import Later
+from bufgym.utils import modules
 
 REGISTER_AS_THEY_ARE_IMPORTED = (
     "bufgym", "bufgym.policies", "bufgym.oracle", "bufgym.model.observe", "bufgym.scenario", "bufgym.cli",
@@ -36,7 +36,7 @@ REGISTRIES = (
     "bufgym.traces.formats.writers:WRITERS",
     "bufgym.traces.formats.bag_files:SOURCES",
     "bufgym.traces.generate.sizes:LAWS",
-    "bufgym.ground.modules:FILES",
+    "bufgym.utils.modules:FILES",
     "bufgym_live.commands:LIVE",
     "bufgym_live.commands:ROS2",
     "bufgym_live.commands:RELAY",

@@ -19,7 +19,6 @@ from agents.settings import DQN, Evolve
 from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark.run import run as rows_of
-from bufgym.ground import files
 from bufgym.model import qoi
 from bufgym.model.qoi import exponential
 from bufgym.oracle import EveryLength
@@ -29,6 +28,7 @@ from bufgym.sb3.networks import SlotExtractor, SlotScorer
 from bufgym.scenario import Interruption, suites
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
+from bufgym.utils import files
 
 SHORT = Interruption(law="uniform", t_min=6, t_max=30)
 STEEP = dataclasses.replace(SHORT, value=exponential(0.2))

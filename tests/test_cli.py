@@ -20,7 +20,7 @@ from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.cli import main
 from bufgym.cli.listing import LISTS
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.traces.shipped import shipped_calls
 
 

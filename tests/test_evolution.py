@@ -22,13 +22,13 @@ from agents.runs import MODEL
 from agents.settings import Cluster, Evolve
 from agents.tasks import Suites
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength, integer, law
 from bufgym.policies import guided, weights
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from studies import families, joint
 
 ON = Suites(("interruption-v1",), capacities=(4,), test_seeds=25)

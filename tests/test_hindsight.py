@@ -22,12 +22,12 @@ from agents.tasks import FAMILY_NAMES, Environment, Families, Suites
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.expert import clairvoyant
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import inputs
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
+from bufgym.utils.errors import BufgymError
 
 L = 4
 SHORT = dataclasses.replace(split_scenario(Environment())[0], duration_s=4.0)

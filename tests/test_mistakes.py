@@ -18,10 +18,10 @@ import bufgym
 from agents.report import Trained, agent_name
 from bufgym import policies, scenario, traces
 from bufgym.benchmark.rows import read_rows
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT
-from bufgym.ground.units import bytes_of, rate_of
+from bufgym.jit import JIT
 from bufgym.scenario import suites
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.units import bytes_of, rate_of
 
 QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10", "--seeds", "1", "--policies", "afr"]
 """A benchmark of ten messages."""

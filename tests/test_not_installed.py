@@ -12,8 +12,8 @@ import pytest
 from cli_cases import Capsys, Patch, fails, shown
 
 from bufgym import cli
-from bufgym.ground import packages
-from bufgym.ground.errors import BufgymError
+from bufgym.utils import packages
+from bufgym.utils.errors import BufgymError
 
 REPO = Path(__file__).resolve().parent.parent
 COMMANDS = {"live": "live", "ros2": "live", "relay": "live", "reproduce": "papers"}

@@ -18,7 +18,7 @@ from needs import needs
 
 import bufgym
 from bufgym import cli
-from bufgym.ground import errors
+from bufgym.utils import errors
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -36,7 +36,7 @@ def test_no_text_file_holds_a_path_of_one_machine() -> None:
 def test_one_version_everywhere() -> None:
     version = bufgym.__version__
     settings = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))
-    assert settings["tool"]["hatch"]["version"]["path"] == "bufgym/ground/__init__.py"
+    assert settings["tool"]["hatch"]["version"]["path"] == "bufgym/utils/__init__.py"
     assert f"\nversion: {version}\n" in (REPO / "CITATION.cff").read_text(encoding="utf-8")
     try:
         installed = importlib.metadata.version("bufgym")
@@ -74,7 +74,7 @@ def test_sb3_without_its_extra_names_it() -> None:
     """``stable_baselines3`` set to None cannot be imported, as if it were not installed."""
     program = (
         "import sys\nsys.modules['stable_baselines3'] = None\n"
-        "from bufgym.ground.errors import BufgymError\n"
+        "from bufgym.utils.errors import BufgymError\n"
         "try:\n    import bufgym.sb3\nexcept BufgymError as error:\n    print(error)"
     )
     told = output_of(program)

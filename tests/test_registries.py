@@ -14,7 +14,7 @@ import sys
 import gymnasium as gym
 import pytest
 from bufgym import policies, scenario
-from bufgym.ground import modules
+from bufgym.utils import modules
 from bufgym.model.observe import OWN_FIELDS, OWN_TERMS, field, reward_term
 from bufgym.scenario import SCENARIOS, Interruption
 

@@ -25,7 +25,6 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 import bufgym
 from bufgym import cli, policies
 from bufgym.envs import SenderVectorEnv
-from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import FIELDS as FIELDS_OF_ALL
 from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv, SlotPolicy, as_policy, make_vec_env
@@ -34,6 +33,7 @@ from bufgym.scenario import get as scenario_of
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
+from bufgym.utils.errors import BufgymError
 
 SMALL: dict[str, dict[str, Any]] = {
     "bufgym/Interruption-v0": {"capacity": 3, "t_max": 20},

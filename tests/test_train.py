@@ -34,9 +34,9 @@ from agents.settings import (
 )  # fmt: skip
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
 from bufgym.scenario import suites
+from bufgym.utils.errors import BufgymError
 
 SHARED: dict[str, Any] = {"name": "tiny", "steps": 512, "validate_every": 250_000, "validation_episodes": 2}
 SMALL: dict[str, Any] = {**SHARED, "width": 8, "num_envs": 4, "batch_size": 64, "checkpoint_every": 128}

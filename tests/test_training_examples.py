@@ -14,7 +14,7 @@ from cli_cases import Capsys, Patch
 from needs import needs
 
 from bufgym.benchmark import leaderboard
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 
 pytestmark = pytest.mark.skipif(not JIT, reason=needs("compiled", "they train and measure, which takes compiled code"))
 

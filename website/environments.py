@@ -12,7 +12,6 @@ from typing import Any
 
 import bufgym
 from bufgym import scenario
-from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import (
     CANDIDATE_FIELDS,
     FIELDS,
@@ -25,6 +24,7 @@ from bufgym.model.observe import (
     RewardTerm,
 )
 from bufgym.scenario import FleetScenario
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.environments import MAPPING
 from website.films import FILMS
 from website.markdown import code, parameters, table

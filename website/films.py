@@ -19,9 +19,9 @@ from bufgym import policies
 from bufgym.envs import SenderEnv
 from bufgym.envs.expert import Player
 from bufgym.envs.render.image import COLOURS, canvas_of, pixels
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Episode, Interruption, Scenario, get, suites
 from bufgym.scenario.numbered import draw, numbered
+from bufgym.utils.errors import BufgymError
 from website import interactive, picture
 from website.picture import fading, play
 

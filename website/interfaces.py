@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import bufgym  # noqa: F401  (registers the environments)
-from bufgym.ground.libraries import library
 from bufgym.model import Link
 from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
+from bufgym.utils.libraries import library
 
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "candidates.svg"
 X = np.array([0.0, 0.9, 1.6, 2.8, 3.15, 3.7, 4.9, 5.8, 6.2, 7.2])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bufgym.benchmark import leaderboard
 from bufgym.benchmark.tasks import task_of
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 
 def put(folder: Path, policy: str, path: Path) -> None:

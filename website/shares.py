@@ -12,7 +12,7 @@ from pathlib import Path
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.folder import read
 from bufgym.benchmark.score import scores
-from bufgym.ground.libraries import library
+from bufgym.utils.libraries import library
 
 POLICIES = {"target-gap": "tab:gray", "gap-price": "tab:blue", "price-dp": "tab:orange"}
 """Policies beside AFR, and their colours."""

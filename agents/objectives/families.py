@@ -14,8 +14,8 @@ from agents.report import Report, Trained, agent_name
 from agents.settings import Hindsight, Settings
 from bufgym import policies
 from bufgym.benchmark.bootstrap import Interval, written
-from bufgym.ground.tables import aligned
 from bufgym.policies import Policy
+from bufgym.utils.tables import aligned
 
 RIVALS = ("target-gap", "gap-price", "learned")
 TEST_RUNS = 96

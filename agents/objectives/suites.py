@@ -14,9 +14,9 @@ from agents.families import Family, divided, merged, of_suite
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.objective import Objective
 from agents.report import Report, Trained, report_suites
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.sb3 import GymVecEnv
+from bufgym.utils.errors import BufgymError
 
 PARTS, RUNS = 8, 60
 """Parts of the training runs, and runs of each suite in a part."""

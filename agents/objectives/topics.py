@@ -19,8 +19,6 @@ from agents.objectives.objective import Objective
 from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
-from bufgym.ground import files
-from bufgym.ground.errors import BufgymError
 from bufgym.model.link import FOREVER
 from bufgym.policies import Policy
 from bufgym.policies.guided_topics import SchedulerWeights
@@ -28,6 +26,8 @@ from bufgym.scenario import Client, suites
 from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 from bufgym.sim.rules import age_until
+from bufgym.utils import files
+from bufgym.utils.errors import BufgymError
 
 RIVAL = "robofleet"
 

@@ -5,7 +5,7 @@
 
 from typing import TYPE_CHECKING
 
-from bufgym.ground.modules import on_demand
+from bufgym.utils.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym.benchmark import drops, leaderboard, report

@@ -7,9 +7,9 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
-from bufgym.ground.processes import end_with
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
+from bufgym.utils.processes import end_with
 
 BACKENDS = ("loky", "threading", "sequential", "ray", "dask")
 

@@ -20,13 +20,13 @@ from bufgym.benchmark.run import run
 from bufgym.benchmark.sources import PolicyLike as PolicyLike
 from bufgym.benchmark.sources import make_policy as make_policy
 from bufgym.benchmark.sweep import Sweep
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.files import write_text
-from bufgym.ground.libraries import library
-from bufgym.ground.modules import is_named
 from bufgym.policies import Policy
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.files import write_text
+from bufgym.utils.libraries import library
+from bufgym.utils.modules import is_named
 
 KEYWORDS = ("capacity", "seeds", "progress", "about", "label", "against", "out", "form")
 OF_A_QUEUE = ("max_bytes", "decide_at", "bound")

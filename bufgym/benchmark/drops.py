@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym.benchmark.tasks import QueueTask
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import replaced
-from bufgym.ground.tables import Table
 from bufgym.policies import Policy
 from bufgym.scenario import Uplink
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim.state import NEVER
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import replaced
+from bufgym.utils.tables import Table
 
 # Most topics for a readable table; the CSV file has all.
 _SHOWN_TOPICS = 6

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import TIE
+from bufgym.utils.errors import BufgymError
 
 Numbers = NDArray[np.float64]
 Cell = tuple[str, int]

@@ -13,9 +13,9 @@ from typing import Any
 
 from bufgym.benchmark.rows import Row, read_rows
 from bufgym.benchmark.tasks import TASKS, Task
-from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import write_text
-from bufgym.ground.strict_json import check, read_object
+from bufgym.utils.errors import BufgymError, where
+from bufgym.utils.files import write_text
+from bufgym.utils.strict_json import check, read_object
 
 FORMAT = 2  # Version of the folder's layout, raised when manifest, rows or timeline change their meaning
 

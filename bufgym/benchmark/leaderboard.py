@@ -18,12 +18,12 @@ from bufgym.benchmark.summary import places, shown
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import task_of
-from bufgym.ground import __version__
-from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import read_utf8, write_text
-from bufgym.ground.kernel.closure import closure
-from bufgym.oracle import kept
+from bufgym.jit.fingerprint import fingerprint
+from bufgym.oracle import cached
 from bufgym.scenario import suites
+from bufgym.utils import __version__
+from bufgym.utils.errors import BufgymError, where
+from bufgym.utils.files import read_utf8, write_text
 
 COLUMNS: Layout = {
     **{"suite": str, "policy": str, "rank": int, "cells": int, "quantity": str},
@@ -71,11 +71,13 @@ def made_of(spec: str) -> str:
     except BufgymError:
         return ""
     functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send
-    closures = [closure(getattr(function, "py_func", function)) for function in functions if function is not None]
-    if policy.privileged is not None:  # an oracle, by the texts of its files, as its plans are kept
-        closures.append(kept.sources())
+    fingerprints = [
+        fingerprint(getattr(function, "py_func", function)) for function in functions if function is not None
+    ]
+    if policy.privileged is not None:  # an oracle, by the texts of its files, as its plans are cached
+        fingerprints.append(cached.sources())
     numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client
-    digest = hashlib.sha256(repr((closures, numbers)).encode()).hexdigest()
+    digest = hashlib.sha256(repr((fingerprints, numbers)).encode()).hexdigest()
     return f"{sys.implementation.cache_tag}-{digest[:12]}"
 
 

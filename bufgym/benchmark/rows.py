@@ -7,10 +7,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import replaced
-from bufgym.ground.libraries import library
 from bufgym.sim.metrics import Outcome
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import replaced
+from bufgym.utils.libraries import library
 
 Row = dict[str, Any]
 Layout = Mapping[str, type]

@@ -10,10 +10,10 @@ from typing import Any
 
 from bufgym.benchmark import tasks
 from bufgym.benchmark.rows import Row
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.progress import bar
 from bufgym.policies import Policy, names
 from bufgym.scenario.numbered import by_trace, draw
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.progress import bar
 
 _BATCH_MESSAGES = 1_000_000  # messages held at a time, 88 bytes each; many seeds run in several batches
 

@@ -16,10 +16,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from bufgym import policies
-from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, registry
 from bufgym.policies.registry import OnArrival
+from bufgym.utils import modules
+from bufgym.utils.errors import BufgymError
 
 PolicyLike = Policy | str | Path | OnArrival
 

@@ -17,8 +17,8 @@ from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, inter
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
 from bufgym.benchmark.table import NOBODY, NONE, RunRows, Unranked, signed
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.tables import Table
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.tables import Table
 
 
 class Quantity(NamedTuple):

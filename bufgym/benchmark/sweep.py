@@ -28,14 +28,14 @@ from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import check_distinct, run
 from bufgym.benchmark.table import unranked_among
 from bufgym.benchmark.tasks import Task
-from bufgym.ground import __version__, modules
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import locked, write_text
-from bufgym.ground.progress import bar
 from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace
 from bufgym.scenario.registry import with_parameters
 from bufgym.scenario.suites import Setting
+from bufgym.utils import __version__, modules
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import locked, write_text
+from bufgym.utils.progress import bar
 
 _SEEDS_PER_SHARD = 25
 

@@ -7,9 +7,9 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from bufgym.ground.tables import Table as Table
 from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
+from bufgym.utils.tables import Table as Table
 
 RunRows = Sequence[Mapping[str, Any]]
 Unranked = Mapping[str, str]

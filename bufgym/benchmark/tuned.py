@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from bufgym import policies
-from bufgym.ground.strict_json import read_object
+from bufgym.utils.strict_json import read_object
 
 FILE = Path(__file__).with_name("tuned.json")
 """{suite: {policy: {"setting", "score", "default_score", "split", "command", "bufgym", ...}}}, a file of our own."""

@@ -7,10 +7,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from bufgym import policies, scenario
+from bufgym import jit, policies, scenario
 from bufgym.benchmark.run import run
 from bufgym.envs import FleetVecEnv, SenderVectorEnv
-from bufgym.ground import kernel
 from bufgym.scenario import FleetScenario, Interruption
 
 _L = 2
@@ -54,7 +53,7 @@ PARTS: dict[str, Callable[[], object]] = {
 
 def compile_part(what: str) -> float:
     """Compile one of ``PARTS``; return the time taken in s."""
-    kernel.compile_silently()
+    jit.compile_silently()
     began_s = time.perf_counter()
     PARTS[what]()
     return time.perf_counter() - began_s

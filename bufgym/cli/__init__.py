@@ -18,8 +18,8 @@ from typing import Any
 from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandError, UnknownOptionError
 
 from bufgym.cli.options import OPTIONS
-from bufgym.ground import __version__, modules, packages
-from bufgym.ground.errors import BufgymError, TraceWarning, printable
+from bufgym.utils import __version__, modules, packages
+from bufgym.utils.errors import BufgymError, TraceWarning, printable
 
 __all__ = ["app", "main"]
 

@@ -35,7 +35,7 @@ from bufgym.cli.scenarios import (
     StreamOptions,
     WorkloadOptions,
 )
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison

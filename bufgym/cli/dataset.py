@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 from bufgym.cli.options import Count, Natural, Seeds
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 
 def dataset(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from cyclopts import Group, Parameter
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 
 @Parameter(name="*", group=Group.create_ordered("Weights (.safetensors)"))

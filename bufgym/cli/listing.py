@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, get_args
 
 from bufgym.cli.options import PolicyFile, columns, load_policies
-from bufgym.ground.modules import first_line
+from bufgym.utils.modules import first_line
 
 Kind = Literal["environments", "scenarios", "suites", "policies", "values", "rewards", "observations", "traces"]
 

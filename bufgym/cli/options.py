@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from cyclopts import Group, Parameter
 
-from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
-from bufgym.ground.tables import aligned
-from bufgym.ground.units import bytes_of, rate_of
+from bufgym.utils import modules
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
+from bufgym.utils.tables import aligned
+from bufgym.utils.units import bytes_of, rate_of
 
 if TYPE_CHECKING:
     from bufgym.benchmark.tasks import Task

@@ -8,9 +8,9 @@ from typing import Any
 
 from bufgym.cli.listing import environments
 from bufgym.cli.options import Count, Least0, Natural, PolicyFile, one_policy
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.files import replaced
-from bufgym.ground.libraries import library
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.files import replaced
+from bufgym.utils.libraries import library
 
 FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}  # Suffix of a film -> Pillow's name of the format
 

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bufgym.cli.options import Whole
-from bufgym.ground.errors import BufgymError, printable
+from bufgym.utils.errors import BufgymError, printable
 
 DEFAULT = "docs/leaderboard.csv"
 
@@ -76,11 +76,11 @@ def warmup() -> None:
     from concurrent.futures import ProcessPoolExecutor, as_completed
     from multiprocessing import get_context
 
+    from bufgym import jit
     from bufgym.benchmark import warmup as compiling
-    from bufgym.ground import kernel
-    from bufgym.ground.processes import end_with
+    from bufgym.utils.processes import end_with
 
-    if not kernel.JIT:
+    if not jit.JIT:
         print("compilation is off (NUMBA_DISABLE_JIT): nothing to do")
         return
     began_s = time.perf_counter()
@@ -90,4 +90,4 @@ def warmup() -> None:
         parts = {processes.submit(compiling.compile_part, what): what for what in compiling.PARTS}
         for number, part in enumerate(as_completed(parts), 1):
             print(f"{number}/{len(parts)} {parts[part]}: {part.result():.1f} s", flush=True)
-    print(f"ready after {time.perf_counter() - began_s:.0f} s; compiled code is in {kernel.FOLDER}")
+    print(f"ready after {time.perf_counter() - began_s:.0f} s; compiled code is in {jit.FOLDER}")

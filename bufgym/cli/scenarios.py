@@ -12,9 +12,9 @@ from cyclopts import Group, Parameter
 
 from bufgym.cli.options import Bytes, Count, Least0, Positive, Whole, given, refuse
 from bufgym.cli.trace_bags import MOTION, MotionOptions, RecordingOptions, workload_lines
-from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError, printable
-from bufgym.ground.progress import bar
+from bufgym.utils import modules
+from bufgym.utils.errors import BufgymError, printable
+from bufgym.utils.progress import bar
 
 if TYPE_CHECKING:
     from bufgym.traces import Motion

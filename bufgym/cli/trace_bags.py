@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from bufgym.cli.options import Positive, given, refuse
-from bufgym.ground.errors import BufgymError, printable
-from bufgym.ground.progress import bar
-from bufgym.ground.tables import aligned
+from bufgym.utils.errors import BufgymError, printable
+from bufgym.utils.progress import bar
+from bufgym.utils.tables import aligned
 
 if TYPE_CHECKING:
     from bufgym.traces import MotionSettings, Workload

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from bufgym.cli.options import columns
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 if TYPE_CHECKING:
     from bufgym.traces.datasets.fetch import Fetched

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from bufgym.cli.options import columns
-from bufgym.ground.errors import BufgymError, TraceError, printable
-from bufgym.ground.libraries import library
+from bufgym.utils.errors import BufgymError, TraceError, printable
+from bufgym.utils.libraries import library
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from bufgym import oracle  # noqa: F401  (registers the clairvoyant as a policy 
 from bufgym.envs.fleet_rows import FleetVecEnv
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv
-from bufgym.ground.modules import on_demand
+from bufgym.utils.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym.envs.fleet import FleetEnv, parallel_env

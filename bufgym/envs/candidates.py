@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.output import StepOutput, write_progress
-from bufgym.ground.kernel import kernel, stretch
+from bufgym.jit import kernel, unchecked_slice
 from bufgym.model.buffer import ACCEPT
 from bufgym.model.observe import (
     CANDIDATE_FIELDS,
@@ -50,7 +50,7 @@ def new_choices(n: int, candidates: int, at_arrivals: bool) -> Choices:
 @kernel
 def candidate_decision(batch: Batch, i: int, action: int, choices: Choices) -> int:
     """The decision that an action of row ``i`` stands for."""
-    order = stretch(choices.order, i, 0, choices.order.shape[1])
+    order = unchecked_slice(choices.order, i, 0, choices.order.shape[1])
     return decision_of_candidate(
         order, batch.senders[i].occupancy, choices.at_arrivals == 1, has_room(batch, i), action
     )
@@ -73,9 +73,11 @@ def write_candidates(batch: Batch, i: int, ended: bool, output: StepOutput, choi
         mask[i, 0] = 1
         return
     buffer, arrival = view(batch, i), arrival_of(batch, i)
-    order, cost = stretch(choices.order, i, 0, places), stretch(choices.cost, i, 0, places)
+    order, cost = unchecked_slice(choices.order, i, 0, places), unchecked_slice(choices.cost, i, 0, places)
     find_candidates(buffer, arrival, order, cost)
-    observe_candidates(buffer, arrival, order, cost, stretch(output.flat, i, 0, _PER_CANDIDATE * places + _QUEUE))
+    observe_candidates(
+        buffer, arrival, order, cost, unchecked_slice(output.flat, i, 0, _PER_CANDIDATE * places + _QUEUE)
+    )
     room, at_arrivals = has_room(batch, i), choices.at_arrivals == 1
     for action in range(actions):
         decision = decision_of_candidate(order, sender.occupancy, at_arrivals, room, action)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from bufgym.envs.fleet_rows import fleet_rows
 from bufgym.envs.observation import Observation
 from bufgym.envs.options import RENDER_MODES, Options
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import needs
 from bufgym.scenario import FleetScenario, Uplink
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import needs
 
 with needs("pettingzoo", "fleet", "FleetEnv"):
     from pettingzoo import ParallelEnv

@@ -10,11 +10,11 @@ from bufgym.envs.options import SLOTS, Options, read_arguments
 from bufgym.envs.rows import Rows
 from bufgym.envs.step import step_cells
 from bufgym.envs.vector import SenderVectorEnv
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.threads import Threads
 from bufgym.model.checks import whole
 from bufgym.scenario import FleetScenario, Uplink
 from bufgym.sim.cell import Fleet
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.threads import Threads
 
 
 class FleetRows(Rows):

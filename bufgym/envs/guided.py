@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.options import GUIDED, RULE, InvalidActionError, Options
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
-from bufgym.ground.kernel import kernel, stretch, table
+from bufgym.jit import kernel, unchecked_slice, unchecked_table
 from bufgym.model.observe import Chosen
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, GuidedWeights, follow, inputs, recall
 from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
@@ -62,13 +62,13 @@ def write_guided(batch: Batch, i: int, ended: bool, output: StepOutput, guide: G
     buffer, arrival = view(batch, i), arrival_of(batch, i)
     if guide.sees == SEES_RULE:
         entries = batch.senders[i].capacity + 1
-        rows = table(output.flat, i, 0, _SLOTS, entries)
-        context = stretch(output.flat, i, _SLOTS * entries, _CONTEXT)
+        rows = unchecked_table(output.flat, i, 0, _SLOTS, entries)
+        context = unchecked_slice(output.flat, i, _SLOTS * entries, _CONTEXT)
         observe_rule(buffer, arrival, guide.memory[i], rows, context)
         return
     recall(buffer, arrival, guide.memory[i], guide.base)
     if guide.sees == SEES_INPUTS:
-        inputs(buffer, arrival, guide.memory[i], guide.base, stretch(output.flat, i, 0, N_INPUTS))
+        inputs(buffer, arrival, guide.memory[i], guide.base, unchecked_slice(output.flat, i, 0, N_INPUTS))
 
 
 class Guiding:

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.observe import BUILT_IN, OWN_FIELDS, Field, chosen_at, own_field
+from bufgym.utils.errors import BufgymError, unknown
 
 Observation = Any
 """A dict of arrays; for "flat", one array."""
@@ -194,7 +194,7 @@ class BufferPool(Generic[Buffers]):
     """
 
     def __init__(self, make: Callable[[], tuple[Buffers, Sequence[NDArray[Any]]]]) -> None:
-        """``make`` returns new buffers, and their arrays with all views of them that are handed out."""
+        """``make`` returns new buffers, and their arrays with all views of them that are returned."""
         self._make = make
         self._pool: list[tuple[Buffers, Sequence[NDArray[Any]], list[int]]] = []
 
@@ -213,7 +213,7 @@ _POOLED = 4  # Most buffers in a pool
 
 
 class Handed:
-    """Hands out observations of one row. Making a dict of twenty views costs more than a step, so a pool holds them."""
+    """Returns observations of one row. Making a dict of twenty views costs more than a step, so a pool holds them."""
 
     def __init__(self, form: ObservationForm) -> None:
         self._form = form

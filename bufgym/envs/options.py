@@ -9,11 +9,11 @@ import numpy as np
 
 from bufgym import scenario as scenarios
 from bufgym.envs.observation import MaskKeys
-from bufgym.ground.errors import BufgymError, UnknownArgumentError, unknown
 from bufgym.model.checks import above_0, whole
 from bufgym.model.observe.candidates import MOST_CANDIDATES
 from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
+from bufgym.utils.errors import BufgymError, UnknownArgumentError, unknown
 
 if TYPE_CHECKING:
     from bufgym.envs.render import Window

@@ -1,11 +1,11 @@
-"""What a step hands out: the arrays of n rows, and the kernels that write rewards, masks and observations into them."""
+"""What a step returns: the arrays of n rows, and the kernels that write rewards, masks and observations into them."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel, stretch, table
+from bufgym.jit import kernel, unchecked_slice, unchecked_table
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import FOREVER
 from bufgym.model.observe import (
@@ -161,12 +161,17 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput, cho
         arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
         first = _ALL_SLOT_FIELDS * entries
         if entries > 0:
-            observe_topic_slots(buffer, arrival, arriving, table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries))
-        observe_topic_context(buffer, arrival, arriving, stretch(output.flat, i, first, _ALL_CONTEXT_FIELDS))
+            observe_topic_slots(
+                buffer, arrival, arriving, unchecked_table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries)
+            )
+        observe_topic_context(buffer, arrival, arriving, unchecked_slice(output.flat, i, first, _ALL_CONTEXT_FIELDS))
     elif chosen is None:
         arrival = arrival_of(batch, i)
         first = _SLOT_FIELDS * entries
-        rows, context = table(output.flat, i, 0, _SLOT_FIELDS, entries), stretch(output.flat, i, first, _CONTEXT_FIELDS)
+        rows, context = (
+            unchecked_table(output.flat, i, 0, _SLOT_FIELDS, entries),
+            unchecked_slice(output.flat, i, first, _CONTEXT_FIELDS),
+        )
         observe(buffer, arrival, rows, context)
 
 
@@ -176,7 +181,7 @@ def write_named(batch: Batch, i: int, chosen: Chosen, flat: NDArray[np.float32])
     waiting = batch.senders[i].waiting
     if waiting == NOTHING_WAITS:
         return
-    buffer, row = view(batch, i), stretch(flat, i, 0, flat.shape[1])
+    buffer, row = view(batch, i), unchecked_slice(flat, i, 0, flat.shape[1])
     if batch.several is None:
         write_chosen(buffer, arrival_of(batch, i), chosen, row)
     else:

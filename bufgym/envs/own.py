@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.observation import ObservationForm, Place
 from bufgym.envs.output import StepOutput
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import at, compile_for, kernel, named, stretch
+from bufgym.jit import compile_signature, kernel, named, unchecked_at, unchecked_slice
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.model.observe import Field, OwnTerm
@@ -23,6 +22,7 @@ from bufgym.policies.registry import view_type
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch, batch_type
 from bufgym.sim.view import last_arrival, view
+from bufgym.utils.errors import BufgymError
 
 # Columns of ``marks``: counts of a sender at the step before, and that step's end.
 TRANSMITTED, CREDITED, DROPS, UNTIL = range(4)
@@ -134,10 +134,10 @@ def step_of(batch: Batch, i: int, marks: NDArray[np.int64], ended: bool, paramet
     sender = batch.senders[i]
     arrived = sender.next + 1 if sender.waiting == ARRIVAL_WAITS else sender.next
     return Step(
-        stretch(batch.arrivals, i, 0, arrived),
-        stretch(batch.log, i, 0, arrived),
-        stretch(batch.order, i, marks[i, TRANSMITTED], sender.transmitted - marks[i, TRANSMITTED]),
-        stretch(batch.order, i, marks[i, CREDITED], sender.credited - marks[i, CREDITED]),
+        unchecked_slice(batch.arrivals, i, 0, arrived),
+        unchecked_slice(batch.log, i, 0, arrived),
+        unchecked_slice(batch.order, i, marks[i, TRANSMITTED], sender.transmitted - marks[i, TRANSMITTED]),
+        unchecked_slice(batch.order, i, marks[i, CREDITED], sender.credited - marks[i, CREDITED]),
         sender.rejected + sender.evicted - marks[i, DROPS],
         marks[i, UNTIL],
         end_of_step(batch, i, ended),
@@ -146,7 +146,7 @@ def step_of(batch: Batch, i: int, marks: NDArray[np.int64], ended: bool, paramet
         sender.backlog_bytes,
         sender.capacity,
         ended,
-        stretch(batch.topics, i, 0, sender.topics),
+        unchecked_slice(batch.topics, i, 0, sender.topics),
         parameters,
     )
 
@@ -157,7 +157,7 @@ def end_of_step(batch: Batch, i: int, ended: bool) -> int:
     sender = batch.senders[i]
     if not ended or sender.credited == 0:
         return int(sender.now_us)
-    last = at(batch.log, i, at(batch.order, i, sender.credited - 1))
+    last = unchecked_at(batch.log, i, unchecked_at(batch.order, i, sender.credited - 1))
     return int(max(sender.now_us, last.transmitted_us + sender.propagation_us))
 
 
@@ -266,13 +266,13 @@ def _writer(kind: str, several: bool) -> Any:
         rest = [*(types[name] for name in ("marks", "flags", "table", "constants")), whole, types["table"]]
     signature = numba.types.void(batch_type(several), cast(Any, numba.types).FunctionType(types[kind]), *rest)
     loops: dict[str, Any] = {"slot": write_slots, "context": write_context, "term": write_term}
-    return compile_for(signature, loops[kind])
+    return compile_signature(signature, loops[kind])
 
 
 def _compiled(what: str, kind: str, own: Field | OwnTerm) -> Callable[..., None]:
     """The loop of ``_writer`` over this field's or term's function."""
     try:
-        function = compile_for(_types()[kind], own.function)
+        function = compile_signature(_types()[kind], own.function)
     except cast(Any, numba).core.errors.NumbaError as error:
         reason = " ".join(str(error).split())
         rule = "leave out compile=True, and it runs as plain Python"

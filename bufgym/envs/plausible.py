@@ -8,7 +8,7 @@ motion, and to evict the head when its turn is near (the socket is free within `
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import direct, kernel
+from bufgym.jit import kernel, without_dispatch
 from bufgym.policies.gaps import gap_left
 from bufgym.policies.target_gap import free_soon
 from bufgym.sim.state import ARRIVAL_WAITS, Batch
@@ -18,7 +18,7 @@ NEAR = 1.5
 """Arrivals, as ``target-gap`` has them."""
 
 
-@direct
+@without_dispatch
 @kernel
 def keep_plausible(batch: Batch, rows: NDArray[np.int64], action_mask: NDArray[np.int8]) -> None:
     """Clear the actions of ``rows`` that are valid and not plausible.

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.checks import is_number
 from bufgym.model.observe import OWN_TERMS, OwnTerm, own_term, terms_for
+from bufgym.utils.errors import BufgymError, unknown
 
 
 def reward_weights(

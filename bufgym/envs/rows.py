@@ -1,4 +1,4 @@
-"""Rows, the base of every environment: n senders, the arrays they hand out, and one compiled step over all of them.
+"""Rows, the base of every environment: n senders, the arrays they return, and one compiled step over all of them.
 
 ``Rows`` has a link for each sender; in ``fleet_rows`` the robots of a cell share one.
 """
@@ -23,8 +23,6 @@ from bufgym.envs.plausible import keep_plausible
 from bufgym.envs.regret import Regret
 from bufgym.envs.reward import reward_weights
 from bufgym.envs.step import step_rows
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.threads import Threads
 from bufgym.model.observe import (
     BUILT_IN,
     CANDIDATE_FIELDS,
@@ -43,6 +41,8 @@ from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
 from bufgym.sim.senders import Begun
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.threads import Threads
 
 NO_ACTIONS: NDArray[np.int64] = np.zeros(0, np.int64)
 """Argument of ``step_rows`` and ``step_cells`` where episodes begin."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from bufgym.envs.observation import Observation
 from bufgym.envs.options import RENDER_MODES, Options, read_arguments
 from bufgym.envs.rows import NUMBERED, Rows, check_entries
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Scenario
+from bufgym.utils.errors import BufgymError
 
 _ROW = np.zeros(1, np.int64)
 

@@ -1,4 +1,4 @@
-"""The step of every environment: its effect on senders and the arrays it hands out, as compiled code.
+"""The step of every environment: its effect on senders and the arrays it returns, as compiled code.
 
 An environment is n *rows*, each with a sender of its own. ``step_rows`` steps senders that have a link each,
 ``step_cells`` steps the robots of cells that share one. The same kernels write observations and rewards for both. The
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bufgym.envs.candidates import Choices, candidate_decision, write_candidates
 from bufgym.envs.guided import Guide, guided_decision, write_guided
 from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_named, write_observation, write_rewards
-from bufgym.ground.kernel import direct, kernel, prefetch
+from bufgym.jit import kernel, prefetch, without_dispatch
 from bufgym.model.buffer import HOLD
 from bufgym.model.observe import Chosen
 from bufgym.sim.decisions import answer_send, decide
@@ -33,7 +33,7 @@ def advance(batch: Batch, i: int) -> None:
     settle_gains(batch, i, event == END)
 
 
-@direct
+@without_dispatch
 @kernel
 def step_rows(
     batch: Batch,
@@ -110,7 +110,7 @@ def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
     return due
 
 
-@direct
+@without_dispatch
 @kernel
 def step_cells(
     batch: Batch,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from bufgym.envs.observation import BufferPool, Observation
 from bufgym.envs.options import RENDER_MODES, Options, read_arguments
 from bufgym.envs.rows import Rows, check_entries
-from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
+from bufgym.utils.errors import BufgymError
 
 
 class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
@@ -121,7 +121,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._seed_the_rest()
         self.rows.reset(chosen, options.get("episodes"))
         self._steps[mask] = 0
-        self._done = self._done & ~mask  # a new array: the last step may have handed out the old one
+        self._done = self._done & ~mask  # a new array: the last step may have returned the old one
         self._any_done = bool(self._done.any())
         if self._window is not None:
             self.render()

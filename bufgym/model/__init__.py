@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from bufgym.ground.modules import on_demand
+from bufgym.utils.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym.model import observe, qoi

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import item, kernel
+from bufgym.jit import kernel, unchecked_item
 from bufgym.model.documented import documented
 from bufgym.model.qoi import merging_loss, value
+from bufgym.utils.errors import BufgymError
 
 MESSAGE = np.dtype(
     [
@@ -224,7 +224,7 @@ def fill(buffer: Buffer) -> float:
 def of_topic(slots: NDArray[Any], k: int, topic: int, step: int) -> int:
     """The next slot on this topic from ``k`` on in steps of 1 or -1; -1 or ``len(slots)`` if there is none."""
     k += step
-    while 0 <= k < len(slots) and item(slots, k).topic != topic:
+    while 0 <= k < len(slots) and unchecked_item(slots, k).topic != topic:
         k += step
     return k
 
@@ -246,8 +246,8 @@ def could_fit(spare_bytes: int, slots: NDArray[Any], topics: NDArray[Any]) -> bo
     """Whether ``spare_bytes`` would not be negative if every droppable message went."""
     k = 0
     while spare_bytes < 0 and k < len(slots):
-        slot = item(slots, k)
-        if len(topics) == 1 or item(topics, slot.topic).no_drop == 0:
+        slot = unchecked_item(slots, k)
+        if len(topics) == 1 or unchecked_item(topics, slot.topic).no_drop == 0:
             spare_bytes += slot.size_bytes
         k += 1
     return spare_bytes >= 0
@@ -256,7 +256,7 @@ def could_fit(spare_bytes: int, slots: NDArray[Any], topics: NDArray[Any]) -> bo
 @kernel
 def is_first(buffer: Buffer, k: int) -> bool:
     """Whether slot ``k`` is the oldest of its topic. Each topic's messages are sent in order."""
-    return before(buffer, k, item(buffer.slots, k).topic) < 0
+    return before(buffer, k, unchecked_item(buffer.slots, k).topic) < 0
 
 
 @kernel
@@ -270,17 +270,17 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
         Time gaps before and after, us; gaps in x before and after; the gap in x left if the message is dropped.
     """
     s, by_topic = len(buffer.slots), len(buffer.topics) > 1
-    message = arrival if k == s else item(buffer.slots, k)
+    message = arrival if k == s else unchecked_item(buffer.slots, k)
     at_us, x, topic = message.arrival_us, message.x, message.topic
     from_us, from_x = at_us, x
     follows = not by_topic or (arriving and arrival.topic == topic)  # whether the arrival is the next message
     j = before(buffer, k, topic)
     if j >= 0:
-        from_us, from_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
+        from_us, from_x = unchecked_item(buffer.slots, j).arrival_us, unchecked_item(buffer.slots, j).x
     elif follows:
         from_us, from_x = buffer.dequeued_arrival_us, buffer.dequeued_x
-    elif item(buffer.topics, topic).dequeued > 0:
-        past = item(buffer.topics, topic)
+    elif unchecked_item(buffer.topics, topic).dequeued > 0:
+        past = unchecked_item(buffer.topics, topic)
         from_us, from_x = past.dequeued_arrival_us, past.dequeued_x
     back_us, back_x = at_us - from_us, x - from_x
     if k == s:
@@ -288,13 +288,13 @@ def gaps(buffer: Buffer, arrival: Any, arriving: bool, k: int) -> tuple[int, int
         return back_us, step_us, back_x, step_x, back_x + step_x
     j = after(buffer, k, topic)
     if j == s and not follows:
-        past = item(buffer.topics, topic)
+        past = unchecked_item(buffer.topics, topic)
         step_us = max(past.previous_us - at_us, 0) + past.step_us
         step_x = max(past.previous_x - x, 0.0) + past.step_x
         return back_us, step_us, back_x, step_x, back_x + step_x
     to_us, to_x = arrival.arrival_us, arrival.x
     if j < s:
-        to_us, to_x = item(buffer.slots, j).arrival_us, item(buffer.slots, j).x
+        to_us, to_x = unchecked_item(buffer.slots, j).arrival_us, unchecked_item(buffer.slots, j).x
     return back_us, to_us - at_us, back_x, to_x - x, to_x - from_x
 
 

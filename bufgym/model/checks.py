@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError, unknown
+from bufgym.utils.errors import BufgymError, unknown
 
 MAX_WINDOW = 10**6
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import item, kernel
+from bufgym.jit import kernel, unchecked_item
 from bufgym.model.checks import whole
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Trace
+from bufgym.utils.errors import BufgymError
 
 FOREVER = 2**62  # A time that never comes, us
 
@@ -168,12 +168,12 @@ class KnotStore:
 def segment(knots: NDArray[np.int64], first: int, last: int, hint: int, point: int) -> int:
     """Find k with knots[k] <= point < knots[k + 1] and first <= k < last; try ``hint``, the last answer, first."""
     for k in range(hint, min(hint + 4, last)):
-        if item(knots, k) <= point < item(knots, k + 1):
+        if unchecked_item(knots, k) <= point < unchecked_item(knots, k + 1):
             return k
     low, high = first, last
     while high - low > 1:
         middle = (low + high) // 2
-        if item(knots, middle) <= point:
+        if unchecked_item(knots, middle) <= point:
             low = middle
         else:
             high = middle
@@ -203,8 +203,10 @@ def position_at(
             return total + whole * carried + share(rest, span, carried), last - 1
         laps, t = t_us // duration, t_us % duration
     k = segment(us, first, last, hint, t)
-    from_us, from_bytes = item(us, k), item(size, k)
-    return laps * total + from_bytes + share(t - from_us, item(us, k + 1) - from_us, item(size, k + 1) - from_bytes), k
+    from_us, from_bytes = unchecked_item(us, k), unchecked_item(size, k)
+    return laps * total + from_bytes + share(
+        t - from_us, unchecked_item(us, k + 1) - from_us, unchecked_item(size, k + 1) - from_bytes
+    ), k
 
 
 @kernel
@@ -226,8 +228,8 @@ def time_of(
         laps = (position - 1) // total
         within = position - laps * total
     k = segment(size, first, last, hint, within - 1)  # size[k] < within <= size[k + 1]
-    from_us, from_bytes = item(us, k), item(size, k)
-    span, carried = item(us, k + 1) - from_us, item(size, k + 1) - from_bytes
+    from_us, from_bytes = unchecked_item(us, k), unchecked_item(size, k)
+    span, carried = unchecked_item(us, k + 1) - from_us, unchecked_item(size, k + 1) - from_bytes
     # Rounded up: the segment's span minus the rest, rounded down.
     return laps * duration + from_us + span - share(from_bytes + carried - within, carried, span), k
 

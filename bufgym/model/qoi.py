@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.checks import is_number
+from bufgym.utils import modules
+from bufgym.utils.errors import BufgymError
 
 EXPONENTIAL, SATURATING, TABULATED = 0, 1, 2
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import kernel, records
+from bufgym.jit import kernel, records
 from bufgym.model.buffer import MAX_CAPACITY, TOPIC
 from bufgym.model.checks import is_number, whole
 from bufgym.model.qoi import Value
+from bufgym.utils.errors import BufgymError
 
 MAX_TOPICS = 256
 MAX_NUMBER = 1e12  # The largest priority, weight, rate limit (Hz) and deadline (s)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import Floats, Ints, at, kernel
+from bufgym.jit import Floats, Ints, kernel, unchecked_at
 from bufgym.model.qoi import value
 from bufgym.sim.state import Batch
 
@@ -79,8 +79,11 @@ def find_steps(batch: Batch, ahead: Ahead, i: int, place: int, rivals: Rivals) -
                 continue
             if count == len(rivals.message):
                 return NO_WORK_SPACE
-            added = value(batch.v[batch.senders[i].v_start :], at(batch.arrivals, i, j).x - at(batch.arrivals, i, m).x)
-            rivals.message[count], rivals.least[count] = j, max(enough, at(ahead.c, i, j))
+            added = value(
+                batch.v[batch.senders[i].v_start :],
+                unchecked_at(batch.arrivals, i, j).x - unchecked_at(batch.arrivals, i, m).x,
+            )
+            rivals.message[count], rivals.least[count] = j, max(enough, unchecked_at(ahead.c, i, j))
             rivals.top[count], rivals.added[count] = top, added
             count = _rank(ahead, i, rivals, count)
         stop = _write_steps(ahead, i, rivals, count, place)
@@ -139,7 +142,7 @@ def _write_steps(ahead: Ahead, i: int, rivals: Rivals, count: int, place: int) -
             j = rivals.message[k]
             first, end, added = (
                 step_of(ahead, i, j, min(rivals.top[k], last) + b),
-                at(ahead.stop, i, j),
+                unchecked_at(ahead.stop, i, j),
                 rivals.added[k],
             )
         for step in range(first, end):
@@ -164,10 +167,10 @@ def _write_steps(ahead: Ahead, i: int, rivals: Rivals, count: int, place: int) -
 @kernel
 def _beaten(batch: Batch, ahead: Ahead, i: int, m: int, j: int) -> bool:
     """Whether j + 1 follows ``m`` better than ``j`` after every byte."""
-    if ahead.lead[i, j] == np.inf or at(ahead.between, i, j + 1) > m:
+    if ahead.lead[i, j] == np.inf or unchecked_at(ahead.between, i, j + 1) > m:
         return False
-    v, x = batch.v[batch.senders[i].v_start :], at(batch.arrivals, i, m).x
-    added = value(v, at(batch.arrivals, i, j + 1).x - x) - value(v, at(batch.arrivals, i, j).x - x)
+    v, x = batch.v[batch.senders[i].v_start :], unchecked_at(batch.arrivals, i, m).x
+    added = value(v, unchecked_at(batch.arrivals, i, j + 1).x - x) - value(v, unchecked_at(batch.arrivals, i, j).x - x)
     return bool(added > ahead.lead[i, j] + TIE)
 
 
@@ -175,13 +178,13 @@ def _beaten(batch: Batch, ahead: Ahead, i: int, m: int, j: int) -> bool:
 def _lead(batch: Batch, ahead: Ahead, i: int, m: int) -> float:
     """``Ahead.lead`` of a message."""
     b = ahead.link[i, 0]
-    if m + 1 == batch.senders[i].arrivals or at(ahead.c, i, m + 1) + b > ahead.link[i, 2]:
+    if m + 1 == batch.senders[i].arrivals or unchecked_at(ahead.c, i, m + 1) + b > ahead.link[i, 2]:
         return np.inf
     # Both gains fall with the byte at which a message ends; they differ most just after the other's has fallen.
-    first, last = at(ahead.c, i, m) + b, at(ahead.c, i, m) + (ahead.link[i, 1] + 1) * b
-    k, stop = at(ahead.begin, i, m), at(ahead.stop, i, m)
-    other, end = at(ahead.begin, i, m + 1), at(ahead.stop, i, m + 1)
-    least, most = at(ahead.c, i, m + 1) + b, 0.0
+    first, last = unchecked_at(ahead.c, i, m) + b, unchecked_at(ahead.c, i, m) + (ahead.link[i, 1] + 1) * b
+    k, stop = unchecked_at(ahead.begin, i, m), unchecked_at(ahead.stop, i, m)
+    other, end = unchecked_at(ahead.begin, i, m + 1), unchecked_at(ahead.stop, i, m + 1)
+    least, most = unchecked_at(ahead.c, i, m + 1) + b, 0.0
     while k + 1 < stop and ahead.latest[k + 1] >= last:
         k += 1
     while k < stop and ahead.latest[k] >= first:
@@ -204,12 +207,12 @@ def _furthest(batch: Batch, ahead: Ahead, i: int, m: int) -> int:
     furthest = m + 1
     if furthest >= arrivals:
         return furthest
-    begin, stop = at(ahead.begin, i, m + 1), at(ahead.stop, i, m + 1)
+    begin, stop = unchecked_at(ahead.begin, i, m + 1), unchecked_at(ahead.stop, i, m + 1)
     for k in range(begin + 1, stop):
         furthest = max(furthest, ahead.follow[k])
-    c, c_next = at(ahead.c, i, m), at(ahead.c, i, m + 1)
+    c, c_next = unchecked_at(ahead.c, i, m), unchecked_at(ahead.c, i, m + 1)
     while c_next > c and furthest + 1 < arrivals:
-        if at(ahead.c, i, furthest + 1) >= c_next + 2 * b:
+        if unchecked_at(ahead.c, i, furthest + 1) >= c_next + 2 * b:
             break
         furthest += 1
     if stop - begin == 1 or ahead.latest[begin + 1] < c + (ahead.link[i, 1] + 1) * b:
@@ -221,12 +224,12 @@ def _furthest(batch: Batch, ahead: Ahead, i: int, m: int) -> int:
 def _ends_before(ahead: Ahead, i: int, m: int, j: int) -> tuple[int, int]:
     """First and last byte at which ``m`` may end so that ``j`` follows it; (0, -1) if neither j nor a later one can."""
     b, room, ends = ahead.link[i, 0], ahead.link[i, 1], ahead.link[i, 2]
-    c, c_j = at(ahead.c, i, m), at(ahead.c, i, j)
+    c, c_j = unchecked_at(ahead.c, i, m), unchecked_at(ahead.c, i, j)
     enough, reach = c + b, c + (room + 1) * b
-    if at(ahead.between, i, j) > m:
-        if at(ahead.idle, i, j) >= reach:
+    if unchecked_at(ahead.between, i, j) > m:
+        if unchecked_at(ahead.idle, i, j) >= reach:
             return 0, -1  # ``between`` could be sent before every further message, too
-        enough = max(enough, at(ahead.idle, i, j) + 1)
+        enough = max(enough, unchecked_at(ahead.idle, i, j) + 1)
     if c_j + b > ends or room == 0:
         return 0, -1
     return enough, min(c_j + room * b, ends - b, reach)
@@ -235,7 +238,7 @@ def _ends_before(ahead: Ahead, i: int, m: int, j: int) -> tuple[int, int]:
 @kernel
 def step_of(ahead: Ahead, i: int, m: int, e: int) -> int:
     """Index of the step that message ``m`` of sender ``i`` is on if it ends at byte ``e``."""
-    low, high = at(ahead.begin, i, m), at(ahead.stop, i, m)
+    low, high = unchecked_at(ahead.begin, i, m), unchecked_at(ahead.stop, i, m)
     while high - low > 1:
         middle = (low + high) // 2
         if ahead.latest[middle] >= e:
@@ -251,7 +254,7 @@ def sends(ahead: Ahead, i: int, m: int, e: int) -> float:
 
     -1 if it found no room; -2 if neither it nor any later message can be delivered any more.
     """
-    b, c = ahead.link[i, 0], at(ahead.c, i, m)
+    b, c = ahead.link[i, 0], unchecked_at(ahead.c, i, m)
     u = max(e, c)
     if u + b > ahead.link[i, 2]:
         return -2.0

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bufgym.ground.kernel import Floats, Ints, kernel
+from bufgym.jit import Floats, Ints, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.programme import Problem, Room, waiting_cost
 

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import Floats, Ints, interruptible, kernel
+from bufgym.jit import Floats, Ints, interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.qoi import Value
 from bufgym.oracle import labels, pieces, unequal
+from bufgym.oracle.cached import Found, cached
 from bufgym.oracle.interruption import evenly_kept
-from bufgym.oracle.kept import Found, kept
 from bufgym.oracle.programme import NEVER, Messages
 from bufgym.policies.registry import built_in
 from bufgym.scenario import Episode
+from bufgym.utils.errors import BufgymError
 
 LONG = 1 << 16  # Messages from which on an episode is worked on in pieces
 _SHORT = 2_000  # messages of an episode whose plan takes a fraction of a second on any link
@@ -41,7 +41,7 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     """The best plan for one episode under L = ``capacity`` messages and B = ``max_bytes`` bytes.
 
     Exact for equal sizes where every arrival asks for a decision, up to ``LONG`` messages; an upper bound otherwise
-    (see ``Plan.certified``). Plans that take long are kept on disk (see ``kept``).
+    (see ``Plan.certified``). Plans that take long are cached on disk (see ``cached``).
     """
     check_limits(capacity, max_bytes)
     episode.check_one_queue()
@@ -59,7 +59,7 @@ def clairvoyant(episode: Episode, capacity: int, v: Value, *, max_bytes: int | N
     if n < _QUICK or (n < _SHORT and (size == size[0]).all()):
         return Plan(*find())
     inputs = *stream, asked, min(capacity, n), most_bytes, v.array
-    return Plan(*kept(inputs, n, lambda: interruptible(find)))
+    return Plan(*cached(inputs, n, lambda: interruptible(find)))
 
 
 def _plan(c: Ints, size: Ints, x: Floats, ends: int, asked: slice, capacity: int, most_bytes: int, v: Value) -> Found:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import Floats, Ints, at, kernel
+from bufgym.jit import Floats, Ints, kernel, unchecked_at
 from bufgym.model.qoi import value
 from bufgym.oracle.ahead import TIE, Ahead, sends, step_of
 from bufgym.sim.decisions import has_room
@@ -100,7 +100,7 @@ def reach(batch: Batch, ahead: Ahead, work: Work, i: int) -> tuple[float, int]:
     sender = batch.senders[i]
     h, e = so_far(batch, i, ahead.link[i, 2])
     if e <= ahead.link[i, 2]:
-        e = max(e, at(ahead.c, i, sender.next)) if sender.busy == 0 else e
+        e = max(e, unchecked_at(ahead.c, i, sender.next)) if sender.busy == 0 else e
         look(batch, ahead, work, i, e)
     return h, e
 
@@ -129,7 +129,7 @@ def so_far(batch: Batch, i: int, ends: int) -> tuple[float, int]:
     if e > ends:
         counted -= sender.busy
     for k in range(sender.credited, counted):
-        gain += at(batch.log, i, at(batch.order, i, k)).gain
+        gain += unchecked_at(batch.log, i, unchecked_at(batch.order, i, k)).gain
     return (1.0 + gain if counted > 0 else 0.0), e
 
 
@@ -139,10 +139,10 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
     sender = batch.senders[i]
     own, n, b = sender.occupancy + 1, sender.next, ahead.link[i, 0]
     v = batch.v[sender.v_start :]
-    last_x = at(batch.slots, i, sender.first - 1).x
+    last_x = unchecked_at(batch.slots, i, sender.first - 1).x
     sent = sender.dequeued > 0
     for k in range(own):
-        x = at(batch.arrivals, i, n).x if k == own - 1 else at(batch.slots, i, sender.first + k).x
+        x = unchecked_at(batch.arrivals, i, n).x if k == own - 1 else unchecked_at(batch.slots, i, sender.first + k).x
         work.x[k] = x
         work.first[k] = value(v, x - last_x) if sent else 1.0  # the very first message gains the 1 in H
         for j in range(k):
@@ -150,7 +150,7 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
     count, chosen = 0, n + 1
     for t in range(1, own + 2):
         if t <= own:
-            while n + 1 + count < sender.arrivals and at(ahead.c, i, n + 1 + count) < e + (t - 1) * b:
+            while n + 1 + count < sender.arrivals and unchecked_at(ahead.c, i, n + 1 + count) < e + (t - 1) * b:
                 count += 1
             work.arrived[t] = count
         if t == 1:
@@ -174,7 +174,7 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
                 if after >= 0 and after + 1 <= most:
                     break  # a later message has no larger gain after it
                 if after >= 0:
-                    gain = value(v, at(batch.arrivals, i, m).x - work.x[k]) + after
+                    gain = value(v, unchecked_at(batch.arrivals, i, m).x - work.x[k]) + after
                     if gain > most + TIE or target < 0:
                         most, target = gain, m
             work.jump[t - 1, k], work.target[t - 1, k] = most, target
@@ -186,16 +186,16 @@ def look_ahead(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
     """Fill ``jump`` and ``target`` for no message of the queue: what follows the message sent last, and -1 for none."""
     sender = batch.senders[i]
     v, n = batch.v[sender.v_start :], sender.next
-    x = at(batch.slots, i, sender.first - 1).x
+    x = unchecked_at(batch.slots, i, sender.first - 1).x
     most, target = 0.0, -1
     for m in range(n + 1, sender.arrivals):
-        if at(ahead.between, i, m) > n and at(ahead.idle, i, m) >= e:
+        if unchecked_at(ahead.between, i, m) > n and unchecked_at(ahead.idle, i, m) >= e:
             break  # another message could be sent in the meantime
         after = sends(ahead, i, m, e)
         if after < -1 or (after >= 0 and after + 1 <= most):
             break  # a later message has no larger gain after it
         if after >= 0:
-            added = value(v, at(batch.arrivals, i, m).x - x) if sender.dequeued > 0 else 1.0
+            added = value(v, unchecked_at(batch.arrivals, i, m).x - x) if sender.dequeued > 0 else 1.0
             if added + after > most + TIE or target < 0:
                 most, target = added + after, m
     work.jump[0, 0], work.target[0, 0] = most, target
@@ -253,10 +253,10 @@ def forced(batch: Batch, ahead: Ahead, work: Work, i: int, e: int, count: int, u
     """
     b, n = ahead.link[i, 0], batch.senders[i].next
     v = batch.v[batch.senders[i].v_start :]
-    last_x = at(batch.slots, i, batch.senders[i].first - 1).x
+    last_x = unchecked_at(batch.slots, i, batch.senders[i].first - 1).x
     known = min(until + spare, count) + work.arrived[until]
     for m in range(known):
-        work.places[m] = work.x[work.slots[m]] if m < count else at(batch.arrivals, i, n + 1 + m - count).x
+        work.places[m] = work.x[work.slots[m]] if m < count else unchecked_at(batch.arrivals, i, n + 1 + m - count).x
     for m in range(min(1 + spare, count) + work.arrived[1]):
         work.forced[1, m] = work.first[work.slots[m]] if m < count else value(v, work.places[m] - last_x)
     for t in range(2, until + 1):

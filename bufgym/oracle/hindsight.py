@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps, new_rivals
 from bufgym.oracle.from_queue import find_most, find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.sim import Senders
 from bufgym.sim.state import ARRIVAL_WAITS
+from bufgym.utils.errors import BufgymError
 
 _ROOM = 1 << 16
 """Initial room, in steps of 20 bytes each; it grows as needed."""

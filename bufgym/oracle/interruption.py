@@ -14,12 +14,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import Floats, Ints, kernel
+from bufgym.jit import Floats, Ints, kernel
 from bufgym.model.qoi import Value, value
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Scenario
 from bufgym.sim import Senders
+from bufgym.utils.errors import BufgymError
 
 
 def _check(capacity: int, T: int) -> None:

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import Floats, Ints, interruptible, kernel
+from bufgym.jit import Floats, Ints, interruptible, kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.checks import whole
 from bufgym.model.qoi import Value
 from bufgym.oracle.interruption import integer
 from bufgym.policies.gaps import min_gap
 from bufgym.policies.registry import Policy
+from bufgym.utils.errors import BufgymError
 
 OBJECTIVES = ("ratio", "qoi")
 

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bufgym.ground.kernel import Ints, kernel
-from bufgym.ground.progress import bar
+from bufgym.jit import Ints, kernel
 from bufgym.model.qoi import value
 from bufgym.oracle.programme import Messages, Problem, find_idle
 from bufgym.oracle.unequal import priced, without_idle
+from bufgym.utils.progress import bar
 
 CELLS = 128  # Grid steps within a message's reach: the more, the closer the bound
 MOST_CELLS = 512  # The same at most where even a step a message makes more of them

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from bufgym.ground.kernel import Floats, Ints, kernel
+from bufgym.jit import Floats, Ints, kernel
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.qoi import value
 from bufgym.oracle import beam

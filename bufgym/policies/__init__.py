@@ -3,7 +3,6 @@
 import functools
 import os
 
-from bufgym.ground import files
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, has_space, is_first
 from bufgym.policies import (  # noqa: F401  (each registers its policies)
     afr,
@@ -22,6 +21,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
 )
 from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later
 from bufgym.policies.schedulers import make_room
+from bufgym.utils import files
 
 __all__ = [
     "ACCEPT", "HOLD", "REJECT", "ClientSettings", "Policy", "after", "before", "get", "has_space", "is_first", "load",

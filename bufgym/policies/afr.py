@@ -12,7 +12,7 @@ paper. They differ in the bound for halving r: 3s <= 2L in the code, s/L < 2/3 i
 p along with the queue; the text does not mention p.
 """
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
 from bufgym.policies.registry import Arrival, Memory, built_in
 

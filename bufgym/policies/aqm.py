@@ -5,7 +5,7 @@ Both drop early to tell TCP senders to slow down. A camera does not, so here the
 
 import math
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.classic import keep_first
 from bufgym.policies.registry import Arrival, Memory, built_in

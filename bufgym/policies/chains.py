@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import item, kernel
+from bufgym.jit import kernel, unchecked_item
 from bufgym.model.buffer import Buffer
 from bufgym.model.qoi import value
 
@@ -67,7 +67,7 @@ def x_of(buffer: Buffer, arrival: Any, i: int, end_x: float) -> float:
         return buffer.dequeued_x
     s = len(buffer.slots)
     if i <= s:
-        return float(item(buffer.slots, i - 1).x)
+        return float(unchecked_item(buffer.slots, i - 1).x)
     return float(arrival.x) if i == s + 1 else end_x
 
 
@@ -76,5 +76,5 @@ def bytes_of(buffer: Buffer, arrival: Any, i: int) -> int:
     """The bytes of place ``i`` > 0 of a chain; the end has none."""
     s = len(buffer.slots)
     if i <= s:
-        return int(item(buffer.slots, i - 1).size_bytes)
+        return int(unchecked_item(buffer.slots, i - 1).size_bytes)
     return int(arrival.size_bytes) if i == s + 1 else 0

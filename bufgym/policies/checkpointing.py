@@ -7,7 +7,7 @@ can stay below ln 4 (Bringmann et al., arXiv 1302.4216; Bar-On et al., arXiv 170
 `steady` writes the n-th arrival as n = m 2^h with m odd, and for each m keeps the last few, with the largest h.
 """
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, fill, has_space
 from bufgym.policies.afr import MEMORY, C, P, R, afr_departure, thin
 from bufgym.policies.classic import keep_last

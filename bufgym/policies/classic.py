@@ -1,13 +1,13 @@
 """Drop rules of today's middleware and network queues, which decide by position alone."""
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space
 from bufgym.policies.registry import Arrival, Memory, built_in
 
 
 @kernel
 def keep_last(buffer: Buffer, arrival: Arrival, depth: float) -> int:
-    """Keep the newest ``depth`` messages: the head goes if as many are queued or the newcomer does not fit."""
+    """Keep the newest ``depth`` messages: drop-oldest if as many are queued or the newcomer does not fit."""
     return ACCEPT if len(buffer.slots) < depth and has_space(buffer, arrival) else 0
 
 

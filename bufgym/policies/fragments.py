@@ -5,7 +5,7 @@ See docs/methods.md, "Messages in fragments".
 
 import math
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first, keep_last
 from bufgym.policies.registry import Arrival, Memory, built_in

@@ -6,7 +6,7 @@ motion gaps the robot's odometry.
 
 import numpy as np
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, arrival_gain, gaps, has_space, loss, motion_gaps, suffices
 from bufgym.model.qoi import value
 from bufgym.policies.registry import Arrival, Memory, built_in

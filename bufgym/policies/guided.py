@@ -27,8 +27,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import Buffer
 from bufgym.model.observe.declare import Field, Function, writer
 from bufgym.model.observe.on_board import mean_bytes
@@ -39,6 +38,7 @@ from bufgym.policies.price_dp import VARIANCE, remember_sizes, share
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.target_gap import SEEN_US, Numbers, bursty, head_goes, link_rate, needless, remember, target
 from bufgym.policies.thinning import places, steady
+from bufgym.utils.errors import BufgymError
 
 
 class Output(NamedTuple):
@@ -102,7 +102,7 @@ class Known(NamedTuple):
     has_target: bool  # whether the target gap is known
     gap: float  # the target gap g, or come / (s + 1) where it is unknown
     gain: float  # V(g)
-    head_gap: float  # the gap left if the head goes; 0 for an empty queue
+    head_gap: float  # the gap left if the head is dropped; 0 for an empty queue
     log_rate_variance: float  # of the logarithm of the link's rate
     log_bytes_variance: float  # of the logarithm of bytes
     share: float  # a, the share of price-dp in the plain rule
@@ -138,7 +138,7 @@ INPUT_FIELDS = (
     declared("unknown", "1 where the target gap is unknown, otherwise 0",
              lambda buffer, known: 0.0 if known.has_target else 1.0),
     declared("one", "always 1", lambda buffer, known: 1.0),
-    declared("head_gap", "lg(the gap left if the head goes, g); 0 for an empty queue",
+    declared("head_gap", "lg(the gap left if the head is dropped, g); 0 for an empty queue",
              lambda buffer, known: lg(known.head_gap, known.gap) if known.messages > 1 else 0.0),
     declared("share", "a, the share of price-dp in the plain rule", lambda buffer, known: known.share),
     declared("plain",

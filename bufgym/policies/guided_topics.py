@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, fill, is_first, loss
 from bufgym.model.observe.declare import writer
 from bufgym.model.observe.topics import largest

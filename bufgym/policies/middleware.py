@@ -29,7 +29,7 @@ def expired(buffer: Buffer, memory: Memory) -> bool:
 
 @built_in("lifespan", parameters={"lifespan_s": 0.5}, on_dequeue=expired, source="DDS QoS LIFESPAN")
 def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """DDS LIFESPAN: nothing older than `lifespan_s` is sent; the head goes when full.
+    """DDS LIFESPAN: nothing older than `lifespan_s` is sent; drop-oldest when full.
 
     DDS removes a message when it expires. Here it goes when it would be sent; until then it would be next to go anyway.
     """
@@ -38,7 +38,7 @@ def lifespan(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 
 @built_in("time-filter", parameters={"separation_s": 0.1}, source="DDS QoS TIME_BASED_FILTER, minimum_separation")
 def time_filter(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; the head goes when full."""
+    """DDS TIME_BASED_FILTER: accepts at most one message in `separation_s`; drop-oldest when full."""
     s, separation_us = len(buffer.slots), 1e6 * buffer.parameters[0]
     # The tail is the message accepted last, as it is never dropped before the head.
     last_us = buffer.slots[s - 1].arrival_us if s > 0 else buffer.dequeued_arrival_us

@@ -10,7 +10,7 @@ is the *unit* below. Where g is unknown, g is the even gap that the queue has no
 
     if a queued message adds nothing: it goes
     elif there is room, and the queue is empty or the socket idle: accept
-    elif the socket is free before ``price_near`` more arrivals, and dropping the head has an advantage: the head goes
+    elif the socket is free before ``price_near`` more arrivals, and dropping the head has an advantage: drop the head
     elif the queue is full: the largest advantage goes
     elif the largest advantage exceeds ``price_threshold`` units: it goes, though there is room
     else: accept
@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps, newcomer_stays
 from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.on_board import mean_bytes

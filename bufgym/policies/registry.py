@@ -26,12 +26,12 @@ from typing import Any, NamedTuple, cast, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.kernel import JIT, compile_for
-from bufgym.ground.modules import first_line, takes
-from bufgym.ground.settings import named_settings
+from bufgym.jit import JIT, compile_signature
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.checks import changed, check_name, constants
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.modules import first_line, takes
+from bufgym.utils.settings import named_settings
 
 Arrival = Any
 """A MESSAGE record."""
@@ -208,7 +208,7 @@ def _compiled(*functions: Any) -> Functions:
     A function that is a kernel already is compiled again from its text, for the one signature.
     """
     plain = [getattr(function, "py_func", function) for function in functions]
-    return cast(Functions, tuple(map(compile_for, signatures(), plain)) if JIT else functions)
+    return cast(Functions, tuple(map(compile_signature, signatures(), plain)) if JIT else functions)
 
 
 @functools.cache

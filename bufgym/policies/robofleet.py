@@ -5,7 +5,7 @@ See docs/methods.md, "Robofleet's clients, ours beside theirs".
 
 import math
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies.registry import Arrival, ClientSettings, Memory, built_in
 from bufgym.policies.schedulers import fits, make_room, oldest, topic_of

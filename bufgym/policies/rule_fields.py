@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, has_space, motion_gaps
 from bufgym.model.observe import Field
 from bufgym.model.observe.declare import TINY, writer

@@ -45,7 +45,7 @@ COUNT = 0
     source="fixed decimation, 30 to 10 frames/s (Golodetz et al. 2018 [golodetz2018collaborative])",
 )
 def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Fixed decimation: of the arrivals it is asked about, one in `every` is queued; the head goes when full."""
+    """Fixed decimation: of the arrivals it is asked about, one in `every` is queued; drop-oldest when full."""
     n, every = memory[COUNT], buffer.parameters[0]
     if buffer.evictions == 0:
         memory[COUNT] += 1
@@ -60,7 +60,7 @@ def decimate(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     source="motion keyframes of collaborative mapping, a threshold on distance or angle",
 )
 def keyframe(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """Motion keyframes: accepts messages `step` in x beyond the last keyframe; the head goes when full."""
+    """Motion keyframes: accepts messages `step` in x beyond the last keyframe; drop-oldest when full."""
     s, step = len(buffer.slots), buffer.parameters[0]
     last_x = buffer.slots[s - 1].x if s > 0 else buffer.dequeued_x  # the tail is never dropped before the head
     if s + buffer.dequeued > 0 and arrival.x - last_x < step:

@@ -8,10 +8,10 @@ message of each topic. On a sender with a single topic, each is a queue that dro
 import math
 from typing import Any
 
-from bufgym.ground.kernel import kernel
-from bufgym.ground.modules import first_line
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer, could_fit, has_space, is_first
 from bufgym.policies.registry import Arrival, Memory, built_in
+from bufgym.utils.modules import first_line
 
 
 @kernel

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 
 HEADER = 5
 """Numbers before the fields: fields read, the context's share of them, widths of both layers, size of one network."""

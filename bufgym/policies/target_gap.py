@@ -10,7 +10,7 @@ g. It is wide if the queue is full, or if the link sends few messages for the mo
     soon <- whether the socket is free before ``near`` more arrivals
     if a queued message adds nothing: it goes
     elif there is room, and the queue is empty or the socket idle: accept
-    elif soon and the message behind the head lies nearer to g than the head: the head goes
+    elif soon and the message behind the head lies nearer to g than the head: drop the head
     elif the queue is full: what leaves the smallest gap goes, older ones rather
     elif the smallest gap that can be left is at most g: it goes, though there is room
     else: accept
@@ -33,14 +33,14 @@ A queue of up to ``SHORT_QUEUE`` messages holds too little to wait for a target.
     S, M <- times to send a message of mean size at the rates over 0.1 s and ``link_s``, at most ``SLOWEST`` arrivals
     if the link is not steady and the socket is free before ``chance`` more arrivals:
         if the head's neighbours lie no farther apart than the scene moves in
-           (early + early_full f) arrivals + (slow - slow_full f) S + mean_full f M: the head goes
+           (early + early_full f) arrivals + (slow - slow_full f) S + mean_full f M: drop the head
 
 On a steady link a queue of fewer than ``LEAST`` messages knows at least how far apart the link sends. Its head is asked
 by that, and a queue with one place at every arrival:
 
     e <- motion since the message dequeued last was taken, by time: what comes while the link sends one message
     if the link is steady, and soon or L = 1:
-        if the message behind the head lies nearer to e than the head: the head goes
+        if the message behind the head lies nearer to e than the head: drop the head
 
 The numbers are the policy's parameters. ``python -m agents.tune SUITE --policies target-gap --split train`` finds them
 again. The other constants are structural, and are not tuned.
@@ -51,7 +51,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, Buffer, has_space, motion_gaps, running_mean
 from bufgym.model.link import FOREVER
 from bufgym.model.observe.on_board import mean_bytes

@@ -9,7 +9,7 @@ lost this way. The remaining room should fill up within ``HORIZON_US``, since me
 are sent too; so the messages lie a little closer. If the robot knows that the stream ends earlier, they do by then.
 """
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import Buffer
 from bufgym.model.observe.on_board import mean_bytes
 from bufgym.policies.gaps import gap_left

@@ -9,7 +9,7 @@ socket drains (``fragments.ahead_of_newcomer``), and nothing is dropped until th
 pauses the encoder, so every frame is dropped. These messages have no key frames: each counts as a delta frame.
 """
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.policies.classic import keep_first
 from bufgym.policies.fragments import PIPE, RATE, UNKNOWN, account, ahead_of_newcomer

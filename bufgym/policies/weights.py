@@ -15,14 +15,14 @@ import safetensors
 from numpy.typing import NDArray
 from safetensors.numpy import save as serialized
 
-from bufgym.ground import __version__, strict_json
-from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import read_whole, replaced
 from bufgym.policies.candidate_network import CandidateWeights
 from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.registry import Policy
+from bufgym.utils import __version__, strict_json
+from bufgym.utils.errors import BufgymError, where
+from bufgym.utils.files import read_whole, replaced
 
 StrPath = str | os.PathLike[str]
 Tensors = dict[str, NDArray[np.float32]]

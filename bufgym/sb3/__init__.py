@@ -9,7 +9,7 @@
 ``export`` (or ``bufgym export``) writes a slot network to a file that bufgym runs without torch.
 """
 
-from bufgym.ground.libraries import needs
+from bufgym.utils.libraries import needs
 
 with needs(("stable_baselines3", "sb3_contrib", "torch"), "train", "bufgym.sb3"):
     from bufgym.sb3.export import export, weights_of

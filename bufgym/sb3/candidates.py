@@ -13,7 +13,6 @@ from torch import nn
 
 from bufgym.envs.observation import ObservationForm
 from bufgym.envs.own import write_in_python
-from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
 from bufgym.model.observe import (
     BUILT_IN,
@@ -29,6 +28,7 @@ from bufgym.model.observe import (
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.weights import MAX_WIDTH
 from bufgym.sb3.networks import array, takes_masks
+from bufgym.utils.errors import BufgymError
 
 _FIRST = CANDIDATE_FIELDS[0].name
 _ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}

@@ -9,7 +9,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from torch import Tensor, nn
 
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle import EveryLength
 from bufgym.policies import Policy
 from bufgym.policies import weights as files
@@ -19,6 +18,7 @@ from bufgym.policies.weights import MAX_WIDTH, StrPath
 from bufgym.sb3.candidates import candidates_of, perceptron
 from bufgym.sb3.networks import SlotExtractor, SlotScorer, array
 from bufgym.scenario import suites
+from bufgym.utils.errors import BufgymError
 
 CHECKED = (4, 8, 16, 32)  # Values of L for the regrets noted in the file
 

@@ -15,7 +15,7 @@ from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPo
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 ACCEPT_BIAS = 2.0  # Initial logit of accepting: exploration that drops messages where there is room learns little
 

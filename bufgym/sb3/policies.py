@@ -12,7 +12,6 @@ from stable_baselines3.common.policies import BasePolicy
 
 from bufgym.envs.observation import ObservationForm
 from bufgym.envs.own import write_in_python
-from bufgym.ground.errors import BufgymError
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies import Policy, candidate_network
@@ -24,6 +23,7 @@ from bufgym.policies.weights import StrPath
 from bufgym.sb3.candidates import CandidateDecisions, candidates_of, perceptron
 from bufgym.sb3.export import read_policy, refuse_normalized, weights_of
 from bufgym.sb3.networks import SlotScorer, takes_masks
+from bufgym.utils.errors import BufgymError
 
 
 def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Policy:

@@ -25,7 +25,7 @@ from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from bufgym.ground.errors import BufgymError, UnknownArgumentError
+from bufgym.utils.errors import BufgymError, UnknownArgumentError
 
 
 def make_vec_env(

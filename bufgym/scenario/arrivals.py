@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT, item, kernel, records
+from bufgym.jit import JIT, kernel, records, unchecked_item
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import MAX_TIME_US
 from bufgym.model.topics import MAX_TOPICS
+from bufgym.utils.errors import BufgymError
 
 MAX_TOTAL_BYTES = 2**60
 """Most bytes of all messages of an episode: with the link's bytes meanwhile they stay far below 2**63."""
@@ -58,7 +58,7 @@ def _fill(arrivals: NDArray[Any], period_us: float, jitter: float, draws: NDArra
         arrival_us = int((k + shift) * period_us)
         if k == 0:
             first_us = arrival_us
-        message = item(arrivals, k)
+        message = unchecked_item(arrivals, k)
         message.seq, message.arrival_us, message.size_bytes, message.topic = k, arrival_us - first_us, size_bytes, 0
         message.x, message.uniform, message.gain = float(k), 0.0, 0.0
 
@@ -99,7 +99,7 @@ def _checked(arrivals: NDArray[Any]) -> tuple[int, int, int, bool]:
     """Find (the field that breaks its rule or -1, the message, bytes of all, whether x never falls)."""
     before_us, total_bytes, before_x, rises = 0, 0, -_LARGEST, True
     for k in range(len(arrivals)):
-        message = item(arrivals, k)
+        message = unchecked_item(arrivals, k)
         at_us, size_bytes, x = message.arrival_us, message.size_bytes, message.x
         if message.seq != k:
             return _SEQ, k, 0, False
@@ -127,8 +127,8 @@ def _checked_by_topic(arrivals: NDArray[Any], latest_x: NDArray[np.float64]) -> 
     ``latest_x`` is of each topic that can have an x of its own; all other topics count as one, with the last entry.
     """
     for k in range(len(arrivals)):
-        topic = min(item(arrivals, k).topic, len(latest_x) - 1)
-        if item(arrivals, k).x < latest_x[topic]:
+        topic = min(unchecked_item(arrivals, k).topic, len(latest_x) - 1)
+        if unchecked_item(arrivals, k).x < latest_x[topic]:
             return _X, k
-        latest_x[topic] = item(arrivals, k).x
+        latest_x[topic] = unchecked_item(arrivals, k).x
     return -1, 0

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import traces
-from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.checks import above_0, between
 from bufgym.model.qoi import Value
@@ -16,6 +14,8 @@ from bufgym.traces import Motion, Trace
 from bufgym.traces.generate.sizes import EQUAL, parsed
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
+from bufgym.utils import modules
+from bufgym.utils.errors import BufgymError
 
 MAX_RATE_HZ = 100_000  # Highest arrival rate: times are whole microseconds, at least ten to a period
 
@@ -105,7 +105,7 @@ def links(text: str) -> list[Trace]:
     """The traces that text names: a shipped one, a file, or a generator, which is a function seed -> Trace.
 
     ``module:function:100-119`` names a generator and its seeds; the seeds of ``module:function`` are 0 to ``GENERATED``
-    - 1. The module is imported (see ``bufgym.ground.modules``).
+    - 1. The module is imported (see ``bufgym.utils.modules``).
     """
     match = _GENERATOR.fullmatch(text)
     if match is None or Path(text).exists():

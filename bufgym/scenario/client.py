@@ -14,8 +14,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.files import check_keys, read_toml
 from bufgym.model import qoi
 from bufgym.model.checks import above_0, check_window, whole
 from bufgym.model.link import MAX_TIME_US, Link
@@ -30,6 +28,8 @@ from bufgym.traces import Motion, Trace
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.files import check_keys, read_toml
 
 ENCODINGS = ("ros", "json")  # Encodings of rivals, in place of Robofleet's flatbuffers (``Policy.client.encoding``)
 

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import check_window, whole
 from bufgym.model.link import FOREVER, MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import MAX_ACK_DELAY_US, Topic
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
 from bufgym.traces.workload import MAX_MESSAGES
+from bufgym.utils.errors import BufgymError
 
 
 class Streams(NamedTuple):

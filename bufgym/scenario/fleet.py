@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
@@ -19,6 +18,7 @@ from bufgym.scenario.arrivals import check_messages, read_only, sealed
 from bufgym.scenario.episode import Episode, Streams, check_end, check_link
 from bufgym.scenario.texts import links_by_name
 from bufgym.scenario.uplink import Uplink
+from bufgym.utils.errors import BufgymError
 
 MAX_ROBOTS = 256
 """Most robots of a cell."""

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.checks import above_0, whole
 from bufgym.model.link import MAX_TIME_US, Link
@@ -20,6 +19,7 @@ from bufgym.scenario.episode import Episode, Streams
 from bufgym.traces import Trace
 from bufgym.traces.generate.sizes import EQUAL, drawn
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
+from bufgym.utils.errors import BufgymError
 
 LAWS = ("fixed", "uniform", "log-uniform", "geometric")
 

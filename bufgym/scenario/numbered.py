@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError, unknown
 from bufgym.model.checks import whole
 from bufgym.scenario.episode import Streams
+from bufgym.utils.errors import BufgymError, unknown
 
 SEEDS_PER_TRACE = 1000
 """Episode s of trace k in a suite has the seed 1000 k + s, so no two traces of a scenario share a draw."""

@@ -9,9 +9,6 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.settings import named_settings
 from bufgym.model.qoi import Value
 from bufgym.scenario.afr_evaluation import afr_evaluation
 from bufgym.scenario.client import client_over_lte, read_client
@@ -19,6 +16,9 @@ from bufgym.scenario.episode import Scenario
 from bufgym.scenario.interruption import Interruption
 from bufgym.scenario.texts import how_rated
 from bufgym.scenario.uplink import uplink_over_lte
+from bufgym.utils import modules
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.settings import named_settings
 
 
 def _suite() -> Scenario:
@@ -94,7 +94,7 @@ def get(spec: str | os.PathLike[str] | Scenario, /, **overrides: Any) -> Scenari
     """The scenario of that name, or ``spec`` itself, with changed parameters; BufgymError for unknown ones.
 
     A name that ends in .toml, or a path, names a client's configuration (``read_client``). ``module:function`` is
-    imported (see ``bufgym.ground.modules``); it is a scenario or makes one without arguments. A name may carry
+    imported (see ``bufgym.utils.modules``); it is a scenario or makes one without arguments. A name may carry
     parameters, as in ``"lte:rate_hz=5,motion=none"``.
     """
     if isinstance(spec, os.PathLike):

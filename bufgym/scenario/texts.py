@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from bufgym.ground.errors import printable
 from bufgym.traces import Motion, Trace
+from bufgym.utils.errors import printable
 
 
 def first_and_last(names: Sequence[str]) -> str:

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.checks import whole
 from bufgym.model.link import MAX_TIME_US, Link
@@ -24,6 +23,7 @@ from bufgym.traces import Motion, Trace, read_workload
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import Workload
+from bufgym.utils.errors import BufgymError
 
 _JITTER_HZ = 30.0
 """Reference rate. At any rate an episode leaves its stream where the jitter of so many messages a second does. So

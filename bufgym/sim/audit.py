@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import at, item, kernel
+from bufgym.jit import kernel, unchecked_at, unchecked_item
 from bufgym.model.qoi import value
 from bufgym.scenario import Episode
 from bufgym.sim.state import NEVER, Batch
@@ -37,22 +37,22 @@ def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) ->
     sender, n = batch.senders[i], len(arrivals)
     sent, dropped = 0, 0
     for k in range(n):
-        if not _agree(at(batch.arrivals, i, k), item(arrivals, k)):
+        if not _agree(unchecked_at(batch.arrivals, i, k), unchecked_item(arrivals, k)):
             return ARRIVAL
-        entry = at(batch.log, i, k)
+        entry = unchecked_at(batch.log, i, k)
         if entry.dequeued_us != NEVER:
             sent += 1
-            if entry.dropped_us != NEVER or entry.dequeued_us < item(arrivals, k).arrival_us:
+            if entry.dropped_us != NEVER or entry.dequeued_us < unchecked_item(arrivals, k).arrival_us:
                 return LOG
         if entry.dropped_us != NEVER:
             dropped += 1
     before, queued_bytes = -1, 0
     for k in range(sender.first, sender.first + sender.occupancy):
         message = batch.slots[i, k]
-        if not before < message.seq < n or not _agree(message, item(arrivals, message.seq)):
+        if not before < message.seq < n or not _agree(message, unchecked_item(arrivals, message.seq)):
             return QUEUED
         before = message.seq
-        entry = at(batch.log, i, before)
+        entry = unchecked_at(batch.log, i, before)
         if entry.dequeued_us != NEVER or entry.dropped_us != NEVER:
             return QUEUED
         queued_bytes += message.size_bytes
@@ -65,7 +65,7 @@ def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) ->
         return LOG
     gained = 0.0
     for t in range(batch.topics.shape[1]):
-        now, given = at(batch.topics, i, t), item(rules, t)
+        now, given = unchecked_at(batch.topics, i, t), unchecked_item(rules, t)
         if now.priority != given.priority or now.weight != given.weight or now.no_drop != given.no_drop:
             return TOPIC
         if now.period_us != given.period_us or now.limit != given.limit or now.deadline_us != given.deadline_us:
@@ -75,7 +75,7 @@ def _fault(batch: Batch, i: int, arrivals: NDArray[Any], rules: NDArray[Any]) ->
         several, received, x = batch.topics.shape[1] > 1, 0, 0.0
         own_v = batch.v[given.v_start if several else sender.v_start :]
         for k in range(sender.credited):
-            message = item(arrivals, at(batch.order, i, k))
+            message = unchecked_item(arrivals, unchecked_at(batch.order, i, k))
             if several and message.topic != t:
                 continue
             if received > 0:

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.scenario.fleet import MAX_ROBOTS, FleetEpisode
 from bufgym.sim.senders import Senders
 from bufgym.sim.shared_link import load_cell, new_shares
+from bufgym.utils.errors import BufgymError
 
 
 class Fleet:

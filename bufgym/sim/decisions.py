@@ -1,6 +1,6 @@
 """Carrying out decisions: at an arrival, at the head of the queue, and on the message to dequeue."""
 
-from bufgym.ground.kernel import at, kernel, stretch
+from bufgym.jit import kernel, unchecked_at, unchecked_slice
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, of_topic, push, running_mean
 from bufgym.sim import rules
 from bufgym.sim.socket import held_bytes, left_of
@@ -29,11 +29,11 @@ _SHORT_US, _MEDIUM_US, _LONG_US = 100_000, 500_000, 2_000_000
 def arrive(batch: Batch, i: int) -> int:
     """Let the next message arrive: DECISION if it asks for one; else NOTHING, and it is enqueued if there is room."""
     sender = batch.senders[i]
-    arrival = at(batch.arrivals, i, sender.next)
+    arrival = unchecked_at(batch.arrivals, i, sender.next)
     arrives_us = arrival.arrival_us
     sender.now_us = arrives_us
     sender.socket = UNASKED
-    entry = at(batch.log, i, sender.next)
+    entry = unchecked_at(batch.log, i, sender.next)
     entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited, entry.gain = NEVER, NEVER, NEVER, 0, 0.0
     if sender.next > 0:
         gap_us = arrives_us - sender.previous_us
@@ -93,7 +93,7 @@ def measure_rate(batch: Batch, i: int) -> None:
 def has_room(batch: Batch, i: int) -> bool:
     """Whether the present arrival fits without a drop, by messages and by bytes."""
     sender = batch.senders[i]
-    arrival = at(batch.arrivals, i, sender.next)
+    arrival = unchecked_at(batch.arrivals, i, sender.next)
     if sender.occupancy >= sender.capacity or rules.at_limit(batch, i, arrival.topic):
         return False
     return bool(sender.backlog_bytes + arrival.size_bytes <= sender.max_bytes)
@@ -111,8 +111,8 @@ def can_evict(batch: Batch, i: int, k: int) -> bool:
         return False
     if batch.several is None:
         return True
-    topic = at(batch.slots, i, sender.first + k).topic
-    arriving = at(batch.arrivals, i, sender.next).topic
+    topic = unchecked_at(batch.slots, i, sender.first + k).topic
+    arriving = unchecked_at(batch.arrivals, i, sender.next).topic
     if rules.no_drop(batch, i, topic) or (topic != arriving and rules.at_limit(batch, i, arriving)):
         return False
     return rules.can_fit(batch, i)
@@ -127,7 +127,10 @@ def can_reject(batch: Batch, i: int) -> bool:
     if batch.several is None:
         return True
     sender = batch.senders[i]
-    topic, limited = at(batch.arrivals, i, sender.next).topic, at(batch.log, i, sender.next).limited == 1
+    topic, limited = (
+        unchecked_at(batch.arrivals, i, sender.next).topic,
+        unchecked_at(batch.log, i, sender.next).limited == 1,
+    )
     return (
         limited
         or not rules.no_drop(batch, i, topic)
@@ -143,7 +146,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     lowest priority. If B has no room even after an eviction, the arrival waits on and the policy is asked again.
     """
     sender = batch.senders[i]
-    arrival = at(batch.arrivals, i, sender.next)
+    arrival = unchecked_at(batch.arrivals, i, sender.next)
     valid, enqueue, victim = True, True, -1
     if decision >= 0 and can_evict(batch, i, decision):
         victim = decision
@@ -167,12 +170,12 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
         gain = rules.gain_behind(batch, i, sender.occupancy, arrival.topic, arrival.x)
         sender.retained_gain += gain
         sender.first = push(batch.slots, i, sender.first, sender.occupancy, arrival)
-        at(batch.slots, i, sender.first + sender.occupancy).gain = gain
+        unchecked_at(batch.slots, i, sender.first + sender.occupancy).gain = gain
         sender.occupancy += 1
         sender.backlog_bytes += arrival.size_bytes
         sender.peak_backlog_bytes = max(sender.peak_backlog_bytes, sender.backlog_bytes)
     else:
-        at(batch.log, i, sender.next).dropped_us = sender.now_us
+        unchecked_at(batch.log, i, sender.next).dropped_us = sender.now_us
         sender.rejected += 1
     if batch.several is not None:
         rules.arrived_on_topic(batch, i, arrival, enqueue)
@@ -187,17 +190,17 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
 def remove(batch: Batch, i: int, k: int) -> None:
     """Evict slot ``k``: its gap and the next one on its topic become one."""
     sender = batch.senders[i]
-    gone = at(batch.slots, i, sender.first + k)
+    gone = unchecked_at(batch.slots, i, sender.first + k)
     sender.backlog_bytes -= gone.size_bytes
     sender.retained_gain -= gone.gain
-    at(batch.log, i, place_of(batch, i, gone)).dropped_us = sender.now_us
+    unchecked_at(batch.log, i, place_of(batch, i, gone)).dropped_us = sender.now_us
     if batch.several is not None:
-        at(batch.topics, i, gone.topic).queued -= 1
+        unchecked_at(batch.topics, i, gone.topic).queued -= 1
     j = k + 1
     if batch.several is not None:
-        j = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, gone.topic, 1)
+        j = of_topic(unchecked_slice(batch.slots, i, sender.first, sender.occupancy), k, gone.topic, 1)
     if j < sender.occupancy:
-        behind = at(batch.slots, i, sender.first + j)
+        behind = unchecked_at(batch.slots, i, sender.first + j)
         merged = rules.gain_behind(batch, i, k, gone.topic, behind.x)
         sender.retained_gain += merged - behind.gain
         behind.gain = merged
@@ -210,7 +213,7 @@ def remove(batch: Batch, i: int, k: int) -> None:
 def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
     """Take the policy's answer to DEQUEUE: drop the head, or let it go. A no_drop message is never dropped."""
     sender = batch.senders[i]
-    if drop and not rules.no_drop(batch, i, at(batch.slots, i, sender.first).topic):
+    if drop and not rules.no_drop(batch, i, unchecked_at(batch.slots, i, sender.first).topic):
         remove(batch, i, 0)
     else:
         sender.socket = CLEARED
@@ -222,10 +225,10 @@ def can_send(batch: Batch, i: int, k: int) -> bool:
     sender = batch.senders[i]
     if not 0 <= k < sender.occupancy:
         return False
-    topic = at(batch.slots, i, sender.first + k).topic
+    topic = unchecked_at(batch.slots, i, sender.first + k).topic
     older = k - 1
     if batch.several is not None:
-        older = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
+        older = of_topic(unchecked_slice(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
     return older < 0 and rules.sendable(batch, i, k)
 
 

@@ -11,8 +11,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT, NotKeptError, compile_for, interruptible, kernel, named, only_kept
+from bufgym.jit import JIT, NotCachedError, cached_only, compile_signature, interruptible, kernel, named
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.policies.registry import Policy, signatures
@@ -22,6 +21,7 @@ from bufgym.sim.socket import credit
 from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type
 from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
+from bufgym.utils.errors import BufgymError
 
 if JIT:
     import numba
@@ -75,7 +75,9 @@ def compiled_rollout(shared: bool, several: bool) -> Any:
     functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     shares = shares_type() if shared else numba.types.none
-    return compile_for(numba.types.void(batch_type(several), shares, memory, *functions, numba.types.boolean), rollout)
+    return compile_signature(
+        numba.types.void(batch_type(several), shares, memory, *functions, numba.types.boolean), rollout
+    )
 
 
 _view = getattr(view, "py_func", view)
@@ -158,7 +160,7 @@ def choose_own(policy: Policy, spent_s: float, several: bool, memory: NDArray[np
     """The policy's own rollout, if it pays after so many seconds in the one for all; else None."""
     if not JIT or spent_s <= _PAYS_IF_KEPT_S:
         return None
-    with suppress(NotKeptError), only_kept() if spent_s < _PAYS_S else nullcontext():
+    with suppress(NotCachedError), cached_only() if spent_s < _PAYS_S else nullcontext():
         kinds = batch_type(several), cast(Any, numba).typeof(memory)
         return own_rollout(policy.compiled, policy.hears_departures).compile(kinds)
     return None

@@ -10,7 +10,7 @@ its limits never bind; the sender's record has the score instead. That saves a t
 
 from typing import Any
 
-from bufgym.ground.kernel import at, kernel, stretch
+from bufgym.jit import kernel, unchecked_at, unchecked_slice
 from bufgym.model.buffer import could_fit, of_topic
 from bufgym.model.qoi import value
 from bufgym.model.topics import age_between
@@ -24,19 +24,19 @@ def gain_behind(batch: Batch, i: int, k: int, topic: int, x: float) -> float:
     if batch.several is None:  # slot -1 holds the message dequeued last
         if k == 0 and sender.dequeued == 0:
             return 0.0
-        return value(batch.v[sender.v_start :], x - at(batch.slots, i, sender.first + k - 1).x)
-    rules = at(batch.topics, i, topic)
-    j = of_topic(stretch(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
+        return value(batch.v[sender.v_start :], x - unchecked_at(batch.slots, i, sender.first + k - 1).x)
+    rules = unchecked_at(batch.topics, i, topic)
+    j = of_topic(unchecked_slice(batch.slots, i, sender.first, sender.occupancy), k, topic, -1)
     if j < 0 and rules.dequeued == 0:
         return 0.0
-    before_x = at(batch.slots, i, sender.first + j).x if j >= 0 else rules.dequeued_x
+    before_x = unchecked_at(batch.slots, i, sender.first + j).x if j >= 0 else rules.dequeued_x
     return float(rules.weight * value(batch.v[rules.v_start :], x - before_x))
 
 
 @kernel
 def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None:
     """Record that ``message`` has arrived, and was enqueued or not."""
-    topic = at(batch.topics, i, message.topic)
+    topic = unchecked_at(batch.topics, i, message.topic)
     if topic.arrived > 0:
         topic.step_us, topic.step_x = message.arrival_us - topic.previous_us, message.x - topic.previous_x
     else:
@@ -55,7 +55,7 @@ def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None
 @kernel
 def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
     """Record that the socket has dequeued ``message``."""
-    topic = at(batch.topics, i, message.topic)
+    topic = unchecked_at(batch.topics, i, message.topic)
     topic.queued -= 1
     topic.dequeued += 1
     topic.dequeued_arrival_us, topic.dequeued_x = message.arrival_us, message.x
@@ -66,7 +66,7 @@ def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
 def received_on_topic(batch: Batch, i: int, message: Any, received_us: int) -> None:
     """Record that ``message`` has reached the server: its topic is younger again, and it may be late."""
     age_until(batch, i, message.topic, received_us)
-    topic = at(batch.topics, i, message.topic)
+    topic = unchecked_at(batch.topics, i, message.topic)
     topic.received += 1
     topic.newest_us = max(topic.newest_us, message.arrival_us)
     if received_us - message.arrival_us > topic.deadline_us:
@@ -80,8 +80,8 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     Counting begins with the topic's first arrival and ends with the episode's last, whatever a policy does.
     """
     sender = batch.senders[i]
-    rules = at(batch.topics, i, topic)
-    until_us = min(until_us, at(batch.arrivals, i, sender.arrivals - 1).arrival_us)
+    rules = unchecked_at(batch.topics, i, topic)
+    until_us = min(until_us, unchecked_at(batch.arrivals, i, sender.arrivals - 1).arrival_us)
     if rules.arrived == 0 or until_us <= rules.aged_us:
         return
     area = age_between(rules.newest_us, rules.aged_us, until_us)
@@ -94,7 +94,7 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
 def too_soon(batch: Batch, i: int, topic: int) -> bool:
     """Whether the present arrival is too close to its topic's last message kept (or sent) for the rate limit."""
     sender = batch.senders[i]
-    rules = at(batch.topics, i, topic)
+    rules = unchecked_at(batch.topics, i, topic)
     if sender.limit_since_sent == 1:
         return bool(rules.dequeued > 0 and sender.now_us - rules.last_dequeue_us < rules.period_us)
     return bool(rules.kept_us >= 0 and sender.now_us - rules.kept_us < rules.period_us)
@@ -105,7 +105,7 @@ def at_limit(batch: Batch, i: int, topic: int) -> bool:
     """Whether this topic has as many queued messages as it may have."""
     if batch.several is None:
         return False
-    rules = at(batch.topics, i, topic)
+    rules = unchecked_at(batch.topics, i, topic)
     return bool(rules.queued >= rules.limit)
 
 
@@ -114,16 +114,18 @@ def no_drop(batch: Batch, i: int, topic: int) -> bool:
     """Whether messages of this topic may not be dropped."""
     if batch.several is None:
         return False
-    return bool(at(batch.topics, i, topic).no_drop == 1)
+    return bool(unchecked_at(batch.topics, i, topic).no_drop == 1)
 
 
 @kernel
 def can_fit(batch: Batch, i: int) -> bool:
     """Whether the present arrival's bytes would fit if every droppable message went."""
     sender = batch.senders[i]
-    spare_bytes = sender.max_bytes - sender.backlog_bytes - at(batch.arrivals, i, sender.next).size_bytes
+    spare_bytes = sender.max_bytes - sender.backlog_bytes - unchecked_at(batch.arrivals, i, sender.next).size_bytes
     return could_fit(
-        spare_bytes, stretch(batch.slots, i, sender.first, sender.occupancy), stretch(batch.topics, i, 0, sender.topics)
+        spare_bytes,
+        unchecked_slice(batch.slots, i, sender.first, sender.occupancy),
+        unchecked_slice(batch.topics, i, 0, sender.topics),
     )
 
 
@@ -136,8 +138,8 @@ def last_resort_victim(batch: Batch, i: int) -> int:
     if not can_fit(batch, i):
         return best
     for k in range(sender.occupancy):
-        slot = at(batch.slots, i, sender.first + k)
-        priority = at(batch.topics, i, slot.topic).priority
+        slot = unchecked_at(batch.slots, i, sender.first + k)
+        priority = unchecked_at(batch.topics, i, slot.topic).priority
         if not no_drop(batch, i, slot.topic) and (best < 0 or priority < lowest):
             best, lowest = k, priority
     return best
@@ -153,7 +155,7 @@ def sendable(batch: Batch, i: int, k: int) -> bool:
     full = sender.dequeued - sender.acked >= sender.window
     if batch.several is None:
         return not full
-    rules = at(batch.topics, i, at(batch.slots, i, sender.first + k).topic)
+    rules = unchecked_at(batch.topics, i, unchecked_at(batch.slots, i, sender.first + k).topic)
     if full and not (sender.flush_no_drop == 1 and rules.no_drop == 1):
         return False
     if sender.limit_at_send == 0 or rules.no_drop == 1 or rules.dequeued == 0:

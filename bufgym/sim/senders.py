@@ -7,7 +7,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import KnotStore
 from bufgym.model.qoi import Value
@@ -18,6 +17,7 @@ from bufgym.sim.audit import touched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
 from bufgym.sim.state import SENDER, beginning, new_batch
+from bufgym.utils.errors import BufgymError
 
 Begun = tuple[int, Episode, np.random.Generator | None]
 """Arguments of ``Senders.load``: a sender, the episode it begins, and the generator of its uniform draws."""

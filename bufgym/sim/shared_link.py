@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel, records
+from bufgym.jit import kernel, records
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.decisions import arrive

@@ -1,6 +1,6 @@
 """The socket: dequeueing, transmission, acks, and receipt at the server."""
 
-from bufgym.ground.kernel import at, kernel
+from bufgym.jit import kernel, unchecked_at
 from bufgym.model.link import FOREVER, carried_by, finish_of
 from bufgym.sim.rules import dequeued_on_topic, received_on_topic, sendable
 from bufgym.sim.state import CARRIES, FREED, HELD, IDLE, UNASKED, Batch, place_of
@@ -28,13 +28,13 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     first = sender.first
     if k > 0:
         # Everything but its gain is in the list of arrivals too.
-        sent = at(batch.slots, i, first + k)
+        sent = unchecked_at(batch.slots, i, first + k)
         place, gain = place_of(batch, i, sent), sent.gain
         for j in range(first + k, first, -1):
-            batch.slots[i, j] = at(batch.slots, i, j - 1)
-        batch.slots[i, first] = at(batch.arrivals, i, place)
-        at(batch.slots, i, first).gain = gain
-    head = at(batch.slots, i, first)
+            batch.slots[i, j] = unchecked_at(batch.slots, i, j - 1)
+        batch.slots[i, first] = unchecked_at(batch.arrivals, i, place)
+        unchecked_at(batch.slots, i, first).gain = gain
+    head = unchecked_at(batch.slots, i, first)
     place = place_of(batch, i, head)
     batch.order[i, sender.dequeued] = place
     sender.busy += 1
@@ -46,7 +46,7 @@ def dequeue(batch: Batch, i: int, k: int) -> None:
     sender.last_dequeue_us = sender.now_us
     sender.departures += 1
     sender.socket, sender.chosen = UNASKED, 0
-    entry = at(batch.log, i, place)
+    entry = unchecked_at(batch.log, i, place)
     entry.dequeued_us, entry.gain = sender.now_us, head.gain
     if batch.several is not None:
         dequeued_on_topic(batch, i, head)
@@ -57,8 +57,8 @@ def next_size_bytes(batch: Batch, i: int) -> int:
     """Size of the message in the socket that the link carries or is to carry next."""
     sender = batch.senders[i]
     if sender.busy == 1:
-        return int(at(batch.slots, i, sender.first - 1).size_bytes)
-    return int(at(batch.arrivals, i, at(batch.order, i, sender.transmitted)).size_bytes)
+        return int(unchecked_at(batch.slots, i, sender.first - 1).size_bytes)
+    return int(unchecked_at(batch.arrivals, i, unchecked_at(batch.order, i, sender.transmitted)).size_bytes)
 
 
 @kernel
@@ -67,9 +67,9 @@ def held_bytes(batch: Batch, i: int) -> int:
     sender = batch.senders[i]
     if sender.busy == 0:
         return 0
-    total_bytes = at(batch.slots, i, sender.first - 1).size_bytes
+    total_bytes = unchecked_at(batch.slots, i, sender.first - 1).size_bytes
     for k in range(sender.transmitted, sender.dequeued - 1):
-        total_bytes += at(batch.arrivals, i, at(batch.order, i, k)).size_bytes
+        total_bytes += unchecked_at(batch.arrivals, i, unchecked_at(batch.order, i, k)).size_bytes
     return int(total_bytes)
 
 
@@ -100,7 +100,7 @@ def begin_transmission(batch: Batch, i: int) -> None:
 def finish_transmission(batch: Batch, i: int, at_us: int) -> None:
     """Let the last byte of the message in transmission cross the link; without acks its place is free."""
     sender = batch.senders[i]
-    at(batch.log, i, at(batch.order, i, sender.transmitted)).transmitted_us = at_us
+    unchecked_at(batch.log, i, unchecked_at(batch.order, i, sender.transmitted)).transmitted_us = at_us
     sender.carried_us += at_us - sender.began_us
     sender.now_us, sender.finish_us, sender.link = at_us, FOREVER, FREED
     sender.transmitted += 1
@@ -116,7 +116,9 @@ def next_ack_us(batch: Batch, i: int) -> int:
     sender = batch.senders[i]
     if sender.acked == sender.transmitted:  # always so without acks to wait for
         return FOREVER
-    return int(at(batch.log, i, at(batch.order, i, sender.acked)).transmitted_us + sender.ack_delay_us)
+    return int(
+        unchecked_at(batch.log, i, unchecked_at(batch.order, i, sender.acked)).transmitted_us + sender.ack_delay_us
+    )
 
 
 @kernel
@@ -124,12 +126,12 @@ def credit(batch: Batch, i: int, until_us: int) -> None:
     """Count the information that reached the server by ``until_us``, propagation included."""
     sender = batch.senders[i]
     while sender.credited < sender.transmitted:
-        seq = at(batch.order, i, sender.credited)
-        entry = at(batch.log, i, seq)
+        seq = unchecked_at(batch.order, i, sender.credited)
+        entry = unchecked_at(batch.log, i, seq)
         received_us = entry.transmitted_us + sender.propagation_us
         if until_us < received_us:
             break
         sender.delivered_gain += entry.gain
         sender.credited += 1
         if batch.several is not None:
-            received_on_topic(batch, i, at(batch.arrivals, i, seq), received_us)
+            received_on_topic(batch, i, unchecked_at(batch.arrivals, i, seq), received_us)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel, records
+from bufgym.jit import kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER

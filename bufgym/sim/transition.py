@@ -4,7 +4,7 @@
 Otherwise it holds the cells of ``bufgym.sim.shared_link``. Numba compiles each case separately.
 """
 
-from bufgym.ground.kernel import at, kernel
+from bufgym.jit import kernel, unchecked_at
 from bufgym.sim.decisions import arrive, choose, oldest_sendable
 from bufgym.sim.shared_link import Shares, join, next_in_cell
 from bufgym.sim.socket import begin_transmission, dequeue, finish_transmission, may_dequeue, next_ack_us
@@ -96,7 +96,7 @@ def next_on_link(batch: Batch, i: int) -> int:
     """
     sender = batch.senders[i]
     more = sender.next < sender.arrivals
-    arrives_us = at(batch.arrivals, i, sender.next).arrival_us if more else NOT_YET
+    arrives_us = unchecked_at(batch.arrivals, i, sender.next).arrival_us if more else NOT_YET
     ack_us = next_ack_us(batch, i)
     if sender.finish_us <= arrives_us and sender.finish_us < ack_us:
         finish_transmission(batch, i, sender.finish_us)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from bufgym.ground.kernel import at, kernel, stretch
+from bufgym.jit import kernel, unchecked_at, unchecked_slice
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
 from bufgym.sim.socket import held_bytes, left_of
@@ -14,20 +14,20 @@ def view(batch: Batch, i: int) -> Buffer:
     """What the policy of sender ``i`` may see now."""
     sender = batch.senders[i]
     first, occupancy = sender.first, sender.occupancy
-    last = at(batch.slots, i, first - 1)
+    last = unchecked_at(batch.slots, i, first - 1)
     dequeued_arrival_us, dequeued_x, dequeued_seq = last.arrival_us, last.x, last.seq
     previous_us, previous_x = sender.previous_us, sender.previous_x
     if sender.dequeued == 0:
         dequeued_arrival_us, dequeued_x = previous_us, previous_x
-        dequeued_seq = at(batch.arrivals, i, max(sender.next - 1, 0)).seq
+        dequeued_seq = unchecked_at(batch.arrivals, i, max(sender.next - 1, 0)).seq
         if occupancy > 0:
             # a scheduler holds back the first of all
-            oldest = at(batch.slots, i, first)
+            oldest = unchecked_at(batch.slots, i, first)
             dequeued_arrival_us, dequeued_x, dequeued_seq = oldest.arrival_us, oldest.x, oldest.seq
     if batch.several is not None and sender.waiting == ARRIVAL_WAITS:
         # these gaps belong to the newcomer's topic
-        arrival = at(batch.arrivals, i, sender.next)
-        topic = at(batch.topics, i, arrival.topic)
+        arrival = unchecked_at(batch.arrivals, i, sender.next)
+        topic = unchecked_at(batch.topics, i, arrival.topic)
         previous_us, previous_x = arrival.arrival_us, arrival.x
         if topic.arrived > 0:
             previous_us, previous_x = topic.previous_us, topic.previous_x
@@ -36,9 +36,12 @@ def view(batch: Batch, i: int) -> Buffer:
             dequeued_arrival_us, dequeued_x = topic.dequeued_arrival_us, topic.dequeued_x
         elif topic.queued > 0:
             k = first
-            while at(batch.slots, i, k).topic != arrival.topic:
+            while unchecked_at(batch.slots, i, k).topic != arrival.topic:
                 k += 1
-            dequeued_arrival_us, dequeued_x = at(batch.slots, i, k).arrival_us, at(batch.slots, i, k).x
+            dequeued_arrival_us, dequeued_x = (
+                unchecked_at(batch.slots, i, k).arrival_us,
+                unchecked_at(batch.slots, i, k).x,
+            )
     left_bytes, left_fraction = 0, 0.0
     if sender.busy > 0 and sender.shows_left == 1:
         total_bytes = held_bytes(batch, i)
@@ -49,13 +52,13 @@ def view(batch: Batch, i: int) -> Buffer:
         left_fraction = left_bytes / total_bytes
     remaining_us = max(sender.ends_us - sender.now_us, 0) if sender.ends_us < FOREVER else FOREVER
     return Buffer(
-        stretch(batch.slots, i, first, occupancy), sender.capacity, sender.max_bytes, sender.backlog_bytes,
+        unchecked_slice(batch.slots, i, first, occupancy), sender.capacity, sender.max_bytes, sender.backlog_bytes,
         sender.now_us, sender.forgotten + sender.dequeued, dequeued_arrival_us, dequeued_x, dequeued_seq,
         previous_us, previous_x, min(sender.busy, 1), left_bytes, left_fraction,
         sender.now_us - sender.last_dequeue_us, sender.period_us, sender.arrival_bytes,
         sender.departures, sender.service_ratio, sender.drained_bytes, sender.drained_us,
         1e6 * sender.short_rate, 1e6 * sender.medium_rate, 1e6 * sender.long_rate,
-        batch.v[sender.v_start :], stretch(batch.topics, i, 0, sender.topics),
+        batch.v[sender.v_start :], unchecked_slice(batch.topics, i, 0, sender.topics),
         sender.window, sender.dequeued - sender.acked, sender.evictions, remaining_us, batch.parameters,
     )  # fmt: skip
 
@@ -63,11 +66,11 @@ def view(batch: Batch, i: int) -> Buffer:
 @kernel
 def arrival_of(batch: Batch, i: int) -> Any:
     """The arrival that waits for a decision."""
-    return at(batch.arrivals, i, batch.senders[i].next)
+    return unchecked_at(batch.arrivals, i, batch.senders[i].next)
 
 
 @kernel
 def last_arrival(batch: Batch, i: int) -> Any:
     """The arrival that waits for a decision; where the socket asks, the latest arrival."""
     sender = batch.senders[i]
-    return at(batch.arrivals, i, sender.next if sender.waiting == ARRIVAL_WAITS else sender.next - 1)
+    return unchecked_at(batch.arrivals, i, sender.next if sender.waiting == ARRIVAL_WAITS else sender.next - 1)

@@ -14,11 +14,11 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.generate.markov import link_rates
 from bufgym.traces.generate.parameters import LOW_QUANTILES, PROBABILITIES, SHOULDER_S, LinkParameters, OutageParameters
 from bufgym.traces.trace import Float64Array
+from bufgym.utils.errors import BufgymError
 
 Rates: TypeAlias = Sequence[Float64Array]
 """A row for each recording: float64[n], the rate of each second in bytes/s."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.traces.poses import Poses, angles, gaps_between, longest_s, unit
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array, first_true, freeze
+from bufgym.utils.errors import BufgymError
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from bufgym.ground import files
-from bufgym.ground.units import rate_of
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import read_trace
 from bufgym.traces.formats.motions import read_motion
@@ -14,6 +12,8 @@ from bufgym.traces.generate.lte import LteMode
 from bufgym.traces.generate.rules import steady
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import After, Trace
+from bufgym.utils import files
+from bufgym.utils.units import rate_of
 
 # Mode and mean in bytes/s of lte-synthetic-<seed>.csv. The means lie around the 6.9 MB/s of 30 frames of 230 kB a
 # second: from a link that barely suits a robot to one where only breakdowns are a problem.

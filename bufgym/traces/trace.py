@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 Int64Array = npt.NDArray[np.int64]
 Float64Array = npt.NDArray[np.float64]

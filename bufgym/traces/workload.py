@@ -6,9 +6,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.poses import longest_s
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array, freeze
+from bufgym.utils.errors import BufgymError
 
 MAX_MESSAGES: Final = 10**7
 MAX_MESSAGE_BYTES: Final = 10**10

@@ -15,14 +15,14 @@ from bufgym.benchmark.run import run
 from bufgym.benchmark.warmup import PARTS
 from bufgym.cli import main
 from bufgym.envs.expert import Player
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import FOLDER, JIT
+from bufgym.jit import FOLDER, JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run as run_senders
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 PLAYABLE = [p.name for p in map(policies.get, policies.names()) if not (p.drops_at_dequeue or p.unbounded)]
 

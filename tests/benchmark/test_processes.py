@@ -13,8 +13,8 @@ from cli_cases import fails, shown
 from needs import needs
 from sweep_cases import THREE, bufgym, ended
 
-from bufgym.ground.files import locked
-from bufgym.ground.kernel import announce
+from bufgym.jit import announce
+from bufgym.utils.files import locked
 
 pytest.importorskip("joblib", reason=needs("extras", "joblib"))
 
@@ -77,7 +77,7 @@ def test_workers_end_with_their_parent(how: signal.Signals, tmp_path: Path) -> N
 
 
 def test_a_worker_whose_parent_is_gone_before_it_begins_ends() -> None:
-    late = "import os, time; from bufgym.ground.processes import end_with; end_with(os.getpid()); time.sleep(600)"
+    late = "import os, time; from bufgym.utils.processes import end_with; end_with(os.getpid()); time.sleep(600)"
     assert subprocess.run([sys.executable, "-c", late], check=False).returncode == 1
 
 

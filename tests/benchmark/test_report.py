@@ -19,8 +19,8 @@ from bufgym.benchmark import folder as inputs
 from bufgym.benchmark import report
 from bufgym.benchmark.report import tables, timeline
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import FleetScenario, suites
+from bufgym.utils.errors import BufgymError
 
 pytest.importorskip("jinja2", reason=needs("extras", "jinja2"))
 pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))

@@ -17,12 +17,12 @@ from bufgym import oracle, policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
 from bufgym.benchmark.tasks.queue import QueueTask, row_to_show
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import replaced
 from bufgym.model import qoi
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink, numbered
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import replaced
 
 SLOW = Trace.steps([(1.0, 300_000), (1.0, 0)], name="slow")
 FAST = Trace.steps([(1.0, 9_000_000)], name="fast")

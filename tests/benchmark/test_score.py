@@ -306,9 +306,9 @@ def test_the_score_leads_and_is_computed_on_sums() -> None:
 
 
 def test_policies_that_no_row_tells_apart_are_one_line() -> None:
-    twins = [{**entry, "policy": name} for entry in BASE for name in ("ros-keep-last", "near")]
-    twins[-1] |= {"delivered": 2}
-    rows = [*twins, *BASE, *MINE]
+    rivals = [{**entry, "policy": name} for entry in BASE for name in ("ros-keep-last", "near")]
+    rivals[-1] |= {"delivered": 2}
+    rows = [*rivals, *BASE, *MINE]
     assert table.with_equal_rows(rows) == {"drop-oldest": ["ros-keep-last"]}
     lines = table.means_table(rows).plain().split("\n")
     assert [line.split()[0] for line in lines[1:4]] == ["mine", "drop-oldest", "near"]

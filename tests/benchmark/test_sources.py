@@ -17,9 +17,9 @@ from bufgym import policies, scenario
 from bufgym.benchmark import folder, sources
 from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
-from bufgym.ground import files
 from bufgym.policies import REJECT
 from bufgym.scenario import FleetScenario
+from bufgym.utils import files
 
 MODULE = """
 from bufgym.policies import ACCEPT, REJECT, Policy, register
@@ -137,7 +137,7 @@ def test_what_cannot_be_loaded(module: str, word: str, says: str, capsys: Capsys
 
 @pytest.mark.parametrize("word", ["os:system", "mine.zip", "mine.safetensors"])
 def test_a_name_from_elsewhere_loads_nothing(word: str) -> None:
-    """``policies.get`` also gets names from leaderboards and results of strangers."""
+    """``policies.get`` also gets names from untrusted leaderboards and results."""
     refuse(r"unknown policy", policies.get, word)
 
 

@@ -25,11 +25,11 @@ from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import score
 from bufgym.benchmark.tasks import TASKS
 from bufgym.benchmark.tasks.stress import ratios
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import closure as closures
+from bufgym.jit import fingerprint as fingerprints
 from bufgym.policies import target_gap
 from bufgym.scenario import Uplink, suites
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 QUANTITIES = (
     Quantity("mean", "mean", score, "of H", interval=False),
@@ -179,10 +179,10 @@ def test_a_row_whose_policy_changed_is_stale(monkeypatch: pytest.MonkeyPatch) ->
     }
     known["lte-v1/old"] = Entry("lte-v1", "min-gap", 1, 1, {}, "0")  # it does not say
     assert leaderboard.stale(known) == []
-    closures._of_one.cache_clear()
+    fingerprints._of_one.cache_clear()
     monkeypatch.setattr(target_gap, "SHORT_QUEUE", target_gap.SHORT_QUEUE + 1)
     assert leaderboard.stale(known) == ["lte-v1/target-gap", "outage-v1/target-gap"]
-    closures._of_one.cache_clear()
+    fingerprints._of_one.cache_clear()
 
 
 def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:

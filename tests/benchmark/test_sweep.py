@@ -17,9 +17,9 @@ from bufgym.benchmark import run, sweep
 from bufgym.benchmark.rows import read_rows, write_rows
 from bufgym.benchmark.sweep import Sweep
 from bufgym.cli.options import load_policies
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Uplink, numbered, suites
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 pytest.importorskip("joblib", reason=needs("extras", "joblib"))
 

@@ -1,4 +1,4 @@
-"""Random episodes for the tests, each in two forms: for the package and for its slow twins in ``naive``."""
+"""Random episodes for the tests, each in two forms: for the package and for its slow reference models in ``naive``."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import records
+from bufgym.jit import records
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, MESSAGE, NO_PARAMETERS, REJECT, TOPIC, UNLIMITED_BYTES, Buffer
 from bufgym.model.link import FOREVER, Link
@@ -24,7 +24,7 @@ def decide_anything(buffer: Any, arrival: Any, memory: Any) -> int:
     return int(arrival.uniform * (buffer.capacity + 4)) - 2
 
 
-# The twin draws from [accept, reject, 0, 1, ..., L + 1]: floor(uniform x (L + 4)) - 2, as ACCEPT is -2 and REJECT -1.
+# The reference draws from [accept, reject, 0, 1, ..., L + 1]: floor(uniform x (L + 4)) - 2; ACCEPT is -2, REJECT -1.
 assert (ACCEPT, REJECT) == (-2, -1)
 ANYTHING = Policy("test-anything", decide_anything, compile=True)
 
@@ -57,10 +57,10 @@ def newcomer() -> Any:
 
 @dataclass
 class Case:
-    """One episode, its limits, and the same for the twin."""
+    """One episode, its limits, and the same for the reference model."""
 
     episode: Episode
-    twin_messages: list[dict[str, Any]]
+    reference_messages: list[dict[str, Any]]
     knots: list[tuple[int, int]]
     capacity: int
     max_bytes: int | None
@@ -77,10 +77,10 @@ class Case:
         senders.run(policy)
         return senders
 
-    def run_twin(self, policy: naive.Policy) -> naive.Sender:
+    def run_reference(self, policy: naive.Policy) -> naive.Sender:
         link = naive.Link(self.knots, self.episode.link.trace.after, self.episode.link.offset_us)
         sender = naive.Sender(link, policy, self.capacity, self.max_bytes, self.decide_at)
-        return sender.run(self.twin_messages, self.episode.first_decision, self.episode.last_decision)
+        return sender.run(self.reference_messages, self.episode.first_decision, self.episode.last_decision)
 
 
 @st.composite
@@ -110,8 +110,8 @@ def drawn_messages(rng: np.random.Generator, n: int, largest: int, arrival_us: A
     return arrivals
 
 
-def twin_messages(arrivals: NDArray[Any]) -> list[dict[str, Any]]:
-    """MESSAGE[n] as the twins have it."""
+def reference_messages(arrivals: NDArray[Any]) -> list[dict[str, Any]]:
+    """MESSAGE[n] as the reference models have it."""
     fields = {"seq": "seq", "us": "arrival_us", "bytes": "size_bytes", "topic": "topic", "x": "x", "uniform": "uniform"}
     return [{name: a[field].item() for name, field in fields.items()} for a in np.asarray(arrivals)]
 
@@ -129,7 +129,7 @@ def cases(draw: st.DrawFn, max_bytes: bool = True, max_messages: int = 40) -> Ca
     last = draw(st.sampled_from([2**31, n // 2]))
     return Case(
         Episode(arrivals, link, first, last),
-        twin_messages(arrivals),
+        reference_messages(arrivals),
         knots,
         draw(st.integers(1, 6)),
         draw(st.one_of(st.none(), st.integers(1_000, 15_000))) if max_bytes else None,
@@ -156,9 +156,9 @@ def log(senders: Senders, i: int = 0) -> dict[str, dict[int, int]]:
     return {name: {k: int(us) for k, us in enumerate(rows[name]) if us != NEVER} for name in names}
 
 
-def twin_log(twin: Any) -> dict[str, dict[int, int]]:
-    """The same of a twin."""
-    return {"dequeued_us": twin.dequeued, "transmitted_us": twin.transmitted, "dropped_us": twin.dropped}
+def reference_log(reference: Any) -> dict[str, dict[int, int]]:
+    """The same of a reference model."""
+    return {"dequeued_us": reference.dequeued, "transmitted_us": reference.transmitted, "dropped_us": reference.dropped}
 
 
 def order(senders: Senders, i: int = 0) -> list[int]:

@@ -1,4 +1,4 @@
-"""The slow twins of ``bufgym.policies.thinning`` and ``target_gap``; gaps in ``x`` (motion) or ``seq`` (messages).
+"""Slow reference models of ``policies.thinning`` and ``target_gap``; gaps in ``x`` (motion) or ``seq`` (messages).
 
 ``Seen`` keeps all that it saw and takes its means anew each time.
 """

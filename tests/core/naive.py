@@ -1,6 +1,6 @@
-"""Slow, obvious twins of the compiled kernels: lists, dictionaries and fractions, written from the model's description.
+"""Slow, obvious reference models of the kernels: lists, dictionaries and fractions, from the model's description.
 
-Nothing here calls a kernel, and nothing here is clever. A twin and its kernel must agree exactly.
+Nothing here calls a kernel, and nothing here is clever. A reference model and its kernel must agree exactly.
 """
 
 import itertools

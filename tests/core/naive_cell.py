@@ -1,4 +1,4 @@
-"""The slow, obvious twin of ``bufgym.sim``: robots that share a link byte by byte, with lists and fractions.
+"""The slow, obvious reference model of ``bufgym.sim``: robots that share a link byte by byte, with lists and fractions.
 
 ``whole=True`` shares whole bytes, as the package does, and must agree with it exactly. ``whole=False`` is processor
 sharing itself: every byte is divided, however small the shares.

@@ -1,4 +1,4 @@
-"""Slow, obvious twins of middleware that sends in fragments, and of WebRTC's frame dropper."""
+"""Slow, obvious reference models of middleware that sends in fragments, and of WebRTC's frame dropper."""
 
 import itertools
 import math

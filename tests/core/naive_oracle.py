@@ -19,13 +19,13 @@ class Link(naive.Link):
 
 def fork(sender):
     """A copy whose future does not touch this one's."""
-    twin = copy.copy(sender)
+    reference = copy.copy(sender)
     for name, held in vars(sender).items():
         if isinstance(held, dict):
-            setattr(twin, name, held.copy())
+            setattr(reference, name, held.copy())
         elif isinstance(held, list):
-            setattr(twin, name, [each.copy() if isinstance(each, list) else each for each in held])
-    return twin
+            setattr(reference, name, [each.copy() if isinstance(each, list) else each for each in held])
+    return reference
 
 
 def best(link, messages, capacity, v, max_bytes=None, decide_at="arrival", first_decision=0, last_decision=math.inf):

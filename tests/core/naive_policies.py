@@ -1,4 +1,4 @@
-"""Slow, obvious twins of the policies, written from their papers' descriptions: lists and dictionaries, no kernels."""
+"""Slow, obvious reference models of the policies, from their papers' descriptions: lists and dictionaries."""
 
 import math
 from fractions import Fraction
@@ -211,8 +211,8 @@ class Anything(queues.Policy):
         return queues.one_of([queues.ACCEPT, queues.REJECT, *range(self.sender.capacity + 2)], newcomer["uniform"])
 
 
-def twins(v):
-    """What makes the twin of each built-in policy, by name."""
+def references(v):
+    """What makes the reference model of each built-in policy, by name."""
     return {
         "drop-oldest": lambda: queues.Policy(lambda sender, queue, newcomer: 0),
         "drop-newest": lambda: queues.Policy(queues.drop_newest),
@@ -253,7 +253,7 @@ def twins(v):
 
 
 def policy(spec, v):
-    """The twin of the built-in policy of that name, with settings as in ``decimate:every=2``."""
+    """The reference model of the built-in policy of that name, with settings as in ``decimate:every=2``."""
     name, _, settings = spec.partition(":")
     pairs = [setting.split("=") for setting in settings.split(",") if setting]
-    return twins(v)[name](**{key: float(number) for key, number in pairs})
+    return references(v)[name](**{key: float(number) for key, number in pairs})

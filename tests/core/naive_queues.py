@@ -1,4 +1,4 @@
-"""Slow, obvious twins of what middleware and networks do; ``naive_policies`` has the others."""
+"""Slow, obvious reference models of what middleware and networks do; ``naive_policies`` has the others."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Slow, obvious twins of the schedulers: each answers for a ``naive_sender.Sender``, from what that sender knows."""
+"""Slow, obvious reference models of the schedulers: each answers from what its ``naive_sender.Sender`` knows."""
 
 import math
 
@@ -112,7 +112,7 @@ class RosNative(Fifo):
         return sorted(self.heads(), key=lambda m: (self.last_sent(m["topic"]), m["topic"]))[0]
 
 
-TWINS = {
+REFERENCES = {
     "fifo": Fifo,
     "strict-priority": StrictPriority,
     "age-greedy": AgeGreedy,

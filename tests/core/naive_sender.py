@@ -1,4 +1,4 @@
-"""Slow, obvious twin of a sender, of one queue or of several topics: lists, and everything from scratch.
+"""Slow, obvious reference model of a sender, of one queue or of several topics: lists, and everything from scratch.
 
 Written from the model's description; it calls no kernel. A list holds each topic's queue, another the messages in
 flight. Messages are dictionaries: seq, us, bytes, x, uniform, topic.

@@ -1,4 +1,4 @@
-"""The cell: sharing worked by hand, against the twins, and the one robot that must not notice that it is a cell."""
+"""The cell: sharing by hand, against the reference models, and the one robot that must not notice that it is a cell."""
 
 import itertools
 import math
@@ -67,18 +67,18 @@ def cells(draw):
     return FleetEpisode(tuple(robots), link), knots, draw(st.integers(1, 6)), max_bytes
 
 
-def twin(episode, knots, policy, capacity, max_bytes=None, decide_at="arrival", whole=True):
+def reference(episode, knots, policy, capacity, max_bytes=None, decide_at="arrival", whole=True):
     link = naive.Link(knots, episode.link.trace.after, episode.link.offset_us)
     cell = Cell(link, [policy() for _ in episode.arrivals], capacity, max_bytes, decide_at, whole)
-    return cell.run([cases.twin_messages(arrivals) for arrivals in episode.arrivals])
+    return cell.run([cases.reference_messages(arrivals) for arrivals in episode.arrivals])
 
 
-class TwinAccept(naive.Policy):
+class ReferenceAccept(naive.Policy):
     def decide(self, queue, newcomer):
         return naive.ACCEPT
 
 
-class TwinLook(naive_policies.Anything):
+class ReferenceLook(naive_policies.Anything):
     """Decides at random, and notes how much of the message in transmission is left."""
 
     def __init__(self):
@@ -91,7 +91,7 @@ class TwinLook(naive_policies.Anything):
 
 @kernels
 @given(cells(), st.sampled_from(["arrival", "overflow"]))
-def test_the_whole_byte_twin_agrees_exactly(drawn, decide_at):
+def test_the_whole_byte_reference_agrees_exactly(drawn, decide_at):
     episode, knots, capacity, max_bytes = drawn
     seen = [[] for _ in episode.arrivals]
 
@@ -102,8 +102,8 @@ def test_the_whole_byte_twin_agrees_exactly(drawn, decide_at):
     limits = {"max_bytes": max_bytes, "decide_at": decide_at}
     memory = np.arange(episode.robots, dtype=np.float64)[:, None]
     fleet = run_fleet(policies.Policy("test-look", look), [episode], capacity, V, memory=memory, **limits)
-    for i, robot in enumerate(twin(episode, knots, TwinLook, capacity, max_bytes, decide_at).robots):
-        assert cases.log(fleet.senders, i) == cases.twin_log(robot)
+    for i, robot in enumerate(reference(episode, knots, ReferenceLook, capacity, max_bytes, decide_at).robots):
+        assert cases.log(fleet.senders, i) == cases.reference_log(robot)
         assert cases.order(fleet.senders, i) == robot.order
         told = outcome(fleet.senders, i)
         assert told.arrived == told.delivered + told.in_transmission + told.buffered + told.dropped
@@ -122,7 +122,7 @@ def test_processor_sharing_itself_within_a_few_bytes(drawn):
     # a message that ends a microsecond sooner or later may leave an idle link another microsecond's bytes.
     episode, knots, _, _ = drawn
     fleet = run_fleet(ACCEPTS, [episode], 100, V)
-    slow = twin(episode, knots, TwinAccept, 100, whole=False)
+    slow = reference(episode, knots, ReferenceAccept, 100, whole=False)
     per_us = max(math.ceil((b - a) / (t - s)) for (s, a), (t, b) in itertools.pairwise(knots))
     bound = (2 + per_us) * slow.starts + len(slow.robots) + 2 * per_us
     for i, robot in enumerate(slow.robots):

@@ -7,13 +7,13 @@ from typing import Any
 import naive_oracle
 import numpy as np
 import pytest
-from cases import VALUES, Case, cases, trace, traces, twin_messages
+from cases import VALUES, Case, cases, reference_messages, trace, traces
 from hypothesis import given
 from hypothesis import strategies as st
 from refusal_cases import refused
 
 from bufgym import policies, scenario
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
@@ -65,7 +65,9 @@ def small(draw: st.DrawFn, equal: bool, windows: bool = False) -> Case:
         episode = replace(episode, first_decision=int(rng.integers(0, 3)), last_decision=int(rng.integers(0, n + 1)))
     max_bytes = draw(st.sampled_from([None, None, unit, 2 * unit, 7 * unit, 3 * unit - 1]))
     decide_at = draw(st.sampled_from(["arrival", "overflow"])) if windows else "arrival"
-    return Case(episode, twin_messages(episode.arrivals), knots, draw(st.integers(1, 3)), max_bytes or None, decide_at)
+    return Case(
+        episode, reference_messages(episode.arrivals), knots, draw(st.integers(1, 3)), max_bytes or None, decide_at
+    )
 
 
 SMALL = {
@@ -83,7 +85,7 @@ def test_is_the_best_of_all_decisions_or_an_upper_bound(kind, data, v):
     plan = clairvoyant(case.episode, case.capacity, v, max_bytes=case.max_bytes)
     link = naive_oracle.Link(case.knots, case.episode.link.trace.after, case.episode.link.offset_us)
     window = (case.episode.first_decision, case.episode.last_decision)
-    best = naive_oracle.best(link, case.twin_messages, case.capacity, v, case.max_bytes, case.decide_at, *window)
+    best = naive_oracle.best(link, case.reference_messages, case.capacity, v, case.max_bytes, case.decide_at, *window)
     assert plan.qoi >= best - EXACT
     assert plan.certified or kind != "equal sizes"
     if plan.certified and case.decide_at == "arrival":

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from refusal_cases import refused
 
 from bufgym import scenario, traces
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream, Streams, read_client, robofleet_example
+from bufgym.utils.errors import BufgymError
 
 LINK = traces.Trace.constant(1e6, 60.0, name="1 MB/s")
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "client.toml"

@@ -8,7 +8,6 @@ import pytest
 from refusal_cases import refuse, refused
 
 from bufgym import policies, scenario
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import MAX_TIME_US, Link
@@ -19,6 +18,7 @@ from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet, run_fleet
 from bufgym.traces import Trace
 from bufgym.traces.workload import Workload
+from bufgym.utils.errors import BufgymError
 
 STEADY = Link(Trace.constant(1e6, 10))
 THREE = messages(np.array([0, 10, 20]), 5)

@@ -1,6 +1,6 @@
-"""Middleware that sends in fragments beside what a real one did, and WebRTC's frame dropper beside its twin.
+"""Middleware that sends in fragments beside what a real one did, and WebRTC's frame dropper beside its reference model.
 
-``test_policy_registry`` has each decision of all of them beside their twins.
+``test_policy_registry`` has each decision of all of them beside their reference models.
 """
 
 from types import SimpleNamespace
@@ -85,21 +85,21 @@ FRAMES = st.tuples(
 
 @kernels
 @given(st.lists(FRAMES, min_size=20, max_size=60))
-def test_webrtc_is_its_twin_frame_by_frame(frames):
+def test_webrtc_is_its_reference_frame_by_frame(frames):
     """The bucket shrinks with its target, leaks and follows; a large frame is spread; patterns begin anew."""
-    twin, memory = FrameDropper(), dropper()
+    reference, memory = FrameDropper(), dropper()
     for target, size, period_us in frames:
-        twin.sender = SimpleNamespace(periods=[period_us])
-        twin.set_rates(target), twin.leak()
+        reference.sender = SimpleNamespace(periods=[period_us])
+        reference.set_rates(target), reference.leak()
         webrtc.retarget(memory, target), webrtc.leak(memory, period_us)
-        assert memory[[webrtc.LEVEL, webrtc.RATIO]] == pytest.approx([twin.accumulator, twin.ratio])
+        assert memory[[webrtc.LEVEL, webrtc.RATIO]] == pytest.approx([reference.accumulator, reference.ratio])
         dropped = webrtc.drops_frame(memory, period_us)
-        assert dropped == twin.drop_frame()
+        assert dropped == reference.drop_frame()
         if not dropped:
-            twin.fill(size), webrtc.fill(memory, size, period_us)
+            reference.fill(size), webrtc.fill(memory, size, period_us)
             assert (memory[webrtc.LEVEL], memory[webrtc.LARGE_LEFT]) == (
-                pytest.approx(twin.accumulator),
-                twin.large_count,
+                pytest.approx(reference.accumulator),
+                reference.large_count,
             )
 
 

@@ -82,7 +82,7 @@ def may_go(buffer, arrival, k):
     return enough and within and buffer.topics[buffer.slots[k].topic].no_drop == 0
 
 
-def twin(whole):
+def reference(whole):
     """All candidates are weighed, the heaviest is searched for afterwards; near ties are told to the test."""
     near = []
 
@@ -108,18 +108,18 @@ def twin(whole):
         sends = [(weight_of(buffer, buffer.slots[k], buffer.slots[k].gain, n, "send"), k) for k in oldest]
         return kept[0] if kept else heaviest(sends)[1] if sends else HOLD
 
-    return Policy("twin", on_arrival, on_send=on_send, reads_rate=True), near
+    return Policy("reference model", on_arrival, on_send=on_send, reads_rate=True), near
 
 
 @given(topic_cases(min_topics=2, max_messages=25), st.integers(0, 2**32), st.integers(1, 20))
-def test_decides_as_its_twin_compiled_and_not(case, seed, capacity):
+def test_decides_as_its_reference_compiled_and_not(case, seed, capacity):
     case = replace(case, case=replace(case.case, capacity=capacity), client=ClientSettings())
     policy = random_scheduler(seed).policy("some")
     ours, again, memory = case.run(policy), case.senders(), policy.new_memory(1, capacity)
     memory[:] = np.nan  # what it held before does not matter
     again.run(policy, memory)
     assert same(ours, again)
-    other, near = twin(random_scheduler(seed))
+    other, near = reference(random_scheduler(seed))
     assert same(ours, case.run(other)) or any(near)
     assert same(ours, case.run(replace(policy, compile=False)))
     if case.case.episode.first_decision == 0 and case.case.episode.last_decision > 10**6:

@@ -14,12 +14,12 @@ import pytest
 from needs import needs
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import JIT, announce, cache, direct, interruptible, kernel
+from bufgym.jit import JIT, announce, cache, interruptible, kernel, without_dispatch
 
 TALE = """
 import os
 {before}
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 
 @kernel
 def double(k):
@@ -28,7 +28,7 @@ def double(k):
 print(double(21))
 """
 
-PATIENT = "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 1e6"
+PATIENT = "from bufgym.jit import announce as k; k.PATIENCE_S = 1e6"
 """Beforehand: no notice, however long a busy machine takes to compile."""
 
 
@@ -66,7 +66,7 @@ def test_damaged_code_is_compiled_anew(tmp_path: Path, left: float) -> None:
 
 @needs_compilation
 def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path: Path) -> None:
-    impatient = "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0"
+    impatient = "from bufgym.jit import announce as k; k.PATIENCE_S = 0.0"
     assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
     assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
 
@@ -74,7 +74,7 @@ def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path
 @needs_compilation
 @pytest.mark.parametrize(
     "before",
-    [PATIENT, "from bufgym.ground.kernel import announce as k; k.PATIENCE_S = 0.0; k.compile_silently()"],
+    [PATIENT, "from bufgym.jit import announce as k; k.PATIENCE_S = 0.0; k.compile_silently()"],
     ids=["quick", "silent"],
 )
 def test_what_is_not_announced(tmp_path: Path, before: str) -> None:
@@ -85,11 +85,11 @@ def test_what_is_not_announced(tmp_path: Path, before: str) -> None:
 def test_who_wants_only_what_is_kept_compiles_nothing(tmp_path: Path) -> None:
     asked = """
 import sys
-from bufgym.ground.kernel import NotKeptError, only_kept
+from bufgym.jit import NotCachedError, cached_only
 try:
-    with only_kept():
+    with cached_only():
         print(double(21))
-except NotKeptError:
+except NotCachedError:
     print(double(21))
     print("compiled", file=sys.stderr)
 """
@@ -109,7 +109,7 @@ def test_where_no_folder_can_be_written_a_temporary_one_serves(tmp_path: Path) -
 
 @needs_compilation
 def test_a_full_disk_keeps_no_code(tmp_path: Path) -> None:
-    full = "import bufgym.ground.kernel.cache as c\ndef full(*_): raise OSError(28, 'no space left')\n"
+    full = "import bufgym.jit.cache as c\ndef full(*_): raise OSError(28, 'no space left')\n"
     run(tmp_path, before=full + "c.replaced = full", NUMBA_CACHE_DIR=str(tmp_path / "code"))
     assert not list((tmp_path / "code").rglob("*.nbc"))
 
@@ -125,7 +125,7 @@ def test_a_direct_call_is_the_call() -> None:
             if numbers.several is not None:
                 numbers.of[k] += 1
 
-    one, directly = np.arange(12.0), direct(double)
+    one, directly = np.arange(12.0), without_dispatch(double)
     several = one.copy()
     for _ in range(3):
         directly(Numbers(one), 0.5, 1)

@@ -1,4 +1,4 @@
-"""Learned policies decide as their weights say: against a slow twin, a fixed policy, and the network they came from."""
+"""Learned policies decide as their weights, a slow reference model, a fixed policy and their network say."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def weights(draw):
     return Weights(fields, network(rng, len(fields), *widths), network(rng, len(fields), *widths))
 
 
-def twin(made):
+def reference(made):
     """A policy that decides by these weights: every candidate is scored, the best is searched for afterwards."""
 
     def on_arrival(buffer, arrival, memory):
@@ -61,12 +61,12 @@ def twin(made):
             return ACCEPT
         return first
 
-    return Policy("twin", on_arrival)
+    return Policy("reference model", on_arrival)
 
 
 @kernels
 @given(cases(), VALUES, weights(), st.integers(1, 20))
-def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
+def test_decides_as_its_reference_compiled_and_not(case, v, made, capacity):
     case = replace(case, capacity=capacity)
     policy = made.policy("random-weights")
     ours, again, memory = case.run(policy, v), case.senders(v), policy.new_memory(1, capacity)
@@ -75,14 +75,14 @@ def test_decides_as_its_twin_compiled_and_not(case, v, made, capacity):
         again.load(0, case.episode)
         again.run(policy, memory)
         assert same(ours, again)
-    assert same(ours, case.run(twin(made), v))
+    assert same(ours, case.run(reference(made), v))
     assert same(ours, case.run(replace(policy, compile=False), v))
-    if case.episode.first_decision == 0 and case.episode.last_decision > len(case.twin_messages):
+    if case.episode.first_decision == 0 and case.episode.last_decision > len(case.reference_messages):
         assert int(ours.batch.senders["invalid"][0]) == 0
 
 
 @kernels
-def test_the_twin_counts_as_one_does_by_hand():
+def test_the_reference_counts_as_one_does_by_hand():
     # h = relu(2 * 3 - 1, -4 * 3 + 1) = (5, 0); score = 10 * 5 + 100 * 0 + 7 * 3 + 0.5
     weight, bias = np.float32([[2, -4]]), np.float32([-1, 1])
     net = Network(np.float32([7]), np.float32([0.5]), ((weight, bias),), np.float32([10, 100]))

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refusal_cases import refuse, refused
 
-from bufgym.ground.kernel import records
+from bufgym.jit import records
 from bufgym.model import link, qoi
 from bufgym.model.buffer import MESSAGE, evict, push, row_width
 from bufgym.model.link import FOREVER, KnotStore, Link, position_at, segment, time_of
@@ -59,9 +59,9 @@ def carrying(knots, after):
 def test_agrees_with_fractions(case, t_us, position):
     knots, after = case
     carried, first_time = carrying(knots, after)
-    twin = naive.Link(knots, after)
-    assert carried(t_us) == int(twin.bytes_by(t_us))
-    at = twin.first_time(position)
+    reference = naive.Link(knots, after)
+    assert carried(t_us) == int(reference.bytes_by(t_us))
+    at = reference.first_time(position)
     assert first_time(position) == (FOREVER if at is None else at)
     if at is not None:
         # The first microsecond at which that many bytes could have crossed, and no later one.
@@ -128,10 +128,10 @@ def test_exact_wherever_the_result_is_below_2_to_the_62(after):
     for _ in range(300):
         knots = huge_traces(rng)
         carried, first_time = carrying(knots, after)
-        twin = naive.Link(knots, after)
+        reference = naive.Link(knots, after)
         for _ in range(10):
             t_us, position = (int(rng.integers(1, 2 ** int(rng.integers(1, 62)))) for _ in range(2))
-            exact, at = int(twin.bytes_by(t_us)), twin.first_time(position)
+            exact, at = int(reference.bytes_by(t_us)), reference.first_time(position)
             if exact < 2**62:
                 assert carried(t_us) == exact
                 checked += 1
@@ -147,13 +147,13 @@ def test_information_by_hand():
 
 
 @given(VALUES, st.lists(st.integers(0, 40), max_size=20))
-def test_information_agrees_with_twin(v, steps):
+def test_information_agrees_with_reference(v, steps):
     x = (np.cumsum(steps) / 8).tolist()
     assert v.information(x) == naive.information(v, x)
 
 
 @given(st.floats(0.05, 0.99), st.floats(0.1, 30), st.floats(0, 50))
-def test_kinds_agree_with_twins(base, distance, d):
+def test_kinds_agree_with_references(base, distance, d):
     assert qoi.exponential(base)(d) == pytest.approx(naive.exponential(base)(d), abs=1e-15)
     assert qoi.exponential(base)(d) == pytest.approx(1 - base**d, abs=1e-12)
     assert qoi.saturating(distance)(d) == naive.saturating(distance)(d)

@@ -1,4 +1,4 @@
-"""What is observed: event by event against a twin, written from the tables; each field in its bounds and documented."""
+"""What is observed: event by event against a reference model of the tables; each field in its bounds and documented."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from cases import ANYTHING, VALUES, cases
 from hypothesis import given
-from topic_cases import CONTEXT_NAMES, SLOT_NAMES, TWIN_V, TopicCase, observed, topic_cases
+from topic_cases import CONTEXT_NAMES, REFERENCE_V, SLOT_NAMES, TopicCase, observed, topic_cases
 
 from bufgym import policies
-from bufgym.ground.kernel import named
+from bufgym.jit import named
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, UNLIMITED_BYTES
 from bufgym.model.link import Link
@@ -34,7 +34,7 @@ def per(g, r):
     return float(g / (g + r)) if g > 0 else 0.0
 
 
-class Twin:
+class Reference:
     """The fields of one moment, from what the slow sender of ``naive_sender`` knows."""
 
     def __init__(self, case: TopicCase, sender, buffer) -> None:
@@ -45,7 +45,7 @@ class Twin:
         self.L = case.case.capacity
 
     def v(self, lane):
-        return TWIN_V[self.topics[lane].value or self.case.v]
+        return REFERENCE_V[self.topics[lane].value or self.case.v]
 
     def even(self, lane, field, last):
         """The even spacing of a topic: from what was sent last (until then: kept first) to its arrival ``last``.
@@ -166,12 +166,12 @@ class Twin:
 
 @pytest.mark.kernels
 @given(topic_cases(max_messages=25).filter(lambda case: len(case.topics) != 1))
-def test_every_field_is_its_twins(case):
-    def check(event, senders, twin):
+def test_every_field_is_its_references(case):
+    def check(event, senders, reference):
         if event == "decision" or (event == "send" and case.topics):
             seen = named(senders.batch)
             buffer = python_view(seen, 0)
-            by_definition = Twin(case, twin, buffer)
+            by_definition = Reference(case, reference, buffer)
             by_definition = by_definition.slots() | by_definition.context()
             arrival = seen.arrivals[0, min(seen.senders[0].next, seen.senders[0].arrivals - 1)]
             for name, numbers in observed(buffer, arrival, event == "decision").items():
@@ -179,10 +179,10 @@ def test_every_field_is_its_twins(case):
                 np.testing.assert_allclose(numbers, by_definition[name], rtol=1e-6, atol=1e-6, err_msg=what)
                 assert ((numbers >= 0) & (numbers <= 1)).all(), name
 
-    case.beside_its_twin(check)
+    case.beside_its_reference(check)
 
 
-def test_the_twin_knows_every_field():
+def test_the_reference_knows_every_field():
     known = {field.name for field in FIELDS + TOPIC_FIELDS}
     assert {*SLOT_NAMES, *CONTEXT_NAMES} == known, "tests/core/topic_cases.py observes them by definition"
     assert not [field.name for field in TOPIC_FIELDS if field.group != "topic"]

@@ -1,4 +1,4 @@
-"""Fields of what a robot has on board: the link's rate by hand and against the twin, gaps in messages, and bytes."""
+"""Fields of what a robot has on board: the link's rate by hand and by the reference model, gaps in messages, bytes."""
 
 import math
 from dataclasses import replace
@@ -36,14 +36,14 @@ def drained(buffer, arrival):
 
 
 @given(cases())
-def test_the_links_rate_as_the_twin_measures_it(case):
+def test_the_links_rate_as_the_reference_measures_it(case):
     case = replace(case, decide_at="arrival", episode=replace(case.episode, first_decision=0, last_decision=2**31))
     policy, seen = watched(drained)
     case = replace(case, max_bytes=None)
     case.run(policy, V)
-    measured = case.run_twin(naive.policy("drop-newest", V)).measured
-    twin = [(m["drained"], m["drained_us"], *(1e6 * m[n] for n in ("short", "medium", "long"))) for m in measured]
-    assert seen == twin
+    measured = case.run_reference(naive.policy("drop-newest", V)).measured
+    reference = [(m["drained"], m["drained_us"], *(1e6 * m[n] for n in ("short", "medium", "long"))) for m in measured]
+    assert seen == reference
 
 
 def seen(**known):

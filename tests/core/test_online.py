@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from refusal_cases import refuse
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import OnlineOptimum, ideal, integer, law, online_optimum
@@ -21,6 +20,7 @@ from bufgym.policies import ACCEPT, REJECT, Policy
 from bufgym.scenario import Episode, Interruption, Streams, messages, registry
 from bufgym.sim import run
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 kernels = pytest.mark.kernels
 V = qoi.exponential(0.618)

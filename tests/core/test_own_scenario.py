@@ -13,12 +13,12 @@ import bufgym  # noqa: F401  (registers the environments)
 from bufgym import scenario
 from bufgym.benchmark.rows import read_rows
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import SCENARIOS, Episode, Interruption, Uplink, messages
 from bufgym.scenario.client import read_client
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 MODULE = """
 import numpy as np

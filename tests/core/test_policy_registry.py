@@ -1,21 +1,21 @@
-"""The registry: what holds for every policy, beside its slow twin too, policies of one's own, and what is refused."""
+"""The registry: what holds for every policy and its slow reference model, policies of one's own, what is refused."""
 
 from dataclasses import replace
 
 import naive
 import pytest
-from cases import ANYTHING, VALUES, cases, log, order, same, twin_log
+from cases import ANYTHING, VALUES, cases, log, order, reference_log, same
 from hypothesis import given
-from naive_policies import twins
+from naive_policies import references
 from policy_cases import interruption, kept
 from refusal_cases import refuse
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model import qoi
 from bufgym.policies import ACCEPT, REJECT, register, registry
 from bufgym.sim.metrics import outcome
+from bufgym.utils.errors import BufgymError
 
 ALL = tuple(name for name in policies.names() if policies.get(name).privileged is None)
 
@@ -40,31 +40,31 @@ SETTINGS = [
 ]
 """Settings under which the short random episodes meet every branch."""
 ALIASES = ["dds-keep-all", "zenoh-ring", "foxglove-sdk", "rosbridge", "latest-only"]
-ALIASES += [name for name in ALL if policies.get(name).for_topics and name in twins(qoi.exponential())]
+ALIASES += [name for name in ALL if policies.get(name).for_topics and name in references(qoi.exponential())]
 """Other names for the same on one queue."""
-SPECS = sorted({*twins(qoi.exponential()), *SETTINGS} - {*ALIASES, *(spec.partition(":")[0] for spec in SETTINGS)})
+SPECS = sorted({*references(qoi.exponential()), *SETTINGS} - {*ALIASES, *(spec.partition(":")[0] for spec in SETTINGS)})
 
 
 @pytest.mark.parametrize("spec", [*(pytest.param(spec, marks=pytest.mark.kernels) for spec in SPECS), *ALIASES])
 @given(cases(), VALUES)
-def test_agrees_with_twin(spec, case, v):
+def test_agrees_with_reference(spec, case, v):
     policy = ANYTHING if spec == "test-anything" else policies.get(spec)
-    ours, twin = case.run(policy, v), case.run_twin(naive.policy(spec, v))
-    assert log(ours) == twin_log(twin)
-    assert order(ours) == twin.order
+    ours, reference = case.run(policy, v), case.run_reference(naive.policy(spec, v))
+    assert log(ours) == reference_log(reference)
+    assert order(ours) == reference.order
     sender, told = ours.batch.senders[0], outcome(ours, 0)
-    assert (sender["rejected"], sender["evicted"]) == (twin.rejected, twin.evicted)
-    assert (sender["dequeued"], sender["transmitted"]) == (len(twin.dequeued), len(twin.transmitted))
-    assert sender["backlog_bytes"] == sum(m["bytes"] for m in twin.queue)
-    assert told.invalid == twin.invalid
-    assert (told.arrived, told.delivered) == (len(case.twin_messages), len(twin.order))
-    assert (told.dropped, told.in_transmission) == (len(twin.dropped), len(twin.socket))
-    assert told.buffered == len(twin.queue)
-    x = [case.twin_messages[k]["x"] for k in twin.order]
+    assert (sender["rejected"], sender["evicted"]) == (reference.rejected, reference.evicted)
+    assert (sender["dequeued"], sender["transmitted"]) == (len(reference.dequeued), len(reference.transmitted))
+    assert sender["backlog_bytes"] == sum(m["bytes"] for m in reference.queue)
+    assert told.invalid == reference.invalid
+    assert (told.arrived, told.delivered) == (len(case.reference_messages), len(reference.order))
+    assert (told.dropped, told.in_transmission) == (len(reference.dropped), len(reference.socket))
+    assert told.buffered == len(reference.queue)
+    x = [case.reference_messages[k]["x"] for k in reference.order]
     assert told.qoi == naive.information(v, x)
     # What was credited message by message is H; what is kept or sent is H of all of it.
     assert (sender["delivered_gain"] + 1 if x else 0) == pytest.approx(told.qoi, abs=1e-12)
-    kept = x + [m["x"] for m in [*(sent.message for sent in twin.socket), *twin.queue]]
+    kept = x + [m["x"] for m in [*(sent.message for sent in reference.socket), *reference.queue]]
     assert (sender["retained_gain"] + 1 if kept else 0) == pytest.approx(naive.information(v, kept), abs=1e-9)
 
 
@@ -73,12 +73,14 @@ ELSEWHERE = {"target-gap": "test_target_gap.py", "price-dp": "test_price_dp.py",
 
 
 def test_each_built_in_policy_has_a_reference_model():
-    models = twins(qoi.exponential())
+    models = references(qoi.exponential())
     written = [name for name in ALL if not policies.get(name).weights and name not in ELSEWHERE]
     lacking = sorted({*written} - {*models})
-    assert not lacking, f"no reference model of {lacking}: add it to twins() in tests/core/naive_policies.py"
+    assert not lacking, f"no reference model of {lacking}: add it to reference models() in tests/core/naive_policies.py"
     unknown = sorted({*models} - {*ALL, "test-anything"})
-    assert not unknown, f"tests/core/naive_policies.py: twins() names {unknown}, which bufgym/policies/ has not"
+    assert not unknown, (
+        f"tests/core/naive_policies.py: reference models() names {unknown}, which bufgym/policies/ has not"
+    )
     foreign = [n for n in (*policies.names(), *policies.names(named_only=True)) if not policies.get(n).built_in]
     assert not foreign, f"{foreign} must be under @built_in, not @register, in bufgym/policies/"
     assert policies.get("decimate:every=2").built_in and not policies.get(keep_even).built_in
@@ -91,10 +93,10 @@ def test_every_decision_is_possible_compiled_and_as_plain_python(name, case, v):
     assert policy.name == name
     assert policy.summary.endswith("."), f"{name}: the first line of its docstring must say how it decides"
     if policy.unbounded:
-        case = replace(case, capacity=len(case.twin_messages), max_bytes=None)
+        case = replace(case, capacity=len(case.reference_messages), max_bytes=None)
     senders = case.run(policy, v)
     # Outside the arrivals that ask, a full queue rejects without being asked: those are not the policy's.
-    if case.episode.first_decision == 0 and case.episode.last_decision > len(case.twin_messages):
+    if case.episode.first_decision == 0 and case.episode.last_decision > len(case.reference_messages):
         assert outcome(senders, 0).invalid == 0
     assert policy.unbounded or senders.batch.senders[0]["peak_backlog_bytes"] <= (case.max_bytes or 2**62)
     assert same(senders, case.run(replace(policy, compile=False), v))

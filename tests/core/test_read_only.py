@@ -11,7 +11,6 @@ from bufgym.benchmark import run as bench
 from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.envs import SenderEnv
 from bufgym.envs.expert import Player
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
@@ -21,6 +20,7 @@ from bufgym.sim import Senders, audit, run
 from bufgym.sim.cell import run_fleet
 from bufgym.sim.state import NEVER
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 V = qoi.exponential()
 EPISODE = Episode(messages(np.arange(40) * 1_000, 4_000), Link(Trace.constant(1e6, 10)))

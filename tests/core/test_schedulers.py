@@ -1,4 +1,4 @@
-"""Schedulers and Robofleet's rivals: their clients, and settings that are refused. (All else: ``test_topics_twin``.)"""
+"""Schedulers and Robofleet's rivals: their clients, and settings that are refused. (All else: test_topics_reference)"""
 
 import naive_schedulers
 import numpy as np
@@ -7,18 +7,18 @@ from cases import order, trace
 from refusal_cases import refused
 
 from bufgym import policies
-from bufgym.ground import files
 from bufgym.model import qoi
 from bufgym.model.checks import check_window
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic, check_topics
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders, run
+from bufgym.utils import files
 
 pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.618)
 MS = 1_000
-NAMES = list(naive_schedulers.TWINS)
+NAMES = list(naive_schedulers.REFERENCES)
 ALL = [name for name in policies.names() if policies.get(name).privileged is None]
 
 

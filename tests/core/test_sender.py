@@ -1,6 +1,6 @@
 """The sender by hand; its byte limit B, under which a policy is asked again until the newcomer fits.
 
-``test_topics_twin`` and ``test_policy_registry`` hold it beside its twin.
+``test_topics_reference`` and ``test_policy_registry`` hold it beside its reference model.
 """
 
 import math

@@ -10,9 +10,9 @@ import pytest
 from refusal_cases import refuse
 
 from bufgym.benchmark.sweep import Sweep
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Interruption, Uplink, suites
 from bufgym.scenario.numbered import draw
+from bufgym.utils.errors import BufgymError
 
 EMBEDDED = [name for name, suite in suites.SUITES.items() if suite.kind in ("queue", "stress") and not suite.needs]
 RECORDED = [name for name, suite in suites.SUITES.items() if suite.needs]

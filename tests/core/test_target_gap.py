@@ -112,7 +112,7 @@ RATES = (0.0, 80.0, 900.0, 7_500.0, 30_000.0)
 
 @st.composite
 def moments(draw):
-    """(buffer, newcomer, memory, what the twin has seen): queues short and long, links idle, steady and fading."""
+    """(buffer, newcomer, memory, what the reference has seen): queues short and long, links idle, steady and fading."""
     rng, pick = np.random.default_rng(draw(st.integers(0, 2**32))), lambda *choices: draw(st.sampled_from(choices))
     seen, memory, even = Seen(), np.zeros(6), draw(st.booleans())
     for _ in range(draw(st.integers(1, 5))):  # what has come: windows of 20 s and 15 s are passed
@@ -137,7 +137,7 @@ def moments(draw):
 @kernels
 @settings(max_examples=4 * settings().max_examples)
 @given(moments())
-def test_each_rule_is_its_twins_at_any_moment(moment):
+def test_each_rule_is_its_references_at_any_moment(moment):
     """Windows, horizons and limits beyond those of the short random episodes below."""
     buffer, arrival, memory, seen = moment
     means = [running_mean(seen.sent, 20e6), sum(us for _, us in seen.sent), running_mean(seen.moved, 15e6)]
@@ -154,7 +154,7 @@ def test_each_rule_is_its_twins_at_any_moment(moment):
         assert spare(buffer, arrival, victim) == spared(buffer, arrival, victim)
 
 
-def twin():
+def reference():
     """A policy that decides alike, of what it has seen."""
     seen = Seen()
 
@@ -171,16 +171,16 @@ def twin():
         victim = least_gap(buffer, arrival)
         return ACCEPT if fits(buffer, arrival) and (seen.bursty or not spared(buffer, arrival, victim)) else victim
 
-    return Policy("twin", on_arrival, reads_rate=True)
+    return Policy("reference model", on_arrival, reads_rate=True)
 
 
 @kernels
 @given(cases(max_messages=25), VALUES)
-def test_decides_as_its_twin(case, v):
-    assert same(case.run(POLICY, v), case.run(twin(), v))
+def test_decides_as_its_reference(case, v):
+    assert same(case.run(POLICY, v), case.run(reference(), v))
     told = replace(case.episode, ends_us=int(case.episode.arrivals["arrival_us"][-1]) * 3 // 4)
     for other in (replace(case, decide_at="overflow"), replace(case, episode=told)):
-        assert same(other.run(POLICY, v), other.run(twin(), v))
+        assert same(other.run(POLICY, v), other.run(reference(), v))
 
 
 def test_over_fading_links_less_is_lost_than_by_the_smallest_gap_alone():

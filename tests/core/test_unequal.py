@@ -5,7 +5,7 @@ from functools import cache
 import naive_oracle
 import numpy as np
 import pytest
-from cases import VALUES, trace, twin_messages
+from cases import VALUES, reference_messages, trace
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -78,8 +78,8 @@ def test_no_plan_beats_the_bound_and_the_plan_found_keeps_to_its_room(seed):
     knots = [(0, 0), (4_000, int(rng.integers(2, 9)) * 1_500), (5_000 + 2_000 * (seed % 2), 12_000), (14_000, 24_000)]
     after = ("loop", "hold", "stop")[seed // 9 % 3]
     episode = Episode(messages(us, size, x), Link(trace(knots, after)))
-    twins = twin_messages(episode.arrivals)
-    best = naive_oracle.best(naive_oracle.Link(knots, after, 0), twins, L, v, max_bytes, "arrival", 0, n)
+    references = reference_messages(episode.arrivals)
+    best = naive_oracle.best(naive_oracle.Link(knots, after, 0), references, L, v, max_bytes, "arrival", 0, n)
     plan = clairvoyant(episode, L, v, max_bytes=max_bytes)
     result = outcome(run(policies.get("clairvoyant"), [episode], L, v, max_bytes=max_bytes), 0)
     assert result.invalid == 0 and result.delivered == plan.kept.sum()

@@ -15,11 +15,11 @@ from safetensors.numpy import save as safetensors
 from weight_cases import ABOUT, CHOICES, KINDS, QUEUE, TOPICS, made, parts_of, put, put_changed, random_weights, refused
 
 from bufgym import __version__, policies
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.policies import learned, registry, weights
 from bufgym.scenario import Interruption
 from bufgym.sim import run
+from bufgym.utils.errors import BufgymError
 
 
 @pytest.fixture

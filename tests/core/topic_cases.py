@@ -1,4 +1,4 @@
-"""Random episodes with topics, each for the package and for its twin in ``naive_sender``."""
+"""Random episodes with topics, each for the package and for its reference model in ``naive_sender``."""
 
 import functools
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from typing import Any
 import naive
 import naive_sender
 import numpy as np
-from cases import Case, cases, twin_messages
+from cases import Case, cases, reference_messages
 from hypothesis import strategies as st
 
 from bufgym import policies
@@ -21,15 +21,15 @@ from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, SEND
 from bufgym.sim.transition import next_event
 
-TWIN_V = {
+REFERENCE_V = {
     **{qoi.exponential(base): naive.exponential(base) for base in (0.3, 0.618, 0.95)},
     **{qoi.saturating(distance): naive.saturating(distance) for distance in (0.5, 2.0, 7.0)},
 }
-"""V functions and their twins."""
-V = st.sampled_from(list(TWIN_V))
+"""V functions and their reference models."""
+V = st.sampled_from(list(REFERENCE_V))
 
 EVENTS = dict(zip(range(5), ("end", "departure", "decision", "dequeue", "send"), strict=True))
-"""The twin's names of ``sim.END``, ``sim.DEPARTURE`` and so on."""
+"""The reference model's names of ``sim.END``, ``sim.DEPARTURE`` and so on."""
 assert (END, DEPARTURE, DECISION, DEQUEUE, SEND) == tuple(range(5))
 
 CLIENT_RULES = ("limit_at_send", "limit_since_sent", "flush_no_drop")
@@ -82,9 +82,11 @@ class TopicCase:
         hooks |= {"on_dequeue": drop_some} if self.drops_heads else {}
         return policies.Policy("test-anything", decide_anything, client=self.client, compile=compile, **hooks)
 
-    def twin(self) -> naive_sender.Sender:
+    def reference(self) -> naive_sender.Sender:
         case, episode = self.case, self.case.episode
-        rules: Any = [twin_rules(topic, self.v) for topic in self.topics] or naive_sender.Rules(TWIN_V[self.v])
+        rules: Any = [reference_rules(topic, self.v) for topic in self.topics] or naive_sender.Rules(
+            REFERENCE_V[self.v]
+        )
         link = naive.Link(case.knots, episode.link.trace.after, episode.link.offset_us)
         settings = {rule: getattr(self.client, rule) for rule in CLIENT_RULES}
         settings |= {"window": episode.window, "ack_delay_us": episode.ack_delay_us}
@@ -92,32 +94,32 @@ class TopicCase:
         settings |= {"schedules": self.schedules, "drops_heads": self.drops_heads, "max_bytes": case.max_bytes}
         return naive_sender.Sender(link, rules, case.capacity, **settings)
 
-    def beside_its_twin(self, check: Callable[[str, Senders, Any], None]) -> tuple[Senders, Any]:
-        """Product and twin after the same answers to the same events; ``check(event, senders, twin)`` sees each."""
+    def beside_its_reference(self, check: Callable[[str, Senders, Any], None]) -> tuple[Senders, Any]:
+        """Product and reference after the same answers to events; ``check(event, senders, reference)`` sees each."""
         senders = self.senders()
         batch, to_kernel = (senders.batch, {"decision": decide, "send": answer_send, "dequeue": answer_dequeue})
 
-        def ask(twin: Any, event: str) -> Any:
+        def ask(reference: Any, event: str) -> Any:
             assert EVENTS[next_event(batch, None, 0)] == event
-            check(event, senders, twin)
-            answer = self.answer(twin, event)
+            check(event, senders, reference)
+            answer = self.answer(reference, event)
             if event in to_kernel:
                 to_kernel[event](batch, 0, answer)
             return answer
 
-        return senders, self.run_twin(ask)
+        return senders, self.run_reference(ask)
 
-    def run_twin(self, ask: Callable[[Any, str], Any] | None = None) -> Any:
-        """The twin after the episode; ``ask(twin, event)`` answers, as the policy does if not given."""
-        twin, episode = self.twin(), self.case.episode
-        twin.ask = functools.partial(ask or self.answer, twin)
-        return twin.run(self.case.twin_messages, episode.first_decision, episode.last_decision)
+    def run_reference(self, ask: Callable[[Any, str], Any] | None = None) -> Any:
+        """The reference model after the episode; ``ask(reference, event)`` answers, as the policy does if not given."""
+        reference, episode = self.reference(), self.case.episode
+        reference.ask = functools.partial(ask or self.answer, reference)
+        return reference.run(self.case.reference_messages, episode.first_decision, episode.last_decision)
 
-    def answer(self, twin: Any, event: str) -> Any:
-        known = {"capacity": self.case.capacity, "now_us": twin.now, "dequeued": len(twin.dequeued)}
-        buffer = SimpleNamespace(slots=twin.slots(), **known)
+    def answer(self, reference: Any, event: str) -> Any:
+        known = {"capacity": self.case.capacity, "now_us": reference.now, "dequeued": len(reference.dequeued)}
+        buffer = SimpleNamespace(slots=reference.slots(), **known)
         if event == "decision":
-            return decide_anything(buffer, SimpleNamespace(uniform=twin.newcomer["uniform"]), None)
+            return decide_anything(buffer, SimpleNamespace(uniform=reference.newcomer["uniform"]), None)
         if event == "send":
             return send_anything(buffer, None)
         return drop_some(buffer, None) if event == "dequeue" else None
@@ -140,9 +142,9 @@ def observed(buffer: Any, arrival: Any, arriving: bool) -> dict[str, Any]:
     return dict(zip(SLOT_NAMES, slots, strict=False)) | dict(zip(CONTEXT_NAMES, context, strict=False))
 
 
-def twin_rules(topic: Topic, v: qoi.Value) -> naive_sender.Rules:
+def reference_rules(topic: Topic, v: qoi.Value) -> naive_sender.Rules:
     return naive_sender.Rules(
-        TWIN_V[topic.value or v],
+        REFERENCE_V[topic.value or v],
         topic.priority,
         topic.priority if topic.weight is None else topic.weight,
         0 if topic.rate_limit_hz is None else round(1e6 / topic.rate_limit_hz),
@@ -177,7 +179,7 @@ def topic_cases(draw: st.DrawFn, min_topics: int = 0, max_messages: int = 60) ->
         arrivals["topic"] = np.random.default_rng(draw(st.integers(0, 2**32))).integers(0, n, len(arrivals))
     window, ack_delay_us = draw(st.integers(1, 4)), draw(st.sampled_from([0, 0, 1, 700, 20_000]))
     episode = replace(case.episode, arrivals=arrivals, window=window, ack_delay_us=ack_delay_us)
-    case = replace(case, episode=episode, twin_messages=twin_messages(arrivals))
+    case = replace(case, episode=episode, reference_messages=reference_messages(arrivals))
     topics = tuple(draw(topic_rules(f"topic {k}")) for k in range(n))
     client = ClientSettings(**{rule: draw(st.booleans()) for rule in CLIENT_RULES})
     v, schedules, drops_heads = (

@@ -10,11 +10,11 @@ from safetensors.numpy import load as tensors_of
 from safetensors.numpy import save as safetensors
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Network, Weights
+from bufgym.utils.errors import BufgymError
 
 
 def network(rng, inputs, *widths):

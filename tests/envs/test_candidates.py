@@ -12,7 +12,7 @@ from refusal_cases import refuse
 from bufgym import oracle, policies
 from bufgym.envs import SenderEnv, SenderVectorEnv, expert
 from bufgym.envs.rows import Rows
-from bufgym.ground.kernel import named
+from bufgym.jit import named
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.observe.candidates import take_logarithms

@@ -17,7 +17,6 @@ from bufgym import oracle, policies
 from bufgym.cli import main
 from bufgym.envs import SenderEnv, SenderVectorEnv, expert
 from bufgym.envs.expert.dataset import KINDS, record
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.oracle import law, online_optimum
@@ -27,6 +26,7 @@ from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 V = qoi.exponential(0.5)
 LINK = (Trace.steps([(1.0, 900_000), (0.7, 100_000)], name="t"),)

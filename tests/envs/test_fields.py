@@ -7,11 +7,11 @@ import pytest
 from env_cases import SMALL
 
 from bufgym.envs import SenderEnv, SenderVectorEnv
-from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.observe import BUILT_IN, CANDIDATE_FIELDS, FIELDS, QUEUE_FIELDS, field
 from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 L, N = 4, 3
 SETTING: dict[str, Any] = {"capacity": L, **SMALL["bufgym/Uplink-v0"]}
@@ -110,7 +110,7 @@ def test_fields_beside_candidates_by_hand() -> None:
     assert seen["occupancy"].tolist() == [1.0]
     # Three gaps of a second up to the newcomer: the even spacing is 1 s, and each message leaves a gap of two of them.
     assert seen["time_merged"].tolist() == [0.5, 0.5, 0.5]
-    seen, *_ = env.step(2)  # the head goes: 2 and 3 queue, 4 asks, and 0 was the last to be dequeued
+    seen, *_ = env.step(2)  # drop-oldest: 2 and 3 queue, 4 asks, and 0 was the last to be dequeued
     # The even spacing is 4/3 s. Without message 2 a gap of 3 s is left; without 3 or 4, one of 2 s.
     np.testing.assert_allclose(seen["time_merged"], [3 / (3 + 8 / 3), 2 / (2 + 8 / 3), 2 / (2 + 8 / 3)], rtol=1e-6)
 

@@ -18,11 +18,11 @@ from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
 from bufgym.envs.expert import Player
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Streams, Uplink, suites
 from bufgym.scenario.numbered import Pool, draw
 from bufgym.traces import Trace, drive_motion, write_csv
+from bufgym.utils.errors import BufgymError
 
 PLAYED = ("random", "drop-oldest")
 L = 2

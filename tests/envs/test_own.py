@@ -21,7 +21,7 @@ import bufgym
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
 from bufgym.envs.options import Options
 from bufgym.envs.rows import Rows
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.observe import field, reward_term

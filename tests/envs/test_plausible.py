@@ -13,12 +13,12 @@ from bufgym.envs.expert.player import Player
 from bufgym.envs.options import Options
 from bufgym.envs.plausible import NEAR, keep_plausible
 from bufgym.envs.rows import Rows
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import named
+from bufgym.jit import named
 from bufgym.scenario import Interruption, Uplink
 from bufgym.scenario.uplink import uplink_over_lte
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 SWITCHING = Uplink(traces=(Trace.steps([(1.0, 2_000_000), (1.5, 60_000)]),), rate_hz=20, duration_s=10.0)
 
@@ -55,7 +55,7 @@ def test_in_an_interruption_the_two_smallest_gaps_may_go() -> None:
     assert plausible(rows)[0].tolist() == [1, 0, 0, 1, 1, 0]
 
 
-def slow_twin(rows: Rows, i: int) -> list[int]:
+def slow_reference(rows: Rows, i: int) -> list[int]:
     """The mask of row ``i`` by sorting, from what a policy sees."""
     valid: list[int] = rows.output.action_mask[i].tolist()
     if rows.output.terminated[i]:
@@ -76,7 +76,7 @@ def test_over_a_switching_link_it_is_what_sorting_says(L: int) -> None:
     cleared, heads = 0, 0
     while not rows.output.terminated.all():
         mask = plausible(rows)
-        assert mask.tolist() == [slow_twin(rows, i) for i in range(3)]
+        assert mask.tolist() == [slow_reference(rows, i) for i in range(3)]
         cleared += int((rows.output.action_mask - mask).sum())
         heads += int((mask[:, :L].sum(axis=1) > 2).sum())
         rows.step((rng.random(mask.shape) * mask).argmax(axis=1))

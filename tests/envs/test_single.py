@@ -1,4 +1,4 @@
-"""The single environment: Gymnasium's own checks, rewards by hand, masks, wrong use; what it hands out."""
+"""The single environment: Gymnasium's own checks, rewards by hand, masks, wrong use; what it returns."""
 
 import copy
 import math
@@ -14,7 +14,7 @@ from refusal_cases import refused
 
 from bufgym.envs import SenderEnv
 from bufgym.envs.observation import Handed, ObservationForm
-from bufgym.ground.kernel import named
+from bufgym.jit import named
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link

@@ -9,7 +9,7 @@ from refusal_cases import refuse
 
 from bufgym.envs import SenderEnv, render
 from bufgym.envs.render import scene
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.observe import REWARD_TERMS, TOPIC_REWARD_TERMS

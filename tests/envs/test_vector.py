@@ -106,7 +106,7 @@ GUIDED = [("fading", "guided"), ("fading", None), ("dying", "guided"), ("interru
     ],
 )
 def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: Any, limit: Any, options: Any) -> None:
-    """Row i is the single environment with seed s + i, bit for bit, in all that it hands out."""
+    """Row i is the single environment with seed s + i, bit for bit, in all that it returns."""
     check_equal_to_sync(case, mode, limit, 150, **options)
 
 
@@ -117,7 +117,7 @@ def test_equal_for_a_few_steps(case: str, mode: Any) -> None:
 
 
 def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, steps: int, **options: Any) -> None:
-    """The batch and Gymnasium's own vector of single environments hand out the same."""
+    """The batch and Gymnasium's own vector of single environments return the same."""
 
     def one() -> gym.Env[Any, Any]:
         env = single(case, **options)

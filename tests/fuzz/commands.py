@@ -32,7 +32,7 @@ bufgym.envs.expert.dataset.make"""
 
 
 def leave_out_work() -> None:
-    from bufgym.ground.errors import BufgymError
+    from bufgym.utils.errors import BufgymError
 
     def left_out(*_: object, **__: object) -> NoReturn:
         raise BufgymError("left out")

@@ -25,11 +25,11 @@ from recording_cases import RECORDINGS, recorded_data
 
 from bufgym import policies
 from bufgym.benchmark import leaderboard, report
-from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.policies import weights as weight_files
 from bufgym.scenario import read_client
 from bufgym.traces import FORMATS, Trace, load_motion, read_motion, read_trace, read_workload
 from bufgym.traces.datasets.unpack import unpack
+from bufgym.utils.errors import BufgymError, TraceError
 
 HERE = Path(__file__).parent
 pytestmark = pytest.mark.skipif(not hasattr(__import__("signal"), "SIGALRM"), reason=needs("system", "alarms"))
@@ -149,7 +149,7 @@ def links(folder: Path) -> Kind:
     return files, read
 
 
-@pytest.mark.filterwarnings("ignore::bufgym.ground.errors.TraceWarning")
+@pytest.mark.filterwarnings("ignore::bufgym.utils.errors.TraceWarning")
 @pytest.mark.parametrize("kind", [weights, poses, bags, toml, results, archives, links])
 def test_broken_files(tmp_path: Path, kind: Callable[[Path], Kind]) -> None:
     files, read = kind(tmp_path)

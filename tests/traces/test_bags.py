@@ -25,12 +25,12 @@ from mcap.writer import CompressionType
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from bufgym.ground.errors import TraceWarning
 from bufgym.traces import MotionSettings, read_workload, workload_from_bag
 from bufgym.traces.datasets.unpack import unpack
 from bufgym.traces.formats import bag_files, bags
 from bufgym.traces.formats.bags import read_bag
 from bufgym.traces.formats.splits import is_recording
+from bufgym.utils.errors import TraceWarning
 
 ODOMETRY, STRING = "nav_msgs/msg/Odometry", "std_msgs/msg/String"
 
@@ -204,7 +204,7 @@ def test_times_records_chunks_and_counts_out_of_all_proportion(tmp_path: Path, m
 
 def test_a_recording_unpacks_to_no_more_than_it_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """100 kB may be unpacked from next to nothing, instead of 64 MiB."""
-    monkeypatch.setattr("bufgym.ground.files.FREELY_UNPACKED_BYTES", 100_000)
+    monkeypatch.setattr("bufgym.utils.files.FREELY_UNPACKED_BYTES", 100_000)
     for mode in (CompressionMode.FILE, CompressionMode.MESSAGE):
         entries = [(0, "/t", STRING, cases.text("x" * 20_000_000))]
         path = cases.write_rosbag2(tmp_path / f"bomb{mode.name}", entries, StoragePlugin.SQLITE3, mode)

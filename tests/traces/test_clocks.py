@@ -14,9 +14,9 @@ pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 import bag_cases as cases
 from rosbags.rosbag2 import StoragePlugin
 
-from bufgym.ground.errors import TraceError, TraceWarning
 from bufgym.traces import read_workload
 from bufgym.traces.formats.bags import read_bag
+from bufgym.utils.errors import TraceError, TraceWarning
 
 ODOMETRY, STRING = "nav_msgs/msg/Odometry", "std_msgs/msg/String"
 

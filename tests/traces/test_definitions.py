@@ -14,9 +14,9 @@ pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 import bag_cases as cases
 from rosbags.rosbag2 import StoragePlugin
 
-from bufgym.ground.errors import TraceError
 from bufgym.traces.formats.bags import read_bag
 from bufgym.traces.formats.definitions import ros_type, typestore
+from bufgym.utils.errors import TraceError
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 DDS = "nav_msgs::msg::dds_::Odometry_"

@@ -24,12 +24,12 @@ from refusal_cases import refuse
 from requests import PreparedRequest, Response
 
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.datasets import fetch, table
 from bufgym.traces.datasets import unpack as unpacking
 from bufgym.traces.datasets.fetch import Fetched, cache_folder, fetch_dataset
 from bufgym.traces.datasets.table import Remote, datasets
 from bufgym.traces.datasets.unpack import unpack
+from bufgym.utils.errors import BufgymError
 
 
 def test_two_at_once_fetch_once(site: Site, tmp_path: Path) -> None:

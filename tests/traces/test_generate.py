@@ -17,7 +17,6 @@ from refusal_cases import refuse
 
 from bufgym import policies, scenario, traces
 from bufgym.benchmark import drops
-from bufgym.ground.errors import TraceError
 from bufgym.traces import (
     Motion,
     Trace,
@@ -35,6 +34,7 @@ from bufgym.traces.generate.driving import drive_motion
 from bufgym.traces.generate.markov import MAX_OUTAGE_S, link_rates, markov_link
 from bufgym.traces.generate.parameters import LINKS, LinkParameters, OutageParameters, fitted_links, read_links
 from bufgym.traces.generate.rules import ramp, steady, tunnel
+from bufgym.utils.errors import TraceError
 
 MODES = ("bicycle", "bus", "car", "foot", "train", "tram")
 SEEDED: Any = (lambda seed: markov_link("tram", seed, 120), lambda seed: synthetic_lte(seed, 120))

@@ -10,8 +10,8 @@ from refusal_cases import refuse
 
 pytest.importorskip("yaml", reason=needs("extras", "yaml"))
 
-from bufgym.ground.errors import TraceError
 from bufgym.traces.formats.bags import read_bag
+from bufgym.utils.errors import TraceError
 
 SOURCE = ODD_FILES / "meta_comment"
 

@@ -12,10 +12,10 @@ from link_files import written
 from recording_cases import fetched
 from refusal_cases import refuse
 
-from bufgym.ground.errors import TraceError
 from bufgym.traces import Motion, MotionSettings, Poses, motion_from_poses, read_motion, write_motion_csv
 from bufgym.traces.formats.trajectories import read_poses
 from bufgym.traces.poses import angles, quaternions, rotations, slerp
+from bufgym.utils.errors import TraceError
 
 # 1 m forward in the first second, then a turn of 90 degrees about z in the next: 1 / 2 m = 0.5; 90 / 60 degrees = 1.5.
 H = math.sqrt(0.5)

@@ -24,9 +24,9 @@ import zstandard
 from mcap.writer import CompressionType
 from recording_cases import ODD_FILES
 
-from bufgym.ground.errors import TraceWarning
 from bufgym.traces import read_bag, read_workload
 from bufgym.traces.formats.bags import messages
+from bufgym.utils.errors import TraceWarning
 
 STRING = "std_msgs/msg/String"
 SIZES = [109 + k for k in range(12)]
@@ -135,7 +135,7 @@ def test_twelve_files_are_read_and_played_in_the_order_of_the_metadata(tmp_path:
     assert [len(call.args[1]) for call in robot.publish.call_args_list] == SIZES
 
 
-@pytest.mark.filterwarnings("ignore::bufgym.ground.errors.TraceWarning")
+@pytest.mark.filterwarnings("ignore::bufgym.utils.errors.TraceWarning")
 def test_messages_come_again_in_the_order_of_the_bag(tmp_path: Path) -> None:
     """Threads of a recorder log late: 2 before 1; and the second file begins before the first ends."""
     names = ["a.mcap", "b.mcap"]
@@ -206,7 +206,7 @@ def test_without_metadata_files_come_in_order_of_time(tmp_path: Path, storage: s
         holds_all(tmp_path / "bag")
     more = tmp_path / "bag" / "more.mcap"
     more.write_bytes(b"")
-    refuse(r"more\.mcap: holds no recording: must be mended, or left out", read_bag, tmp_path / "bag")
+    refuse(r"more\.mcap: holds no recording: must be fixed, or left out", read_bag, tmp_path / "bag")
     cases.write_ros1(tmp_path / "one.bag", [(0, "/t", STRING, cases.text("x", cases.ROS1))]).rename(more)
     refuse(r"more\.mcap: holds no recording", read_bag, tmp_path / "bag")
     write(tmp_path / ("one.db3" if storage == "mcap" else "one.mcap"), rows(0)).rename(more)

@@ -13,9 +13,9 @@ from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
 from bufgym.cli import main
-from bufgym.ground.errors import TraceError, TraceWarning
 from bufgym.traces import Trace, read_motion, read_trace, read_workload
 from bufgym.traces.formats.trajectories import read_poses
+from bufgym.utils.errors import TraceError, TraceWarning
 
 RIGHT: list[tuple[str, Any, str | None]] = [
     ("good.mcap", (2.95, 1.475), None),

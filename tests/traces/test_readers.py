@@ -11,10 +11,10 @@ from link_files import HEADER, SAMPLES, UCC_HEADER, knots, written
 from refusal_cases import refuse
 
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces import FORMATS, detect_format, read_trace
 from bufgym.traces.formats import links, mahimahi
 from bufgym.traces.formats import text as text_files
+from bufgym.utils.errors import BufgymError, TraceError
 
 NUTTCP = """Start time: 1730498381814
 [2024-11-01T14:59:42.722595-0700] nuttcp-t: v8.1.4: socket

@@ -9,8 +9,8 @@ from needs import needs
 from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
-from bufgym.ground.errors import BufgymError, TraceError, TraceWarning
 from bufgym.traces import read_trace, read_workload
+from bufgym.utils.errors import BufgymError, TraceError, TraceWarning
 
 pytest.importorskip("mcap", reason=needs("extras", "mcap"))
 pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))

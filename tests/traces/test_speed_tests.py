@@ -9,8 +9,8 @@ from link_files import written
 from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
-from bufgym.ground.errors import TraceError
 from bufgym.traces import read_trace
+from bufgym.utils.errors import TraceError
 
 
 def sums(count: int, sender: bool, **more: Any) -> list[dict[str, Any]]:

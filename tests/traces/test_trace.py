@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from link_files import written
 from refusal_cases import refuse, refused
 
-from bufgym.ground.errors import TraceError, where
 from bufgym.traces import Trace, describe, difference, read_trace, write_csv, write_mahimahi
+from bufgym.utils.errors import TraceError, where
 
 # 2 s at 1 MB/s, 1 s of nothing, 1 s at 0.3 MB/s.
 STORY = Trace("story", np.array([0, 2_000_000, 3_000_000, 4_000_000]), np.array([0, 2_000_000, 2_000_000, 2_300_000]))

@@ -9,9 +9,9 @@ from link_files import written
 from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
-from bufgym.ground.errors import TraceError, TraceWarning
 from bufgym.traces import read_motion
 from bufgym.traces.formats.trajectories import read_poses
+from bufgym.utils.errors import TraceError, TraceWarning
 
 PER_S = {"ns": 10**9, "us": 10**6, "ms": 10**3}
 
@@ -30,7 +30,7 @@ def since_boot(unit: str, days: float, rate_hz: int, separator: str = ",", decim
 @pytest.mark.parametrize("unit", PER_S)
 @pytest.mark.parametrize("rate_hz", [30, 200, 1000])
 @pytest.mark.parametrize("days", [1, 2, 6.9, 7, 8.1, 10, 12, 19.7, 33, 48.6, 60])
-@pytest.mark.filterwarnings("ignore:.*times are taken as times in .* since a start:bufgym.ground.errors.TraceWarning")
+@pytest.mark.filterwarnings("ignore:.*times are taken as times in .* since a start:bufgym.utils.errors.TraceWarning")
 def test_times_since_a_boot_have_their_length_or_are_asked_about(
     tmp_path: Path, days: float, rate_hz: int, unit: str, header: bool
 ) -> None:

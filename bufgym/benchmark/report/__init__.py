@@ -17,12 +17,12 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.summary import Summary
 from bufgym.benchmark.table import Unranked
 from bufgym.benchmark.tasks import Task
-from bufgym.ground import __version__
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import write_text
 from bufgym.policies import Policy
 from bufgym.scenario import about
 from bufgym.scenario.suites import Setting
+from bufgym.utils import __version__
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import write_text
 
 __all__ = ["markdown", "page_of_rows", "page_of_run", "run_of", "write"]
 

@@ -16,7 +16,7 @@ from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.score import CellScore
 from bufgym.benchmark.summary import Quantity, Summary
 from bufgym.benchmark.table import REGRET_AT_MOST, means, percent
-from bufgym.ground.libraries import library
+from bufgym.utils.libraries import library
 
 PALETTE = {
     **{"ink": "#1b1f24", "grid": "#e7eaee", "axis": "#a3abb5", "muted": "#a2aab4"},

@@ -10,7 +10,7 @@ from bufgym.benchmark.report import charts, tables, timeline
 from bufgym.benchmark.report.charts import Context
 from bufgym.benchmark.score import DISCRIMINATIVE, REFERENCE, CellScore
 from bufgym.benchmark.summary import Summary, places, title
-from bufgym.ground.libraries import library
+from bufgym.utils.libraries import library
 
 CHARTS = (charts.ranking, charts.capacities, charts.outages, charts.delays, timeline.timeline)
 """Functions that make the charts; each returns None if the run has nothing to show."""

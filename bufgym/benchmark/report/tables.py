@@ -8,7 +8,7 @@ from bufgym.benchmark.folder import SuiteRun
 from bufgym.benchmark.score import CellScore, Scores, Standing
 from bufgym.benchmark.summary import Summary, places, table_of, title
 from bufgym.benchmark.table import SCORE, UPPER_BOUND, score
-from bufgym.ground.tables import Table
+from bufgym.utils.tables import Table
 
 NOTHING_SCORED = (
     "Nothing is scored here: on these episodes Drop Oldest's regret is under 1 % in every cell, so there is nothing to"

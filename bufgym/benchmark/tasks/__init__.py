@@ -11,8 +11,8 @@ from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.benchmark.tasks.stress import StressTask
 from bufgym.benchmark.tasks.task import Task
 from bufgym.benchmark.tasks.topics import TopicsTask
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import suites
+from bufgym.utils.errors import BufgymError
 
 __all__ = ["TASKS", "FleetTask", "QueueTask", "StressTask", "Task", "TopicsTask", "task_for", "task_of"]
 

@@ -13,12 +13,12 @@ from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import Quantity, Run, Summary, by_run, summarise
 from bufgym.benchmark.table import NOBODY, Unranked, decimal, percent, score, signed
 from bufgym.benchmark.tasks.task import Result, Task, counted
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle.measure import TIE
 from bufgym.policies import Policy, get, names
 from bufgym.scenario import FleetEpisode, FleetScenario
 from bufgym.sim.cell import run_fleet
 from bufgym.sim.metrics import Outcome, outcome
+from bufgym.utils.errors import BufgymError
 
 ROWS: Layout = {
     **{"scenario": str, "trace": str, "seed": int, "robots": int, "policy": str, "capacity": int, "robot": int},

@@ -16,7 +16,6 @@ from bufgym.benchmark.summary import Quantity, Summary, difference, table_over
 from bufgym.benchmark.table import NOBODY, REGRET_AT_MOST, Table, Unranked, percent, score
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.benchmark.tuned import tuned
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle import Plan, clairvoyant
 from bufgym.oracle.clairvoyant import privileged
 from bufgym.oracle.measure import BASELINE, TIE, regret
@@ -27,6 +26,7 @@ from bufgym.scenario.suites import Setting
 from bufgym.sim import NEVER, Senders, run
 from bufgym.sim.metrics import outcome
 from bufgym.sim.senders import padded
+from bufgym.utils.errors import BufgymError
 
 SHARE = f"regret / {REFERENCE}'s"  # Title of the share of AFR's regret, see ``score``
 

@@ -16,7 +16,7 @@ from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario.suites import Setting
 
-LEAST_REGRET = 0.001  # Least regret of the better yardstick for a cell to count; below it a ratio means nothing
+LEAST_REGRET = 0.001  # Least regret of the better microbenchmark for a cell to count; below it a ratio means nothing
 
 
 class Ratios(NamedTuple):
@@ -32,10 +32,14 @@ def ratios(scored: Scores) -> dict[str, Ratios]:
     """Compute the ratios of each policy; empty if the reference did not run."""
     regrets = {(c.policy, (c.scenario, c.capacity)): c.regret.value for c in scored.cells}
     cells = dict.fromkeys(cell for _, cell in regrets)
-    yardsticks = {cell: min(regrets.get((name, cell), math.nan) for name in (REFERENCE, BASELINE)) for cell in cells}
+    microbenchmarks = {
+        cell: min(regrets.get((name, cell), math.nan) for name in (REFERENCE, BASELINE)) for cell in cells
+    }
     found = {}
     for policy in dict.fromkeys(policy for policy, _ in regrets):
-        by_cell = {cell: regrets[policy, cell] / least for cell, least in yardsticks.items() if least > LEAST_REGRET}
+        by_cell = {
+            cell: regrets[policy, cell] / least for cell, least in microbenchmarks.items() if least > LEAST_REGRET
+        }
         by_cell = {cell: ratio for cell, ratio in by_cell.items() if not math.isnan(ratio)}
         where = max(by_cell, key=lambda cell: by_cell[cell], default=None)
         worst = math.nan if where is None else by_cell[where]

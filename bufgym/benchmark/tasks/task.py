@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 from bufgym.benchmark.rows import Layout, Row
 from bufgym.benchmark.summary import Quantity, Summary, table_of
 from bufgym.benchmark.table import NOBODY, Table, Unranked, invalid
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy
 from bufgym.scenario import about
 from bufgym.scenario.suites import Setting
+from bufgym.utils.errors import BufgymError
 
 Result = list[Row]
 """Rows of one run without scenario, trace, seed, policy and capacity, which ``run`` adds."""

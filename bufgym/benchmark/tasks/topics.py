@@ -13,12 +13,12 @@ from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
 from bufgym.benchmark.table import NOBODY, Column, RunRows, Unranked, decimal, mean, percent, score
 from bufgym.benchmark.tasks.task import Result, Task, counted
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.tables import Table
 from bufgym.policies import Policy, names
 from bufgym.scenario import Client, Episode
 from bufgym.sim import Senders, run
 from bufgym.sim.metrics import TopicOutcome, received, topic_outcomes, weighted_qoi
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.tables import Table
 
 BASELINE = "robofleet"
 """Robofleet's client as published."""

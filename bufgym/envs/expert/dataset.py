@@ -16,8 +16,8 @@ from bufgym import policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.envs.expert.hindsight import Clairvoyant
 from bufgym.envs.expert.player import Player
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.libraries import needs
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.libraries import needs
 
 VARIABLE = "MINARI_DATASETS_PATH"
 """Environment variable for the folder of Minari's data sets; unset, ``~/.minari/datasets``."""

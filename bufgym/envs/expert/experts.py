@@ -9,10 +9,10 @@ from bufgym import policies
 from bufgym.envs.expert.player import Player
 from bufgym.envs.fleet_rows import FleetRows
 from bufgym.envs.rows import Rows
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle import law, online_optimum
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption
+from bufgym.utils.errors import BufgymError
 
 _STATE = ("next", "evictions", "now_us", "dequeued", "waiting")
 """Fields of SENDER that tell one decision of an episode from the next."""

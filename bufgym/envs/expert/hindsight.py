@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from bufgym.envs.expert.experts import rows_of
 from bufgym.envs.fleet_rows import FleetRows
-from bufgym.ground.errors import BufgymError
 from bufgym.oracle.hindsight import Hindsight
+from bufgym.utils.errors import BufgymError
 
 _TIE = 1e-9  # Values closer than this are equal: they sum the same gaps in another order
 

@@ -7,8 +7,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import compile_for, entry, located, named
+from bufgym.jit import compile_signature, entry_point_of, named, with_address
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.policies import Policy
 from bufgym.policies.registry import signatures
@@ -16,6 +15,7 @@ from bufgym.sim import Senders
 from bufgym.sim.rollout import answer_of, python_arrival, python_view
 from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch, batch_type
 from bufgym.sim.view import arrival_of, view
+from bufgym.utils.errors import BufgymError
 
 
 class Player:
@@ -33,7 +33,7 @@ class Player:
             raise BufgymError(f"policy {policy.name} {reason}: it can be benchmarked, but not play in an environment")
         self.policy = policy
         self._parameters = policy.parameter_array
-        self._functions = tuple(map(located, signatures(), policy.compiled)) if policy.compile else None
+        self._functions = tuple(map(with_address, signatures(), policy.compiled)) if policy.compile else None
         self.memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)
@@ -142,4 +142,4 @@ def compiled_ask(several: bool) -> Any:
     types = numba.types
     numbers, memory = types.Array(types.int64, 1, "C"), types.Array(types.float64, 2, "C")
     kinds = batch_type(several), memory, numbers, numbers, on_arrival, on_departure, on_send, types.boolean, numbers
-    return entry(compile_for(types.void(*kinds), ask))
+    return entry_point_of(compile_signature(types.void(*kinds), ask))

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.render.scene import DROPPED, NEWCOMER, QUEUED, SENDING, STATES, Scene, letter, link_rates, scene_of
-from bufgym.ground.errors import install
 from bufgym.sim import Senders
+from bufgym.utils.errors import install
 
 COLOURS = ("#2a9d5c", "#2f6fde", "#e0a100", "#d1495b", "#8e3bb8")
 """The colour of each state."""

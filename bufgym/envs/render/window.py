@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import install
+from bufgym.utils.errors import install
 
 MOST = 16
 """Images shown at once, the first ones: a batch may have thousands of rows, and an image takes a 20th of a second."""

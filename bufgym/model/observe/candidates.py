@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import item, kernel
+from bufgym.jit import kernel, unchecked_item
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.observe.declare import Field, writer
 from bufgym.model.qoi import merging_loss, value
@@ -82,9 +82,9 @@ def find_candidates(buffer: Buffer, arrival: Any, order: NDArray[Any], cost: NDA
     may_reject = buffer.evictions == 0 and (s > 0 or buffer.busy > 0)
     for j in range(s + 1 if may_reject else s):
         if j < s:
-            message = item(buffer.slots, j)
+            message = unchecked_item(buffer.slots, j)
             x, size_bytes = message.x, message.size_bytes
-            after = (item(buffer.slots, j + 1).x if j + 1 < s else arrival.x) - x
+            after = (unchecked_item(buffer.slots, j + 1).x if j + 1 < s else arrival.x) - x
         else:
             x, size_bytes = arrival.x, arrival.size_bytes
             after = x - buffer.previous_x
@@ -250,11 +250,11 @@ def observe_candidates(
         if j == NONE:
             rows[:_FLAGS, column], rows[_FLAGS:, column] = 0.0, 1.0
             continue
-        from_x = item(buffer.slots, j - 1).x if j > 0 else buffer.dequeued_x
-        x = item(buffer.slots, j).x if j < s else arrival.x
+        from_x = unchecked_item(buffer.slots, j - 1).x if j > 0 else buffer.dequeued_x
+        x = unchecked_item(buffer.slots, j).x if j < s else arrival.x
         after = step
         if j < s:
-            after = (item(buffer.slots, j + 1).x if j + 1 < s else arrival.x) - x
+            after = (unchecked_item(buffer.slots, j + 1).x if j + 1 < s else arrival.x) - x
         candidate = Candidate(cost[column], x - from_x, after, even, (j + 1) / (s + 1), j == s, j == 0)
         _write_candidate(candidate, column, rows)
     around = Around(

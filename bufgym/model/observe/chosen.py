@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import Buffer
 from bufgym.model.observe.declare import Field
 from bufgym.model.observe.on_board import ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, choose_context, choose_on_board_slots

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 
 # So that 0 / (0 + reference) is 0 where nothing moved at all.
 TINY = 1e-30

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import Buffer, gaps
 from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import Field, chooser, clear, squash, writer

@@ -15,14 +15,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground import modules
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.settings import named_settings
 from bufgym.model.checks import changed, check_name, constants, is_number
 from bufgym.model.observe.candidates import CANDIDATE_FIELDS, QUEUE_FIELDS
 from bufgym.model.observe.chosen import BUILT_IN
 from bufgym.model.observe.declare import Field, Function
 from bufgym.model.observe.topics import TOPIC_FIELDS
+from bufgym.utils import modules
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.settings import named_settings
 
 
 @dataclass(frozen=True)

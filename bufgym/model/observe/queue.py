@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import item, kernel
+from bufgym.jit import kernel, unchecked_item
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer, arrival_gain
 from bufgym.model.observe.declare import TINY, Field, chooser, clear, kept, length, ratio, single, squash, writer
 from bufgym.model.qoi import EXPONENTIAL, merging_loss, value
@@ -92,7 +92,7 @@ def _shared_by_slots(buffer: Buffer, arrival: Any, even_lost: float) -> Shared:
 @kernel
 def _before_all(buffer: Buffer, newest: float) -> Before:
     """What comes before slot 0."""
-    gain = item(buffer.slots, 0).gain if len(buffer.slots) > 0 else newest
+    gain = unchecked_item(buffer.slots, 0).gain if len(buffer.slots) > 0 else newest
     return Before(gain, buffer.dequeued_arrival_us, buffer.dequeued_x)
 
 
@@ -105,13 +105,13 @@ def _slot_of(
     Losses equal ``buffer.loss``, from the gains that the messages carry.
     """
     s, newest = len(buffer.slots), shared.newest
-    message, place = (item(buffer.slots, k), (k + 1) * shared.rank) if k < s else (arrival, 1.0)
+    message, place = (unchecked_item(buffer.slots, k), (k + 1) * shared.rank) if k < s else (arrival, 1.0)
     at_us, x, size_bytes = message.arrival_us, message.x, message.size_bytes
     back_us, back_x = at_us - before.arrival_us, x - before.x
     if k < s:
         behind, next_gain = arrival, newest
         if k + 1 < s:
-            behind = item(buffer.slots, k + 1)
+            behind = unchecked_item(buffer.slots, k + 1)
             next_gain = behind.gain
         merged_us, on_x, merged_x = behind.arrival_us - before.arrival_us, behind.x - x, behind.x - before.x
     else:  # the next step is expected to be as long as the last one

@@ -8,7 +8,7 @@ counts them for each topic by the same ``age_between``; one queue has the weight
 import functools
 from typing import Any
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.observe.own import OWN_TERMS, REWARD_TERMS, RewardTerm, reward_term
 from bufgym.model.topics import age_between
 

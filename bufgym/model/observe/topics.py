@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.model.buffer import Buffer, arrival_gain, gaps, is_first
 from bufgym.model.observe.declare import TINY, Field, kept, length, ratio, single, squash, writer
 from bufgym.model.observe.queue import CONTEXT_FIELDS, ROUNDING, SLOT_FIELDS, Newcomer, Slot, write_context, write_slot

@@ -9,10 +9,10 @@ gets the next version.
 of robots. Messages of one queue have equal sizes, so that the clairvoyant's bound is exact, but for ``cameras``.
 """
 
-from bufgym.ground.errors import unknown
 from bufgym.scenario.suites import cameras, recorded, shared_uplinks, stress, synthetic
 from bufgym.scenario.suites.suite import CAPACITIES, SPLITS, Setting, Suite
 from bufgym.scenario.suites.synthetic import RATE_HZ, motion_value, time_value
+from bufgym.utils.errors import unknown
 
 __all__ = ["CAPACITIES", "RATE_HZ", "SPLITS", "SUITES", "Setting", "Suite", "get", "motion_value", "time_value"]
 

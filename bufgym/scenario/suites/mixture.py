@@ -4,11 +4,11 @@ import functools
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.scenario import suites
 from bufgym.scenario.episode import Episode, Scenario, Streams
+from bufgym.utils.errors import BufgymError
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario.afr_evaluation import LINK, evaluation
 from bufgym.scenario.suites.suite import Build, Setting, Suite
 from bufgym.scenario.suites.synthetic import SIZE_BYTES, TRACES, both_sizes, both_values
 from bufgym.traces import Motion, markov_link, read_motion, read_trace
 from bufgym.traces.formats.speed_tests import runs_of
+from bufgym.utils.errors import BufgymError
 
 _TUM = {
     "train": ("freiburg1_desk", "freiburg1_xyz", "freiburg2_desk"),

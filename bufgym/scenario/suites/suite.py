@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 SPLITS = ("train", "validation", "test")
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, Final, Literal
 from urllib.parse import urljoin
 
-from bufgym.ground import __version__, files
-from bufgym.ground.errors import BufgymError, where
 from bufgym.traces.datasets.table import Dataset, Remote, datasets
 from bufgym.traces.datasets.unpack import ending, unpack
 from bufgym.traces.formats.faults import StrPath, os_errors
+from bufgym.utils import __version__, files
+from bufgym.utils.errors import BufgymError, where
 
 MAX_BYTES: Final = 64 * 2**30  # No file may be longer
 SILENCE_S: Final = 30.0  # An attempt fails when the server sends nothing for so long, s

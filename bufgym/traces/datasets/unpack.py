@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import unpacked_limit
 from bufgym.traces.formats.faults import os_errors
+from bufgym.utils.errors import BufgymError, where
+from bufgym.utils.files import unpacked_limit
 
 MAX_UNPACKED_BYTES: Final = 2 * 2**30
 MAX_MEMBERS: Final = 100_000

@@ -1,6 +1,6 @@
 """The files of recordings: every message in an MCAP file, a ROS 1 bag or a SQLite file, in the order of the file.
 
-A recording may be a stranger's, so none of its own figures is trusted. A record is no longer than the file, a chunk
+A recording may be untrusted, so none of its own figures is trusted. A record is no longer than the file, a chunk
 unpacks to no more than MAX_CHUNK_BYTES, and the whole to no more than `files.unpacked_limit` of its size. SQLite views
 can make a small file endless. So rosbag2's SQLite files are read by two plain queries.
 """
@@ -16,8 +16,8 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import IO, Any, Final
 
-from bufgym.ground.files import unpacked_limit
 from bufgym.traces.formats.definitions import BagTopic, ros_type
+from bufgym.utils.files import unpacked_limit
 
 # A chunk of a recording has some MB, a robot some hundred topics; more is a mistake, or a bomb.
 MAX_CHUNK_BYTES: Final = 2**28

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.definitions import TF_TYPES, check_definition, check_form
 from bufgym.traces.formats.definitions import BagTopic as BagTopic
 from bufgym.traces.formats.definitions import typestore as typestore
@@ -17,6 +16,7 @@ from bufgym.traces.formats.faults import LeftOut, StrPath, fault
 from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE
 from bufgym.traces.poses import Poses, unit
 from bufgym.traces.trace import Float64Array, Int64Array
+from bufgym.utils.errors import BufgymError
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 _POSE_TYPES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")

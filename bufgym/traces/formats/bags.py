@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.bag_files import MAX_TOPICS, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.clocks import LogTimes, warn_of_shared_times
@@ -21,6 +20,7 @@ from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.splits import damage_errors, split_messages, splits
 from bufgym.traces.poses import Poses
 from bufgym.traces.trace import Int64Array
+from bufgym.utils.errors import BufgymError
 
 MAX_BAG_MESSAGES: Final = 10**7
 

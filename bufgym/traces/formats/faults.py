@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.ground.errors import TraceError, TraceWarning, where
+from bufgym.utils.errors import TraceError, TraceWarning, where
 
 StrPath = str | PathLike[str]
 
@@ -20,7 +20,7 @@ _MANY: Final = 10  # Samples of one time that are more than a burst: sound recor
 def fault(
     path: StrPath, rule: str, *, line: int | None = None, value: object | None = None, field: str | None = None
 ) -> TraceError:
-    """Make the error about a file; arguments are as in `bufgym.ground.errors.where`."""
+    """Make the error about a file; arguments are as in `bufgym.utils.errors.where`."""
     return TraceError(where(path, line, value, rule, field=field))
 
 

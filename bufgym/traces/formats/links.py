@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from bufgym.ground.errors import BufgymError, TraceError
 from bufgym.traces.formats import tables
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
@@ -25,6 +24,7 @@ from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
 from bufgym.traces.trace import After, Trace
+from bufgym.utils.errors import BufgymError, TraceError
 
 _SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json", ".list", ".out")
 

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 from datetime import datetime
 from typing import Any, Final
 
-from bufgym.ground import strict_json
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots
 from bufgym.traces.formats.tables import MAX_MBIT_PER_S
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
+from bufgym.utils import strict_json
 
 UCC_COLUMNS: Final = ("DL_bitrate", "UL_bitrate")
 

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats import bags
 from bufgym.traces.formats.clocks import NS_PER_S
 from bufgym.traces.formats.faults import StrPath, warn
@@ -20,6 +19,7 @@ from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import gaps_between, longest_s
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym.traces.workload import Workload
+from bufgym.utils.errors import BufgymError
 
 _FAR_S: Final = 60  # From a few first or last messages to all others
 _FEW: Final = 0.1  # Of all messages

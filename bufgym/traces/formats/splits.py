@@ -2,7 +2,7 @@
 
 A recording is one file, or a rosbag2 folder. A folder has the files that its ``metadata.yaml`` names, in that order,
 and no others. A folder without it, as a recorder leaves it that was killed, has all its ``.mcap`` and ``.db3`` files in
-order of time, which a warning says. A stranger's YAML can be nested so deep that its parser crashes, so its depth is
+order of time, which a warning says. Untrusted YAML can be nested so deep that its parser crashes, so its depth is
 measured first.
 
 What a file holds is told from its first bytes. One that zstd packed as a whole (``.zstd``) is read from an unpacked
@@ -19,12 +19,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import read_utf8
-from bufgym.ground.libraries import library, missing
 from bufgym.traces.formats import bag_files
 from bufgym.traces.formats.bag_files import SOURCES, Message, RefusedError, Unpacked, journals, unzstd, unzstd_pieces
 from bufgym.traces.formats.faults import StrPath, fault, os_errors, warn
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import read_utf8
+from bufgym.utils.libraries import library, missing
 
 MAX_METADATA_BYTES: Final = 2**23
 
@@ -38,7 +38,7 @@ _STORAGES: Final = {"sqlite3": "rosbag2", "mcap": "mcap"}
 _NONE: Final = ("", "none", "null", "~")  # of a compression, in small letters
 _MOST_NESTED: Final = 50  # ROS 2 writes six levels
 _LISTED_FILES: Final = 20  # A warning names no more
-_MENDS: Final = {
+_FIXES: Final = {
     "mcap": "`mcap recover {0} -o sound.mcap`",
     "ros1": "`rosbag reindex {0}`",
     "rosbag2": "`sqlite3 {0} .recover | sqlite3 sound.db3`",
@@ -101,7 +101,7 @@ def _sound(split: Split, types: dict[str, str], unpacked: Unpacked) -> Generator
 
     def sound() -> str:
         first = f"its first {count:,} messages ({abs(last_ns - first_ns) / 1e9:.3f} s) are sound; " if count else ""
-        mend = _MENDS[split.kind].format(split.path.name.removesuffix(".zstd"))
+        mend = _FIXES[split.kind].format(split.path.name.removesuffix(".zstd"))
         return f"; {first}{mend} saves what is sound" + ", once `zstd -d` has unpacked it" * split.packed
 
     with damage_errors(split.path, after=sound):
@@ -217,7 +217,7 @@ def _unlisted(folder: Path) -> list[Split]:
     found = [_split(path) for alike in by_size.values() for path in alike]
     for split in found:
         if split.kind not in _STORAGES.values():
-            raise fault(split.path, "holds no recording: must be mended, or left out of the folder")
+            raise fault(split.path, "holds no recording: must be fixed, or left out of the folder")
         if split.kind != found[0].kind:
             raise fault(split.path, f"must be a recording of the same storage as {found[0].path.name}")
     found.sort(key=_begins_ns)

@@ -16,9 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Final, Literal, NamedTuple
 
-from bufgym.ground.errors import TraceError
-from bufgym.ground.files import replaced, unpacked_limit
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
+from bufgym.utils.errors import TraceError
+from bufgym.utils.files import replaced, unpacked_limit
 
 # Text after decompression; reading stops as soon as there is more.
 MAX_TEXT_BYTES: Final = 4 * 2**30

@@ -21,7 +21,6 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.rows import BlockReader, RowReader, read_rows
@@ -29,6 +28,7 @@ from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_t
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
 from bufgym.traces.poses import Poses, normalize, quaternions
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+from bufgym.utils.errors import BufgymError
 
 POSE_FORMATS: Final = ("tum", "euroc", "kitti")
 

@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.motions import coordinate
@@ -18,6 +17,7 @@ from bufgym.traces.formats.text import open_text, split_cells, write_text
 from bufgym.traces.formats.trajectories import seconds
 from bufgym.traces.trace import US_PER_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES, MAX_MESSAGES, Workload
+from bufgym.utils.errors import BufgymError
 
 WORKLOAD_HEADERS: Final = ("time_s,bytes", "time_s,bytes,topic", "time_s,bytes,x", "time_s,bytes,topic,x")
 

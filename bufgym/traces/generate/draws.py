@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.trace import Float64Array
+from bufgym.utils.errors import BufgymError
 
 # Uniforms that make one nearly normal number: the variance of twelve is 1.
 NORMAL_UNIFORMS: Final = 12

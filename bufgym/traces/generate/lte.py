@@ -7,9 +7,9 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import NORMAL_UNIFORMS, checked, stream, whole_seconds
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Trace
+from bufgym.utils.errors import BufgymError
 
 LteMode = Literal["walk", "drive", "train"]
 

@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import NORMAL_UNIFORMS, ar1, checked, nearly_normal, stream, whole_seconds
 from bufgym.traces.generate.parameters import DEVIATIONS, SHOULDER_S, LinkParameters, OutageParameters, fitted_links
 from bufgym.traces.trace import US_PER_S, Float64Array, Trace
+from bufgym.utils.errors import BufgymError
 
 MAX_LINK_S: Final = 10**6
 # No outage is longer; the longest of the recordings lasted 13 s.

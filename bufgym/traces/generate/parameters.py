@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Final, get_type_hints
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.logs import read_json
 from bufgym.traces.formats.text import write_text
 from bufgym.traces.generate.draws import checked, is_finite
+from bufgym.utils.errors import BufgymError
 
 LINKS: Final = Path(__file__).with_name("links.json")
 UPLINKS: Final = Path(__file__).with_name("uplinks.json")

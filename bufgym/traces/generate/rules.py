@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import checked
 from bufgym.traces.trace import US_PER_S, After, Trace
+from bufgym.utils.errors import BufgymError
 
 # A linear change is cut into steps of this length; each carries the bytes of the line.
 STEP_US: Final = 100_000

@@ -13,15 +13,15 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from bufgym.ground import files
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.settings import named_settings
 from bufgym.traces.formats.faults import fault
 from bufgym.traces.formats.text import open_text, split_cells
 from bufgym.traces.generate.draws import ar1, checked
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import Float64Array, Int64Array
 from bufgym.traces.workload import MAX_MESSAGE_BYTES
+from bufgym.utils import files
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.settings import named_settings
 
 EQUAL: Final = "equal"
 FLOOR: Final = 0.1  # What a camera at rest sends, in `motion`, as if it moved at this part of its mean speed

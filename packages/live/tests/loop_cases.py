@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from needs import needs
 
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 
 compiled = pytest.mark.skipif(not JIT, reason=needs("compiled", "uncompiled, decisions take as long as messages do"))
 

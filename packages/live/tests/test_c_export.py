@@ -13,8 +13,7 @@ from needs import needs
 from refusal_cases import refuse
 
 from bufgym import policies
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy
@@ -24,6 +23,7 @@ from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.c import CALL, SUPPORTED, header, random_episode, recorded
 from bufgym_live.robot.c.header import without_c
 from tests.core.weight_cases import random_choices, random_weights

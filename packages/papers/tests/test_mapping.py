@@ -1,4 +1,4 @@
-"""Maps: a flat wall worked by hand, a slow twin, the error of a shifted plane, and the same bits every time."""
+"""Maps: a flat wall by hand, a slow reference model, the error of a shifted plane, the same bits every time."""
 
 import frame_cases
 import numpy as np
@@ -64,7 +64,7 @@ def slow_integrate(into: Map, grid: VoxelGrid, depth: Depth, camera: Camera, pos
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_kernels_do_what_their_twins_do(seed: int) -> None:
+def test_the_kernels_do_what_their_references_do(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pose = np.eye(4)
     pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]

@@ -16,10 +16,10 @@ from refusal_cases import refuse
 
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT
-from bufgym.ground.libraries import library
+from bufgym.jit import JIT
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
 from bufgym_papers.figures import FIGURES, afr_fig5, afr_fig7, afr_fig8, frame_tasks, page, run
 from bufgym_papers.figures.figure import UNDECIDED, about, of_all, statements, within
 from bufgym_papers.figures.frame_runs import spearman

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from needs import needs
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
+from bufgym.utils.errors import BufgymError
 
 pytest.importorskip("cv2", reason=needs("extras", "cv2"))
 pytest.importorskip("rvl", reason=needs("extras", "rvl"))

@@ -7,8 +7,8 @@ it, and ``wire`` defines the protocol on its WebSockets.
 
 from typing import TYPE_CHECKING, Any
 
-from bufgym.ground.libraries import needs
-from bufgym.ground.modules import on_demand
+from bufgym.utils.libraries import needs
+from bufgym.utils.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym_live.relay.address import security, token

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import read_utf8
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import read_utf8
 from bufgym_live.relay import wire
 from bufgym_live.robot.sockets import connected
 

@@ -12,7 +12,7 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.ground.errors import printable
+from bufgym.utils.errors import printable
 from bufgym_live.relay.config import Rotation
 from bufgym_live.relay.disk import Disk
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.scenario import Stream
 from bufgym.traces.formats.bags import messages, read_bag
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import ros_messages
 from bufgym_live.relay.robot import Robot
 

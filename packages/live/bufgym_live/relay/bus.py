@@ -13,9 +13,9 @@ from importlib import import_module
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import read_utf8
-from bufgym.ground.libraries import needs
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import read_utf8
+from bufgym.utils.libraries import needs
 from bufgym_live.relay.config import Nats, StoreLimits
 from bufgym_live.relay.wire import RefusedError
 
@@ -28,7 +28,7 @@ ASK_S: Final = 5.0  # Time between two questions whether the server still knows 
 TRIES: Final = 30  # Times that a message is tried for which this relay has no room, once a second
 AHEAD_BYTES: Final = 2**18  # Most bytes on their way to the server of which it has not said that it has them
 MANY: Final = 256  # Messages that are taken at a time before all are taken again
-_TWIN_S: Final = 1.0  # time for another relay of this name to answer
+_SAME_NAME_S: Final = 1.0  # time for another relay of this name to answer
 _BACKLOG_S: Final = 30.0  # time for what the server holds for this relay to come
 _TAKE_S: Final = 10.0  # time after which a message is given again that was neither taken nor put back
 _HEADER_BYTES: Final = 256
@@ -86,7 +86,7 @@ class Bus:
 
         Raises BufgymError: NATS does not let this relay in, or another relay has its name. Any other error may pass.
         """
-        async with asyncio.timeout(ANSWER_S + _TWIN_S):
+        async with asyncio.timeout(ANSWER_S + _SAME_NAME_S):
             await self._client.connect(self._settings.place, error_cb=self._wrong, **given)
             await self._take_name()
             self._stream = self._client.jetstream(timeout=ANSWER_S)
@@ -137,7 +137,7 @@ class Bus:
         subject = f"{NAME}.{self._settings.name}"
         await self._client.subscribe(subject, cb=here)
         with contextlib.suppress(self._library.errors.NoRespondersError, TimeoutError):
-            await self._client.request(subject, timeout=_TWIN_S)
+            await self._client.request(subject, timeout=_SAME_NAME_S)
             raise BufgymError(f"nats: name = {self._settings.name!r}: another relay has it; each needs its own")
 
     async def _take_place(self, known: set[str]) -> None:

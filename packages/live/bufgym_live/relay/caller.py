@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from websockets.exceptions import WebSocketException
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import wire
 from bufgym_live.relay.admission import POLICY_VIOLATION, Accepted
 from bufgym_live.relay.hub import Hub

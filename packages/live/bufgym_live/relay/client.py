@@ -20,10 +20,10 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import wire
 from bufgym_live.relay.session import Session
 from bufgym_live.robot.log import Record
@@ -33,7 +33,7 @@ from bufgym_live.robot.sockets import until_writable
 
 @dataclass(eq=False)
 class _Away:
-    """A message that a queue has handed out."""
+    """A message that a queue has returned."""
 
     queue: PolicyQueue
     item: Item
@@ -81,7 +81,7 @@ class RobotClient(Session):
         self._numbers = {topic.name: k for k, topic in enumerate(topics)}
         self._capacity, self._window, self._value, self._log = capacity, window, value, log
         self._queues: deque[PolicyQueue] = deque()
-        """Queues by age: messages go into the last; the others hand out their rest under their own policies."""
+        """Queues by age: messages go into the last; the others return their rest under their own policies."""
         self._changes = 0
         self._away: deque[_Away] = deque()
         self._moved = asyncio.Event()
@@ -146,7 +146,7 @@ class RobotClient(Session):
         return [*super()._works(), self._send_all(), self._leave_all()]
 
     async def _send_all(self) -> None:
-        """Send what the queues hand out, in order, after the messages that the last connection left."""
+        """Send what the queues return, in order, after the messages that the last connection left."""
         for away in self._away:
             away.pong = None
         for away in list(self._away):

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import Group, Parameter
 
 from bufgym.cli.options import Count, PolicyFile, PortNumber, one_policy
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
 from bufgym_live.robot import commands as live
 from bufgym_live.robot.decided_in import Compiled, decide_in_python
 

@@ -12,9 +12,9 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import read_toml
 from bufgym.model.checks import MAX_WINDOW
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import read_toml
 from bufgym_live.relay.orders import COMMAND_S
 from bufgym_live.relay.patterns import pattern
 

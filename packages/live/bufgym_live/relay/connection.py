@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from websockets.exceptions import WebSocketException
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import outbox, policies, protocol, replay, wire
 from bufgym_live.relay.admission import POLICY_VIOLATION
 from bufgym_live.relay.caller import Caller

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import needs
 from bufgym.traces.formats.bag_poses import Frames
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import needs
 from bufgym_live.relay import ros_messages, wire
 from bufgym_live.relay.config import Config, Foxglove, Rule
 from bufgym_live.relay.gate import Gate, hidden_host

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import read_utf8
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import read_utf8
 from bufgym_live.relay.config import Tls, Tokens
 from bufgym_live.relay.wire import RefusedError
 

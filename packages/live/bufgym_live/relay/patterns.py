@@ -10,7 +10,7 @@ import functools
 import re
 from typing import Any, Final, NamedTuple
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 MAX_CHARACTERS: Final = 512
 MAX_MEMORY_BYTES: Final = 2**18  # Memory limit of one expression's automaton

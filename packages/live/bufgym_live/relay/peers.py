@@ -16,7 +16,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import policies, protocol, wire
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.bus import HOLD, MESSAGE, TRIES, Bus, options

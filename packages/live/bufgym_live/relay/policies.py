@@ -11,8 +11,8 @@ import signal
 import threading
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.processes import compiling
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.processes import compiling
 from bufgym_live.relay.plain import PLAIN, Latest
 
 if TYPE_CHECKING:
@@ -67,12 +67,12 @@ def compiled(chosen: Policy) -> Policy:
 
 def kept(chosen: Policy) -> bool:
     """Whether the policy is in the compiler's cache; if so, load it."""
-    from bufgym.ground.kernel import NotKeptError, only_kept
+    from bufgym.jit import NotCachedError, cached_only
 
     try:
-        with only_kept():
+        with cached_only():
             _used(chosen)
-    except NotKeptError:
+    except NotCachedError:
         return False
     return True
 

@@ -19,8 +19,8 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from bufgym.ground import strict_json
-from bufgym.ground.errors import BufgymError
+from bufgym.utils import strict_json
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import wire
 
 MOST_BYTES: Final = 4 * 2**20  # Limit on the payloads of a piece

@@ -21,11 +21,11 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.scenario import Stream
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import wire
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.drive import TOPIC, Drive, Velocity

@@ -9,8 +9,8 @@ import struct
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario import Stream
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import ros_messages, wire
 from bufgym_live.relay.robot import Robot
 from bufgym_live.robot.ros1 import needs_rospy

@@ -21,8 +21,8 @@ from websockets.exceptions import NegotiationError
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import needs
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import needs
 from bufgym_live.relay import connection, pages, policies, turns, wire
 from bufgym_live.relay.admission import Accepted, Admission
 from bufgym_live.relay.caller import Caller

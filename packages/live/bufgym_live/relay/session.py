@@ -32,7 +32,7 @@ from bufgym_live.robot.sockets import unsent_bytes
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
-_FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting mends
+_FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting fixes
 
 
 class HomeIsBack(Exception):  # noqa: N818  (nothing is wrong)

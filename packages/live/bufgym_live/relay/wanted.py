@@ -51,7 +51,7 @@ class Wanted:
 
 
 async def _called(on_message: OnMessage, message: Message) -> None:
-    """Call a program's function; its fault, which nothing here mends, goes to the event loop."""
+    """Call a program's function; its fault, which nothing here fixes, goes to the event loop."""
     try:
         done = on_message(message)
         if inspect.isawaitable(done):

@@ -14,8 +14,8 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from bufgym.ground import strict_json
-from bufgym.ground.errors import BufgymError
+from bufgym.utils import strict_json
+from bufgym.utils.errors import BufgymError
 
 PATH: Final = "/relay"
 SUBPROTOCOL: Final = "bufgym.relay.v1"

@@ -7,7 +7,7 @@ runs the queue's log through the simulator, which makes the same decisions, bit 
 
 from typing import TYPE_CHECKING
 
-from bufgym.ground.modules import on_demand
+from bufgym.utils.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym_live.robot.channels import TRANSPORTS

@@ -14,7 +14,7 @@ import threading
 import time
 from typing import Any, Final
 
-from bufgym.ground.libraries import needs
+from bufgym.utils.libraries import needs
 from bufgym_live.robot.bus_channel import Hear, Open, Peer
 from bufgym_live.robot.sockets import DEAD_AFTER_S
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from bufgym.cli.options import Count, Least0, PolicyFile, Positive, command_line, load_policies, policies_of
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.commands import REDRAW_S, redraw
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from bufgym.cli.options import Count, Least0, PolicyFile, PortNumber, Positive, one_policy
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.decided_in import Compiled, decide_in_python
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from bufgym.cli.options import Positive
-from bufgym.ground.tables import Table
+from bufgym.utils.tables import Table
 from bufgym_live.robot.queue import PolicyQueue
 
 POLICIES = ("drop-oldest", "afr", "learned")

@@ -17,5 +17,5 @@ Compiled = Annotated[
 
 def decide_in_python(*, unless: bool = False) -> None:
     """Let this program run without a compiler from now on, if it has not imported one yet."""
-    if not unless and "bufgym.ground.kernel" not in sys.modules:
+    if not unless and "bufgym.jit" not in sys.modules:
         os.environ["NUMBA_DISABLE_JIT"] = "1"

@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.mcap_file import McapFile
 
 Record = dict[str, Any]

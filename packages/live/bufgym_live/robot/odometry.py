@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces import MotionSettings
 from bufgym.traces.formats.bag_poses import Frames, named_source, placed
 from bufgym.traces.poses import angles
+from bufgym.utils.errors import BufgymError
 
 _NORM = 0.9, 1.1  # norms of a valid quaternion; some drivers send zeros at first
 

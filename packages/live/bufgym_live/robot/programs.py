@@ -17,10 +17,10 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.processes import end_with
 from bufgym.scenario import Episode
 from bufgym.traces import MotionSettings
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.processes import end_with
 from bufgym_live.robot.queue import PolicyQueue
 from bufgym_live.robot.receiver import Received
 

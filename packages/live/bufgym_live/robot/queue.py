@@ -22,7 +22,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.buffer import check_limits
 from bufgym.model.checks import between, check_window, is_number, whole
@@ -30,6 +29,7 @@ from bufgym.model.link import MAX_TIME_US
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.log import LogFile, Record, settings
 from bufgym_live.robot.row import ROOM, LiveRow
 
@@ -85,7 +85,7 @@ class PolicyQueue:
             value: V of the QoI; 1 - 0.618^d by default.
             decide_at: "arrival" or "overflow", as in the simulator.
             topics: rules of each topic, by topic number; empty for one queue without rules.
-            window: n_T, most messages handed out and not yet gone.
+            window: n_T, most messages returned and not yet gone.
             duration_s: time from now until the stream ends, as far as it is known; messages may come later.
             log: a ``LogFile`` or any function, called with a record of each event.
             seed: seed of randomised policies' draws.
@@ -102,7 +102,7 @@ class PolicyQueue:
         rules["window"] = check_window(window)
         self._row = LiveRow(self.policy, capacity, value, room=whole("room", room, 8, 2**30), **rules)
         self.left_bytes: Callable[[], int | None] = lambda: None
-        """Called at each ``put``: returns the bytes handed out that have not left, None if unknown. A transport sets
+        """Called at each ``put``: returns the bytes returned that have not left, None if unknown. A transport sets
         it."""
         self._topics = max(1, len(topics))
         self._one_scene = not topics
@@ -156,7 +156,7 @@ class PolicyQueue:
         return seq
 
     def close(self) -> None:
-        """Accept no more messages; queued ones are still handed out, then ``get`` returns None."""
+        """Accept no more messages; queued ones are still returned, then ``get`` returns None."""
         with self._lock:
             if not self._closed:
                 self._closed = True
@@ -197,10 +197,10 @@ class PolicyQueue:
             self.gone()
 
     def gone(self) -> None:
-        """Report that the oldest message handed out has left: it was acked, or all its bytes are on their way."""
+        """Report that the oldest message returned has left: it was acked, or all its bytes are on their way."""
         with self._lock:
             if not self._away:
-                raise BufgymError("no message was handed out that has not left yet")
+                raise BufgymError("no message was returned that has not left yet")
             item = self._away.popleft()
             now_us = self._stamp(None)
             with self._deciding():
@@ -221,7 +221,7 @@ class PolicyQueue:
 
     @property
     def _drained(self) -> bool:
-        """Whether no message will be handed out any more."""
+        """Whether no message will be returned any more."""
         return self._closed and not self._held and not self._ready
 
     @contextmanager

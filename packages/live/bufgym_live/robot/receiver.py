@@ -11,8 +11,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.checks import whole
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.bus_channel import BusServer
 from bufgym_live.robot.buses import BUSES, MQTT_PORT
 from bufgym_live.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel

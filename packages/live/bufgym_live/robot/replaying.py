@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import records as zeroed
+from bufgym.jit import records as zeroed
 from bufgym.model.buffer import MESSAGE
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
@@ -18,6 +17,7 @@ from bufgym.sim import Senders, run
 from bufgym.sim.metrics import Outcome, outcome
 from bufgym.sim.state import NEVER
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.log import Record, of, read_log, value_of
 
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT, entry, located
+from bufgym.jit import JIT, entry_point_of, with_address
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
@@ -20,6 +19,7 @@ from bufgym.sim import Senders
 from bufgym.sim.rollout import compiled_rollout, python_rollout
 from bufgym.sim.state import CARRIES, NOT_YET, Batch
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 ROOM = 2**16  # Columns of a new row, 7 MB. After this many messages the settled ones are forgotten.
 
@@ -60,8 +60,10 @@ class LiveRow:
         self._use(self.senders.batch, room)
         self._functions: Any = policy.compiled if policy.compile else None
         if JIT and policy.compile:
-            self._functions = tuple(map(located, signatures(), policy.compiled))
-        self._rollout: Any = entry(compiled_rollout(False, bool(self.batch.several))) if self._functions else None
+            self._functions = tuple(map(with_address, signatures(), policy.compiled))
+        self._rollout: Any = (
+            entry_point_of(compiled_rollout(False, bool(self.batch.several))) if self._functions else None
+        )
 
     def _use(self, batch: Batch, room: int) -> None:
         """Switch to these arrays; columns of future messages are free."""

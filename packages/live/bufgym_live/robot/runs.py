@@ -8,10 +8,10 @@ from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import write_text
-from bufgym.ground.tables import Table
 from bufgym.oracle.measure import regret
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import write_text
+from bufgym.utils.tables import Table
 
 DIFFER: Final = 0.01  # Relative difference in simulated H beyond which two policies should rank alike live
 

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Final, Literal
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.channels import Channel
 from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, STREAM_BYTES, Frame, FrameError
 from bufgym_live.robot.path_window import PathWindow
@@ -50,7 +50,7 @@ class Sender:
         self._acked = asyncio.Event()
         self._window = PathWindow()
         self._max_body_bytes = 0
-        self._next = 0  # the number of the message that the queue hands out next
+        self._next = 0  # the number of the message that the queue returns next
         self._left = 0  # messages reported to the queue as left
         self._said_goodbye = False  # then the receiver may hang up before we know that our goodbye was sent
 

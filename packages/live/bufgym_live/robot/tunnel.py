@@ -26,8 +26,8 @@ from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.link import FOREVER, Link
+from bufgym.utils.errors import BufgymError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from bufgym import oracle
-from bufgym.ground.errors import BufgymError
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode, Streams, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.channels import TRANSPORTS, Channel
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.queue import PolicyQueue

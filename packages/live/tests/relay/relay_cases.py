@@ -147,7 +147,7 @@ async def client(
 
 
 @contextlib.asynccontextmanager
-async def stranger(port: int, local: str = "127.0.0.1") -> AsyncIterator[tuple[Any, Any]]:
+async def untrusted(port: int, local: str = "127.0.0.1") -> AsyncIterator[tuple[Any, Any]]:
     """A bare TCP connection: its reader and its writer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(local, 0))
     try:

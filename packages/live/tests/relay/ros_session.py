@@ -16,7 +16,7 @@ from loop_cases import beside
 from pose_cases import ESTIMATE, POSE, message
 from relay_cases import client, relay, settings, until, wait
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay.session import Session
 from bufgym_live.relay.wire import Message
 

@@ -21,9 +21,9 @@ from relay_cases import ALL, Server, settings, until, wait
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosedError
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.traces.formats import bags
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import audit, backoff, server
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.config import Rule

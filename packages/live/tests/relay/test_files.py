@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from needs import needs
 from refusal_cases import refuse
-from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, stranger, until, wait, within
+from relay_cases import ALL, client, full_disk, nothing, process, relay, settings, until, untrusted, wait, within
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.formats import bags
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import disk
 from bufgym_live.relay.audit import FILE, Audit
 from bufgym_live.relay.config import Rotation, Rule
@@ -101,7 +101,7 @@ async def test_a_deleted_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             server.hub.tick()
             await robot.put("/robots/a/camera")
             await until("a recording", lambda: len(recordings(tmp_path / "relay" / FOLDER)) == 1)
-        async with stranger(server.port) as (reader, writer):
+        async with untrusted(server.port) as (reader, writer):
             writer.write(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             assert b"503" in await wait("an answer", reader.readline())
 

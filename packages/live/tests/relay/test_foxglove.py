@@ -16,7 +16,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import ros_messages
 from bufgym_live.relay.config import Foxglove, Rule
 from bufgym_live.relay.foxglove import Bridge, Screen

@@ -19,7 +19,7 @@ from refusal_cases import refuse
 from relay_cases import client, relay, settings, until, wait
 from websockets.exceptions import WebSocketException
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import identity
 from bufgym_live.relay.address import token
 from bufgym_live.relay.config import Rule, Tls, Tokens
@@ -195,7 +195,7 @@ class Authority:
 
 
 async def test_a_certificate_names_who_it_is(tmp_path: Path) -> None:
-    authority, stranger = Authority(tmp_path, "authority"), Authority(tmp_path, "stranger")
+    authority, untrusted = Authority(tmp_path, "authority"), Authority(tmp_path, "untrusted")
     certificate, key = authority.issue("server", HERE)
 
     def context(issuer: Authority | None) -> ssl.SSLContext:
@@ -209,7 +209,7 @@ async def test_a_certificate_names_who_it_is(tmp_path: Path) -> None:
             assert anna.welcome["identity"]["email"] == "anna@x.org"
         async with client(server.port, tls=context(None)) as nobody:
             assert nobody.welcome["code"] == "unauthorized"
-        for tls in (context(stranger), None):  # without TLS nothing is said at all
+        for tls in (context(untrusted), None):  # without TLS nothing is said at all
             with pytest.raises((OSError, WebSocketException)):
                 async with client(server.port, tls=tls):
                     pass

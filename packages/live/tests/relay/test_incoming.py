@@ -11,7 +11,7 @@ import pytest
 from refusal_cases import refuse
 from relay_cases import Client, client, relay, settings, until, wait
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import admission, wire
 from bufgym_live.relay.config import Limits
 from bufgym_live.relay.patterns import pattern

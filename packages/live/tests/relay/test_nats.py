@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from nats_cases import alone, connected, nats_server, needs_server, shared, still
 from refusal_cases import refuse
-from relay_cases import client, nothing, relay, settings, stranger, until, wait, within
+from relay_cases import client, nothing, relay, settings, until, untrusted, wait, within
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import Nats, StoreLimits
 from bufgym_live.relay.hub import Hub
 from bufgym_live.relay.peers import Delays, Peers
@@ -52,7 +52,7 @@ async def test_relays_hear_each_other_again_after_nats_has_stood_still(tmp_path:
 async def test_a_relay_connects_again_whose_library_has_stopped_to_read(tmp_path: Path) -> None:
     """A header that is no text ends the reader of the library, which tells nobody."""
     port, broken = free_port("127.0.0.1"), b"NATS/1.0 \xff\xff\xff x\r\n\r\n"
-    async with nats_server(port, tmp_path), shared(port, "a") as a, stranger(port) as (_, bus):
+    async with nats_server(port, tmp_path), shared(port, "a") as a, untrusted(port) as (_, bus):
         bus.write(b'CONNECT {"verbose": false, "headers": true}\r\n')
         bus.write(b"HPUB bufgym.relay.message %d %d\r\n%b\r\n" % (len(broken), len(broken), broken))
         await wait("NATS to have it", bus.drain())

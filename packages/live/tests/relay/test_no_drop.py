@@ -16,7 +16,7 @@ from loop_cases import beside
 from refusal_cases import refuse
 from relay_cases import Corner, client, nothing, process, relay, settings, until, wait
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import backoff
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Limits, Rotation, Rule, StoreLimits

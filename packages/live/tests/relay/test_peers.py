@@ -10,7 +10,7 @@ import pytest
 from nats_cases import SHARED, nats, nats_server, needs_server, shared
 from relay_cases import client, nothing, relay, settings, until, wait
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import Rule, Server, StoreLimits, bus
 from bufgym_live.relay.wire import Message, encode
 from bufgym_live.robot.sockets import free_port
@@ -137,7 +137,7 @@ async def test_a_command_that_is_refused_reaches_no_other_relay(relays: list[Ser
 
 
 async def test_what_comes_from_the_bus_is_doubted(relays: list[Server], robot: str) -> None:
-    """A stranger on the bus sends rubbish: it is audited, nobody's connection ends, and commands go on."""
+    """An untrusted client on the bus sends rubbish: it is audited, nobody's connection ends, and commands go on."""
     a, b, _ = relays
     command, odometry = f"{robot}/command", f"{robot}/odom"
     assert a.config.nats is not None

@@ -13,8 +13,8 @@ from msgspec import Raw
 from refusal_cases import refuse
 from relay_cases import settings
 
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import registry
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import backoff, protocol, wire
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.config import Config, Limits, Rule

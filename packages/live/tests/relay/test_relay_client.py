@@ -14,10 +14,10 @@ from loop_cases import beside, compiled
 from refusal_cases import refuse
 from relay_cases import Corner, client, relay, settings, until, wait, within
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import backoff
 from bufgym_live.relay.address import parsed, security, token
 from bufgym_live.relay.client import RobotClient
@@ -220,12 +220,12 @@ async def test_another_relay_stands_in_while_home_is_away(tmp_path: Path) -> Non
 async def test_who_is_not_let_in_is_told_why(corner: Corner) -> None:
     """An address without a rule is not talked to, and tries again; one whose token is no good gives up."""
     async with relay(settings(rules=())) as server:
-        stranger = Session(f"ws://127.0.0.1:{server.port}", "stranger")
-        async with beside(stranger.run()):
-            await until("another try", lambda: len(stranger.faults) > 1)
-        assert "HTTP 403" in stranger.faults[0] and "no rule" in stranger.faults[0]
+        untrusted = Session(f"ws://127.0.0.1:{server.port}", "untrusted")
+        async with beside(untrusted.run()):
+            await until("another try", lambda: len(untrusted.faults) > 1)
+        assert "HTTP 403" in untrusted.faults[0] and "no rule" in untrusted.faults[0]
     with pytest.raises(RefusedError, match=r"ws://127.0.0.1:\d+: refused: unauthorized: token"):
-        await wait("the refusal", Session(corner.url, "stranger", token="x.y.z").run())
+        await wait("the refusal", Session(corner.url, "untrusted", token="x.y.z").run())
 
 
 def test_tokens_addresses_and_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

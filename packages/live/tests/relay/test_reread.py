@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from needs import needs
-from relay_cases import ALL, client, nothing, process, relay, settings, stranger, until, wait
+from relay_cases import ALL, client, nothing, process, relay, settings, until, untrusted, wait
 from test_identity import HERE, Authority
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay.config import Rule, Tls
 from bufgym_live.relay.rules import Identity, Permissions
 from bufgym_live.robot.sockets import free_port
@@ -89,7 +89,7 @@ async def test_sighup_rereads_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("method", ["HEAD", "POST", "TRACE"])
 async def test_only_get_is_answered(method: str) -> None:
-    async with relay(settings()) as server, stranger(server.port) as (reader, writer):
+    async with relay(settings()) as server, untrusted(server.port) as (reader, writer):
         writer.write(f"{method} / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 3\r\n\r\nabc".encode())
         answer = await wait("the answer", reader.read())
         head, _, body = answer.partition(b"\r\n\r\n")

@@ -20,8 +20,8 @@ from refusal_cases import refuse
 from relay_cases import Corner, settings
 
 from bufgym import cli
-from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import policies
 from bufgym_live.relay.config import Config, Foxglove, Limits, Rotation, Rule, load
 from bufgym_live.relay.held import StoredSession

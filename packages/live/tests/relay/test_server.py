@@ -16,9 +16,9 @@ from loop_cases import beside
 from refusal_cases import refuse
 from relay_cases import Client, Corner, client, nothing, relay, settings, until, wait
 
-from bufgym.ground import processes
-from bufgym.ground.errors import BufgymError
 from bufgym.policies import Policy, registry
+from bufgym.utils import processes
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import policies
 from bufgym_live.relay import server as serving
 from bufgym_live.relay.config import Limits, Rule
@@ -155,7 +155,7 @@ async def test_a_flood_of_json_waits_and_others_are_served() -> None:
 
 
 async def test_it_answers_monitors() -> None:
-    """Of 5 messages beyond 20 at a time, the counts are those of the audit log. A stranger's address gets none."""
+    """Of 5 messages beyond 20 at a time, the counts are those of the audit log. An untrusted address gets none."""
 
     def get(port: int, path: str, local: str = "127.0.0.1") -> tuple[int, str]:
         with contextlib.closing(HTTPConnection("127.0.0.1", port, 60, (local, 0))) as asking:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from loop_cases import beside
-from relay_cases import client, nothing, relay, settings, stranger, until, wait
+from relay_cases import client, nothing, relay, settings, until, untrusted, wait
 
 from bufgym_live.relay import connection, disk
 from bufgym_live.relay.audit import FILE, _Lines
@@ -55,7 +55,7 @@ def said_last(server: Server) -> dict[str, str]:
 
 async def health(server: Server) -> str:
     """The status line of the answer to ``GET /healthz``, and the answer."""
-    async with stranger(server.port) as (reader, writer):
+    async with untrusted(server.port) as (reader, writer):
         writer.write(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         return str(await wait("an answer", reader.read()))
 
@@ -142,7 +142,7 @@ async def test_too_much_waits_for_the_disk(
 
 
 async def test_a_session_whose_command_waits_keeps_its_place(tmp_path: Path, go: threading.Event) -> None:
-    """One session at most. A stranger is refused while the command waits; sent again, the command is taken once."""
+    """One session at most. Another client is refused while the command waits; sent again, the command is taken once."""
     config = settings(folder=tmp_path, limits=Limits(sessions=1))
     async with relay(config) as server, client(server.port, local="127.0.0.2", session="a") as robot:
         await robot.subscribe("command$", durable=True)
@@ -151,8 +151,8 @@ async def test_a_session_whose_command_waits_keeps_its_place(tmp_path: Path, go:
             await operator.command(1, COMMAND)
             await operator.rest()
         await until("its end", lambda: len(server.hub.members) == 1)
-        async with client(server.port, session="x") as stranger:
-            assert stranger.welcome["code"] == "too_many"
+        async with client(server.port, session="x") as untrusted:
+            assert untrusted.welcome["code"] == "too_many"
         go.set()
         await robot.came(1)
         async with client(server.port, session="o") as operator:
@@ -160,5 +160,5 @@ async def test_a_session_whose_command_waits_keeps_its_place(tmp_path: Path, go:
             await operator.acked(COMMAND, 1)
             assert await nothing(operator, robot)
         await until("its end", lambda: len(server.hub.members) == 1)
-        async with client(server.port, session="x") as stranger:
-            assert stranger.welcome["op"] == "welcome"
+        async with client(server.port, session="x") as untrusted:
+            assert untrusted.welcome["op"] == "welcome"

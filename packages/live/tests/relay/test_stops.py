@@ -13,7 +13,7 @@ from cut_cases import Cuttable, cuttable
 from loop_cases import beside, compiled
 from relay_cases import client, relay, settings, until, wait
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import backoff
 from bufgym_live.relay.clock import RelayClock
 from bufgym_live.relay.config import Rule

@@ -14,9 +14,9 @@ from live_cases import Channel, in_order, meeting_port, put, receiving, sending
 from loop_cases import beside, until
 from refusal_cases import refuse
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.link import Link
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import LogFile, PolicyQueue, read_log, replay
 from bufgym_live.robot import buses as libraries
 from bufgym_live.robot.bus_channel import BusChannel, BusServer

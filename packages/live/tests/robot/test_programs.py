@@ -19,11 +19,11 @@ from refusal_cases import refuse
 
 from bufgym import policies
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import programs as live
 from bufgym_live.robot.odometry import Odometry
 from bufgym_live.robot.programs import pose_stamp, publish_in_time, received, running

@@ -132,7 +132,7 @@ def test_hours_leave_no_trace_in_memory(name: str) -> None:
 
 
 def test_what_breaks_the_rules_is_refused() -> None:
-    """Messages that cannot be put, a message gone that was not handed out, and policies that see too much."""
+    """Messages that cannot be put, a message gone that was not returned, and policies that see too much."""
     bench = Bench()
     bench.put(10, x=1.0)
     for rule, settings in (
@@ -146,7 +146,7 @@ def test_what_breaks_the_rules_is_refused() -> None:
         refuse(rule, bench.queue.put, "message", **{"size_bytes": 1, **settings})
         bench.put(20, x=1.0)  # nothing happened
         assert replay(bench.records).differences == ()
-    refuse("handed out", bench.queue.gone)
+    refuse("returned", bench.queue.gone)
     for name in policies.names():
         if not policies.get(name).ranked:
             refuse("live queue", PolicyQueue, name, 4)

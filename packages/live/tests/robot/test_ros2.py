@@ -19,11 +19,11 @@ from needs import needs
 from refusal_cases import refuse
 from ros1_cases import played
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.model.qoi import exponential
 from bufgym.model.topics import Topic
 from bufgym.scenario import Stream, read_client
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import PolicyQueue, replay
 from bufgym_live.robot.frames import FrameError
 from bufgym_live.robot.log import of, read_log

@@ -21,7 +21,7 @@ from needs import needs
 from ros1_cases import played
 
 from bufgym import policies
-from bufgym.ground.kernel import JIT
+from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages

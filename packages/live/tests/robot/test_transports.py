@@ -194,7 +194,7 @@ async def test_waiting_for_a_processor_is_not_waiting_for_bytes(monkeypatch: pyt
     assert await waited_s() == pytest.approx(1e-6)
 
 
-# What strangers cannot take from a receiver: its memory, its sockets, its time.
+# What untrusted clients cannot take from a receiver: its memory, its sockets, its time.
 
 HALF = header(Frame(GREETING, 0, body=bytes(16))) + bytes(range(16)) + header(Frame(DATA, 0, body=bytes(60)))
 """A greeting, and the header of a message of 60 bytes that never comes."""

@@ -13,7 +13,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
-from bufgym.ground.errors import BufgymError, unknown
+from bufgym.utils.errors import BufgymError, unknown
 from bufgym_papers.figures.figure import Figure, report, save_picture, statements
 from bufgym_papers.figures.rows import FigureRows
 

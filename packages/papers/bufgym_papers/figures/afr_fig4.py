@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.ground.tables import aligned
 from bufgym.model.buffer import REJECT, Buffer
 from bufgym.policies.afr import C, P, R
 from bufgym.scenario import Interruption
+from bufgym.utils.tables import aligned
 from bufgym_papers.figures.figure import COLOURS, Figure, finish, legend_below
 from bufgym_papers.figures.rows import FigureRows, listed
 

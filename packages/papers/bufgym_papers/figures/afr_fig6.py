@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import traces
-from bufgym.ground.errors import BufgymError
 from bufgym.scenario.afr_evaluation import FRAME_BYTES, LINK, PAPER_FRAMES, RATE_HZ
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures.figure import COLOURS, Figure, finish, legend_below, whole
 from bufgym_papers.figures.rows import FigureRows, listed
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.benchmark.bootstrap import Interval
-from bufgym.ground.tables import aligned
+from bufgym.utils.tables import aligned
 from bufgym_papers.figures.figure import about, finish, heat_table, of_all, within
 from bufgym_papers.figures.frame_runs import POLICIES, FrameFigure, over_places
 from bufgym_papers.figures.rows import FigureRows

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import JIT, compile_for, records
+from bufgym.jit import JIT, compile_signature, records
 from bufgym.model.buffer import ACCEPT, MESSAGE, Buffer
 from bufgym.policies.registry import Policy, signatures
 from bufgym.scenario import Interruption
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures.figure import COLOURS, Figure, about, finish, legend_below, whole
 from bufgym_papers.figures.rows import FigureRows, listed
 
@@ -61,7 +61,7 @@ def compiled_loop() -> Any:
     view, message, reals = arrival.args
     messages = numba.types.Array(message, 1, "C")
     int_ = numba.types.int64
-    return compile_for(int_(view, messages, reals, reals, numba.types.FunctionType(arrival), int_), decide_often)
+    return compile_signature(int_(view, messages, reals, reals, numba.types.FunctionType(arrival), int_), decide_often)
 
 
 def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:

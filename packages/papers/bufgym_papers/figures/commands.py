@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from bufgym.cli.options import columns
-from bufgym.ground.errors import BufgymError, unknown
-from bufgym.ground.files import read_whole, write_text
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.files import read_whole, write_text
 
 
 def reproduce(
@@ -79,7 +79,7 @@ def _text(name: str, out: Path, data: Path | None, *, named: bool, live: bool) -
 @contextmanager
 def _steps(name: str, runs: int, takes_s: float) -> Iterator[Callable[[], None]]:
     """Show the progress of live runs as a bar, or as lines without a terminal."""
-    from bufgym.ground.progress import bar
+    from bufgym.utils.progress import bar
 
     def note(text: str) -> None:
         print(f"{name}: {text}", file=sys.stderr, flush=True)

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
 from bufgym.benchmark.bootstrap import Interval
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import read_toml
-from bufgym.ground.libraries import library
 from bufgym.model import checks
 from bufgym.model.checks import above_0
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import read_toml
+from bufgym.utils.libraries import library
 from bufgym_papers.figures.rows import FigureRows
 
 COLOURS = {

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from bufgym import traces
 from bufgym.benchmark.bootstrap import Interval, interval, stream, times_drawn
 from bufgym.benchmark.rows import Row
-from bufgym.ground.libraries import library
 from bufgym.scenario.afr_evaluation import LINK, PAPER_FRAMES, fade
 from bufgym.scenario.suites import CAPACITIES
 from bufgym.traces import Trace
+from bufgym.utils.libraries import library
 from bufgym_papers.figures.figure import COLOURS, Figure, whole
 from bufgym_papers.figures.frame_tasks import FOLDERS, FrameTask, Kind, carry_out, stage
 from bufgym_papers.figures.rows import FigureRows

@@ -12,11 +12,11 @@ from typing import Any, Literal, NamedTuple, cast
 
 from bufgym.benchmark import cluster
 from bufgym.benchmark.rows import Row
-from bufgym.ground import __version__
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
-from bufgym.ground.progress import bar
 from bufgym.traces import Trace
+from bufgym.utils import __version__
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
+from bufgym.utils.progress import bar
 from bufgym_papers.perception.recordings import open_sequence
 from bufgym_papers.perception.room import made_up_room
 from bufgym_papers.perception.stage import WIDTH, Stage

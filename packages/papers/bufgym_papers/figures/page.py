@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures import FIGURES, TAKES_DATA, figure
 from bufgym_papers.figures.figure import PAPERS, UNDECIDED, facts_of, source, statements
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures.figure import COLOURS, UNDECIDED, about, at_least_0, finish, legend_below
 from bufgym_papers.figures.robofleet_evaluation import MBIT, PROGRAMS, SHORT, CloudFigure, Sent, stream
 from bufgym_papers.figures.rows import FigureRows

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from bufgym.benchmark.rows import Row
-from bufgym.ground.errors import BufgymError
 from bufgym.traces import ramp
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures.figure import COLOURS, at_least_0, finish, legend_below
 from bufgym_papers.figures.robofleet_evaluation import JITTER, MBIT, SHORT, CloudFigure, cloud_bytes, curves, stream
 from bufgym_papers.figures.rows import FigureRows, average

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.benchmark.rows import Row, write_rows
-from bufgym.ground.tables import aligned
+from bufgym.utils.tables import aligned
 
 
 class FigureRows(list[Row]):

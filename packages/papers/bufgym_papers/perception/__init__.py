@@ -7,7 +7,7 @@ map and measures its error. `tracking` follows the camera by the frames alone an
 
 from typing import TYPE_CHECKING
 
-from bufgym.ground.modules import on_demand
+from bufgym.utils.modules import on_demand
 
 if TYPE_CHECKING:
     from bufgym_papers.perception.frames import Sequence

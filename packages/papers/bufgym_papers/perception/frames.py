@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, quaternions
 from bufgym.traces.trace import Float64Array, Int64Array
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
 
 Depth = npt.NDArray[np.float32]
 """float32[height, width], metres; 0 where nothing was measured."""

@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.libraries import library
 from bufgym.traces.trace import Float64Array
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.libraries import library
 from bufgym_papers.perception import tsdf
 from bufgym_papers.perception.frames import Camera, Sequence
 

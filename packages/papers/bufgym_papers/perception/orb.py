@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.libraries import library
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.scenario import Episode
+from bufgym.utils.libraries import library
 from bufgym_papers.perception.frames import Image, Sequence
 
 FEATURES: Final = 500  # Features of an image at most, as OpenCV has it by default

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 from bufgym.traces.trace import Float64Array as Array
 
 BASELINE_M = 0.075  # Distance from the camera to the projector along x, m

@@ -19,13 +19,13 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import read_utf8, read_whole
-from bufgym.ground.libraries import library
 from bufgym.traces.formats.text import open_text
 from bufgym.traces.formats.trajectories import read_poses, seconds
 from bufgym.traces.poses import Poses, gaps_between, rotations
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+from bufgym.utils.errors import BufgymError, where
+from bufgym.utils.files import read_utf8, read_whole
+from bufgym.utils.libraries import library
 from bufgym_papers.perception.frames import Camera, Depth, Image, Sequence
 
 TUM_CAMERA: Final = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

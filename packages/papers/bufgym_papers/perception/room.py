@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.generate.draws import stream
 from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, quaternions
 from bufgym.traces.shipped import load_motion
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.perception import rays
 from bufgym_papers.perception.frames import Depth, Image, Sequence, encoded_bytes
 from bufgym_papers.perception.recordings import SEVEN_SCENES_CAMERA, SEVEN_SCENES_HZ, matrices

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.ground.errors import BufgymError
 from bufgym.traces.poses import rotations
 from bufgym.traces.trace import Float64Array
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.perception import icp, tsdf
 from bufgym_papers.perception.frames import Camera, Depth, Sequence
 from bufgym_papers.perception.mapping import FAR_M, Map, VoxelGrid, grid_of

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 
 NEAR_M = 0.3  # Least depth used, m; a Kinect measures from 0.4 m on
 

@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.perception.frames import Sequence
 from bufgym_papers.perception.mapping import points_of
 

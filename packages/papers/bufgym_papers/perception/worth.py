@@ -14,13 +14,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.observe import reward_term
 from bufgym.policies.registry import Memory
 from bufgym.scenario import Uplink
 from bufgym.scenario.draws import shipped
 from bufgym.scenario.suites import motion_value
 from bufgym.traces.workload import Workload
+from bufgym.utils.errors import BufgymError
 from bufgym_papers.perception import streams, views
 from bufgym_papers.perception.frames import Sequence
 from bufgym_papers.perception.room import made_up_room

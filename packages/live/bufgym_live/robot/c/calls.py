@@ -8,8 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.kernel import at, compile_for, kernel, records
+from bufgym.jit import compile_signature, kernel, records, unchecked_at
 from bufgym.model.link import FOREVER, Link
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy, signatures
@@ -20,6 +19,7 @@ from bufgym.sim.state import DECISION, DEPARTURE, END, Batch, batch_type
 from bufgym.sim.transition import next_event
 from bufgym.sim.view import arrival_of, view
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 
 INIT, ARRIVAL, DEQUEUE, SENT, ENDS = range(5)  # Kinds of calls, as in ``parts/parity.h``
 
@@ -59,9 +59,13 @@ def _record(
         while event != END:
             sender = batch.senders[i]
             while sent < sender.transmitted:
-                place = at(batch.order, i, sent)
+                place = unchecked_at(batch.order, i, sent)
                 n = _note(
-                    calls, n, SENT, at(batch.log, i, place).transmitted_us, at(batch.arrivals, i, place).size_bytes
+                    calls,
+                    n,
+                    SENT,
+                    unchecked_at(batch.log, i, place).transmitted_us,
+                    unchecked_at(batch.arrivals, i, place).size_bytes,
                 )
                 sent += 1
             buffer = view(batch, i)
@@ -86,7 +90,7 @@ def _compiled_record() -> Any:
     memory = numba.types.Array(numba.types.float64, 2, "C")
     calls = numba.types.Array(numba.from_dtype(CALL), 1, "C")
     signature = numba.types.int64(batch_type(several=False), memory, arrives, departs, numba.types.boolean, calls)
-    return compile_for(signature, _record)
+    return compile_signature(signature, _record)
 
 
 def recorded(

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from bufgym import policies
-from bufgym.ground import __version__
-from bufgym.ground.errors import BufgymError, printable
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
 from bufgym.model.link import FOREVER
 from bufgym.model.observe import candidates
@@ -22,6 +20,8 @@ from bufgym.policies.learned import Weights
 from bufgym.policies.scoring import Scorer, unpack
 from bufgym.policies.target_gap import straight
 from bufgym.traces.formats.text import write_text
+from bufgym.utils import __version__
+from bufgym.utils.errors import BufgymError, printable
 from bufgym_live.robot.c.calls import random_episode, recorded
 
 _PARTS, _RULES = (Path(__file__).parent / folder for folder in ("parts", "rules"))

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 if TYPE_CHECKING:  # the command says first whether policies run compiled, and these would import the compiler
     from bufgym.model.qoi import Value

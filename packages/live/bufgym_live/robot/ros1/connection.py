@@ -60,7 +60,7 @@ class PolicyConnection:
         return True
 
     def _run(self) -> None:
-        """Send what the queue hands out, until the connection is closed."""
+        """Send what the queue returns, until the connection is closed."""
         try:
             while not self._connection.done and (item := self.queue.get()) is not None:
                 try:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from bufgym.cli.options import Count, PolicyFile, one_policy
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.commands import PORT, RECEIVER, Host, Port, Transport, Window, address, listens_at, say
 from bufgym_live.robot.decided_in import Compiled, decide_in_python
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.utils.errors import BufgymError, install
 from bufgym_live.robot.frames import FrameError
 from bufgym_live.robot.ros2.uninstalled import stand_in
 

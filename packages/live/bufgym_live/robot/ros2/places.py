@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model.topics import Topic
 from bufgym.scenario import Client, Stream
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.ros2.names import resolved
 
 MOST_BY_PATTERN: Final = 8

@@ -14,11 +14,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Client
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import LogFile, PolicyQueue
 from bufgym_live.robot.channels import TRANSPORTS
 from bufgym_live.robot.log import Record

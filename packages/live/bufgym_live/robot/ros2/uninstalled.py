@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any, Final
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 _FAST_DDS: Final = "rmw_fastrtps_cpp"
 _NAMED: Final = {b"rosidl_typesupport_fastrtps_c": ("::msg", 7), b"rosidl_typesupport_introspection_c": ("__msg", 8)}

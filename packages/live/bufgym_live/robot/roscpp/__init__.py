@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Final
 
 from bufgym import policies
-from bufgym.ground import __version__
-from bufgym.ground.errors import BufgymError
 from bufgym.model import qoi
 from bufgym.policies import Policy
 from bufgym.traces.formats.text import write_text
+from bufgym.utils import __version__
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.c.header import SUPPORTED, header
 
 _SOURCE: Final = Path(__file__).with_name("source")

@@ -1,6 +1,6 @@
 """What every room stands on: the one error, files written whole or not at all, objects by name, compiled kernels."""
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 __all__ = ["BufgymError", "__version__"]
 __version__ = "0.2.0"

@@ -1,6 +1,6 @@
 """Your own policy, V, link generator or scenario, named in text as ``module:function``.
 
-Importing the module runs its code, and modules in the current folder count too. Names from strangers' files, such as
+Importing the module runs its code, and modules in the current folder count too. Names from untrusted files, such as
 leaderboards, results and configurations of clients, therefore never get here.
 """
 
@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 _NAMED = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 """A setting such as ``decimate:every=2`` does not match, as it has "=" after the colon."""

@@ -4,11 +4,11 @@ import contextlib
 from typing import Any
 
 FOLDER = ""
-"""No code is kept."""
-only_kept = contextlib.nullcontext
+"""No code is cached."""
+cached_only = contextlib.nullcontext
 
 
-class NotKeptError(Exception):
+class NotCachedError(Exception):
     """Never raised here."""
 
 
@@ -17,7 +17,7 @@ def kernel(function: Any) -> Any:
     return function
 
 
-def compile_for(signature: Any, function: Any) -> Any:
+def compile_signature(signature: Any, function: Any) -> Any:
     """``function`` itself, whatever its types."""
     return function
 
@@ -26,5 +26,5 @@ def compile_silently() -> None:
     """Do nothing: nothing is compiled."""
 
 
-direct = entry = kernel
-located = compile_for
+without_dispatch = entry_point_of = kernel
+with_address = compile_signature

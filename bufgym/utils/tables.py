@@ -4,11 +4,11 @@ import html
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from bufgym.ground.errors import printable
+from bufgym.utils.errors import printable
 
 
 class Table(NamedTuple):
-    """A table that is written as aligned text, Markdown or HTML. Names in it may be a stranger's."""
+    """A table that is written as aligned text, Markdown or HTML. Names in it may be untrusted."""
 
     head: Sequence[str]
     blocks: Sequence[tuple[str, Sequence[Sequence[str]]]]  # (title or nothing, lines of cells)

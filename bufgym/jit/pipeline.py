@@ -11,7 +11,7 @@ from numba import types
 from numba.core import codegen, compiler, config, datamodel, ir, ir_utils, untyped_passes
 from numba.core.compiler_machinery import FunctionPass, register_pass
 
-from bufgym.ground.kernel import announce
+from bufgym.jit import announce
 
 # Numba has no types.
 _Compiler: Any = compiler.Compiler

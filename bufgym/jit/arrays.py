@@ -42,22 +42,22 @@ def named(arrays: Arrays) -> Arrays:
     return made
 
 
-def item(array: NDArray[Any], k: int) -> Any:
+def unchecked_item(array: NDArray[Any], k: int) -> Any:
     """``array[k]``."""
     return array[k]
 
 
-def at(array: NDArray[Any], i: int, k: int) -> Any:
+def unchecked_at(array: NDArray[Any], i: int, k: int) -> Any:
     """``array[i, k]``."""
     return array[i, k]
 
 
-def stretch(array: NDArray[Any], i: int, first: int, length: int) -> Any:
+def unchecked_slice(array: NDArray[Any], i: int, first: int, length: int) -> Any:
     """``array[i, first : first + length]`` of an array in C order."""
     return array[i, first : first + length]
 
 
-def table(array: NDArray[Any], i: int, first: int, rows: int, columns: int) -> Any:
+def unchecked_table(array: NDArray[Any], i: int, first: int, rows: int, columns: int) -> Any:
     """``array[i, first : first + rows * columns]`` as rows x columns, of an array in C order."""
     return array[i, first : first + rows * columns].reshape(rows, columns)
 

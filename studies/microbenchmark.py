@@ -1,4 +1,4 @@
-"""The yardstick for speed: the job of one step of ``Uplink-v0``'s batch, without episodes, logs, limits or topics.
+"""The microbenchmark for speed: the job of one step of ``Uplink-v0``'s batch, without episodes, logs, limits or topics.
 
 A step has one decision, an exact link, the next message, and all numbers of the observation and mask.
 """
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.kernel import Ints, kernel
+from bufgym.jit import Ints, kernel
 
 Reals = NDArray[np.float32]
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 
 
 def named_settings(what: str, text: str, read: Callable[[str], Any] = float) -> tuple[str, dict[str, Any]]:

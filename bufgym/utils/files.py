@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bufgym.ground.errors import BufgymError, unknown, where
+from bufgym.utils.errors import BufgymError, unknown, where
 
 PACKAGE = Path(__file__).resolve().parents[1]
 

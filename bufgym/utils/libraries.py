@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from bufgym.ground.errors import BufgymError, install
+from bufgym.utils.errors import BufgymError, install
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Files of strangers: what is too large, endless, forged or no regular file ends in one line, and soon."""
+"""Untrusted files: what is too large, endless, forged or no regular file ends in one line, and soon."""
 
 import csv
 import os
@@ -13,8 +13,8 @@ from refusal_cases import refuse
 
 from bufgym.benchmark import leaderboard
 from bufgym.cli import main
-from bufgym.ground.errors import BufgymError, printable
 from bufgym.scenario import read_client
+from bufgym.utils.errors import BufgymError, printable
 
 REPO = Path(__file__).resolve().parents[1]
 

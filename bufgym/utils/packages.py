@@ -4,8 +4,8 @@ import tomllib
 from collections.abc import Iterable
 from typing import Any, NoReturn
 
-from bufgym.ground.errors import BufgymError
-from bufgym.ground.files import PACKAGE
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.files import PACKAGE
 
 COMMANDS, ENVIRONMENTS = "bufgym.commands", "bufgym.environments"
 """Groups of entry points: what an installed package adds."""

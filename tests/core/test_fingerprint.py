@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from needs import needs
 
-from bufgym.ground import kernel
-from bufgym.ground.kernel import JIT
-from bufgym.ground.kernel.closure import closure
+from bufgym import jit
+from bufgym.jit import JIT
+from bufgym.jit.fingerprint import fingerprint
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -22,7 +22,7 @@ from typing import NamedTuple
 import math
 import numba.extending
 import numpy as np
-from bufgym.ground.kernel import kernel
+from bufgym.jit import kernel
 
 READ, UNREAD, TABLE = 2, 3, np.array([1.0, 2.0])
 RECORDS = np.zeros(1, [("near", np.int64), ("far", np.int64)])
@@ -64,10 +64,10 @@ def bystander(k):
 
 
 def hash_of(source: str) -> str:
-    """The closure of ``outer`` in a module with this source."""
+    """The fingerprint of ``outer`` in a module with this source."""
     module = ModuleType("tale")
     exec(compile(source, "tale.py", "exec"), module.__dict__)
-    return closure(getattr(module.outer, "py_func", module.outer))
+    return fingerprint(getattr(module.outer, "py_func", module.outer))
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_types_are_told_by_the_names_of_their_fields() -> None:
     """Code finds a field by its place: two tuples that differ in their names alone are different types."""
     import numba
 
-    from bufgym.ground.kernel.cache import told_types
+    from bufgym.jit.cache import spelled_types
 
     whole = numba.types.int64
     tuples = [ModuleType(str(k)) for k in range(2)]
@@ -124,7 +124,7 @@ def test_types_are_told_by_the_names_of_their_fields() -> None:
     for module, source in zip(tuples, (TALE, renamed), strict=True):
         exec(source, module.__dict__)
     one, other = ((numba.types.NamedTuple((whole, whole), module.Pair),) for module in tuples)
-    assert repr(one) == repr(other) and told_types(one) != told_types(other)
+    assert repr(one) == repr(other) and spelled_types(one) != spelled_types(other)
 
 
 def compiled(folder: Path, script: str) -> list[str]:
@@ -167,7 +167,7 @@ def test_a_change_recompiles_what_calls_it_and_nothing_else(tmp_path: Path) -> N
 LEAF = """
 from typing import NamedTuple
 import numpy as np
-from bufgym.ground.kernel import kernel, records
+from bufgym.jit import kernel, records
 
 FACTOR = 2
 CELL = np.dtype([("near", np.int64), ("far", np.int64)])
@@ -238,7 +238,7 @@ def test_a_new_process_never_runs_code_of_an_edited_source(
 
 def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
     """No constant that a kernel reads is told by its address."""
-    from bufgym.ground.kernel import closure as module
+    from bufgym.jit import fingerprint as module
 
     seen: list[str] = []
 
@@ -252,8 +252,8 @@ def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
         from bufgym.sim import rollout
 
         for one in (step.step_rows, step.step_cells, rollout.rollout):
-            closure(getattr(one, "py_func", one))
+            fingerprint(getattr(one, "py_func", one))
     finally:
         module._told = original
-    assert kernel.FOLDER or not JIT
+    assert jit.FOLDER or not JIT
     assert [text for text in seen if " at 0x" in text] == []

@@ -15,7 +15,7 @@ _MOST_MESSAGE = 2000  # longest message, characters
 def printable(text: object) -> str:
     """Return the text on one line, with every character that a terminal obeys written as in Python (``\\x1b``).
 
-    Names come from strangers' files. A newline could forge a line of output, and an escape code could hide another.
+    Names come from untrusted files. A newline could forge a line of output, and an escape code could hide another.
     """
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 

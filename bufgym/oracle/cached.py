@@ -1,4 +1,4 @@
-"""Plans of the clairvoyant that took long, kept on disk beside the compiled code: the next run reads them."""
+"""Plans of the clairvoyant that took long, cached on disk beside the compiled code: the next run reads them."""
 
 import contextlib
 import functools
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.ground.files import PACKAGE, replaced
-from bufgym.ground.kernel import FOLDER
+from bufgym.jit import FOLDER
+from bufgym.utils.files import PACKAGE, replaced
 
 SOURCES = (
     *(
@@ -22,7 +22,7 @@ SOURCES = (
     ),
     *(f"model/{name}.py" for name in ("buffer", "link", "qoi")),
 )
-"""Files of the package that say what a plan is. Another text of theirs finds no plan that was kept before."""
+"""Files of the package that say what a plan is. Another text of theirs finds no plan that was cached before."""
 
 _HEAD = "<d?"  # H, and whether it is certified; a bit for each message follows, then the digest of all before it
 _OTHERS = 3  # Folders that stay of other texts of the sources
@@ -31,15 +31,15 @@ Found = tuple[float, NDArray[np.bool_], bool]
 """(H, the messages to keep, whether H is certified)."""
 
 
-def kept(inputs: tuple[Any, ...], messages: int, find: Callable[[], Found]) -> Found:
+def cached(inputs: tuple[Any, ...], messages: int, find: Callable[[], Found]) -> Found:
     """Return what ``find`` gives for these ``inputs``, from disk if it was found before.
 
-    A file that is missing or damaged is made anew. Where none can be written, nothing is kept.
+    A file that is missing or damaged is made anew. Where none can be written, nothing is cached.
     """
     if not FOLDER:
         return find()
-    told = [one.tobytes() if isinstance(one, np.ndarray) else repr(one).encode() for one in inputs]
-    name = hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in told)).hexdigest()[:32]
+    bytes_of = [one.tobytes() if isinstance(one, np.ndarray) else repr(one).encode() for one in inputs]
+    name = hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in bytes_of)).hexdigest()[:32]
     file = Path(FOLDER).parent / "plans" / sources() / name
     with contextlib.suppress(OSError):
         data = file.read_bytes()

@@ -18,8 +18,8 @@ import numba
 import numpy as np
 from numba.core import compiler, serialize
 
-from bufgym.ground.files import PACKAGE, replaced
-from bufgym.ground.kernel.closure import closure
+from bufgym.jit.fingerprint import fingerprint
+from bufgym.utils.files import PACKAGE, replaced
 
 
 def _is_writable(folder: Path) -> bool:
@@ -54,15 +54,15 @@ FOLDER = _cache_folder()
 _COMPILER = [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(Path(__file__).parent.glob("*.py"))]
 _TOOLS = (sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, np.__version__, *_COMPILER)
 """Versions of all that translates kernels, and the sources of this package."""
-_KEPT_VERSIONS = 16  # most files of one kernel: one for each set of argument types and each state of its sources
+_CACHED_VERSIONS = 16  # most files of one kernel: one for each set of argument types and each state of its sources
 
 
 class Code:
     """Machine code of one kernel on disk, a file for each set of argument types.
 
-    A file is named by everything that its code depends on (see ``closure``). So processes that compile side by side
+    A file is named by everything that its code depends on (see ``fingerprint``). So processes that compile side by side
     never write different code into one file, and code of an earlier source is never found. A damaged file is compiled
-    anew. If no file can be written, nothing is kept.
+    anew. If no file can be written, nothing is cached.
     """
 
     def __init__(self, function: Any, role: str) -> None:
@@ -77,12 +77,12 @@ class Code:
             kept = pickle.loads(self._file(signature, target.codegen()).read_bytes())
             return cast(Any, compiler).CompileResult._rebuild(target, *kept)
         except Exception:  # a file that is missing, or cut short, which ends in many kinds of error
-            if _ONLY_KEPT.get():
-                raise NotKeptError from None
+            if _CACHED_ONLY.get():
+                raise NotCachedError from None
             return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keep the code that was compiled for the types of ``signature``."""
+        """Cache the code that was compiled for the types of ``signature``."""
         if result.lifted or result.library.has_dynamic_globals:  # it holds addresses of this process
             return
         file = self._file(signature, result.codegen)
@@ -91,16 +91,16 @@ class Code:
             with replaced(file) as part:
                 part.write_bytes(cast(Any, serialize).dumps(result._reduce()))
             versions = sorted(file.parent.glob(f"{self._name}-*.nbc"), key=lambda path: path.stat().st_mtime)
-            for old in versions[:-_KEPT_VERSIONS]:
+            for old in versions[:-_CACHED_VERSIONS]:
                 old.unlink(missing_ok=True)
 
     def _file(self, signature: Any, generator: Any) -> Path:
-        # The closure now, as the module's later functions did not exist when the kernel was decorated.
-        depends_on = repr((_TOOLS, closure(self._function), told_types(signature), generator.magic_tuple()))
+        # The fingerprint now, as the module's later functions did not exist when the kernel was decorated.
+        depends_on = repr((_TOOLS, fingerprint(self._function), spelled_types(signature), generator.magic_tuple()))
         return Path(FOLDER, f"{self._name}-{hashlib.sha256(depends_on.encode()).hexdigest()[:20]}.nbc")
 
 
-def told_types(types: Any) -> str:
+def spelled_types(types: Any) -> str:
     """``types``, a signature or several types, in words that name the fields of every tuple too."""
     found, waiting = [repr(types)], list(getattr(types, "args", types))
     while waiting:
@@ -110,18 +110,18 @@ def told_types(types: Any) -> str:
     return "\n".join(found)
 
 
-class NotKeptError(Exception):
+class NotCachedError(Exception):
     """The requested code must be compiled first."""
 
 
-_ONLY_KEPT: ContextVar[bool] = ContextVar("only_kept", default=False)
+_CACHED_ONLY: ContextVar[bool] = ContextVar("cached_only", default=False)
 
 
 @contextlib.contextmanager
-def only_kept() -> Iterator[None]:
-    """Compile nothing in this block: code that is not on disk raises a ``NotKeptError``."""
-    token = _ONLY_KEPT.set(True)
+def cached_only() -> Iterator[None]:
+    """Compile nothing in this block: code that is not on disk raises a ``NotCachedError``."""
+    token = _CACHED_ONLY.set(True)
     try:
         yield
     finally:
-        _ONLY_KEPT.reset(token)
+        _CACHED_ONLY.reset(token)

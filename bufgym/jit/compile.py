@@ -9,8 +9,8 @@ from numba.core import types
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
 
-from bufgym.ground.kernel.cache import Code
-from bufgym.ground.kernel.pipeline import KernelCompiler
+from bufgym.jit.cache import Code
+from bufgym.jit.pipeline import KernelCompiler
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -51,7 +51,7 @@ def kernel(function: Function) -> Function:
     return cast(Function, _dispatcher(_Kernel, function, "called", no_cfunc_wrapper=True))
 
 
-def compile_for(signature: Any, function: Function) -> Function:
+def compile_signature(signature: Any, function: Function) -> Function:
     """Compile ``function`` now for exactly ``signature``, so that it can be passed to other kernels as a value.
 
     Functions of one signature share one type: the kernel that receives them is compiled once and serves them all.
@@ -62,8 +62,8 @@ def compile_for(signature: Any, function: Function) -> Function:
     return cast(Function, compiled)
 
 
-def entry(compiled: Any) -> Any:
-    """The plain code of a ``compile_for`` result, for callers in Python that pass exactly the types of its signature.
+def entry_point_of(compiled: Any) -> Any:
+    """The plain code of a ``compile_signature`` result, for callers that pass exactly the types of its signature.
 
     To find the code for its arguments, Numba looks at every array of every tuple at each call: 3 us, and ten times that
     with functions among them. Here nobody looks, so wrong types go unnoticed.
@@ -72,7 +72,7 @@ def entry(compiled: Any) -> Any:
     return overload.entry_point
 
 
-def direct(compiled: Any) -> Any:
+def without_dispatch(compiled: Any) -> Any:
     """A ``kernel`` over a batch that Python calls for every step, without a look at the types of its arguments.
 
     It has three arguments or more. Calls with equal ``batch.several``, and None as the same of the last three
@@ -107,8 +107,8 @@ class _Located(types.WrapperAddressProtocol):
         return self._signature
 
 
-def located(signature: Any, compiled: Any) -> Any:
-    """A ``compile_for`` result for short calls: Numba looks up its address here, not at each call.
+def with_address(signature: Any, compiled: Any) -> Any:
+    """A ``compile_signature`` result for short calls: Numba looks up its address here, not at each call.
 
     That saves 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
     """

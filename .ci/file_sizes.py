@@ -19,7 +19,7 @@ def lines(folder: str) -> dict[Path, int]:
 
 
 def main() -> int:
-    """Print the weights; the exit status."""
+    """Print the sizes; the exit status."""
     files = {folder: lines(folder) for folder in FOLDERS}
     print(", ".join(f"{folder} {sum(counts.values()):,}" for folder, counts in files.items()))
     long = {path: count for counts in files.values() for path, count in counts.items() if count > LONGEST}

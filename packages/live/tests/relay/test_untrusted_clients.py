@@ -1,4 +1,4 @@
-"""Whatever strangers send, the relay goes on, lets nothing in, and says so in its audit log.
+"""Whatever untrusted clients send, the relay goes on, lets nothing in, and says so in its audit log.
 
 A hundred of each in a commit; ten thousand in the night.
 """
@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from issuer_cases import Issuer
 from mutations import COUNT, SEED, mutated
-from relay_cases import Server, client, connect, relay, settings, stranger, until, wait, within
+from relay_cases import Server, client, connect, relay, settings, until, untrusted, wait, within
 from websockets.datastructures import Headers
 from websockets.exceptions import WebSocketException
 
-from bufgym.ground.errors import BufgymError
+from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import identity, outbox, pages, wire
 from bufgym_live.relay.config import Limits, Rule
 from bufgym_live.relay.wire import Message
@@ -128,7 +128,7 @@ async def test_broken_handshakes() -> None:
 
         async def attack(k: int) -> None:
             uniform = random.Random(f"{SEED}-handshake-{k}")
-            async with stranger(server.port) as (reader, writer):
+            async with untrusted(server.port) as (reader, writer):
                 writer.write(mutated(uniform, REQUEST, [REQUEST, b"GET /../server.py HTTP/1.1\r\n\r\n"]))
                 writer.write_eof()
                 with contextlib.suppress(OSError):
@@ -145,7 +145,7 @@ async def test_slow_handshakes_keep_nobody_out() -> None:
     async with relay(settings(rules=rules, limits=limits)) as server:
         async with contextlib.AsyncExitStack() as stack:
             for _ in range(60):
-                _, writer = await stack.enter_async_context(stranger(server.port, "127.0.0.2"))
+                _, writer = await stack.enter_async_context(untrusted(server.port, "127.0.0.2"))
                 writer.write(REQUEST[:40])
             async with client(server.port) as one:
                 assert one.welcome["op"] == "welcome"
@@ -161,7 +161,7 @@ async def test_slow_handshakes_keep_nobody_out() -> None:
 async def test_half_a_request_and_no_hello_end_in_time() -> None:
     """Also where a byte comes now and then."""
     async with relay(settings(limits=Limits(hello_s=0.05))) as server:
-        async with stranger(server.port) as (reader, writer):
+        async with untrusted(server.port) as (reader, writer):
             for k in range(len(REQUEST)):
                 writer.write(REQUEST[k : k + 1])
                 with contextlib.suppress(OSError, TimeoutError):
@@ -192,7 +192,7 @@ async def test_many_connections_from_a_denied_address(tmp_path: Path) -> None:
         for k in range(count):
             if k == count // 2:
                 before = resident_bytes()
-            async with stranger(server.port, "127.0.0.9") as (reader, writer):
+            async with untrusted(server.port, "127.0.0.9") as (reader, writer):
                 writer.write(REQUEST)
                 assert b"403 Forbidden" in await wait("a refusal", reader.read())
         assert resident_bytes() - before < 20 * 2**20
@@ -212,7 +212,7 @@ async def test_pages_of_others_do_not_connect() -> None:
             ("null", "127.0.0.1", b"403"),
             ("http://[", "127.0.0.1", b"403"),
         ):
-            async with stranger(server.port) as (reader, writer):
+            async with untrusted(server.port) as (reader, writer):
                 writer.write(REQUEST.replace(b"Host: 127.0.0.1", f"Host: {host}\r\nOrigin: {origin}".encode()))
                 assert status in await wait("an answer", reader.readline()), origin
 

@@ -1,7 +1,7 @@
 """Everything that the machine code of a kernel depends on, as one hash.
 
-The *closure* of a kernel is its own code, the kernels that it calls, theirs, and every constant that any of them reads.
-Comments and line numbers are not part of it, nor is anything that no kernel calls.
+The *fingerprint* of a kernel is a hash of its own code, the kernels that it calls, theirs, and every constant that any
+of them reads. Comments and line numbers are not part of it, nor is anything that no kernel calls.
 """
 
 import functools
@@ -16,16 +16,16 @@ _VERSIONED = ("numba", "numpy", "llvmlite")
 """Packages whose version stands for their sources."""
 
 
-def closure(function: Any) -> str:
-    """Hash of ``function``'s closure: equal where its machine code is, for equal types of its arguments."""
-    told: dict[FunctionType, str] = {}
+def fingerprint(function: Any) -> str:
+    """Hash of all that ``function`` depends on: equal where its machine code is, for equal types of its arguments."""
+    texts: dict[FunctionType, str] = {}
     waiting = [function]
     while waiting:
         one = waiting.pop()
-        if one not in told:
-            told[one], calls = _of_one(one)
+        if one not in texts:
+            texts[one], calls = _of_one(one)
             waiting += calls
-    return hashlib.sha256("".join(sorted(told.values())).encode()).hexdigest()
+    return hashlib.sha256("".join(sorted(texts.values())).encode()).hexdigest()
 
 
 @functools.cache
@@ -70,9 +70,9 @@ def _told(value: Any, waiting: list[Any]) -> str:
     if isinstance(value, np.ndarray):
         return f"array {value.dtype.descr} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
     if isinstance(value, tuple | list):
-        return f"{type(value).__qualname__}({', '.join(_told(entry, waiting) for entry in value)})"
+        return f"{type(value).__qualname__}({', '.join(_told(entry_point_of, waiting) for entry_point_of in value)})"
     if isinstance(value, frozenset | set):
-        return f"set({sorted(_told(entry, waiting) for entry in value)})"
+        return f"set({sorted(_told(entry_point_of, waiting) for entry_point_of in value)})"
     if isinstance(value, type):
         fields = tuple(getattr(value, name, None) for name in ("_fields", "__members__"))
         defaults = tuple(getattr(value, "_field_defaults", {}).items())

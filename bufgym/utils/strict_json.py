@@ -1,6 +1,6 @@
 """JSON as its standard has it: Python's parser also takes NaN and Infinity, and makes infinity of ``1e400``.
 
-``read_object`` and ``check`` read files of strangers; their errors name the file, the field and the rule.
+``read_object`` and ``check`` read untrusted files; their errors name the file, the field and the rule.
 """
 
 import json
@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from bufgym.ground.errors import BufgymError, where
-from bufgym.ground.files import read_utf8
+from bufgym.utils.errors import BufgymError, where
+from bufgym.utils.files import read_utf8
 
 MAX_JSON_BYTES = 64 * 2**20  # Size limit; a timeline of 100,000 messages has some 20 MB
 

@@ -1,4 +1,4 @@
-"""The sender with topics and its schedulers: against their twins, and what must hold whatever is decided."""
+"""The sender with topics and its schedulers: against their reference models, and what must hold whatever is decided."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -6,13 +6,12 @@ from itertools import pairwise
 import naive_schedulers
 import numpy as np
 import pytest
-from cases import ANYTHING, VALUES, cases, log, order, same, twin_log
+from cases import ANYTHING, VALUES, cases, log, order, reference_log, same
 from hypothesis import given
 from hypothesis import strategies as st
 from topic_cases import topic_cases
 
-from bufgym import policies, sim
-from bufgym.ground import kernel
+from bufgym import jit, policies, sim
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, arrival_gain, before, gaps, is_first, loss, motion_gaps
 from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER
@@ -30,83 +29,89 @@ kernels = pytest.mark.kernels
 
 @kernels
 @given(topic_cases(max_messages=40))
-def test_agrees_with_twin_event_by_event(case):
+def test_agrees_with_reference_event_by_event(case):
     L = case.case.capacity
 
-    def check(event, senders, twin):
+    def check(event, senders, reference):
         batch = senders.batch
         credit(batch, 0, int(batch.senders[0]["now_us"]))
-        agree(senders, twin)
-        view = python_view(kernel.named(batch), 0)
-        assert (view.window, view.in_flight) == (case.case.episode.window, len(twin.in_flight))
-        assert (view.busy, view.left_bytes) == (int(bool(twin.socket)), twin.left_bytes())
+        agree(senders, reference)
+        view = python_view(jit.named(batch), 0)
+        assert (view.window, view.in_flight) == (case.case.episode.window, len(reference.in_flight))
+        assert (view.busy, view.left_bytes) == (int(bool(reference.socket)), reference.left_bytes())
         if event == "decision":
-            agree_on_gaps(senders, twin)
+            agree_on_gaps(senders, reference)
         if event == "send":
-            can = [twin.sendable(m) for m in twin.slots()]
+            can = [reference.sendable(m) for m in reference.slots()]
             beyond = [False] * (L + 1 - len(can))
             assert [decisions.can_send(batch, 0, k) for k in range(-1, L + 1)] == [False, *can, *beyond]
-            assert decisions.can_hold(batch, 0) == twin.may_hold()
+            assert decisions.can_hold(batch, 0) == reference.may_hold()
 
-    senders, twin = case.beside_its_twin(check)
-    agree_on_log(senders, twin)
+    senders, reference = case.beside_its_reference(check)
+    agree_on_log(senders, reference)
     until = int(senders.batch.senders[0]["now_us"]) + 5_000
     credit(senders.batch, 0, until)
     for k in range(len(case.topics)):
         age_until(senders.batch, 0, k, until)
-    agree(senders, twin, until, to_the_end=True)
+    agree(senders, reference, until, to_the_end=True)
 
 
-def agree(senders, twin, until=None, to_the_end=False):
+def agree(senders, reference, until=None, to_the_end=False):
     """The same is queued and in flight, nothing has been lost, and the sums are those from scratch."""
     batch = senders.batch
     sender = np.asarray(batch.senders)[0]
-    until = twin.now if until is None else until
+    until = reference.now if until is None else until
     slots = np.asarray(batch.slots[0])[sender["first"] : sender["first"] + sender["occupancy"]]
-    assert sender["now_us"] == twin.now
-    assert slots["seq"].tolist() == [m["seq"] for m in twin.slots()]
-    assert sender["backlog_bytes"] == sum(m["bytes"] for m in twin.slots())
-    assert sender["dequeued"] - sender["acked"] == len(twin.in_flight)
-    assert sender["busy"] == len(twin.socket)
-    assert (sender["rejected"], sender["evicted"], sender["invalid"]) == (twin.rejected, twin.evicted, twin.invalid)
-    assert sender["retained_gain"] == pytest.approx(twin.retained_gain(), abs=1e-9)
-    assert sender["delivered_gain"] == pytest.approx(twin.delivered_gain(until), abs=1e-9)
-    for slot, message in zip(slots, twin.slots(), strict=True):
-        last = twin.kept_before(message)
-        gain = twin.gain(twin.lane(message), [last, message]) if last else 0.0
+    assert sender["now_us"] == reference.now
+    assert slots["seq"].tolist() == [m["seq"] for m in reference.slots()]
+    assert sender["backlog_bytes"] == sum(m["bytes"] for m in reference.slots())
+    assert sender["dequeued"] - sender["acked"] == len(reference.in_flight)
+    assert sender["busy"] == len(reference.socket)
+    assert (sender["rejected"], sender["evicted"], sender["invalid"]) == (
+        reference.rejected,
+        reference.evicted,
+        reference.invalid,
+    )
+    assert sender["retained_gain"] == pytest.approx(reference.retained_gain(), abs=1e-9)
+    assert sender["delivered_gain"] == pytest.approx(reference.delivered_gain(until), abs=1e-9)
+    for slot, message in zip(slots, reference.slots(), strict=True):
+        last = reference.kept_before(message)
+        gain = reference.gain(reference.lane(message), [last, message]) if last else 0.0
         assert slot["gain"] == pytest.approx(gain, abs=1e-12)
-    if twin.one_queue:
+    if reference.one_queue:
         return
-    assert sender["aged"] == pytest.approx(twin.aged(until, to_the_end), rel=1e-9, abs=1e-12)
-    assert sender["late"] == pytest.approx(twin.late(until))
-    for k, row in enumerate(np.asarray(batch.topics[0])[: len(twin.rules)]):
-        counted = twin.queues[k], twin.arrived[k], twin.sent[k], twin.received(k, until)
+    assert sender["aged"] == pytest.approx(reference.aged(until, to_the_end), rel=1e-9, abs=1e-12)
+    assert sender["late"] == pytest.approx(reference.late(until))
+    for k, row in enumerate(np.asarray(batch.topics[0])[: len(reference.rules)]):
+        counted = reference.queues[k], reference.arrived[k], reference.sent[k], reference.received(k, until)
         assert [row[what] for what in ("queued", "arrived", "dequeued", "received")] == list(map(len, counted))
-        for last in twin.sent[k][-1:]:
+        for last in reference.sent[k][-1:]:
             sent = row["dequeued_arrival_us"], row["dequeued_x"], row["last_dequeue_us"]
-            assert sent == (last["us"], last["x"], twin.dequeued[last["seq"]])
+            assert sent == (last["us"], last["x"], reference.dequeued[last["seq"]])
 
 
-def agree_on_gaps(senders, twin):
+def agree_on_gaps(senders, reference):
     """What a policy reads about the newcomer and every slot."""
-    seen = kernel.named(senders.batch)
+    seen = jit.named(senders.batch)
     buffer, arrival = python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
-    newcomer, slots = twin.newcomer, twin.slots()
-    reference, last = twin.reference(), twin.kept_before(newcomer)
+    newcomer, slots = reference.newcomer, reference.slots()
+    reference, last = reference.reference(), reference.kept_before(newcomer)
     assert (buffer.dequeued_arrival_us, buffer.dequeued_x) == (reference["us"], reference["x"])
-    gain = twin.gain(twin.lane(newcomer), [last, newcomer]) if last else 0.0
+    gain = reference.gain(reference.lane(newcomer), [last, newcomer]) if last else 0.0
     assert arrival_gain(buffer, arrival) == pytest.approx(gain, abs=1e-12)
-    assert decisions.has_room(senders.batch, 0) == twin.fits(newcomer)
-    assert decisions.can_reject(senders.batch, 0) == (not twin.must_keep(newcomer))
-    evictable = twin.evictable(newcomer)
+    assert decisions.has_room(senders.batch, 0) == reference.fits(newcomer)
+    assert decisions.can_reject(senders.batch, 0) == (not reference.must_keep(newcomer))
+    evictable = reference.evictable(newcomer)
     for k, message in enumerate([*slots, newcomer]):
-        lane = twin.lane(message)
-        (a_us, b_us), (a, b) = twin.gaps(message, "us"), twin.gaps(message, "x")
+        lane = reference.lane(message)
+        (a_us, b_us), (a, b) = reference.gaps(message, "us"), reference.gaps(message, "x")
         assert gaps(buffer, arrival, True, k)[:2] == (a_us, b_us)
         assert motion_gaps(buffer, arrival, k) == (a, b)
-        v = twin.rules[lane].v
-        assert loss(buffer, arrival, k) == pytest.approx(twin.rules[lane].weight * (v(a) + v(b) - v(a + b)), abs=1e-12)
-        own = [j for j, m in enumerate(slots) if twin.lane(m) == lane]
+        v = reference.rules[lane].v
+        assert loss(buffer, arrival, k) == pytest.approx(
+            reference.rules[lane].weight * (v(a) + v(b) - v(a + b)), abs=1e-12
+        )
+        own = [j for j, m in enumerate(slots) if reference.lane(m) == lane]
         assert before(buffer, k, lane) == max([j for j in own if j < k], default=-1)
         if k < len(slots):
             assert slot_after(buffer, k, lane) == min([j for j in own if j > k], default=len(slots))
@@ -114,19 +119,19 @@ def agree_on_gaps(senders, twin):
             assert decisions.can_evict(senders.batch, 0, k) == (message in evictable)
 
 
-def agree_on_log(senders, twin):
-    assert {k for k, entry in enumerate(np.asarray(senders.batch.log[0])) if entry["limited"]} == twin.limited
-    assert log(senders) == twin_log(twin)
-    assert order(senders) == twin.order
+def agree_on_log(senders, reference):
+    assert {k for k, entry in enumerate(np.asarray(senders.batch.log[0])) if entry["limited"]} == reference.limited
+    assert log(senders) == reference_log(reference)
+    assert order(senders) == reference.order
 
 
 @kernels
 @given(topic_cases(max_messages=25))
-def test_rollouts_agree_with_twin_compiled_and_not(case):
-    twin, policy = case.run_twin(), case.policy(compile=True)
+def test_rollouts_agree_with_reference_compiled_and_not(case):
+    reference, policy = case.run_reference(), case.policy(compile=True)
     senders, again = case.run(policy), case.senders()
-    agree_on_log(senders, twin)
-    agree(senders, twin, FOREVER)
+    agree_on_log(senders, reference)
+    agree(senders, reference, FOREVER)
     again.run(replace(policy, compile=False))
     for _ in range(2):
         assert same(senders, again)
@@ -144,7 +149,9 @@ def test_what_the_masks_allow_is_carried_out_and_invariants_hold(case, chance):
     batch, sender = senders.batch, senders.batch.senders[0]
     L, event, now_us = case.case.capacity, None, 0
     # Arrivals that ask nobody may find no room; where all ask, and are given what is possible, nothing is impossible.
-    everyone = case.case.episode.first_decision == 0 and case.case.episode.last_decision > len(case.case.twin_messages)
+    everyone = case.case.episode.first_decision == 0 and case.case.episode.last_decision > len(
+        case.case.reference_messages
+    )
     while event != END:
         event = next_event(batch, None, 0)
         assert sender["now_us"] >= now_us
@@ -160,7 +167,7 @@ def test_what_the_masks_allow_is_carried_out_and_invariants_hold(case, chance):
         elif event == DEQUEUE:
             decisions.answer_dequeue(batch, 0, chance.random() < 0.5)
     assert sender["invalid"] == 0 or not everyone
-    assert sender["next"] == len(case.case.twin_messages)
+    assert sender["next"] == len(case.case.reference_messages)
     assert next_event(batch, None, 0) == END  # and stays there
 
 
@@ -243,21 +250,25 @@ def test_one_topic_without_rules_is_a_plain_sender(case, v, on_send, policy, win
 
 
 @kernels
-@pytest.mark.parametrize("name", naive_schedulers.TWINS)
+@pytest.mark.parametrize("name", naive_schedulers.REFERENCES)
 @given(topic_cases(min_topics=2, max_messages=30))
-def test_schedulers_agree_with_their_twins(name, case):
+def test_schedulers_agree_with_their_references(name, case):
     policy = policies.get(name)
     case = replace(case, client=policy.client, schedules=True, drops_heads=False)
-    twin, episode = case.twin(), case.case.episode
+    reference, episode = case.reference(), case.case.episode
     if not policy.client.awaits_acks:  # then the socket takes the next message when the last has crossed
-        twin.window, twin.ack_delay_us = 1, 0
-    naive_schedulers.TWINS[name](twin)
-    twin.run(case.case.twin_messages, episode.first_decision, episode.last_decision)
+        reference.window, reference.ack_delay_us = 1, 0
+    naive_schedulers.REFERENCES[name](reference)
+    reference.run(case.case.reference_messages, episode.first_decision, episode.last_decision)
     senders = case.run(policy)
-    assert log(senders) == twin_log(twin)
-    assert order(senders) == twin.order
-    assert senders.batch.senders["invalid"][0] == twin.invalid
-    assert twin.invalid == 0 or episode.first_decision > 0 or episode.last_decision < len(case.case.twin_messages)
+    assert log(senders) == reference_log(reference)
+    assert order(senders) == reference.order
+    assert senders.batch.senders["invalid"][0] == reference.invalid
+    assert (
+        reference.invalid == 0
+        or episode.first_decision > 0
+        or episode.last_decision < len(case.case.reference_messages)
+    )
     assert same(senders, case.run(replace(policy, compile=False)))
 
 
@@ -265,11 +276,11 @@ def test_schedulers_agree_with_their_twins(name, case):
 @given(topic_cases(min_topics=2, max_messages=25))
 def test_every_policy_runs_on_topics_and_nothing_is_lost(name, case):
     policy = policies.get(name)
-    capacity = len(case.case.twin_messages) if policy.unbounded else case.case.capacity
+    capacity = len(case.case.reference_messages) if policy.unbounded else case.case.capacity
     case = replace(case, client=policy.client, case=replace(case.case, capacity=capacity, max_bytes=None))
     senders = case.run(policy)
     hold(case, senders)
-    assert senders.batch.senders["next"][0] == len(case.case.twin_messages)
+    assert senders.batch.senders["next"][0] == len(case.case.reference_messages)
     # No no_drop message goes while another that could go is queued.
     rows, arrivals = np.asarray(senders.batch.log[0]), case.case.episode.arrivals
     free = np.array([not topic.no_drop for topic in case.topics])[arrivals["topic"]]

@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba.core import cgutils
 from numba.np import arrayobj
 
-from bufgym.ground.kernel.arrays import at, item, prefetch, stretch, table
+from bufgym.jit.arrays import prefetch, unchecked_at, unchecked_item, unchecked_slice, unchecked_table
 
 
 def _place(context: Any, builder: Any, signature: Any, arguments: Any, indices: Any) -> Any:
@@ -54,8 +54,8 @@ def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: C
     numba_.extending.lower_builtin(function, numba_.types.Array, numba_.types.VarArg(numba_.types.Any))(code)
 
 
-_compile_as(item, lambda array, k: array.dtype, _read)
-_compile_as(at, lambda array, i, k: array.dtype, _read)
-_compile_as(stretch, lambda array, i, first, length: array.copy(ndim=1), _view)
-_compile_as(table, lambda array, i, first, rows, columns: array.copy(ndim=2), _view)
+_compile_as(unchecked_item, lambda array, k: array.dtype, _read)
+_compile_as(unchecked_at, lambda array, i, k: array.dtype, _read)
+_compile_as(unchecked_slice, lambda array, i, first, length: array.copy(ndim=1), _view)
+_compile_as(unchecked_table, lambda array, i, first, rows, columns: array.copy(ndim=2), _view)
 _compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)
