@@ -131,12 +131,12 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
                 by_cell[cell] = s._replace(**none)
         for cell, s in by_cell.items():
             episodes_of = {cell[0]: table.episodes[cell[0]]}
-            qoi, score, lost, more = (
+            qoi, score, regrets, more = (
                 interval(numbers, links_in(episodes_of)) for numbers in (s.qoi, s.score, s.regret, s.difference)
             )
             counts, exact = samples[cell].discriminative, table.exact[cell]
             met = len(episodes_of[cell[0]])
-            cell_scores.append(CellScore(*cell, policy, met, qoi, score, lost, more, counts, exact))
+            cell_scores.append(CellScore(*cell, policy, met, qoi, score, regrets, more, counts, exact))
         overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
     for values in overall.values():
         lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
