@@ -14,7 +14,6 @@ from cyclopts import App
 
 from agents.runs import prepare
 from agents.settings import ALGORITHMS, FLAT, PPO, Evolve, Hindsight, Settings
-from agents.tasks import SlotEnvironment
 from bufgym.cli.options import OPTIONS
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import locked
@@ -26,7 +25,7 @@ app = App(
     error_formatter=lambda said: f"error: {said}",
     suppress_keyboard_interrupt=False,
 )
-BEFORE = {"guided": "evolve", "maskable-ppo": "ppo", "ppo": "ppo --unmasked", "dqn": "dqn", "guided-ppo": "guided-ppo"}
+BEFORE = {"guided": "evolve", "maskable-ppo": "ppo", "ppo": "ppo", "dqn": "dqn", "guided-ppo": "guided-ppo"}
 """A value that ``--algo`` had -> the command that now does it."""
 
 
@@ -84,10 +83,9 @@ def _train(folder: Path, settings: Settings, others: Sequence[Settings]) -> None
 def others_of(settings: Settings) -> list[Settings]:
     """The other ways to an agent, with the settings that evolution has too, each for at most a minute of one core."""
     shared = {name: getattr(settings, name) for name in ("validation_episodes", "name", "resume", "seeds", "seed")}
-    slots = SlotEnvironment(**vars(settings.environment))
     return [
         Hindsight(steps=min(settings.steps, 300_000), environment=settings.environment, **shared),
-        PPO(steps=min(settings.steps, 450_000), environment=slots, **shared),
+        PPO(steps=min(settings.steps, 60_000), environment=settings.environment, **shared),
     ]
 
 

@@ -18,10 +18,9 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.callbacks import Budget, Checkpoints, Curve, Progress, Validation, checkpoint, checkpoints, save
-from agents.evaluation import Agent, SlotModel
 from agents.learner import Learner
 from agents.runs import MODEL, Numbers, Run, Validations
-from agents.settings import OnSlots, SingleDecisions
+from agents.settings import SingleDecisions
 from bufgym.policies import weights
 
 Decisions = TypeVar("Decisions", bound=SingleDecisions)
@@ -44,9 +43,9 @@ class DecisionLearner(Learner[Decisions]):
     def make(self, env: VecEnv) -> Any:
         """Make an untrained model."""
 
+    @abstractmethod
     def weights_of(self, model: Any) -> Any:
-        """The weights of a model whose agent is a compiled policy; None for others, which decide in torch."""
-        return None
+        """The weights of the compiled policy that decides as the model does."""
 
     def callbacks(self, curve: Curve) -> list[BaseCallback]:
         """Work between updates, besides saving and validating."""
@@ -55,17 +54,6 @@ class DecisionLearner(Learner[Decisions]):
     def env(self, folder: Path, seed: int = 0) -> VecEnv:
         """The batch of environments to train on."""
         return self.objective(folder, seed).env(self.settings.num_envs, self.settings.reward, **self.env_options)
-
-    def agent_of(self, model: Any, name: str) -> Agent:
-        """The agent of a model, by its name."""
-        agent: Agent = self.weights_of(model).policy(name)
-        return agent
-
-    def agent(self, run: Run) -> Agent:
-        """A policy if the run kept a file of weights, or its model."""
-        torch.set_num_threads(1)  # on batches this small, more threads only wait for one another
-        model = self.algorithm.load(run.folder / "model.zip", device="cpu")
-        return super().agent(run) if run.file == MODEL else self.agent_of(model, self.settings.algo)
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
         """Train one seed for its steps or so many seconds, from its latest checkpoint if any."""
@@ -82,7 +70,7 @@ class DecisionLearner(Learner[Decisions]):
         curve = Curve(home / "curve.csv", model.num_timesteps)
 
         def measure(model: Any) -> Numbers:
-            return objective.validate(self.agent_of(model, objective.name))
+            return objective.validate(self.weights_of(model).policy(objective.name))
 
         validations = Validations(home, objective.columns, objective.best, settings, model.num_timesteps)
         validation = Validation(home, validations, measure, objective.message, curve)
@@ -98,26 +86,6 @@ class DecisionLearner(Learner[Decisions]):
         env.close()
         shutil.copyfile(checkpoint(home, int(validations.best[0])), home / "model.zip")
         spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
-        found = self.weights_of(self.algorithm.load(home / "model.zip", device="cpu"))
-        if found is not None:
-            weights.save(home / MODEL, found, self.notes(seed, settings.algo))
-        file = "model.zip" if found is None else MODEL
-        return Run(seed, home, spent, curve.record.rows, validations.rows, file, validations.choose)
-
-
-Slots = TypeVar("Slots", bound=OnSlots)
-
-
-class SlotLearner(DecisionLearner[Slots]):
-    """An algorithm that chooses among slots."""
-
-    @property
-    def env_options(self) -> dict[str, Any]:
-        """When it is asked, and what it sees."""
-        return {"actions": "slots", "decide_at": self.settings.decide_at, "fields": self.settings.fields}
-
-    def agent_of(self, model: Any, name: str) -> Agent:
-        """A policy where the model's weights are one, else the model."""
-        compiled = self.weights_of(model) is not None
-        on, decide_at = self.settings.on, self.settings.decide_at
-        return super().agent_of(model, name) if compiled else SlotModel(model, on.slots, decide_at)
+        kept = self.algorithm.load(home / "model.zip", device="cpu")
+        weights.save(home / MODEL, self.weights_of(kept), self.notes(seed, settings.algo))
+        return Run(seed, home, spent, curve.record.rows, validations.rows, MODEL, validations.choose)

@@ -10,13 +10,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from agents.mixed_env import Cell, MixedEnv, cells
+from agents.mixed_env import Cell, cells
 from agents.settings import Settings
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run as run_policies
@@ -24,7 +24,6 @@ from bufgym.benchmark.score import DISCRIMINATIVE, regret
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.oracle import BASELINE, measure, normalised_score
 from bufgym.policies import Policy
-from bufgym.sb3 import takes_masks
 from bufgym.scenario import Episode
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import Senders, run
@@ -42,37 +41,8 @@ def qoi_of(policy: Policy, senders: Senders, episodes: Sequence[Episode]) -> Num
     return np.asarray(sender["delivered_gain"] + (sender["transmitted"] > 0), np.float64)
 
 
-class SlotModel(NamedTuple):
-    """A model of stable-baselines3 that chooses among slots, in torch.
-
-    ``model`` needs ``predict`` alone. ``slots`` is how many it observes, ``decide_at`` when it is asked.
-    """
-
-    model: Any
-    slots: int
-    decide_at: str = "arrival"
-
-    def play(self, cells: Sequence[Cell], sizes: Sequence[int], episodes: Sequence[Episode]) -> list[Outcome]:
-        """The outcome of each episode (one a row) under the most likely action at every decision."""
-        masked, env = takes_masks(self.model), MixedEnv(cells, sizes, self.slots, decide_at=self.decide_at)
-        env.load(episodes)
-        actions = np.zeros(env.num_envs, np.int64)
-        while (live := ~env.ended()).any():
-            observation = {name: column[live] for name, column in env.observation().items()}
-            masks = {"action_masks": env.action_masks()[live]} if masked else {}
-            actions[live], _ = self.model.predict(observation, deterministic=True, **masks)
-            env.act(actions)
-        return [outcome(rows.senders, i) for rows in env.groups for i in range(len(rows))]
-
-
-Agent = Policy | SlotModel
-"""What a learner makes: a policy, compiled and for every L, or a model for the L that it was trained for."""
-
-
-def play(agent: Agent, cells: Sequence[Cell], sizes: Sequence[int], episodes: Sequence[Episode]) -> list[Outcome]:
+def play(agent: Policy, cells: Sequence[Cell], sizes: Sequence[int], episodes: Sequence[Episode]) -> list[Outcome]:
     """The outcome of each episode, ``sizes[c]`` of them in cell c, one cell after the other."""
-    if isinstance(agent, SlotModel):
-        return agent.play(cells, sizes, episodes)
     ends = np.cumsum(sizes).tolist()
     outcomes = []
     for cell, size, end in zip(cells, sizes, ends, strict=True):
@@ -116,7 +86,7 @@ class EvaluationSet:
         """[rows]: this column of a fixed policy's rows."""
         return np.array([self._fixed[*_name(key), policy][column] for key in self._keys], np.float64)
 
-    def play(self, agent: Agent) -> list[Outcome]:
+    def play(self, agent: Policy) -> list[Outcome]:
         """Outcomes of an agent in every row."""
         return play(agent, self.cells, self._sizes, self._episodes)
 
@@ -183,7 +153,7 @@ class ValidationSets:
                 for suite in settings.suites.suite
             ]
 
-    def play(self, agent: Agent) -> Verdict:
+    def play(self, agent: Policy) -> Verdict:
         """An agent's verdict, averaged over the suites."""
         verdicts = [evaluation.verdict(evaluation.play(agent)) for evaluation in self._sets]
         return Verdict(*np.mean(verdicts, axis=0).tolist())

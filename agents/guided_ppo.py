@@ -16,6 +16,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
@@ -79,7 +80,7 @@ class GuidedLearner(DecisionLearner[GuidedPPO]):
         """Make an actor that is still the rule, and a critic."""
         settings = self.settings
         n_steps = min(settings.n_steps, max(1, settings.steps // env.num_envs))
-        arguments = ppo_arguments(settings, env, n_steps)
+        arguments = ppo_arguments(settings, env, n_steps, LinearSchedule(settings.learning_rate, 0.0, 1.0))
         return PPO(GuidedPolicy, env, policy_kwargs={"width": settings.width}, **arguments)
 
     def weights_of(self, model: Any) -> GuidedWeights:

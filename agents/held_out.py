@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.evaluation import Agent, play
+from agents.evaluation import play
 from agents.mixed_env import Cell
 from agents.settings import Settings
 from agents.tasks import Environment
@@ -21,7 +21,7 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.tasks import QueueTask
 from bufgym.oracle import BASELINE, normalised_score, regret
-from bufgym.policies import registry
+from bufgym.policies import Policy, registry
 from bufgym.scenario import Scenario, Uplink
 from bufgym.scenario.numbered import draw
 from bufgym.sim.metrics import Outcome
@@ -55,7 +55,7 @@ class FixedEpisodes:
         self._base = math.fsum(result.qoi for result in self.play(registry.get(BASELINE)))
         self._best = math.fsum(plan.qoi for plan in self._plans)
 
-    def play(self, agent: Agent) -> list[Outcome]:
+    def play(self, agent: Policy) -> list[Outcome]:
         """Outcomes of an agent."""
         return play(agent, [Cell("", self.scenario, self.capacity)], [len(self.episodes)], self.episodes)
 

@@ -11,12 +11,11 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from agents.evaluation import Agent
 from agents.objectives import OBJECTIVES
 from agents.objectives.objective import Objective
 from agents.runs import Run, each_seed
 from agents.settings import Settings
-from bufgym.policies import weights
+from bufgym.policies import Policy, weights
 
 S = TypeVar("S", bound=Settings)
 
@@ -51,8 +50,8 @@ class Learner(ABC, Generic[S]):
             line: line of the progress bar.
         """
 
-    def agent(self, run: Run) -> Agent:
-        """The agent that a run kept, for evaluations: by default a policy from its file of weights."""
+    def agent(self, run: Run) -> Policy:
+        """The agent that a run kept, for evaluations."""
         return weights.load(run.model)
 
     def notes(self, seed: int, name: str) -> dict[str, Any]:

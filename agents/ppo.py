@@ -1,55 +1,97 @@
-"""PPO on the slots of the buffer, with action masks or without."""
+"""stable-baselines3's own PPO and DQN among ordered candidates, and PPO on the slots of a fleet's robots."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import stable_baselines3 as sb3
 from sb3_contrib import MaskablePPO
-from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPolicy
-from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
-from torch import nn
 
-from agents.decisions import SlotLearner
-from agents.settings import PPO, ActorCritic
+from agents.decisions import DecisionLearner
+from agents.settings import DQN, PPO, ActorCritic, FleetPPO, OnCandidates
 from bufgym.sb3 import SlotPolicy, weights_of
 from bufgym.utils.errors import BufgymError
 
+Candidates = TypeVar("Candidates", bound=OnCandidates)
 
-class SlotPPO(SlotLearner[PPO]):
-    """PPO that chooses a slot; with the slot network its agent is a compiled policy, which serves every L."""
+
+class CandidateLearner(DecisionLearner[Candidates]):
+    """An algorithm on the flat observation of ordered candidates; its agent is a compiled policy for every L."""
 
     @property
-    def algorithm(self) -> Any:
-        """MaskablePPO, or PPO without masks."""
-        return sb3.PPO if self.settings.unmasked else MaskablePPO
+    def env_options(self) -> dict[str, Any]:
+        """Asked at a full buffer, where every action is valid, so nothing is masked."""
+        return {"candidates": self.settings.candidates, "info": "none"}
+
+    def weights_of(self, model: Any) -> Any:
+        """The perceptron's weights."""
+        return weights_of(model)
+
+
+class CandidatePPO(CandidateLearner[PPO]):
+    """PPO with the library's own network and settings."""
+
+    algorithm = sb3.PPO
 
     def make(self, env: VecEnv) -> Any:
         """Make an untrained actor and critic."""
         settings = self.settings
-        policy, arguments = network_of(settings)
-        return self.algorithm(policy, env, policy_kwargs=arguments, **ppo_arguments(settings, env, settings.n_steps))
+        arguments = ppo_arguments(settings, env, settings.n_steps, settings.learning_rate)
+        network = {"net_arch": [settings.width, settings.width]}
+        return sb3.PPO("MlpPolicy", env, policy_kwargs=network, **arguments)
+
+
+class CandidateDQN(CandidateLearner[DQN]):
+    """DQN with the library's own network and settings.
+
+    A resumed learner begins with an empty replay.
+    """
+
+    algorithm = sb3.DQN
+
+    def make(self, env: VecEnv) -> Any:
+        """Make an untrained Q network."""
+        settings = self.settings
+        return sb3.DQN(
+            "MlpPolicy",
+            env,
+            learning_rate=settings.learning_rate,
+            buffer_size=max(settings.buffer_size, env.num_envs),
+            learning_starts=settings.learning_starts,
+            batch_size=settings.batch_size,
+            gamma=settings.gamma,
+            train_freq=(settings.train_freq, "step"),
+            gradient_steps=settings.gradient_steps,
+            target_update_interval=settings.target_update_interval,
+            stats_window_size=env.num_envs,
+            policy_kwargs={"net_arch": [settings.width, settings.width]},
+            device="cpu",
+        )
+
+
+class SlotPPO(DecisionLearner[FleetPPO]):
+    """PPO with action masks that chooses a slot of a robot's buffer, for all robots of a fleet."""
+
+    algorithm = MaskablePPO
+    env_options = {"actions": "slots", "decide_at": "arrival"}
+
+    def make(self, env: VecEnv) -> Any:
+        """Make an untrained actor and critic."""
+        settings = self.settings
+        arguments = ppo_arguments(settings, env, settings.n_steps, LinearSchedule(settings.learning_rate, 0.0, 1.0))
+        return MaskablePPO(SlotPolicy, env, policy_kwargs={"width": settings.width, "masked": True}, **arguments)
 
     def weights_of(self, model: Any) -> Any:
-        """The slot network's weights if it is asked at every arrival, as a policy is, and needs no mask of torch."""
-        settings = self.settings
-        return weights_of(model) if settings.scores_slots and settings.decide_at == "arrival" else None
+        """The slot network's weights."""
+        return weights_of(model)
 
 
-def network_of(settings: PPO) -> tuple[Any, dict[str, Any]]:
-    """The actor-critic class and its arguments: the slot network, or a plain one over all numbers at once."""
-    if settings.network == "slots":
-        return SlotPolicy, {"width": settings.width, "masked": not settings.unmasked, "prior": settings.prior}
-    plain = MultiInputActorCriticPolicy if settings.unmasked else MaskableMultiInputActorCriticPolicy
-    return plain, {"net_arch": [2 * settings.width, 2 * settings.width], "activation_fn": nn.ReLU}
-
-
-def ppo_arguments(settings: ActorCritic, env: VecEnv, n_steps: int) -> dict[str, Any]:
+def ppo_arguments(settings: ActorCritic, env: VecEnv, n_steps: int, learning_rate: Any) -> dict[str, Any]:
     """The arguments of PPO's class that do not depend on its policy."""
     return {
-        "learning_rate": LinearSchedule(settings.learning_rate, 0.0, 1.0),
+        "learning_rate": learning_rate,
         "n_steps": n_steps,
         "batch_size": even_batch(n_steps * env.num_envs, settings.batch_size),
         "n_epochs": settings.epochs,

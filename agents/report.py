@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation import Agent, EvaluationSet, sweep_for, test_rows
+from agents.evaluation import EvaluationSet, sweep_for, test_rows
 from agents.figure import draw
 from agents.held_out import fixed_episodes, summarise
 from agents.runs import Run, write_notes
@@ -54,7 +54,7 @@ class Trained:
     settings: Settings
     folder: Path
     runs: Sequence[Run]
-    agents: Sequence[Agent]
+    agents: Sequence[Policy]
     """The agent that each run kept."""
     lines: Mapping[str, float] = field(default_factory=dict)
     """The validation scores to beat."""

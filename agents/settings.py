@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from cyclopts import Parameter
 
-from agents.tasks import Environment, Families, FullBuffer, Kind, SlotEnvironment, Suites
+from agents.tasks import Environment, Families, Kind, Suites
 from bufgym.cli.options import Count, Least0, Natural, Positive, checked, command_line
 from bufgym.policies.weights import MAX_WIDTH
 from bufgym.utils.errors import BufgymError
@@ -120,7 +120,7 @@ class SingleDecisions(Settings):
 
     steps: Natural = 1_500_000
     """Decisions to learn from, for each seed."""
-    reward: Literal["retained", "delivered"] = "retained"
+    reward: Literal["regret", "retained", "delivered"] = "retained"
     width: Count = 32
     """Hidden units a layer."""
     num_envs: Count = 256
@@ -166,31 +166,72 @@ class GuidedPPO(ActorCritic):
 
 
 @dataclass(frozen=True)
-class OnSlots(SingleDecisions):
-    """What algorithms share that choose among the slots of the buffer."""
+class OnCandidates(SingleDecisions):
+    """What algorithms share that choose among ordered candidates at a full buffer, by the library's own settings."""
 
-    environment: Annotated[SlotEnvironment, FLAT] = SlotEnvironment()
-    network: Literal["slots", "plain"] = "slots"
-    """One small network for every slot, or one over all numbers at once."""
-
-    @property
-    def fields(self) -> str | None:
-        """What it sees, as the environment's option."""
-        return None
-
-    @property
-    def decide_at(self) -> str:
-        """When the agent is asked; on suites at every arrival."""
-        return "arrival" if self.suites.suite else self.environment.decide_at
+    kinds = ("environment", "queue")
+    steps: Natural = 200_000
+    """Decisions to learn from, for each seed."""
+    reward: Literal["regret", "retained", "delivered"] = "regret"
+    """regret knows the future, which only the reward does; it needs messages of equal size."""
+    candidates: Count = 2
+    """k: how many of the cheapest candidates the agent chooses among, beside the head."""
+    width: Count = 64
+    """Hidden units of both layers."""
+    gamma: Share = 0.99
+    checkpoint_every: Count = 50_000
+    """Steps."""
 
 
 @dataclass(frozen=True)
-class PPO(OnSlots, ActorCritic):
-    """Train by PPO with action masks, on the slots of the buffer."""
+class PPO(OnCandidates, ActorCritic):
+    """Train by stable-baselines3's PPO, with its own settings, among ordered candidates."""
 
     algo = "ppo"
+    learner = "agents.ppo:CandidatePPO"
+    num_envs: Count = 8
+    """Environments side by side."""
+    n_steps: Count = 256
+    """Steps in each environment between updates: with 8, as many decisions an update as the library has with one."""
+    batch_size: Batch = 64
+    """Decisions of one gradient step."""
+    epochs: Count = 10
+    """Passes over the decisions of an update."""
+    learning_rate: Positive = 3e-4
+    gae_lambda: Share = 0.95
+
+
+@dataclass(frozen=True)
+class DQN(OnCandidates):
+    """Train by stable-baselines3's DQN, with its own settings, among ordered candidates."""
+
+    algo = "dqn"
+    learner = "agents.ppo:CandidateDQN"
+    num_envs: Count = 1
+    """Environments side by side."""
+    batch_size: Batch = 32
+    """Decisions of one gradient step."""
+    learning_rate: Positive = 1e-4
+    train_freq: Count = 4
+    """Steps in each environment between updates."""
+    gradient_steps: Count = 1
+    """Gradient steps of an update."""
+    buffer_size: Count = 200_000
+    """Decisions in the replay, all of a run's; they take 45 MB."""
+    learning_starts: Count = 100
+    """Decisions before the first update."""
+    target_update_interval: Count = 10_000
+    """Decisions between two copies of the network to the target network."""
+
+
+@dataclass(frozen=True)
+class FleetPPO(ActorCritic):
+    """Train by PPO with action masks on the slots of every robot's buffer, for a fleet (--suite fleet-v1)."""
+
+    algo = "fleet-ppo"
     learner = "agents.ppo:SlotPPO"
-    kinds = ("environment", "queue", "fleet")
+    kinds = ("fleet",)
+    suites: Annotated[Suites, FLAT] = Suites(("fleet-v1",))
     steps: Natural = 600_000
     """Decisions to learn from, for each seed."""
     num_envs: Count = 64
@@ -199,53 +240,11 @@ class PPO(OnSlots, ActorCritic):
     """Decisions of one gradient step."""
     learning_rate: Positive = 2e-3
     """At the start; falls linearly to 0."""
-    unmasked: bool = False
-    """Without masks: an invalid action does what a queue does."""
-    prior: Least0 = 0.0
-    """Logit of what the rule gap-price chooses, besides the network's; above 0 the agent sees what the rule knows."""
-
-    @property
-    def scores_slots(self) -> bool:
-        """Whether a compiled policy can decide as it does: a slot network that is not too wide, with masks."""
-        return self.network == "slots" and not self.unmasked and self.width <= MAX_WIDTH
-
-    @property
-    def fields(self) -> str | None:
-        """What the rule knows, where the rule is the prior."""
-        return "rule" if self.prior else None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.kind == "fleet" and not self.scores_slots:
-            rule = f"scores slots with masks, by at most {MAX_WIDTH} hidden units a layer"
-            raise BufgymError(f"suite {self.suites.suite[0]}: a fleet's agent {rule}")
-        if self.prior and (self.kind == "fleet" or not self.scores_slots or self.decide_at != "arrival"):
-            raise BufgymError(
-                f"prior = {self.prior:g}: the rule is the prior of one queue's slot network with masks, of at most"
-                f" {MAX_WIDTH} hidden units a layer, which is asked at every arrival"
-            )
-
-
-@dataclass(frozen=True)
-class DQN(OnSlots):
-    """Train by double DQN with action masks, on the slots of the buffer."""
-
-    algo = "dqn"
-    learner = "agents.dqn:SlotDQN"
-    kinds = ("environment", "queue")
-    environment: Annotated[FullBuffer, FLAT] = FullBuffer()
-    learning_rate: Positive = 5e-4
-    """At the start; falls linearly to 0."""
-    train_freq: Count = 8
-    """Steps in each environment between updates."""
-    gradient_steps: Count = 8
-    """Gradient steps of an update; at 8, each decision is seen about four times."""
-    buffer_size: Count = 100_000
-    """Decisions in the replay; at 32 slots they take about 250 MB."""
-    learning_starts: Count = 4096
-    """Decisions before the first update."""
-    target_update_interval: Count = 8192
-    """Decisions between two copies of the network to the target network."""
+        if self.width > MAX_WIDTH:
+            raise BufgymError(f"width = {self.width}: a file of weights has at most {MAX_WIDTH} hidden units a layer")
 
 
 @dataclass(frozen=True)
@@ -297,5 +296,5 @@ class Hindsight(Settings):
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
 
 
-ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, GuidedPPO, Hindsight)
+ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, FleetPPO, GuidedPPO, Hindsight)
 """Commands of ``train.py``. A new learner is a file with a ``Learner`` (``agents.learner``) and an entry here."""

@@ -36,27 +36,6 @@ class Environment:
         if "Uplink" not in self.env and (self.size_bytes, self.duration_s) != (RGBD_BYTES, Uplink.duration_s):
             raise BufgymError(f"{self.env}: its messages have no size and its episodes no length to set")
 
-    @property
-    def slots(self) -> int:
-        """Slots that an agent observes."""
-        return self.capacity
-
-
-@dataclass(frozen=True)
-class SlotEnvironment(Environment):
-    """One environment, for an agent that chooses among slots."""
-
-    decide_at: Literal["arrival", "overflow"] = "arrival"
-    """When the agent is asked: at every arrival, or only when the buffer is full."""
-
-
-@dataclass(frozen=True)
-class FullBuffer(SlotEnvironment):
-    """The same, where the agent is asked only when the buffer is full, unless it is told otherwise."""
-
-    decide_at: Literal["arrival", "overflow"] = "overflow"
-    """When the agent is asked: at every arrival, or only when the buffer is full."""
-
 
 @dataclass(frozen=True)
 class Suites:
@@ -64,9 +43,8 @@ class Suites:
 
     suite: Names = ()
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
-    validation split, and report on its test split; the agent is asked at every arrival. Several, as in a,b: on all of
-    them at once. A suite of many topics (topics-v1) makes a scheduler, one of a fleet (fleet-v1) an agent
-    that all its robots share."""
+    validation split, and report on its test split. Several, as in a,b: on all of them at once. A suite of many topics
+    (topics-v1) makes a scheduler, one of a fleet (fleet-v1) an agent that all its robots share."""
     data: str | None = None
     """Folder of recordings, for suites that need one."""
     capacities: Capacities = ()
@@ -92,11 +70,6 @@ class Suites:
     def capacities_of(self, suite: str) -> tuple[int, ...]:
         """L to train for and to test at: the given ones, or the suite's."""
         return self.capacities or suites.get(suite).capacities
-
-    @property
-    def slots(self) -> int:
-        """Slots that one agent of all suites observes."""
-        return max(L for suite in self.suite for L in self.capacities_of(suite))
 
 
 FAMILY_NAMES = ("task", "frames", "lte", "generated", "outage", "heavy", "light", "interruption", "steady", "random")

@@ -1,30 +1,23 @@
-"""The parts of training on a suite: padded rows, the slot network, double DQN, evaluation sets."""
+"""The parts of training on a suite: mixed rows, evaluation sets, records, shipped agents."""
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from stable_baselines3.common.logger import Logger
-from train_cases import DropOldest
 
 from agents import mixed_env, runs
-from agents.dqn import INVALID, SlotDQN, valid_actions
-from agents.evaluation import EvaluationSet, SlotModel, sweep_for
-from agents.settings import DQN, Evolve
+from agents.evaluation import EvaluationSet, sweep_for
+from agents.settings import Evolve
 from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark.run import run as rows_of
+from bufgym.envs import SenderVectorEnv
 from bufgym.model import qoi
 from bufgym.model.qoi import exponential
 from bufgym.oracle import EveryLength
 from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv
-from bufgym.sb3.networks import SlotExtractor, SlotScorer
 from bufgym.scenario import Interruption, suites
 from bufgym.scenario.numbered import by_trace, draw
 from bufgym.sim import run
@@ -36,162 +29,47 @@ MIXED = [mixed_env.Cell("short", SHORT, 3), mixed_env.Cell("steep", STEEP, 5)]
 SUITE = Evolve(suites=Suites(("interruption-v1",), capacities=(4, 8)), validation_episodes=60)
 
 
-def mixed_rows(slots: int = 7) -> mixed_env.MixedEnv:
-    """Four rows of each cell of MIXED, each with its own episode, padded to so many slots."""
-    env = mixed_env.MixedEnv(MIXED, [4] * 2, slots)
-    env.load([draw(cell.scenario, seed) for cell in MIXED for seed in range(4)])
-    return env
+def mixed_rows() -> mixed_env.MixedEnv:
+    return mixed_env.MixedEnv(MIXED, [3, 4], reward="retained", info="none")
 
 
-def test_padded_slots_are_empty_and_masked() -> None:
-    env = mixed_rows()
-    for _ in range(6):  # as many arrivals as any episode has fill both kinds of buffer
-        env.act(np.full(8, 8))
-    live = ~env.ended()
-    seen, masks = env.observation(), env.action_masks()
-    assert live[:4].any() and live[4:].any()
-    for rows, L in ((slice(0, 4), 3), (slice(4, 8), 5)):
-        expected = [1.0] * L + [0.0] * (7 - L) + [1.0]  # the newcomer stays last
-        assert (seen["occupied"][rows][live[rows]] == expected).all()
-        assert (masks[rows][live[rows]] == [*map(bool, expected), False]).all()  # no room to accept
-        assert (seen["occupancy"][rows][live[rows]] == 1.0).all()
-
-
-@pytest.mark.parametrize("name", ["drop-oldest", "drop-newest"])
-def test_a_padded_row_is_the_same_sender(name: str) -> None:
-    """With 7 slots, 8 accepts, 7 rejects and 0 evicts the oldest, whatever the row's own L."""
-    env = mixed_rows()
-    while not env.ended().all():
-        env.act(np.where(env.action_masks()[:, 8], 8, 0 if name == "drop-oldest" else 7))
-    for (_, scenario, L), rows in zip(MIXED, env.groups, strict=True):
-        senders = run(policies.get(name), [draw(scenario, seed) for seed in range(4)], L, scenario.value)
-        reached = rows.summary(slice(None))
-        assert reached["qoi"] == pytest.approx(1 + senders.batch.senders["delivered_gain"])
-        assert not reached["invalid"].any()
-
-
-def test_evicting_a_padded_slot_does_what_a_queue_does() -> None:
-    env, queue = mixed_rows(), mixed_rows()
-    while not env.ended().all():
-        env.act(np.full(8, 6))  # a slot that no row has
-        queue.act(np.where(queue.action_masks()[:, 8], 8, 7))
-    for ours, theirs in zip(env.groups, queue.groups, strict=True):
-        assert (ours.summary(slice(None))["qoi"] == theirs.summary(slice(None))["qoi"]).all()
-        assert ours.summary(slice(None))["invalid"].any()
+def test_a_row_of_a_mix_is_the_environment_of_its_cell() -> None:
+    """Rows 0 to 2 are of the first cell, 3 to 6 of the second: the same seeds alone give the same numbers."""
+    env, rng = mixed_rows(), np.random.default_rng(0)
+    alone = [
+        SenderVectorEnv(n, c.scenario, c.capacity, autoreset_mode="SameStep", info="none")
+        for c, n in zip(MIXED, (3, 4), strict=True)
+    ]
+    env.reset(seed=5)
+    for group, other, first in zip(env.groups, alone, (5, 8), strict=True):
+        other.reset(seed=[first + i for i in range(group.num_envs)])
+        group.reset(seed=[first + i for i in range(group.num_envs)])
+    for _ in range(40):
+        actions = rng.integers(3, size=7)
+        seen, rewards, ended, truncated, info = env.step(actions)
+        parts = [other.step(actions[rows]) for other, rows in zip(alone, (slice(0, 3), slice(3, 7)), strict=True)]
+        for mixed, own in zip((seen, rewards, ended, truncated), zip(*parts, strict=True), strict=False):
+            assert np.array_equal(mixed, np.concatenate(own))
+        assert bool(info) == bool(ended.any())
+        if ended.any():
+            assert [final is not None for final in info["final_obs"]] == ended.tolist()
 
 
 def test_rewards_add_up_to_the_information_and_rows_begin_anew() -> None:
-    env = GymVecEnv(mixed_env.MixedEnv(MIXED, [3, 3], reward="retained"))
+    env = GymVecEnv(mixed_rows())
     env.seed(0)
     env.reset()
     ends = 0
     for _ in range(120):
-        masks = np.stack(env.env_method("action_masks"))
         total = env._returns.copy()
-        _, rewards, done, infos = env.step(np.where(masks[:, -1], 6, 0))
+        _, rewards, done, infos = env.step(np.zeros(7, np.int64))
         for i in np.flatnonzero(done):
             assert infos[i]["episode"]["r"] == pytest.approx(total[i] + rewards[i])
-            assert not any(column.any() for column in infos[i]["terminal_observation"].values())
-            if ends > 12:  # a row's first episode is joined somewhere in its middle
-                assert 0 < infos[i]["episode"]["r"] <= infos[i]["episode"]["l"]
+            assert not infos[i]["terminal_observation"].any()
+            if ends > 14:  # a row's first episode is joined somewhere in its middle
+                assert infos[i]["episode"]["r"] > 0
             ends += 1
-        assert np.stack(env.env_method("action_masks"))[done].any(axis=1).all()
-    assert ends > 12
-
-
-def scorer_of(env: mixed_env.MixedEnv, masked: bool = True) -> tuple[SlotExtractor, SlotScorer]:
-    torch.manual_seed(0)
-    features = SlotExtractor(env.single_observation_space)
-    return features, SlotScorer(features, 8, masked)
-
-
-def seen_in(env: mixed_env.MixedEnv) -> dict[str, torch.Tensor]:
-    return {name: torch.as_tensor(column) for name, column in env.observation().items()}
-
-
-def test_scores_and_values_do_not_change_with_padding() -> None:
-    logits, values = [], []
-    for slots in (5, 9):
-        env = mixed_rows(slots=slots)
-        env.act(np.full(8, slots + 1))
-        env.act(np.full(8, slots + 1))
-        features, scorer = scorer_of(env)
-        with torch.no_grad():
-            scores, value = scorer(features(seen_in(env)))
-        logits.append(scores[torch.as_tensor(env.action_masks())])
-        values.append(value)
-    assert torch.allclose(*logits, atol=1e-6) and len(logits[0]) > 16
-    assert torch.allclose(*values, atol=1e-6)
-
-
-def test_leaving_empty_slots_out_changes_no_score_that_counts() -> None:
-    env = mixed_rows()
-    env.act(np.full(8, 8))
-    seen = seen_in(env)
-    features, packed = scorer_of(env)
-    _, full = scorer_of(env, masked=False)
-    full.load_state_dict(packed.state_dict())
-    masks = torch.as_tensor(env.action_masks())
-    ours, theirs = packed.forward_actor(features(seen)), full.forward_actor(features(seen))
-    assert torch.allclose(ours[masks], theirs[masks], atol=1e-6)
-    assert not torch.allclose(ours[~masks][:, None], theirs[~masks][:, None])
-    # Gradients find the way back through the packing.
-    ours[masks].sum().backward()
-    theirs[masks].sum().backward()
-    for a, b in zip(packed.score.parameters(), full.score.parameters(), strict=True):
-        assert torch.allclose(a.grad, b.grad, atol=1e-4)  # type: ignore[arg-type]
-
-
-@pytest.fixture
-def dqn() -> Iterator[Any]:
-    arguments = DQN(width=8, num_envs=8, batch_size=64, gamma=0.5)
-    env = GymVecEnv(mixed_env.MixedEnv(MIXED, [4, 4]))
-    model = SlotDQN(arguments).make(env)
-    model.set_random_seed(0)
-    yield model
-    env.close()
-
-
-def test_the_observation_tells_the_masks(dqn: Any) -> None:
-    rng, env = np.random.default_rng(0), dqn.env
-    seen = env.reset()
-    for _ in range(60):
-        masks = np.stack(env.env_method("action_masks"))
-        assert (valid_actions(seen).numpy() == masks).all()
-        q = dqn.q_net({name: torch.as_tensor(column) for name, column in seen.items()}).detach().numpy()
-        assert ((q == INVALID) == ~masks).all()
-        seen, _, _, _ = env.step((rng.random(masks.shape) * masks).argmax(axis=1))
-
-
-def test_exploration_tries_all_valid_actions_and_no_others(dqn: Any) -> None:
-    dqn.exploration_rate = 1.0
-    dqn._last_obs = dqn.env.reset()
-    masks = np.stack(dqn.env.env_method("action_masks"))
-    tried = np.zeros_like(masks)
-    for _ in range(100):
-        tried[np.arange(8), dqn._sample_action(0, n_envs=8)[0]] = True
-    assert (tried == masks).all()
-    dqn.exploration_rate = 0.0
-    greedy, _ = dqn.predict(dqn._last_obs)
-    assert (dqn._sample_action(0, n_envs=8)[0] == greedy).all()
-
-
-def test_targets_choose_by_one_network_and_value_by_the_other(dqn: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """reward 1, gamma 1/2: the online network prefers action 1 afterwards, which the target network gives 4, not its
-    best 6: target 1 + 4/2 = 3. In the terminal row the target is the reward."""
-    online = torch.nn.Parameter(torch.tensor([[0.0, 2.0, 1.0]]))
-    monkeypatch.setattr(type(dqn.q_net), "forward", lambda self, obs: self.table.expand(2, -1))
-    dqn.q_net.table, dqn.q_net_target.table = online, torch.nn.Parameter(torch.tensor([[6.0, 4.0, 5.0]]))
-    dqn.policy.optimizer = torch.optim.SGD([online], lr=1.0)
-    dqn.lr_schedule = lambda _: 1.0
-
-    seen: dict[str, Any] = {"observations": None, "next_observations": None, "rewards": torch.ones(2, 1)}
-    seen |= {"actions": torch.tensor([[0], [2]]), "dones": torch.tensor([[0.0], [1.0]])}
-    dqn.replay_buffer = SimpleNamespace(sample=lambda batch_size: SimpleNamespace(**seen))
-    dqn._logger = Logger(None, [])
-    dqn.train(1, batch_size=2)
-    # Huber's slope is 1 beyond 1, halved by the mean over two rows: Q(0) moves from 0 towards 3 by 1/2; Q(2) = 1 stays.
-    assert online.detach().numpy() == pytest.approx(np.array([[0.5, 2.0, 1.0]]))
+    assert ends > 14
 
 
 def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: Path) -> None:
@@ -199,8 +77,8 @@ def test_an_agent_that_acts_like_a_policy_has_its_rows_and_its_score(tmp_path: P
     plan, file = sweep_for(few, "interruption-v1", "validation"), tmp_path / "set" / "manifest.json"
     evaluation = EvaluationSet(plan, tmp_path / "set")
     assert len(evaluation.fixed("afr")) == 12
-    assert evaluation.verdict(evaluation.play(SlotModel(DropOldest(), 8))).score == 0
-    rows = evaluation.benchmark_rows(evaluation.play(SlotModel(DropOldest(), 10)), "agent", training_seed=7)  # padded
+    assert evaluation.verdict(evaluation.play(policies.get("drop-oldest"))).score == 0
+    rows = evaluation.benchmark_rows(evaluation.play(policies.get("drop-oldest")), "agent", training_seed=7)
     fixed = {(r["scenario"], r["seed"], r["capacity"]): r for r in evaluation.rows if r["policy"] == "drop-oldest"}
     assert len(rows) == len(fixed) == 12
     for row in rows:

@@ -8,31 +8,36 @@ import numpy as np
 import pytest
 from cli_cases import Patch
 from refusal_cases import refuse
-from test_train import GUIDED, LEARNERS, ON, TINY
+from test_train import LEARNERS, ON
 from train_cases import in_a_folder_of_its_own  # noqa: F401
 
 import train
 from agents import ppo, runs
 from agents.callbacks import checkpoints
-from agents.dqn import MaskedDQN
-from agents.evaluation import SlotModel
 from agents.held_out import FixedEpisodes
 from agents.learner import Learner, learner_of
 from agents.settings import Settings
 from bufgym import policies
+from bufgym.envs import SenderVectorEnv
 from bufgym.policies.weights import save
 
 
-def test_a_slot_network_is_kept_as_a_policy_that_decides_as_it_does() -> None:
-    """The same episodes in torch and compiled, before anything was learned and afterwards."""
-    learner: Any = learner_of(TINY)
-    run = learner.train_seed(runs.prepare(TINY), 0)
-    test = FixedEpisodes(ON, "test", 3)
-    model = ppo.MaskablePPO.load(run.folder / "model.zip")
-    assert run.file == runs.MODEL and test.play(learner.agent(run)) == test.play(SlotModel(model, 3))
-    at_overflow = dataclasses.replace(TINY, environment=dataclasses.replace(ON, decide_at="overflow"))
-    others = (at_overflow, dataclasses.replace(TINY, unmasked=True))
-    assert [learner_of(other).weights_of(model) for other in others] == [None, None]  # type: ignore[attr-defined]
+@pytest.mark.parametrize("algo", ["ppo", "dqn"])
+def test_a_network_is_kept_as_a_policy_that_decides_as_it_does(algo: str) -> None:
+    """The same episodes in torch, in the environment, and compiled, as a policy."""
+    learner: Any = learner_of(LEARNERS[algo])
+    run = learner.train_seed(runs.prepare(LEARNERS[algo]), 0)
+    test, model = FixedEpisodes(ON, "test", 3), learner.algorithm.load(run.folder / "model.zip")
+    envs = SenderVectorEnv(3, test.scenario, ON.capacity, info="full")
+    seen, _ = envs.reset(options={"episodes": test.episodes})
+    reached, live = np.zeros(3), np.ones(3, np.bool_)
+    while live.any():
+        seen, _, ended, _, info = envs.step(model.predict(seen, deterministic=True)[0])
+        reached[live & ended] = info["qoi"][live & ended]
+        live &= ~ended
+    outcomes = test.play(learner.agent(run))
+    assert run.file == runs.MODEL and [outcome.qoi for outcome in outcomes] == pytest.approx(reached)
+    assert any(outcome.dropped for outcome in outcomes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +65,7 @@ def test_a_new_learner_is_a_class_and_its_settings(monkeypatch: Patch) -> None:
     train.add_command(Still)
     with pytest.raises(SystemExit):
         train.typed(["still", "--capacity=3", "--duration-s=1", "--validation-episodes=2", "--name=tiny"])
-    assert asked == [Still(environment=dataclasses.replace(GUIDED, episodes=200), name="tiny", validation_episodes=2)]
+    assert asked == [Still(environment=dataclasses.replace(ON, episodes=200), name="tiny", validation_episodes=2)]
     (run,) = learner_of(asked[0]).train(runs.prepare(asked[0]))
     judges = FixedEpisodes(asked[0].environment, "validation", 2)
     assert run.merit == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
@@ -73,7 +78,7 @@ def test_dqn_goes_on_with_its_optimizer_and_a_fresh_replay() -> None:
     models = []
     for steps in (256, 512):
         learner_of(dataclasses.replace(arguments, steps=steps)).train_seed(folder, 0)
-        model = MaskedDQN.load(checkpoints(folder / "seed-0")[-1])
+        model = ppo.sb3.DQN.load(checkpoints(folder / "seed-0")[-1])
         counts = {int(state["step"]) for state in model.policy.optimizer.state_dict()["state"].values()}
         assert model.num_timesteps == steps and counts == {model._n_updates}
         models.append(model)

@@ -2,9 +2,7 @@
 
 import csv
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from needs import needs
 
@@ -14,14 +12,6 @@ for extra in ("sb3_contrib", "tqdm", "tensorboard", "cma"):
 
 class KilledError(Exception):
     """Stands for what ends a process in the middle of training."""
-
-
-class DropOldest:
-    """Accepts where that is possible, else evicts slot 0; remembers nothing."""
-
-    def predict(self, observation: Any, *, deterministic: bool = False, action_masks: Any = None) -> Any:
-        last = action_masks.shape[1] - 1
-        return np.where(action_masks[:, last], last, np.where(action_masks[:, 0], 0, last - 1)), None
 
 
 def columns(file: Path, *names: str) -> list[tuple[float, ...]]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.evaluation import Agent, qoi_of
+from agents.evaluation import qoi_of
 from agents.held_out import FixedEpisodes, fixed_episodes, split_scenario
 from agents.objectives.objective import Objective
 from agents.report import Report, Trained, by_hand, report_environment
@@ -69,7 +69,7 @@ class EnvironmentObjective(Objective):
         """Mean H over all episodes of a part."""
         return float(np.mean([played.qoi(policy) for played in episodes]))
 
-    def validate(self, agent: Agent) -> tuple[float, ...]:
+    def validate(self, agent: Policy) -> tuple[float, ...]:
         """Score and mean H on the validation episodes."""
         outcomes = self.judges.play(agent)
         # By QoI, which orders agents like the score, and is known even if nothing can be gained.
@@ -86,8 +86,8 @@ class EnvironmentObjective(Objective):
         scores = {name: self.judges.score(self.judges.play(policies.get(name))) for name in by_hand()}
         best = max(scores, key=lambda name: scores[name])
         lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "afr", best))}
-        told = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
-        print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {told}", flush=True)
+        listed = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
+        print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {listed}", flush=True)
         return lines
 
     def report(self, trained: Trained) -> Report:

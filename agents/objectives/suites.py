@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.evaluation import Agent, ValidationSets, Verdict
+from agents.evaluation import ValidationSets, Verdict
 from agents.families import Family, divided, merged, of_suite
 from agents.mixed_env import MixedEnv, cells
 from agents.objectives.objective import Objective
@@ -55,7 +55,7 @@ class SuitesObjective(Objective):
         """Share of AFR's regret, mean over the suites."""
         return float(np.mean([family.share(policy) for family in episodes]))
 
-    def validate(self, agent: Agent) -> tuple[float, ...]:
+    def validate(self, agent: Policy) -> tuple[float, ...]:
         """The verdict on the validation splits."""
         return self.judges.play(agent)
 
