@@ -60,7 +60,8 @@ def draw(
     whiskers = {"ecolor": "0.25", "elinewidth": 1, "capsize": 2}
     right.barh(names, scores, xerr=np.nan_to_num(reach).clip(0).T, color=colours, error_kw=whiskers)
     for name, interval in zip(names, intervals, strict=True):
-        right.text(max(interval.value, np.nan_to_num(interval.high)) + 0.01, name, f"{interval.value:.3f}", va="center")
+        end = min(max(interval.value, np.nan_to_num(interval.high)), 1.0)  # of few links it can lie far outside
+        right.text(end + 0.01, name, f"{interval.value:.3f}", va="center")
     right.set(xlabel="\n".join(["score: 0 is Drop Oldest, 1 the clairvoyant", *notes]), title=title, xlim=(0, 1))
     right.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=120)

@@ -33,6 +33,10 @@ CLIENT = Client((POSE, MAP), (LINK,), value=qoi.exponential(0.618), **NUMBERS)
 """Poses at 0, 0.5, 1 and 1.5 s that take 0.1 s each, maps at 0 and 1 s that take 1 s each."""
 
 
+T_OF_TWO = 12.706
+"""Student's t of 95 % with one degree of freedom, that of two episodes."""
+
+
 def met(policy: str, client: Client = CLIENT, capacity: int = 16) -> dict[str, Row]:
     return {row["topic"]: row for row in run([policies.get(policy)], client, [capacity], 1, label="hand")}
 
@@ -187,7 +191,9 @@ def test_a_summary_of_teams_worked_by_hand() -> None:
     assert [standing.policy for standing in found.overall] == ["mine", "afr"]
     mine, base = found.overall
     assert found.cells == {("s", 4): [mine, base]}
-    assert mine["team"] == (6.0, 4.0, 8.0) and base["team"].value == 5.0
+    # Two episodes of 4 and 8: drawn means are 4, 6, 6 or 8, so the standard error is sqrt(2) sqrt(2) = 2.
+    assert mine["team"] == pytest.approx((6.0, 6.0 - 2 * T_OF_TWO, 6.0 + 2 * T_OF_TWO), rel=0.03)
+    assert base["team"].value == 5.0
     assert mine["gain"] == exactly(1.0) and base["gain"] == exactly(0.0)
     assert mine["above"] == exactly(0.5) and base["above"] == base["below"] == exactly(0.0)
     assert mine["below"].value == 0.25
@@ -202,7 +208,8 @@ def test_intervals_are_over_episodes_not_robots() -> None:
     many = 100
     rows = [*team_rows("afr", (1.0,) * many, (1.0,) * many), *team_rows("mine", (1.0,) * many, (3.0,) * many)]
     mine = FLEET.summary(rows).standings["mine"]
-    assert mine["gain"] == (1.0, 0.0, 2.0) and mine["above"] == (0.5, 0.0, 1.0)
+    for gained, value, error in ((mine["gain"], 1.0, 1.0), (mine["above"], 0.5, 0.5)):
+        assert gained == pytest.approx((value, value - error * T_OF_TWO, value + error * T_OF_TWO), rel=0.03)
 
 
 def test_rounding_is_no_gain_and_nothing_is_fair() -> None:

@@ -76,21 +76,21 @@ async def test_a_client_of_foxglove_sees_the_fleet(corner: Corner, monkeypatch: 
 async def test_a_relay_shows_what_its_rules_allow() -> None:
     """Of what a robot sends, who connects to the relay's own server sees what rules with ``foxglove`` let it see."""
     viewer = Viewer()
-    rules = (ALL, Rule(foxglove=True, receive=True, topic="/robots/[^/]+/(scan|odom|text|camera|stop)"))
-    config = settings(rules=rules, foxglove=Foxglove(port=0), no_drop=("/robots/[^/]+/stop",))
+    rules = (ALL, Rule(foxglove=True, receive=True, topic="/robots/[^/]+/(scan|odom|text|camera|halt)"))
+    config = settings(rules=rules, foxglove=Foxglove(port=0), no_drop=("/robots/[^/]+/halt",))
     async with relay(config) as server, client(server.port) as robot, client(server.port) as other:
         assert server.window is not None
-        await other.subscribe("stop$")
+        await other.subscribe("halt$")
         async with within("what it may see"), beside(viewer.listen(server.window.address)):
             seq = 0
-            while set(viewer.came) != {f"/robots/r/{name}" for name in ("odom", "camera", "text", "stop")}:
+            while set(viewer.came) != {f"/robots/r/{name}" for name in ("odom", "camera", "text", "halt")}:
                 seq += 1
                 await robot.put("/robots/r/private", b"secret")
                 # What says that it is a pose and is none, and a time that no clock of Foxglove's has, stop nothing.
                 await robot.put("/robots/r/odom", b"12", encoding="cdr", type=ODOMETRY)
                 await robot.put("/robots/r/camera", b"jpeg", encoding="jpeg", stamp_us=MAX_STAMP_US)
                 await robot.put("/robots/r/text", b"hello")
-                await robot.command(seq, "/robots/r/stop")
+                await robot.command(seq, "/robots/r/halt")
                 while not any(said.get("op") == "ack" for said in await robot.rest()):
                     pass
                 await other.came(seq)

@@ -329,12 +329,16 @@ AFR = [run_of("afr", 0, 4.0, 4.0), run_of("afr", 1, 3.0, 3.0)]
 
 
 def test_margins_by_hand() -> None:
-    """Of 10 in all, 0.1 + 0.2 are won live and 0.2 + 0.2 in the simulator; an episode is drawn twice, or each once."""
+    """Of 10 in all, 0.1 + 0.2 are won live and 0.2 + 0.2 in the simulator.
+
+    An episode is drawn twice, or each once: .02, .03, .03 or .04 live, so the standard error is .01. Two episodes have
+    one degree of freedom, and Student's t is 12.706.
+    """
     [margin] = margins([*AFR, run_of("random", 0, 4.1, 4.2), run_of("random", 1, 3.2, 3.2)])
     assert (margin.policy, margin.reference, margin.episodes) == ("random", "afr", 2)
-    assert margin.live == pytest.approx((0.03, 0.02, 0.04))
+    assert margin.live == pytest.approx((0.03, 0.03 - 0.12706, 0.03 + 0.12706), rel=0.03)
     assert margin.simulated == pytest.approx((0.04, 0.04, 0.04))
-    assert margin.share == pytest.approx((0.75, 0.5, 1.0))
+    assert margin.share == pytest.approx((0.75, 0.75 - 0.25 * 12.706, 0.75 + 0.25 * 12.706), rel=0.03)
 
 
 def test_nothing_is_said_of_a_single_episode_or_without_the_reference() -> None:
