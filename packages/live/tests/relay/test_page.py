@@ -1,6 +1,7 @@
 """The page in a browser: robots, map, senses, queue, a command, a recording; on a desk and on a phone."""
 
 import asyncio
+import contextlib
 import json
 import math
 import queue
@@ -34,23 +35,30 @@ SEES = """canvas => {
 """How many colours a canvas has."""
 
 
-@pytest.fixture(scope="module")
-def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Of a relay with two made-up robots, in a thread; it records."""
+@contextlib.contextmanager
+def recorded(folder: Path) -> Iterator[int]:
+    """The port of a relay with two made-up robots, in a thread; it records."""
     found: queue.Queue[int] = queue.Queue()
     over = threading.Event()
 
-    async def show(folder: Path) -> None:
+    async def show() -> None:
         async with demo.running(2, policy="drop-oldest", fades=False, folder=folder) as number:
             found.put(number)
             await asyncio.to_thread(over.wait, 600)
 
-    thread = threading.Thread(target=lambda: asyncio.run(show(tmp_path_factory.mktemp("relay"))))
+    thread = threading.Thread(target=lambda: asyncio.run(show()))
     thread.start()
     yield found.get(timeout=120)
     over.set()
     thread.join(120)
     assert not thread.is_alive(), "waited 120 s for the relay's end"
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[int]:
+    """Of a relay for one test: what a test adds, the relay keeps."""
+    with recorded(tmp_path) as number:
+        yield number
 
 
 @pytest.fixture(scope="module")

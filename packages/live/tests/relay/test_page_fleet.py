@@ -42,18 +42,15 @@ ORANGE, WALL = (f"({COUNT})({colour})" for colour in ("[255, 128, 0]", "[140, 15
 
 
 @pytest.fixture(scope="module")
-def running() -> Iterator[tuple[Any, Fleet]]:
-    with browsing() as browser, Fleet() as fleet:
-        yield browser, fleet
+def browser() -> Iterator[Any]:
+    with browsing() as one:
+        yield one
 
 
 @pytest.fixture(params=WIDTHS)
-def opened(running: tuple[Any, Fleet], request: pytest.FixtureRequest) -> Iterator[tuple[Any, Fleet]]:
-    """The page, which must say no error and fit its window's width, and the fleet, which has no robots yet."""
-    browser, fleet = running
-    fleet.robots.clear()
-    fleet.came.clear()
-    with shows(browser, f"http://127.0.0.1:{fleet.port}/", width=request.param) as page:
+def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[tuple[Any, Fleet]]:
+    """The page, which must say no error and fit its window's width, and a fleet that has no robots yet."""
+    with Fleet() as fleet, shows(browser, f"http://127.0.0.1:{fleet.port}/", width=request.param) as page:
         page.set_default_timeout(120_000)
         yield page, fleet
 
@@ -336,8 +333,8 @@ def test_driving_by_hand(opened: tuple[Any, Fleet]) -> None:
     assert fleet.driven == []
 
 
-def test_an_absent_relay_covers_the_page(running: tuple[Any, Fleet]) -> None:
-    page = running[0].new_page()
+def test_an_absent_relay_covers_the_page(browser: Any) -> None:
+    page = browser.new_page()
     with Fleet() as fleet:
         page.goto(f"http://127.0.0.1:{fleet.port}/")
         until(page, f"{text('#state')} === 'live'")
