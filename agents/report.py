@@ -155,9 +155,11 @@ def report_environment(trained: Trained) -> Report:
     rows = test.rows(outcomes)
     entries, alike = summarise(outcomes, rows, best), with_equal_rows(rows)
     unranked = unranked_among(map(registry.get, registry.names()))
-    print(table(entries, best, alike, unranked))
-    print(verdict(entries, best, trained.best.seconds, trained.settings.algo))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
+    over = f"these {len(traces)} links" if traces else "this kind"
+    print(table(entries, best, alike, unranked))
+    print(f"in brackets: 95 % intervals for other episodes of {over}" + ", not for other links" * bool(traces))
+    print(verdict(entries, best, trained.best.seconds, trained.settings.algo, over))
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = trained.save(trained.folder, held_out=held_out, scores=entries)
     bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in unranked}
@@ -174,8 +176,8 @@ def report_environment(trained: Trained) -> Report:
     return [trained.best.seed], notes, "model, figure and numbers"
 
 
-def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float, algo: str) -> str:
-    """One sentence: the distance of the agent's score from AFR, the best rules and other agents.
+def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float, algo: str, over: str) -> str:
+    """One sentence: the distance of the agent's score from AFR, the best rules and other agents, on episodes of what.
 
     It is level with a policy where the 95 % interval of the difference in QoI has 0 in it.
     """
@@ -197,7 +199,8 @@ def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float, algo:
         ahead = known[agent]["score"] - known[name]["score"]
         where = "above" if high < 0 else "below" if low > 0 else "level with"
         told.append(f"{where} {label}" + (f" by {abs(ahead):.3f}" if where != "level with" else f" ({ahead:+.3f})"))
-    return f"after {seconds:.0f} s {agent}, by {algo}, scores {known[agent]['score']:.3f}: {', '.join(told)}"
+    reached = f"{known[agent]['score']:.3f} on episodes of {over}"
+    return f"after {seconds:.0f} s {agent}, by {algo}, scores {reached}: {', '.join(told)}"
 
 
 def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:

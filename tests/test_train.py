@@ -313,8 +313,8 @@ def test_the_verdict_says_how_far_above_whom() -> None:
         *(entry("agent by ppo (seed 1)", 0.6, -2.0, -1.0), entry("agent by ppo (seed 0)", 0.5, -3.0, -1.0)),
         entry("afr", 0.4, -5.0, -4.0),
     ]
-    assert verdict(entries, "a", 61.4, "evolve") == (
-        "after 61 s a, by evolve, scores 0.700: above AFR by 0.300, "
+    assert verdict(entries, "a", 61.4, "evolve", "these 2 links") == (
+        "after 61 s a, by evolve, scores 0.700 on episodes of these 2 links: above AFR by 0.300, "
         "level with the best rule written by hand, min-gap, (+0.010), "
         "below learned by 0.050, above agent by ppo (seed 1) by 0.100"
     )
