@@ -46,7 +46,8 @@ class Sweep:
 
     suite: str
     specs: tuple[str, ...]
-    """Policies, as ``bufgym.policies.get`` takes them; the task's baseline is added if it is missing."""
+    """Policies, as ``bufgym.policies.get`` takes them; the task's baseline and reference, which rows are compared
+    with, are added if they are missing."""
     split: str = "test"  # "train", "validation" or "test"
     capacities: tuple[int, ...] = ()  # L, messages; empty for the suite's own
     seeds: int | None = None  # episodes on each trace; None for the suite's own number
@@ -94,7 +95,8 @@ class Sweep:
             raise BufgymError(f"seeds = {seeds}: must lie between 1 and {SEEDS_PER_TRACE}")
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
-        specs = self.specs if task.baseline in self.specs else (*self.specs, task.baseline)
+        compared = dict.fromkeys((task.baseline, task.reference))
+        specs = (*self.specs, *(name for name in compared if name not in self.specs))
         files = self.sources or sources.loaded(specs, self.home)
         complete = replace(
             self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds

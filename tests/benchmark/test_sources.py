@@ -207,7 +207,7 @@ def test_a_suite_takes_files_and_named_policies_and_those_registered_here(tmp_pa
     shutil.copy(shipped["learned-ppo"], "mine.safetensors")
     options: dict[str, Any] = {"capacity": 2, "seeds": 1, "progress": False}
     done = bufgym.compare([Path("mine.safetensors"), "learned-ppo"], "interruption-v1", **options)
-    assert {row["policy"] for row in done.rows} == {"mine", "learned-ppo", "drop-oldest"}
+    assert {row["policy"] for row in done.rows} == {"mine", "learned-ppo", "drop-oldest", "afr"}
     policies.register("stubborn")(stubborn)
     done = bufgym.compare(stubborn, "interruption-v1", **options)
     assert {row["policy"] for row in done.rows} == {"stubborn", "drop-oldest"}
