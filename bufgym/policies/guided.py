@@ -138,7 +138,7 @@ INPUT_FIELDS = (
     declared("unknown", "1 where the target gap is unknown, otherwise 0",
              lambda buffer, known: 0.0 if known.has_target else 1.0),
     declared("one", "always 1", lambda buffer, known: 1.0),
-    declared("head_gap", "lg(the gap left if the head is dropped, g); 0 for an empty queue",
+    declared("head_gap", "lg(the gap left if the head goes, g); 0 for an empty queue",
              lambda buffer, known: lg(known.head_gap, known.gap) if known.messages > 1 else 0.0),
     declared("share", "a, the share of price-dp in the plain rule", lambda buffer, known: known.share),
     declared("plain",
