@@ -86,8 +86,8 @@ class EnvironmentObjective(Objective):
         scores = {name: self.judges.score(self.judges.play(policies.get(name))) for name in by_hand()}
         best = max(scores, key=lambda name: scores[name])
         lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "afr", best))}
-        told = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
-        print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {told}", flush=True)
+        listed = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
+        print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {listed}", flush=True)
         return lines
 
     def report(self, trained: Trained) -> Report:
