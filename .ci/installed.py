@@ -41,10 +41,10 @@ def check() -> None:
     assert main(["bench", "--policies", "learned,afr,drop-oldest", "--seconds", "5", "--seeds", "1"]) == 0
     assert main(["report", "nowhere"]) == 2
     for command, package in {"live": "live", "ros2": "live", "relay": "live", "reproduce": "papers"}.items():
-        with contextlib.redirect_stderr(io.StringIO()) as told:
+        with contextlib.redirect_stderr(io.StringIO()) as errors:
             assert main([command]) == 2
         where = f"bufgym-{package}: pip install packages/{package}, in bufgym's source tree"
-        assert told.getvalue() == f"bufgym: error: {command} comes with the package {where}\n", told.getvalue()
+        assert errors.getvalue() == f"bufgym: error: {command} comes with the package {where}\n", errors.getvalue()
     try:
         gym.make("bufgym/Mapping-v0")
         raise AssertionError("bufgym/Mapping-v0 was made")

@@ -17,7 +17,7 @@ import coverage
 
 REPO = Path(__file__).resolve().parent.parent
 FOLDERS = ("model", "sim", "policies", "oracle", "envs")
-"""Rooms of the core. All kernels that decide what a sender does are in these."""
+"""Subpackages of the core. All kernels that decide what a sender does are in these."""
 LEAST = 0.95
 """Share of lines that must run."""
 DECORATORS = {"kernel", "direct", "built_in"}

@@ -28,7 +28,7 @@ def read(skipped: Path) -> dict[str, str]:
     return {test: why for test, why in found.items() if group_of(why) != WITHOUT_ONE}
 
 
-def told(skipped: Path) -> str:
+def message(skipped: Path) -> str:
     """A line for each group: how many tests, of what, and what brings it."""
     groups = Counter(group_of(why) or why for why in read(skipped).values())
     if not groups:

@@ -131,8 +131,8 @@ def uncompiled(folder: Path, arguments: list[str]) -> list[Stage]:
 def test(arguments: list[str]) -> list[Stage]:
     """What protects a commit."""
     folder = REPO / "build" / "test"
-    told = {"BUFGYM_SKIPPED": str(SKIPS)}
-    compiled = pytest("compiled", folder, "-m", "not nightly", *arguments, environment=told)
+    settings = {"BUFGYM_SKIPPED": str(SKIPS)}
+    compiled = pytest("compiled", folder, "-m", "not nightly", *arguments, environment=settings)
     return [*check(), compiled, *uncompiled(folder, arguments)]
 
 
@@ -142,13 +142,13 @@ def everything(arguments: list[str]) -> list[Stage]:
         raise SystemExit("make everything runs what make test has skipped: first run make test")
     folder = REPO / "build" / "everything"
     chosen, left, installed = folder / "chosen.txt", folder / "skipped.json", str(folder / "installed.json")
-    told = {"BUFGYM_SKIPPED": str(left)} | ({"BUFGYM_SHARED_DATA": str(DATA)} if DATA.is_dir() else {})
+    settings = {"BUFGYM_SKIPPED": str(left)} | ({"BUFGYM_SHARED_DATA": str(DATA)} if DATA.is_dir() else {})
     skipped = missing.read(SKIPS)
     chosen.write_text("".join(f"{test}\n" for test in skipped), encoding="utf-8")
     none = "" if skipped else "make test skipped nothing"
     no_npm = "" if shutil.which("npm") or TSC.exists() else "npm is not here"
     tool = [PYTHON, ".ci/missing.py"]
-    tests = pytest("skipped before", folder, "-m", "not nightly", *arguments, f"@{chosen}", environment=told)
+    tests = pytest("skipped before", folder, "-m", "not nightly", *arguments, f"@{chosen}", environment=settings)
     return [
         Stage("install", [*tool, "install", str(SKIPS), installed]),
         Stage("page types", [str(TSC), "-p", ".ci/tsconfig.json"], unless=no_npm),
@@ -302,7 +302,7 @@ def main(tier: str, arguments: list[str]) -> int:
     (folder / "summary.txt").write_text(text + "\n", encoding="utf-8")
     print(f"\n{text}")
     if tier in ("test", "everything") and (folder / "skipped.json").exists():
-        print(missing.told(folder / "skipped.json"))
+        print(missing.message(folder / "skipped.json"))
     return int(any(result.failed for result in results))
 
 

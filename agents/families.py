@@ -95,11 +95,11 @@ class Family:
         """The share of AFR's regret."""
         return float(self.shares(self.play(policy))[0])
 
-    def against(self, policies: Sequence[Policy]) -> list[tuple[float, list[Interval]]]:
+    def against(self, several: Sequence[Policy]) -> list[tuple[float, list[Interval]]]:
         """Each policy's share, and how far it lies above each other's, with an interval over links."""
         links = int(self._link.max()) + 1
         weights = times_drawn(links, RESAMPLES, np.random.default_rng(0))
-        shares = [self.shares(self.play(policy), weights) for policy in policies]
+        shares = [self.shares(self.play(policy), weights) for policy in several]
         return [(float(own[0]), [interval(own - other, links) for other in shares]) for own in shares]
 
 

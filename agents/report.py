@@ -191,16 +191,16 @@ def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float, algo:
         "target-gap": "target-gap",
         "learned": "learned",
     }
-    told = []
+    lines = []
     for name, label in {**rivals, **{name: name for name in first}}.items():
         if name not in known:
             continue
         low, high = known[name]["minus_agent_95"]
         ahead = known[agent]["score"] - known[name]["score"]
         where = "above" if high < 0 else "below" if low > 0 else "level with"
-        told.append(f"{where} {label}" + (f" by {abs(ahead):.3f}" if where != "level with" else f" ({ahead:+.3f})"))
+        lines.append(f"{where} {label}" + (f" by {abs(ahead):.3f}" if where != "level with" else f" ({ahead:+.3f})"))
     reached = f"{known[agent]['score']:.3f} on episodes of {over}"
-    return f"after {seconds:.0f} s {agent}, by {algo}, scores {reached}: {', '.join(told)}"
+    return f"after {seconds:.0f} s {agent}, by {algo}, scores {reached}: {', '.join(lines)}"
 
 
 def _drawn(bars: Mapping[str, Interval], alike: Mapping[str, Sequence[str]]) -> tuple[dict[str, Interval], list[str]]:

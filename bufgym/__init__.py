@@ -48,9 +48,9 @@ for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
             disable_env_checker=True,
             kwargs={"scenario": _scenario, **_options},
         )
-for _id, _told in _absent(_GROUP, _gym.registry).items():
+for _id, _message in _absent(_GROUP, _gym.registry).items():
     _stand_in = "bufgym.utils.packages:raise_absent"
-    _gym.register(_id, _stand_in, vector_entry_point=_stand_in, kwargs={"told": f"{_id} {_told}"})
+    _gym.register(_id, _stand_in, vector_entry_point=_stand_in, kwargs={"message": f"{_id} {_message}"})
 
 __getattr__ = _on_demand(
     __name__, {"Comparison": "benchmark.compare", "compare": "benchmark.compare", "make_policy": "benchmark.compare"}

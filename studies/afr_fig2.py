@@ -46,8 +46,8 @@ class Reproduction(Figure):
 
     def claims(self, rows: FigureRows) -> dict[str, Any]:
         dequeued, delivered = (int(rows.column(name).sum()) for name in ("dequeued", "delivered"))
-        told = ", ".join(PLAYED)
-        return {"kept": dequeued == delivered, "dequeued": dequeued, "lost": dequeued - delivered, "policies": told}
+        names = ", ".join(PLAYED)
+        return {"kept": dequeued == delivered, "dequeued": dequeued, "lost": dequeued - delivered, "policies": names}
 
     def draw(self, rows: FigureRows, figure: Any) -> None:
         axes = figure.add_subplot()

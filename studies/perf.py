@@ -128,25 +128,25 @@ class _Meter:
 
     def __init__(self, sizes: Sizes) -> None:
         self.sizes, (self._work, self._steps) = sizes, microbenchmark.passes(max(sizes.batches), sizes.capacity)
-        told = f"steps a second of studies.microbenchmark, n = {max(sizes.batches)}, L = {sizes.capacity}"
+        about = f"steps a second of studies.microbenchmark, n = {max(sizes.batches)}, L = {sizes.capacity}"
         self._work()  # compiled, or loaded from disk, before the clock starts
-        self.microbenchmark = self.figure("microbenchmark", told, self._steps, "steps", lambda: None, self._work)
+        self.microbenchmark = self.figure("microbenchmark", about, self._steps, "steps", lambda: None, self._work)
 
     def figure(
-        self, name: str, told: str, count: int, unit: str, prepare: Work, work: Work, clock: Clock = time.process_time
+        self, name: str, about: str, count: int, unit: str, prepare: Work, work: Work, clock: Clock = time.process_time
     ) -> Measurement:
         """``count`` of ``unit`` in the time of ``work``."""
         bare_s = work_s = float("inf")
         for _ in range(self.sizes.repeats):
             bare_s = min(bare_s, best_s(5, lambda: None, self._work, clock))
             work_s = min(work_s, best_s(1, prepare, work, clock))
-        return Measurement(name, count / work_s, f"{unit}/s", count / work_s * bare_s / self._steps, told)
+        return Measurement(name, count / work_s, f"{unit}/s", count / work_s * bare_s / self._steps, about)
 
-    def of_env(self, name: str, told: str, env: Any, steps: int, single: bool = False, **options: Any) -> Measurement:
+    def of_env(self, name: str, about: str, env: Any, steps: int, single: bool = False, **options: Any) -> Measurement:
         """Decisions a second."""
         actions, decisions = record(env, steps, single)
         reset, work = partial(env.reset, seed=SEED), partial(play, env, actions, single)
-        found = self.figure(name, f"{told}, resets in the time", decisions, "steps", reset, work, **options)
+        found = self.figure(name, f"{about}, resets in the time", decisions, "steps", reset, work, **options)
         env.close()
         return found
 
@@ -159,13 +159,13 @@ def measure(sizes: Sizes | None = None) -> list[Measurement]:
 
 def _batches(meter: _Meter) -> Iterator[Measurement]:
     sizes = meter.sizes
-    told = f"decisions a second of gym.make_vec(vectorization_mode='{NATIVE}'), L = {sizes.capacity}"
-    told += f" ({sizes.topic_slots} for topics, where choices of what to send count too)"
+    about = f"decisions a second of gym.make_vec(vectorization_mode='{NATIVE}'), L = {sizes.capacity}"
+    about += f" ({sizes.topic_slots} for topics, where choices of what to send count too)"
 
     def figure(id: str, n: int, what: str = "", clock: Clock = time.process_time, **options: Any) -> Measurement:
         capacity = sizes.topic_slots if id == TOPICS else sizes.capacity
         vector = gym.make_vec(id, n, vectorization_mode=NATIVE, capacity=capacity, **options)
-        return meter.of_env(f"native batch{what}, {id}, n = {n}", told, vector, sizes.steps(n), clock=clock)
+        return meter.of_env(f"native batch{what}, {id}, n = {n}", about, vector, sizes.steps(n), clock=clock)
 
     yield from (figure(id, n) for id in (*ENVIRONMENTS, TOPICS) for n in sizes.batches)
     largest = max(sizes.batches)
@@ -177,11 +177,11 @@ def _batches(meter: _Meter) -> Iterator[Measurement]:
 
 def _singles(meter: _Meter) -> Iterator[Measurement]:
     steps, capacity = meter.sizes.single_steps, meter.sizes.capacity
-    told = f"calls of Env.step a second, without wrappers, L = {capacity}"
+    about = f"calls of Env.step a second, without wrappers, L = {capacity}"
     for id in ENVIRONMENTS:
         for form in ("flat", "dict"):
             env = gym.make(id, capacity=capacity, observation=form).unwrapped
-            yield meter.of_env(f"single environment, {form}, {id}", told, env, steps, single=True)
+            yield meter.of_env(f"single environment, {form}, {id}", about, env, steps, single=True)
     cart, pushes = gym.make("CartPole-v1").unwrapped, np.random.default_rng(SEED).integers(2, size=steps)
     reset, work = partial(cart.reset, seed=SEED), partial(play, cart, pushes, True)
     yield meter.figure("single CartPole-v1", "the same of Gymnasium's", steps, "steps", reset, work)
@@ -192,14 +192,14 @@ def _rollouts(meter: _Meter) -> Iterator[Measurement]:
     episodes = [draw(scenario, seed) for seed in range(meter.sizes.episodes)]
     arrivals = sum(len(episode.arrivals) for episode in episodes)
     senders = Senders(len(episodes), capacity, scenario.value, max_messages=scenario.max_messages)
-    told = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {capacity};"
-    told += " drawing, loading and scoring them not in the time"
+    about = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {capacity};"
+    about += " drawing, loading and scoring them not in the time"
     load = partial(senders.load_all, [(i, episode, None) for i, episode in enumerate(episodes)])
     for name in POLICIES:
         run = partial(senders.run, policies.get(name))
         load()
         run()  # compiled, or loaded from disk, before the clock starts
-        yield meter.figure(f"rollout, {name}", told, arrivals, "arrivals", load, run)
+        yield meter.figure(f"rollout, {name}", about, arrivals, "arrivals", load, run)
 
 
 def _labels(meter: _Meter) -> Measurement:
@@ -216,8 +216,8 @@ def _labels(meter: _Meter) -> Measurement:
     reset = partial(envs.reset, seed=SEED)
     reset()
     label()  # compiled, or loaded from disk, before the clock starts
-    told = f"decisions a second of gap-price with clairvoyant.regrets(), n = {n}, L = 8, loading episodes in the time"
-    return meter.figure("labels of the clairvoyant", told, n * steps, "labels", reset, label)
+    about = f"decisions a second of gap-price with clairvoyant.regrets(), n = {n}, L = 8, loading episodes in the time"
+    return meter.figure("labels of the clairvoyant", about, n * steps, "labels", reset, label)
 
 
 def report(figures: Sequence[Measurement], repeats: int) -> str:
@@ -228,8 +228,8 @@ def report(figures: Sequence[Measurement], repeats: int) -> str:
     lines.append("Actions drawn beforehand among the valid ones.")
     if not JIT:
         lines.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
-    told = {f.definition: f"- {f.name.split(',')[0]}: {f.definition}" for f in reversed(figures)}
-    return "\n".join([*lines, *reversed(told.values())])
+    definitions = {f.definition: f"- {f.name.split(',')[0]}: {f.definition}" for f in reversed(figures)}
+    return "\n".join([*lines, *reversed(definitions.values())])
 
 
 def _human(number: float) -> str:
@@ -259,14 +259,14 @@ def remember(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> str:
 
     Ratios are compared with the last runs of the same sizes.
     """
-    told = json.loads(json.dumps(asdict(sizes)))  # as the file has it
+    as_in_file = json.loads(json.dumps(asdict(sizes)))  # as the file has it
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
-        before = [line["ratios"] for line in lines if line["sizes"] == told][-BEFORE:]
+        before = [line["ratios"] for line in lines if line["sizes"] == as_in_file][-BEFORE:]
     except (ValueError, KeyError, TypeError) as error:
         raise BufgymError(f"{path}: not a history that studies.perf wrote ({type(error).__name__}: {error})") from None
     ratios = {figure.name: figure.ratio for figure in figures if figure.ratio}
-    line = {"date": date.today().isoformat(), "version": version("bufgym"), "sizes": told, "ratios": ratios}
+    line = {"date": date.today().isoformat(), "version": version("bufgym"), "sizes": as_in_file, "ratios": ratios}
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")

@@ -34,19 +34,19 @@ def test_every_figure_is_a_number_with_its_ratio_and_definition(tmp_path: Path) 
 def test_a_history_says_what_fell_below_the_median_of_the_last_five(tmp_path: Path) -> None:
     file = tmp_path / "new" / "perf.jsonl"
 
-    def told(ratio: float, sizes: perf.Sizes = TINY) -> str:
+    def message(ratio: float, sizes: perf.Sizes = TINY) -> str:
         return perf.remember([perf.Measurement("batch", 1.0, "steps/s", ratio, "")], sizes, file)
 
     for ratio in (1.0, 1.0, 1.0, 9.0, 0.9, 1.1):
-        assert told(ratio).startswith("no ratio"), ratio
-    assert told(0.86).startswith("no ratio fell") and told(0.84) == (
+        assert message(ratio).startswith("no ratio"), ratio
+    assert message(0.86).startswith("no ratio fell") and message(0.84) == (
         "fell by more than 15% below the median of the last 5 runs: batch: 0.84 after 1"
     )
-    assert told(0.1, perf.Sizes()).startswith("no ratio"), "other sizes"
+    assert message(0.1, perf.Sizes()).startswith("no ratio"), "other sizes"
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert len(lines) == 9 and lines[3]["ratios"] == {"batch": 9.0}
     file.write_text("nothing\n")
-    refuse("not a history", told, 1.0)
+    refuse("not a history", message, 1.0)
 
 
 def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:

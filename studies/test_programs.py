@@ -55,8 +55,8 @@ ELSEWHERE = {
 def test_each_documented_program_is_here() -> None:
     pages = [*(REPO / "website").glob("*.py"), *(REPO / "studies").glob("*.*"), *(REPO / "docs").rglob("*.md")]
     written = "\n".join(path.read_text(encoding="utf-8") for path in pages)
-    told = set(re.findall(r"python -m ((?:studies|website)\.\w+)", written))
-    assert told == {words.split()[0] for words in SHORT} | set(ELSEWHERE)
+    documented = set(re.findall(r"python -m ((?:studies|website)\.\w+)", written))
+    assert documented == {words.split()[0] for words in SHORT} | set(ELSEWHERE)
     verbs = set(re.findall(r"python -m (studies\.relay_load \w+)", written))
     assert verbs == {words for words in SHORT if words.startswith("studies.relay_load")}
 

@@ -22,7 +22,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from bufgym import policies
 from bufgym.benchmark import tuned
 from bufgym.benchmark.bootstrap import Interval, written
 from bufgym.benchmark.rows import Row
@@ -31,6 +30,7 @@ from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import decimal
 from bufgym.cli.options import Seeds, Whole, command_line, policy_specs
 from bufgym.oracle.measure import BASELINE, TIE
+from bufgym.policies import get
 from bufgym.scenario import suites
 from bufgym.utils import __version__
 from bufgym.utils.errors import BufgymError
@@ -106,7 +106,7 @@ def settings(policy: str) -> list[str]:
         raise BufgymError(f"policy {policy}: is not tuned: {FIXED[policy]}")
     if policy not in GRIDS and policy not in AROUND:
         raise BufgymError(f"policy {policy!r}: no grid of settings; tuned are: {', '.join((*GRIDS, *AROUND))}")
-    default = policies.get(policy)
+    default = get(policy)
     changes: list[dict[str, float]]
     if policy in GRIDS:
         axes = GRIDS[policy].axes

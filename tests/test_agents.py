@@ -117,11 +117,11 @@ TOPICS = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetenso
 @pytest.mark.parametrize("name", {**SHIPPED, **TOPICS, **NAMED})
 def test_its_file_is_small_and_tells_how_it_was_made(name: str) -> None:
     file = {**SHIPPED, **TOPICS, **NAMED}[name]
-    _, told = weights.read(file)
+    _, meta = weights.read(file)
     policy = policies.get(name)
     assert file.stat().st_size < (8_000 if name not in NAMED else 200_000)
-    assert told["name"] == name and told["training"].startswith(("python train.py --suite ", "python -m agents.joint "))
-    assert told["seeds"] and policy.summary == told["about"] != ""
+    assert meta["name"] == name and meta["training"].startswith(("python train.py --suite ", "python -m agents.joint "))
+    assert meta["seeds"] and policy.summary == meta["about"] != ""
     assert (policy.for_topics, policy.named_only) == (name in TOPICS, name in NAMED)
     assert name in policies.names(for_topics=name in TOPICS, named_only=name in NAMED)
 

@@ -135,8 +135,8 @@ def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: Capsys) 
     text = shown(["bench", *QUICK, "--seeds", "1"], capsys)
     assert "8 traces x 1 seed" in text
     for name in policies.names():
-        told = f"\n{name} " in text or re.search(rf"^note: .*\b{name}\b.*the same rows here", text, re.M)
-        assert bool(told) != policies.get(name).for_topics
+        message = f"\n{name} " in text or re.search(rf"^note: .*\b{name}\b.*the same rows here", text, re.M)
+        assert bool(message) != policies.get(name).for_topics
 
 
 @pytest.mark.skipif(not JIT, reason=needs("compiled", "it plays whole benchmarks, which takes compiled code"))
@@ -189,6 +189,6 @@ def test_a_full_disk_is_named_by_the_file_and_leaves_no_folder(
 
 def test_the_clairvoyant_plans_for_a_sender_that_is_always_asked(trace: str, capsys: Capsys) -> None:
     overflow = ["bench", "--trace", trace, *QUICK, "--decide-at", "overflow"]
-    told = "policy clairvoyant: it plans for a sender that asks at every arrival"
-    fails([*overflow, "--policies", "clairvoyant,afr"], told, capsys)
+    message = "policy clairvoyant: it plans for a sender that asks at every arrival"
+    fails([*overflow, "--policies", "clairvoyant,afr"], message, capsys)
     assert "\nclairvoyant " not in shown(overflow, capsys)

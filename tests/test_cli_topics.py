@@ -79,10 +79,10 @@ def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Caps
     mine = tmp_path / "mine.py"
     mine.write_text(FAR_OFF.format(True))
     chosen = ["--seeds", "1", "--policies", "far-off", "--policy-file", mine]
-    told = shown(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen], capsys)
-    assert told.count("invalid") == 1 and "\nnote: far-off gave 24 invalid decisions\n" in told
+    printed = shown(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen], capsys)
+    assert printed.count("invalid") == 1 and "\nnote: far-off gave 24 invalid decisions\n" in printed
     # Nor do the intervals of a single episode look as if they were known.
-    assert "1 episode of 2 s" in told and "1.000 [–]" in told and "1.000 [1.000" not in told
+    assert "1 episode of 2 s" in printed and "1.000 [–]" in printed and "1.000 [1.000" not in printed
 
 
 def test_a_mistake_typed_is_not_the_files_fault(config: str, capsys: Capsys, monkeypatch: Patch) -> None:

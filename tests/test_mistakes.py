@@ -28,7 +28,7 @@ QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10",
 
 
 @pytest.mark.parametrize(
-    ("command", "told"),
+    ("command", "message"),
     [
         ("report", "report needs FOLDER"),
         ("trace convert lte-synthetic-0", "trace convert needs --out"),
@@ -69,8 +69,8 @@ QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10",
         ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
     ],
 )
-def test_a_mistake_ends_in_a_sentence(command: str, told: str, capsys: Capsys) -> None:
-    fails(command.split(), told, capsys)
+def test_a_mistake_ends_in_a_sentence(command: str, message: str, capsys: Capsys) -> None:
+    fails(command.split(), message, capsys)
 
 
 RULE = """
@@ -86,7 +86,7 @@ UNCOMPILED = "attribute 'no' of type Buffer; File \"mine.py\", line 5\n" if JIT 
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("def broken(:\n", "line 1"),
         ("import a_module_that_is_not_there\n", "line 1: ModuleNotFoundError"),
@@ -97,12 +97,12 @@ UNCOMPILED = "attribute 'no' of type Buffer; File \"mine.py\", line 5\n" if JIT 
         (RULE.format(", compile=True", ", memory", "buffer.no"), UNCOMPILED),
     ],
 )
-def test_a_rule_that_does_not_fit(text: str, told: str, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
+def test_a_rule_that_does_not_fit(text: str, message: str, tmp_path: Path, monkeypatch: Patch, capsys: Capsys) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(text, encoding="utf-8")
     only = ["--policies", "mine"] if "mine" in text else []
-    said = fails([*QUICK, "--policy-file", "mine.py", *only], told, capsys)
-    assert "compile" in said or told != UNCOMPILED or not JIT
+    said = fails([*QUICK, "--policy-file", "mine.py", *only], message, capsys)
+    assert "compile" in said or message != UNCOMPILED or not JIT
 
 
 def test_natural_inputs(tmp_path: Path, capsys: Capsys) -> None:
@@ -169,8 +169,8 @@ def test_help_tells_the_defaults_and_wraps_evenly(capsys: Capsys) -> None:
     text = shown(["bench", "--help"], capsys)
     lte = uplink("lte")
     for option, default in (("fps", lte.rate_hz), ("bytes", lte.size_bytes), ("seconds", lte.duration_s)):
-        told = re.search(rf"--{option} .*?\(default:[ │\n]+([0-9]+)", text, re.DOTALL)
-        assert told and float(told[1]) == default, option
+        message = re.search(rf"--{option} .*?\(default:[ │\n]+([0-9]+)", text, re.DOTALL)
+        assert message and float(message[1]) == default, option
     box = text[text.index("─ Who runs ─") : text.index("─ The stream and its link")].splitlines()[1:-1]
     assert {len(line) - len(line[1:].lstrip()) for line in box if not line.startswith(("│ --", "╰"))} == {21}
     assert "▌" not in shown(["trace", "generate", "link", "--help"], capsys)
@@ -242,5 +242,5 @@ CASES = list(mistakes())
 def test_the_right_name_is_suggested(name: str, call: Callable[[str], Any]) -> None:
     with pytest.raises(BufgymError) as caught:
         call(without_one(name))
-    told = str(caught.value)
-    assert "unknown " in told and f"{without_one(name)!r}; did you mean {name!r}?" in told and "\n" not in told
+    message = str(caught.value)
+    assert "unknown " in message and f"{without_one(name)!r}; did you mean {name!r}?" in message and "\n" not in message

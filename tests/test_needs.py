@@ -56,7 +56,7 @@ def written(folder: Path, **skipped: str) -> Path:
 
 def test_a_line_for_each_group_says_how_many_and_what_brings_it(tmp_path: Path) -> None:
     skipped = {"a": needs("nats"), "b": needs("browser", "no chromium"), "c": needs("nats"), "d": needs("compiled")}
-    lines = tool().told(written(tmp_path, **skipped)).splitlines()[2:]
+    lines = tool().message(written(tmp_path, **skipped)).splitlines()[2:]
     assert [line.split()[0] for line in lines] == ["2", "1"]
     assert lines[0].endswith(" apt-get install nats-server") and "pages in a browser" in lines[1]
 

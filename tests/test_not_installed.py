@@ -40,8 +40,8 @@ def wheel(monkeypatch: Patch, tmp_path: Path) -> None:
 def test_a_command_of_a_package_is_told_in_a_checkout(bare: None, capsys: Capsys) -> None:
     assert "live" not in shown(["--help"], capsys)
     for command, name in COMMANDS.items():
-        told = f"{command} comes with the package bufgym-{name}: pip install -e {REPO / 'packages' / name}"
-        fails([command, "send"], told, capsys)
+        fault = f"{command} comes with the package bufgym-{name}: pip install -e {REPO / 'packages' / name}"
+        fails([command, "send"], fault, capsys)
     fails(
         ["export", "afr", "x.h", "--to", "c"],
         "With more options export comes with the package bufgym-live: pip install",
@@ -52,8 +52,8 @@ def test_a_command_of_a_package_is_told_in_a_checkout(bare: None, capsys: Capsys
 
 def test_so_it_is_by_a_wheel(bare: None, wheel: None, capsys: Capsys) -> None:
     for command, name in COMMANDS.items():
-        told = f"{command} comes with the package bufgym-{name}: pip install packages/{name}, in bufgym's source tree"
-        fails([command], told, capsys)
+        fault = f"{command} comes with the package bufgym-{name}: pip install packages/{name}, in bufgym's source tree"
+        fails([command], fault, capsys)
 
 
 def test_a_wheel_carries_what_every_package_declares(wheel: None) -> None:
@@ -80,16 +80,16 @@ for make in (gym.make, gym.make_vec):
         print(error)
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=True)
-    listed, *told = done.stdout.splitlines()
+    listed, *fault = done.stdout.splitlines()
     assert "bufgym/Uplink-v0" in listed and "bufgym/Mapping-v0" not in listed
     command = f"pip install -e {REPO / 'packages' / 'papers'}"
-    assert told == [f"bufgym/Mapping-v0 comes with the package bufgym-papers: {command}"] * 2
+    assert fault == [f"bufgym/Mapping-v0 comes with the package bufgym-papers: {command}"] * 2
 
 
 def test_a_stand_in_takes_any_argument() -> None:
     with pytest.raises(BufgymError, match="there"):
         packages.raise_absent("there", num_envs=3, render_mode="human")
-    assert "told" not in gym.spec("bufgym/Uplink-v0").kwargs
+    assert "fault" not in gym.spec("bufgym/Uplink-v0").kwargs
 
 
 WITHOUT_EXTRAS = """
@@ -140,9 +140,9 @@ def below(commands, *words):
 
 every = cli.COMMANDS | {entry.name: entry.load() for entry in metadata.entry_points(group=cli.GROUP)}
 for words in below(every):
-    with redirect_stdout(io.StringIO()) as told:
+    with redirect_stdout(io.StringIO()) as fault:
         code = cli.main([*words, "--help"])
-    assert code == 0 and told.getvalue().startswith("Usage: bufgym"), words
+    assert code == 0 and fault.getvalue().startswith("Usage: bufgym"), words
     print(*words)
 for words in (["export", "own.py", "own.safetensors", "--name", "own"], ["relay", "serve", "--config", "x.toml"]):
     assert cli.main(words) == 2

@@ -75,10 +75,10 @@ def typed() -> list[str]:
 
 def test_the_parser_takes_each_command() -> None:
     app = cli.app()
-    told = [shlex.split(line)[1:] for line in typed()]
-    lacking = sorted({name for name in cli.COMMANDS if not any(words[:1] == [name] for words in told)})
+    commands = [shlex.split(line)[1:] for line in typed()]
+    lacking = sorted({name for name in cli.COMMANDS if not any(words[:1] == [name] for words in commands)})
     assert not lacking, f"no page shows how to use the commands {lacking}: docs/guide/ has a page for each task"
-    for command in told:
+    for command in commands:
         if app.parse_commands(command)[2]:
             app.parse_args([*command, *(["x"] if command[-1] in ("--suite", "--config") else [])])
 
@@ -95,11 +95,11 @@ def test_programs_import_public_names_alone() -> None:
             elif isinstance(node, ast.Import):
                 named = [name.name for name in node.names if name.name.startswith("bufgym")]
                 modules = [n for n in named if not importlib.util.find_spec(n).submodule_search_locations]
-                assert not modules, f"{page} imports {modules}, which are no rooms"
+                assert not modules, f"{page} imports {modules}, which are no subpackages"
 
 
 def _is_public(module: str, name: str) -> bool:
-    """Whether a room lists the name in ``__all__``, or has a room of this name."""
+    """Whether a subpackage lists the name in ``__all__``, or has a subpackage of this name."""
     if module.split(".")[0] == "agents":
         return hasattr(importlib.import_module(module), name)
     if module.split(".")[0] != "bufgym" or module == "bufgym_live.robot.ros2":  # it needs ROS 2

@@ -54,12 +54,12 @@ def output_of(program: str) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("room", ["bufgym", "bufgym.model", "bufgym.envs", "bufgym.benchmark"])
-def test_every_public_name_of_a_room_is_found_where_the_room_says(room: str) -> None:
-    module = importlib.import_module(room)
+@pytest.mark.parametrize("package", ["bufgym", "bufgym.model", "bufgym.envs", "bufgym.benchmark"])
+def test_every_public_name_of_a_package_is_found_where_the_package_says(package: str) -> None:
+    module = importlib.import_module(package)
     for name in set(module.__all__) - {"FleetEnv", "parallel_env"}:  # these need PettingZoo
         assert getattr(module, name) is not None
-    with pytest.raises(AttributeError, match=f"module '{room}' has no attribute 'no_such_name'"):
+    with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'no_such_name'"):
         getattr(module, "no_such_name")  # noqa: B009  (mypy knows that it is missing)
 
 
@@ -77,8 +77,8 @@ def test_sb3_without_its_extra_names_it() -> None:
         "from bufgym.utils.errors import BufgymError\n"
         "try:\n    import bufgym.sb3\nexcept BufgymError as error:\n    print(error)"
     )
-    told = output_of(program)
-    assert told.startswith("bufgym.sb3 needs ") and told.strip().endswith('pip install "bufgym[train]"')
+    printed = output_of(program)
+    assert printed.startswith("bufgym.sb3 needs ") and printed.strip().endswith('pip install "bufgym[train]"')
 
 
 def test_a_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,17 +68,17 @@ def test_rows_are_those_of_the_native_batch_and_their_ends_are_told(id: str) -> 
         last, reward, terminated, truncated, info = native.step(actions)
         assert np.array_equal(rewards, np.float32(reward)) and np.array_equal(dones, terminated | truncated)
         sums, lengths = sums + reward, lengths + 1
-        for i, (told, done) in enumerate(zip(infos, dones, strict=True)):
+        for i, (own, done) in enumerate(zip(infos, dones, strict=True)):
             if not done:
-                assert told == {}
+                assert own == {}
                 continue
             final = info["final_obs"][i]
-            assert same(told["terminal_observation"], final)
-            assert told["TimeLimit.truncated"] is False
-            assert (told["episode"]["r"], told["episode"]["l"]) == (pytest.approx(sums[i]), lengths[i])
-            assert all(told[name] == info["final_info"][name][i] for name in ("qoi", "arrived", "delivered", "invalid"))
+            assert same(own["terminal_observation"], final)
+            assert own["TimeLimit.truncated"] is False
+            assert (own["episode"]["r"], own["episode"]["l"]) == (pytest.approx(sums[i]), lengths[i])
+            assert all(own[name] == info["final_info"][name][i] for name in ("qoi", "arrived", "delivered", "invalid"))
             if id != "bufgym/Topics-v0":  # each topic received adds its weight there
-                assert told["qoi"] == pytest.approx(1 + sums[i])
+                assert own["qoi"] == pytest.approx(1 + sums[i])
             sums[i], lengths[i], ends = 0.0, 0, ends + 1
     assert ends >= n
 

@@ -100,12 +100,12 @@ def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, cap
     for rule, reached in (("gap-price", first), ("min-motion-gap", taught)):
         assert reached == np.mean([outcome.qoi for outcome in judges.play(policies.get(rule))])
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    told = {row["policy"]: row["qoi"] for row in results["scores"]}
+    scores = {row["policy"]: row["qoi"] for row in results["scores"]}
     best = results["settings"]["algo"]
     for algo in ("evolve", "hindsight", "ppo"):
         name = "agent (seed 0)" if algo == best else f"agent by {algo} (seed 0)"
         agent = policies.load(folder / algo / "seed-0" / runs.MODEL)
-        assert told[name] == np.mean([outcome.qoi for outcome in test.play(agent)])
+        assert scores[name] == np.mean([outcome.qoi for outcome in test.play(agent)])
     assert (folder / runs.MODEL).read_bytes() == (folder / best / "seed-0" / runs.MODEL).read_bytes()
     assert "the best rule written by hand, " in capsys.readouterr().out
 

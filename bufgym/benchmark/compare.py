@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark import folder, report, sources, table, tasks
 from bufgym.benchmark import sweep as sweeps
@@ -20,7 +19,7 @@ from bufgym.benchmark.run import run
 from bufgym.benchmark.sources import PolicyLike as PolicyLike
 from bufgym.benchmark.sources import make_policy as make_policy
 from bufgym.benchmark.sweep import Sweep
-from bufgym.policies import Policy
+from bufgym.policies import Policy, registry
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
 from bufgym.utils.errors import BufgymError, unknown
@@ -229,10 +228,10 @@ def _compare_on_suite(
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
     players = _with_rival(entrants, rival, tasks.task_of(suite))
-    registered = {*policies.names(), *policies.names(named_only=True)}
+    registered = {*registry.names(), *registry.names(named_only=True)}
     for policy in players:
         base = policy.name.partition(":")[0]
-        if base not in registered or policies.get(base).on_arrival is not policy.on_arrival:
+        if base not in registered or registry.get(base).on_arrival is not policy.on_arrival:
             rule = "register it to run it on a suite, whose processes know it by name"
             raise BufgymError(f"policy {policy.name}: {rule}")
     of_the_sweep = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}

@@ -84,9 +84,9 @@ def made_of(spec: str) -> str:
 def stale(board: Mapping[str, Entry]) -> list[str]:
     """Names of the rows whose policy is made of something else today, as far as they say what it was made of here."""
     here = f"{sys.implementation.cache_tag}-"
-    told = {name: entry for name, entry in board.items() if entry.made_of.startswith(here)}
-    now = {policy: made_of(policy) for policy in {entry.policy for entry in told.values()}}
-    return [name for name, entry in told.items() if entry.made_of != now[entry.policy]]
+    comparable = {name: entry for name, entry in board.items() if entry.made_of.startswith(here)}
+    now = {policy: made_of(policy) for policy in {entry.policy for entry in comparable.values()}}
+    return [name for name, entry in comparable.items() if entry.made_of != now[entry.policy]]
 
 
 def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> list[Entry]:
@@ -105,7 +105,7 @@ def entries(rows: Sequence[Row], suite: str, unranked: Mapping[str, str]) -> lis
 
 def make(path: Path, specs: Mapping[str, Sequence[str]], **options: Any) -> list[Entry]:
     """Run suites with their policies (``specs``, by suite) and write the file, whole or not at all."""
-    board = [entry for suite, policies in specs.items() for entry in _run(suite, policies, **options)]
+    board = [entry for suite, specs_of_suite in specs.items() for entry in _run(suite, specs_of_suite, **options)]
     write(board, path)
     return board
 

@@ -88,10 +88,10 @@ def _unknown(error: CycloptsError, command: str) -> str:
     """What is unknown; if a program or a package that is not installed has it, how to get that."""
     if command == "train":
         return 'train is a program of bufgym\'s source tree: type there "make train", or "python train.py --help"'
-    told = packages.absent(GROUP, entry_points(group=GROUP).names).get(command)
-    if told is None:
+    message = packages.absent(GROUP, entry_points(group=GROUP).names).get(command)
+    if message is None:
         return str(error)
-    return f"{error} With more options {command} {told}" if command in COMMANDS else f"{command} {told}"
+    return f"{error} With more options {command} {message}" if command in COMMANDS else f"{command} {message}"
 
 
 def _shown(root: App, words: Sequence[str]) -> App:

@@ -64,7 +64,7 @@ def _overview(table: list[Dataset]) -> str:
         count = str(len(dataset.files) or "by hand")
         lines.append((dataset.name, count, str(summed), dataset.licence or NOT_KNOWN, dataset.holds))
     sums = "each sha256 was computed from a copy of the published file; no publisher states one"
-    return f"{columns(lines)}\n\n  {sums}\n  kept in {cache_folder()}"
+    return f"{columns(lines)}\n\n  {sums}\n  cached in {cache_folder()}"
 
 
 def _about(dataset: Dataset) -> list[tuple[str, str]]:

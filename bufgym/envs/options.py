@@ -22,7 +22,7 @@ GUIDED = "guided"
 RULE = "rule"
 CANDIDATES, SLOTS = "candidates", "slots"
 ACTIONS = (CANDIDATES, SLOTS, GUIDED)  # What an action is: the candidate or slot that goes, or numbers of the rule
-INFOS = ("full", "steady", "mask", "none")
+INFOS = ("full", "summary", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
 nothing. At an episode's end the summary is always there."""
 MASKS = ("valid", "plausible")
@@ -127,7 +127,7 @@ class Options:
     @property
     def shows_all(self) -> bool:
         """Whether ``info`` has all entries in every step."""
-        return self.info in ("full", "steady")
+        return self.info in ("full", "summary")
 
     @property
     def shows_mask(self) -> bool:

@@ -73,7 +73,7 @@ class Rows:
             options.check_without_own_queue("several topics")
         self.scenario, self.options = scenario, options
         self._shows_all, self._shows_mask = options.shows_all, options.shows_mask
-        self._is_steady = options.info == "steady"
+        self._adds_summary = options.info == "summary"
         self.senders = Senders(
             n,
             options.capacity,
@@ -261,7 +261,7 @@ class Rows:
             info["qoi"] = self.output.qoi.item(i)
             info["invalid"] = self.output.invalid.item(i)
             info["reward_terms"] = dict(zip(self._term_names, self.output.reward_terms[i].tolist(), strict=True))
-        if ended or self._is_steady:
+        if ended or self._adds_summary:
             info |= {name: number.item() for name, number in self.summary(i).items()}
             if self.options.bound:
                 info |= measured(self.senders, i, info["qoi"]) if ended else dict.fromkeys(MEASURED, math.nan)

@@ -108,7 +108,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``mask``: "valid", or "plausible" (slots of one queue) for the few valid actions that a good rule chooses among:
       accept, reject, evict what leaves one of the two smallest gaps, evict the head when its turn is near. The others
       stay valid, and do what they say.
-    - ``info``: "full"; "steady" adds the summary so far in every step, for recorders; "mask" has the action mask alone,
+    - ``info``: "full"; "summary" adds the summary so far in every step, for recorders; "mask" has the mask alone,
       and at an episode's end its summary; "none" has only this summary.
     - ``mask_in_observation``: whether observations hold the action mask, for libraries that look for it there. True
       puts ``action_mask`` beside the fields. Two names, or the library they belong to, make a nested dict: "rllib"

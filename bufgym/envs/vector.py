@@ -59,8 +59,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity=capacity, **arguments)
         if max_episode_steps is not None:
             whole("max_episode_steps", max_episode_steps, 1)
-        if rows.options.info == "steady":
-            raise BufgymError("info = 'steady': is for recorders of a single environment; a batch has 'full'")
+        if rows.options.info == "summary":
+            raise BufgymError("info = 'summary': is for recorders of a single environment; a batch has 'full'")
         modes = {text: mode for mode in AutoresetMode for text in (mode, mode.value, mode.name)}
         if autoreset_mode not in list(modes):
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 
 def _compiles() -> bool:
+    # A program may have switched it off in Numba's settings, which then count and not the environment.
     if "numba" in sys.modules:
         return not sys.modules["numba"].config.DISABLE_JIT
     return os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")

@@ -41,7 +41,7 @@ def _cache_folder() -> str:
         parent = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="bufgym-")
         atexit.register(shutil.rmtree, parent, ignore_errors=True)
         print(
-            "bufgym: compiled code cannot be kept, as neither the package nor the cache folder can be written; "
+            "bufgym: compiled code cannot be cached, as neither the package nor the cache folder can be written; "
             "set NUMBA_CACHE_DIR to a folder that can",
             file=sys.stderr,
         )
@@ -72,10 +72,11 @@ class Code:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Code compiled for the types of ``signature``, or None if there is none."""
+        # Rebuilt code finds its functions by name, also those of modules imported since Numba last looked.
         target.refresh()
         try:
-            kept = pickle.loads(self._file(signature, target.codegen()).read_bytes())
-            return cast(Any, compiler).CompileResult._rebuild(target, *kept)
+            cached = pickle.loads(self._file(signature, target.codegen()).read_bytes())
+            return cast(Any, compiler).CompileResult._rebuild(target, *cached)
         except Exception:  # a file that is missing, or cut short, which ends in many kinds of error
             if _CACHED_ONLY.get():
                 raise NotCachedError from None
@@ -88,8 +89,10 @@ class Code:
         file = self._file(signature, result.codegen)
         with contextlib.suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
+            # Whole or not at all: another process may read it at this moment.
             with replaced(file) as part:
                 part.write_bytes(cast(Any, serialize).dumps(result._reduce()))
+            # Another process may delete one of them meanwhile; that is an OSError, too, and does no harm.
             versions = sorted(file.parent.glob(f"{self._name}-*.nbc"), key=lambda path: path.stat().st_mtime)
             for old in versions[:-_CACHED_VERSIONS]:
                 old.unlink(missing_ok=True)

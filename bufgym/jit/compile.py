@@ -40,7 +40,7 @@ class _Kernel(CPUDispatcher):
 
 
 def _dispatcher(kind: Any, function: Callable[..., Any], role: str, **options: bool) -> Any:
-    """Numba's compiler of ``function``, which keeps its code on disk by ``role``."""
+    """Numba's compiler of ``function``, which caches its code on disk by ``role``."""
     dispatcher = kind(function, targetoptions={**_OPTIONS, **options}, pipeline_class=KernelCompiler)
     dispatcher._cache = Code(function, role)
     return dispatcher
@@ -58,6 +58,7 @@ def compile_signature(signature: Any, function: Function) -> Function:
     """
     compiled = _dispatcher(CPUDispatcher, function, "value")
     compiled.compile(signature)
+    # Another signature is then an error, and not a second, silent compilation.
     compiled.disable_compile()
     return cast(Function, compiled)
 
@@ -97,7 +98,7 @@ class _Located(types.WrapperAddressProtocol):
     def __init__(self, signature: Any, compiled: Any) -> None:
         self._numba_type_ = types.FunctionType(signature)
         self._signature = signature
-        self._kept = compiled  # and its code with it
+        self._compiled = compiled  # the address is valid only as long as this lives
         self._address = int(cast(Any, _get_wrapper_address)(compiled, signature))
 
     def __wrapper_address__(self) -> int:

@@ -25,6 +25,7 @@ def fingerprint(function: Any) -> str:
         if one not in texts:
             texts[one], calls = _of_one(one)
             waiting += calls
+    # Sorted: which function is found first must not count.
     return hashlib.sha256("".join(sorted(texts.values())).encode()).hexdigest()
 
 
@@ -34,7 +35,7 @@ def _of_one(function: FunctionType) -> tuple[str, list[FunctionType]]:
     calls: list[FunctionType] = []
     names: set[str] = set()
     parts = [function.__module__, function.__qualname__, *_code(function.__code__, names)]
-    parts += [f"{name} = {_told(value, calls)}" for name, value in _read(function, sorted(names))]
+    parts += [f"{name} = {_described(value, calls)}" for name, value in _read(function, sorted(names))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest(), calls
 
 
@@ -46,7 +47,7 @@ def _code(code: CodeType, names: set[str]) -> Iterator[str]:
         if isinstance(constant, CodeType):
             yield from _code(constant, names)
         else:
-            yield _told(constant, [])
+            yield _described(constant, [])
 
 
 def _read(function: FunctionType, names: list[str]) -> Iterator[tuple[str, Any]]:
@@ -55,6 +56,7 @@ def _read(function: FunctionType, names: list[str]) -> Iterator[tuple[str, Any]]
     while waiting:
         name, value = waiting.pop()
         yield name, value
+        # Modules may import each other in a circle; no kernel reads deeper than a.b.c.d.
         if isinstance(value, ModuleType) and name.count(".") < 4:
             waiting += [(f"{name}.{part}", getattr(value, part)) for part in names if hasattr(value, part)]
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
@@ -62,7 +64,7 @@ def _read(function: FunctionType, names: list[str]) -> Iterator[tuple[str, Any]]
     yield "defaults", (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items())))
 
 
-def _told(value: Any, waiting: list[Any]) -> str:
+def _described(value: Any, waiting: list[Any]) -> str:
     """``value`` in words that are equal for equal values in every process; functions go to ``waiting`` as well."""
     function = getattr(value, "py_func", value)
     if isinstance(function, FunctionType) and function.__module__.partition(".")[0] not in _VERSIONED:
@@ -70,13 +72,13 @@ def _told(value: Any, waiting: list[Any]) -> str:
     if isinstance(value, np.ndarray):
         return f"array {value.dtype.descr} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
     if isinstance(value, tuple | list):
-        return f"{type(value).__qualname__}({', '.join(_told(entry_point_of, waiting) for entry_point_of in value)})"
+        return f"{type(value).__qualname__}({', '.join(_described(item, waiting) for item in value)})"
     if isinstance(value, frozenset | set):
-        return f"set({sorted(_told(entry_point_of, waiting) for entry_point_of in value)})"
+        return f"set({sorted(_described(item, waiting) for item in value)})"
     if isinstance(value, type):
         fields = tuple(getattr(value, name, None) for name in ("_fields", "__members__"))
         defaults = tuple(getattr(value, "_field_defaults", {}).items())
-        return f"{value.__module__}.{value.__qualname__} {fields} {_told(defaults, waiting)}"
+        return f"{value.__module__}.{value.__qualname__} {fields} {_described(defaults, waiting)}"
     if isinstance(value, ModuleType):
         return value.__name__
     if hasattr(function, "__qualname__"):

@@ -16,21 +16,23 @@ def _place(context: Any, builder: Any, signature: Any, arguments: Any, indices: 
     """LLVM's pointer to the element of the first argument, an array, at ``indices``."""
     kind = signature.args[0]
     view = context.make_array(kind)(context, builder, arguments[0])
+    # wraparound: whether a negative index counts from the end, which costs a branch at each access.
     return cast(Any, cgutils).get_item_pointer(context, builder, kind, view, list(indices), wraparound=False)
 
 
 def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """LLVM's code of ``item`` and ``at``."""
+    """LLVM's code of ``unchecked_item`` and ``unchecked_at``."""
     place = _place(context, builder, signature, arguments, arguments[1:])
     return cast(Any, arrayobj).load_item(context, builder, signature.args[0], place)
 
 
 def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """LLVM's code of ``stretch`` and ``table``."""
+    """LLVM's code of ``unchecked_slice`` and ``unchecked_table``."""
     whole = context.make_array(signature.args[0])(context, builder, arguments[0])
     place = _place(context, builder, signature, arguments, arguments[1:3])
     view = context.make_array(signature.return_type)(context, builder)
     size, shape = whole.itemsize, list(arguments[3:])
+    # Strides of an array in C order, bytes.
     steps = [*(builder.mul(columns, size) for columns in shape[1:]), size]
     cast(Any, arrayobj).populate_array(view, place, shape, steps, size, whole.meminfo, whole.parent)
     return view._getvalue()

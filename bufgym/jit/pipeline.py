@@ -44,6 +44,7 @@ class KernelCompiler(_Compiler):  # type: ignore[misc]
         level = numbas.OPT
         notice.start()
         try:
+            # A global of Numba's, safe to set while the compiler's lock is held.
             numbas.OPT = 2  # LLVM's level; 3 takes longer, and the code is no faster
             result = super().compile_extra(function)
         finally:
@@ -86,6 +87,7 @@ class _OneArgument(_Model):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind)
         if str(kind.instance_class.__module__).startswith("bufgym."):
+            # Only ours: Numba's own code relies on its way for other tuples.
             self.get_argument_type = self.get_value_type
             self.as_argument = self.from_argument = lambda builder, value: value
 
@@ -110,6 +112,7 @@ class _NoneFields(_Pass):  # type: ignore[misc]
                 known = _known(state, statement.value)
                 if known is not _UNKNOWN:
                     statement.value = cast(Any, ir).Const(known, statement.loc)
+                    # Numba looks definitions up apart from the blocks: both must say the same.
                     state.func_ir._definitions[statement.target.name] = [statement.value]
                     changed = True
         return changed

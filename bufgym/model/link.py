@@ -96,6 +96,10 @@ class Link:
 KEPT_KNOTS = 2**20  # Knots to store (16 MB) before traces that no sender uses make room for others
 
 
+PLACE_WORDS = "first_knot", "last_knot", "after", "segment_now", "segment_finish"
+"""Fields of a record of a link (see ``carried_by``), in the order in which ``KnotStore.place`` returns them."""
+
+
 @dataclass(eq=False)
 class _Place:
     """Where the knots of a trace lie, and how many senders use them."""
@@ -107,7 +111,9 @@ class _Place:
 
     def __post_init__(self) -> None:
         first, last = self.first, self.first + len(self.trace.time_us) - 1
-        self.words = np.array([first, last, _AFTER[self.trace.after], first, first], np.int64)
+        given = {"first_knot": first, "last_knot": last, "after": _AFTER[self.trace.after]}
+        given |= {"segment_now": first, "segment_finish": first}  # where the search for a time, or a byte, begins
+        self.words = np.array([given[name] for name in PLACE_WORDS], np.int64)
 
 
 class KnotStore:
@@ -126,7 +132,7 @@ class KnotStore:
         self._idle: dict[int, _Place] = {}
 
     def place(self, trace: Trace, sender: int) -> NDArray[np.int64]:
-        """Store ``trace`` for ``sender``; int64[5], its knots, what follows its end, and twice the first segment."""
+        """Store ``trace`` for ``sender``; return int64[5], the values of ``PLACE_WORDS``."""
         left = self._followed.pop(sender, None)
         if left is not None:
             left.senders -= 1

@@ -163,7 +163,7 @@ class CandidateWeights:
         return [(field.name, field.per, field.unit, field.meaning) for field in (*CANDIDATE_FIELDS, *QUEUE_FIELDS)]
 
     @staticmethod
-    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+    def inputs_text(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
         """What the shapes follow from."""
         asked = "at arrivals" if settings["at_arrivals"] else "at a full buffer"
         return f"{settings['candidates']} candidates, {asked},"

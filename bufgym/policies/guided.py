@@ -13,7 +13,7 @@ residual policy learning does [silver2018residual; johannink2019residual]. ``OUT
 ``linear`` is the policy whose outputs are linear in the inputs, by one set of weights under a light load and by another
 under a heavy one, mixed by h. They are multiplied by 1 - ``plain``. So the plain rule stays on a measured steady link,
 until the link has carried anything, and in bursts, where no target guides the outputs. A queue with one place is apart:
-there the plain rule keeps an early message of each burst, which most outputs mend.
+there the plain rule keeps an early message of each burst, which most outputs improve on.
 
     h <- (log(size / (mean rate over 20 s x arrival period)) - 0.7) / 1.5, at least 0 and at most 1
     outputs <- (1 - plain) (W_light + h W_heavy) inputs
@@ -320,7 +320,7 @@ class GuidedWeights:
         return cls.TABLE
 
     @staticmethod
-    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+    def inputs_text(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
         """What the shapes follow from."""
         return f"{len(fields)} fields"
 

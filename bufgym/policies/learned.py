@@ -182,7 +182,7 @@ class Weights:
         return [*table, price_dp.PARAMETERS] if set(BY_RULE) & set(beside) else table
 
     @staticmethod
-    def told(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
+    def inputs_text(fields: Sequence[str], settings: Mapping[str, Any]) -> str:
         """What the shapes follow from."""
         return f"{len(fields)} fields"
 

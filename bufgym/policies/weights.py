@@ -225,5 +225,5 @@ def _check_shapes(
     for name, shape in required.items():
         if shapes[name] != shape:
             raise misshapen(
-                name, f"must be {list(shape)} for {kind.told(fields, settings)} and hidden layers of {widths}"
+                name, f"must be {list(shape)} for {kind.inputs_text(fields, settings)} and hidden layers of {widths}"
             )

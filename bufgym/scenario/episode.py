@@ -39,6 +39,12 @@ class Streams(NamedTuple):
         return Streams(*(np.random.Generator(np.random.PCG64(child)) for child in root.spawn(3)))
 
 
+WORDS = (
+    "arrivals", "first_decision", "last_decision", "window", "ack_delay_us", "ends_us", "offset_us", "propagation_us",
+)  # fmt: skip
+"""Fields of ``bufgym.sim.state.SENDER`` that an episode gives, in the order of ``Episode.words``."""
+
+
 @dataclass(frozen=True, eq=False)
 class Episode:
     """One drawn episode, checked when it is made; nothing in it is random any more.
@@ -71,7 +77,7 @@ class Episode:
     one_scene: bool = field(init=False, repr=False)
     """Whether x never falls, even across topics: only then can all messages share one queue."""
     words: NDArray[np.int64] = field(init=False, repr=False)
-    """int64[8]: the part of ``bufgym.sim.state.SENDER`` that an episode gives."""
+    """int64[8]: the values of ``WORDS``."""
 
     def __post_init__(self) -> None:
         check_window(self.window)
@@ -92,9 +98,8 @@ class Episode:
         pauses = n if self.ack_delay_us else 0
         self.link.check_reach(int(arrivals["arrival_us"][-1]), total_bytes, pauses, self.ack_delay_us)
         ends_us = FOREVER if self.ends_us is None else self.ends_us
-        asked = self.first_decision, self.last_decision
-        link = self.window, self.ack_delay_us, ends_us, self.link.offset_us, self.link.propagation_us
-        object.__setattr__(self, "words", np.array([n, *asked, *link], np.int64))
+        given = {**vars(self), **vars(self.link), "arrivals": n, "ends_us": ends_us}
+        object.__setattr__(self, "words", np.array([given[name] for name in WORDS], np.int64))
 
     def check_one_queue(self) -> None:
         """Raise unless one queue without topics can hold the messages: x must not fall from one to the next."""

@@ -41,6 +41,7 @@ class Fleet:
         if episode.robots != self.robots:
             raise BufgymError(f"episode of {episode.robots} robots: the cell has {self.robots}")
         self.senders.load_all([(i, episode.episode(robot), uniforms) for robot, i in enumerate(self.rows(c))])
+        # After the senders, as it reads their links and first arrivals.
         load_cell(self.senders.batch, self.shares, c)
 
     def run(self, policy: Policy, memory: NDArray[np.float64] | None = None) -> None:

@@ -34,9 +34,11 @@ def arrive(batch: Batch, i: int) -> int:
     sender.now_us = arrives_us
     sender.socket = UNASKED
     entry = unchecked_at(batch.log, i, sender.next)
+    # Loading an episode leaves the log of the one before; each entry is cleared as its message arrives.
     entry.dequeued_us, entry.transmitted_us, entry.dropped_us, entry.limited, entry.gain = NEVER, NEVER, NEVER, 0, 0.0
     if sender.next > 0:
         gap_us = arrives_us - sender.previous_us
+        # The first gap is the mean; the line below it then changes nothing.
         if sender.next == 1:
             sender.period_us = float(gap_us)
         sender.period_us += _PERIOD_WEIGHT * (gap_us - sender.period_us)
@@ -47,6 +49,7 @@ def arrive(batch: Batch, i: int) -> int:
     else:
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
         sender.arrival_bytes = float(arrival.size_bytes)
+    # Rate limits come before the policy, as in Robofleet's client: it never sees what they drop.
     if batch.several is not None and sender.limit_at_send == 0 and rules.too_soon(batch, i, arrival.topic):
         entry.limited = 1
         decision = REJECT
@@ -75,6 +78,7 @@ def measure_rate(batch: Batch, i: int) -> None:
     seen, w is the time seen so far. Time without bytes to send does not count.
     """
     sender = batch.senders[i]
+    # Measured once and stored: the views of this arrival would otherwise look it up on the trace again.
     held = held_bytes(batch, i)
     sender.left_bytes = left_of(batch, i, held)
     sent_bytes = sender.dequeued_bytes - sender.left_bytes
@@ -163,6 +167,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     if victim >= 0:
         remove(batch, i, victim)
         if sender.screens == 1 and sender.backlog_bytes + arrival.size_bytes > sender.max_bytes:
+            # ``next`` stays where it is, so the same DECISION comes again with the present queue.
             sender.evictions += 1
             return valid
     if enqueue:
@@ -180,6 +185,7 @@ def decide(batch: Batch, i: int, decision: int) -> bool:
     if batch.several is not None:
         rules.arrived_on_topic(batch, i, arrival, enqueue)
     sender.previous_us, sender.previous_x = arrival.arrival_us, arrival.x
+    # Departures count from the arrival that was decided on last.
     sender.departures = 0
     sender.waiting = NOTHING_WAITS
     sender.next += 1
@@ -201,6 +207,7 @@ def remove(batch: Batch, i: int, k: int) -> None:
         j = of_topic(unchecked_slice(batch.slots, i, sender.first, sender.occupancy), k, gone.topic, 1)
     if j < sender.occupancy:
         behind = unchecked_at(batch.slots, i, sender.first + j)
+        # Before the slot is closed, while k is still the place of the message that goes.
         merged = rules.gain_behind(batch, i, k, gone.topic, behind.x)
         sender.retained_gain += merged - behind.gain
         behind.gain = merged
@@ -216,6 +223,7 @@ def answer_dequeue(batch: Batch, i: int, drop: bool) -> None:
     if drop and not rules.no_drop(batch, i, unchecked_at(batch.slots, i, sender.first).topic):
         remove(batch, i, 0)
     else:
+        # Not asked again about this head, only after the next departure, arrival or ack.
         sender.socket = CLEARED
 
 

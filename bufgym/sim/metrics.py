@@ -175,6 +175,7 @@ def ages_between_s(
     if until_us <= from_us:
         return {"mean_age_s": NAN, "peak_age_s": NAN}
     known = received_us < until_us
+    # Between two receipts the age grows by a second a second: each piece is a trapezium.
     begins_us = np.concatenate([[from_us], received_us[known]])
     ends_us = np.concatenate([received_us[known], [until_us]])
     newest_us = np.maximum.accumulate(np.concatenate([[from_us], arrival_us[known]]))

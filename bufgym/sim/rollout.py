@@ -60,6 +60,7 @@ def rollout(
                 answer_send(batch, i, on_send(buffer, memory[i]))
             else:
                 on_departure(buffer, memory[i])
+    # What the link carried arrives, though it be after the last event: TCP loses nothing.
     for i in range(len(batch.senders)):
         credit(batch, i, FOREVER)
 
@@ -80,6 +81,7 @@ def compiled_rollout(shared: bool, several: bool) -> Any:
     )
 
 
+# In plain Python a view keeps its arrays alive; the kernel counts no references.
 _view = getattr(view, "py_func", view)
 _inlined: Any = numba.njit(inline="always")(rollout) if JIT else rollout
 
@@ -152,13 +154,14 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
         credit(batch, i, FOREVER)
 
 
-_PAYS_IF_KEPT_S, _PAYS_S = 0.05, 2.0  # time in the rollout for all after which a policy gets its own: if kept; always
+_PAYS_IF_CACHED_S, _PAYS_S = 0.05, 2.0  # time in the shared rollout that earns a policy its own: if cached; always
 _spent_s: dict[Any, float] = {}
 
 
 def choose_own(policy: Policy, spent_s: float, several: bool, memory: NDArray[np.float64]) -> Any:
     """The policy's own rollout, if it pays after so many seconds in the one for all; else None."""
-    if not JIT or spent_s <= _PAYS_IF_KEPT_S:
+    # Compiling takes seconds, so a policy must have spent about as long; loading takes milliseconds.
+    if not JIT or spent_s <= _PAYS_IF_CACHED_S:
         return None
     with suppress(NotCachedError), cached_only() if spent_s < _PAYS_S else nullcontext():
         kinds = batch_type(several), cast(Any, numba).typeof(memory)

@@ -81,6 +81,7 @@ def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
     """
     sender = batch.senders[i]
     rules = unchecked_at(batch.topics, i, topic)
+    # Else a policy that keeps the link busy for longer would pay for a longer time.
     until_us = min(until_us, unchecked_at(batch.arrivals, i, sender.arrivals - 1).arrival_us)
     if rules.arrived == 0 or until_us <= rules.aged_us:
         return

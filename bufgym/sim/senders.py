@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.model.buffer import UNLIMITED_BYTES, check_limits
-from bufgym.model.link import KnotStore
+from bufgym.model.link import PLACE_WORDS, KnotStore
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic, check_topics, copies_of, topic_table
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode
+from bufgym.scenario.episode import WORDS
 from bufgym.sim.audit import touched
 from bufgym.sim.rollout import roll_out
 from bufgym.sim.shared_link import Shares
@@ -22,9 +23,13 @@ from bufgym.utils.errors import BufgymError
 Begun = tuple[int, Episode, np.random.Generator | None]
 """Arguments of ``Senders.load``: a sender, the episode it begins, and the generator of its uniform draws."""
 
-_NAMES = list(cast(Any, SENDER.names))
-_V = _NAMES.index("v_start")
-_EPISODE, _PLACE = slice(_NAMES.index("arrivals"), _V), slice(_NAMES.index("first_knot"), _NAMES.index("first_seq"))
+
+def _columns(names: Sequence[str]) -> NDArray[np.int64]:
+    """Columns of these fields where a SENDER is seen as whole words: every field of it has eight bytes."""
+    return np.array([list(cast(Any, SENDER.names)).index(name) for name in names], np.int64)
+
+
+_EPISODE, _V, _PLACE = _columns(WORDS), _columns(["v_start"])[0], _columns(PLACE_WORDS)
 """Fields of SENDER that differ from episode to episode: ``Episode.words``, the place of V and of the link's knots."""
 
 
@@ -84,7 +89,7 @@ class Senders:
 
     def load_all(self, begun: Sequence[Begun]) -> None:
         """Call ``load`` for each of ``begun`` at once."""
-        v_starts = [self._checked(episode) for _, episode, _ in begun]  # before any sender is changed
+        v_starts = [self._checked(episode) for _, episode, _ in begun]  # all, before any sender is changed
         batch, rows, episodes, places = self.batch, np.array([i for i, _, _ in begun], np.int64), [], []
         # NumPy copies records field by field; as whole words it copies them five times as fast.
         arrivals, topics, senders = (array.view(np.int64) for array in (batch.arrivals, batch.topics, batch.senders))
@@ -100,6 +105,7 @@ class Senders:
         if begun:
             beginnings[:, _EPISODE], beginnings[:, _V], beginnings[:, _PLACE] = episodes, v_starts, places
         senders.reshape(len(self), -1)[rows] = beginnings
+        # The store makes longer arrays as it grows, and kernels must read the new ones.
         if self._knots.us is not self.batch.knot_us:
             self.batch = self.batch._replace(knot_us=self._knots.us, knot_bytes=self._knots.bytes)
 

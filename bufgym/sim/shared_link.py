@@ -100,6 +100,7 @@ def settle(batch: Batch, shares: Shares, c: int) -> None:
     cell = shares.cells[c]
     cell.reached = carried_by(batch.knot_us, batch.knot_bytes, cell, cell.tick_us)
     if cell.busy > 0:
+        # Whole bytes for each, rounded down: the rest is shared later, so that no byte is given twice.
         share = (cell.reached - cell.position) // cell.busy
         cell.served += share
         cell.position += share * cell.busy
@@ -124,6 +125,7 @@ def next_finish(batch: Batch, shares: Shares, c: int) -> tuple[int, int, int]:
     if cell.busy == 0:
         return FOREVER, cell.position, FOREVER
     goal = least(shares.goals[c])
+    # One byte for this sender is one for every busy sender.
     position = cell.position + cell.busy * (goal - cell.served)
     return goal, position, finish_of(batch.knot_us, batch.knot_bytes, cell, position)
 
@@ -133,6 +135,7 @@ def finish_in_cell(batch: Batch, shares: Shares, c: int, goal: int, position: in
     """Finish the message with the least goal (one, if several are equal), and free its sender's socket."""
     cell = shares.cells[c]
     robot = 0
+    # Of equal goals the lowest row finishes first, on every machine.
     while shares.goals[c, robot] != goal:
         robot += 1
     cell.served, cell.position = goal, position
@@ -155,6 +158,7 @@ def next_in_cell(batch: Batch, shares: Shares, c: int) -> int:
     if cell.robot < cell.robots:
         return arrive_in_cell(batch, shares, c)
     goal, position, finish_us = next_finish(batch, shares, c)
+    # FOREVER - 1: on a dead link nothing finishes, also when no arrival is to come.
     if finish_us <= min(cell.next_us, FOREVER - 1):
         finish_in_cell(batch, shares, c, goal, position, finish_us)
     elif cell.next_us == FOREVER:
@@ -178,6 +182,7 @@ def arrive_in_cell(batch: Batch, shares: Shares, c: int) -> int:
         i = c * cell.robots + robot
         sender = batch.senders[i]
         following = sender.next + 1
+        # Read before ``arrive``, which may settle the arrival and move ``next`` on.
         due_us = batch.arrivals[i, following].arrival_us if following < sender.arrivals else FOREVER
         shares.due_us[c, robot] = due_us
         # The position at which a link of its own would have the same bytes left.

@@ -77,9 +77,11 @@ def held_bytes(batch: Batch, i: int) -> int:
 def left_of(batch: Batch, i: int, total_bytes: int) -> int:
     """Bytes of ``held_bytes`` not yet transmitted."""
     sender = batch.senders[i]
+    # Taken at this very moment: C(now) may be past its first byte, but nothing of it has left yet.
     if sender.busy == 0 or (sender.busy == 1 and sender.last_dequeue_us == sender.now_us):
         return total_bytes
     waiting_bytes = total_bytes - next_size_bytes(batch, i)
+    # Later messages in the socket have not begun: all of their bytes are left.
     carried_bytes = carried_by(batch.knot_us, batch.knot_bytes, sender, sender.now_us)
     left_bytes = sender.position - carried_bytes + waiting_bytes
     return int(min(total_bytes, max(0, left_bytes)))
@@ -129,6 +131,7 @@ def credit(batch: Batch, i: int, until_us: int) -> None:
         seq = unchecked_at(batch.order, i, sender.credited)
         entry = unchecked_at(batch.log, i, seq)
         received_us = entry.transmitted_us + sender.propagation_us
+        # Messages arrive in the order of transmission, as all have the same propagation.
         if until_us < received_us:
             break
         sender.delivered_gain += entry.gain

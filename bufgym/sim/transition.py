@@ -44,8 +44,10 @@ def move_on(batch: Batch, shares: Shares | None, c: int) -> int:
     """Compute ``next_event`` for a cell in which no arrival waits."""
     while True:
         i = sender_of(shares, c)
+        # The message of the last DEPARTURE: the policy has heard of it, and no time has passed, so it begins now.
         if shares is None and batch.senders[i].link != CARRIES and batch.senders[i].busy > 0:
             begin_transmission(batch, i)
+        # The socket before the clock: a free one takes its message at the moment at which it became free.
         event = offer(batch, shares, i)
         if event == NOTHING:
             event = next_on_link(batch, c) if shares is None else next_in_cell(batch, shares, c)
@@ -69,6 +71,7 @@ def offer(batch: Batch, shares: Shares | None, i: int) -> int:
     """
     sender = batch.senders[i]
     if may_dequeue(batch, i):
+        # Drops at the head come first: a scheduler chooses among what is left.
         if sender.ask_at_dequeue == 1 and sender.socket == UNASKED:
             return DEQUEUE
         if sender.socket != CHOSEN:
@@ -82,6 +85,7 @@ def offer(batch: Batch, shares: Shares | None, i: int) -> int:
             if shares is not None:
                 join(batch, shares, i)
             return DEPARTURE
+    # Nothing follows at once: the next message starts at C(now), not on the very next byte.
     if sender.link == FREED:
         sender.link = IDLE
     return NOTHING
@@ -98,12 +102,14 @@ def next_on_link(batch: Batch, i: int) -> int:
     more = sender.next < sender.arrivals
     arrives_us = unchecked_at(batch.arrivals, i, sender.next).arrival_us if more else NOT_YET
     ack_us = next_ack_us(batch, i)
+    # <= lets what finishes at an arrival's own time leave before it; < lets an ack of that time come first.
     if sender.finish_us <= arrives_us and sender.finish_us < ack_us:
         finish_transmission(batch, i, sender.finish_us)
     elif ack_us <= arrives_us:
         sender.now_us = ack_us
         sender.acked += 1
         sender.socket = UNASKED
+    # FOREVER, the finish on a dead link, is above NOT_YET: it never happens, and the run ends here.
     elif arrives_us < NOT_YET:
         return arrive(batch, i)
     else:

@@ -45,6 +45,7 @@ def view(batch: Batch, i: int) -> Buffer:
     left_bytes, left_fraction = 0, 0.0
     if sender.busy > 0 and sender.shows_left == 1:
         total_bytes = held_bytes(batch, i)
+        # Measured as the arrival came; evictions since then have moved no byte.
         if sender.measures == 1 and sender.waiting == ARRIVAL_WAITS:
             left_bytes = sender.left_bytes
         else:

@@ -1,4 +1,4 @@
-"""What every room stands on: the one error, files written whole or not at all, objects by name, compiled kernels."""
+"""What every subpackage stands on: the one error, files written whole or not at all, objects by name, tables."""
 
 from bufgym.utils.errors import BufgymError
 

@@ -34,8 +34,8 @@ def read_whole(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     except (OSError, ValueError) as error:
         if isinstance(error, BufgymError):
             raise
-        told = getattr(error, "strerror", None) or error
-        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {told}"
+        reason = getattr(error, "strerror", None) or error
+        why = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {reason}"
         raise BufgymError(f"{path}: {why}") from None
     if len(data) > most_bytes:
         raise BufgymError(f"{path}: larger than {most_bytes} bytes: must be at most that")

@@ -1,4 +1,4 @@
-"""Packages beside bufgym: what each declares to add, told where the package is not installed."""
+"""Packages beside bufgym: what each declares to add, and the message where the package is not installed."""
 
 import tomllib
 from collections.abc import Iterable
@@ -16,17 +16,17 @@ def absent(group: str, installed: Iterable[str]) -> dict[str, str]:
 
     A checkout has the packages' folders; a wheel carries their declarations as ``bufgym/data/packages/NAME.toml``.
     """
-    told, held = {}, set(installed)
+    messages, held = {}, set(installed)
     carried = sorted((PACKAGE / "data" / "packages").glob("*.toml"))
     for file in carried or sorted((PACKAGE.parent / "packages").glob("*/pyproject.toml")):
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
         folder = f"packages/{file.stem}, in bufgym's source tree" if carried else f"-e {file.parent}"
         for name in project.get("entry-points", {}).get(group, {}):
             if name not in held:
-                told[name] = f"comes with the package {project['name']}: pip install {folder}"
-    return told
+                messages[name] = f"comes with the package {project['name']}: pip install {folder}"
+    return messages
 
 
-def raise_absent(told: str, **_: Any) -> NoReturn:
+def raise_absent(message: str, **_: Any) -> NoReturn:
     """Stand in for an environment whose package is not installed."""
-    raise BufgymError(told)
+    raise BufgymError(message)

@@ -78,7 +78,7 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
 @pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled"))
 def test_each_part_is_named_and_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["warmup"]) == 0
-    told = capsys.readouterr()
-    text = told.out + told.err
+    printed = capsys.readouterr()
+    text = printed.out + printed.err
     assert not [name for name in PARTS if f"/{len(PARTS)} {name}: " not in text]
     assert FOLDER in text

@@ -69,8 +69,8 @@ def test_the_page_says_what_was_run_and_how_to_run_it_again(folder: Path) -> Non
     path = report.write(folder)
     assert path == folder / "report.html"
     page = path.read_text(encoding="utf-8")
-    told = ["Two outages and a good link.", "2026-05-01", "bench --suite tiny-v1 --out &lt;here&gt;", "Out for 20 s."]
-    assert not [words for words in [*told, "not ranked: it knows the future"] if words not in page]
+    texts = ["Two outages and a good link.", "2026-05-01", "bench --suite tiny-v1 --out &lt;here&gt;", "Out for 20 s."]
+    assert not [words for words in [*texts, "not ranked: it knows the future"] if words not in page]
     assert page.count(' flat"') == 2 * len(QOI)  # both capacities of the good link
     assert drawn(page) == ["ranking", "capacities", "outages", "delays", "timeline"]
     assert report.write(folder).read_text(encoding="utf-8") == page and len(page) < 8e6

@@ -227,7 +227,7 @@ def test_other_endings_and_parquet_without_pyarrow_are_refused(tmp_path: Path, m
 
 
 @pytest.mark.parametrize(
-    ("cells", "change", "told"),
+    ("cells", "change", "message"),
     [
         ({"qoi": "many"}, str, "qoi = 'many': must be a number"),
         ({"seed": "1.5"}, str, "seed = '1.5': must be a number"),
@@ -236,14 +236,14 @@ def test_other_endings_and_parquet_without_pyarrow_are_refused(tmp_path: Path, m
         ({}, lambda line: f"{line},7", f"must have {len(RUNS)} cells, as line 1 has"),
     ],
 )
-def test_a_broken_line_is_named(tmp_path: Path, cells: Row, change: Any, told: str) -> None:
+def test_a_broken_line_is_named(tmp_path: Path, cells: Row, change: Any, message: str) -> None:
     """The third row of a file whose first row's label spans two lines: line 1 + 2 + 1 + 1 = 5."""
     path = write_rows([row(scenario="two\nlines"), row(), row(**cells)], tmp_path / "rows.csv")
     *rest, last = path.read_text().splitlines()
     path.write_text("\n".join([*rest, change(last)]) + "\n")
     with pytest.raises(BufgymError) as caught:
         read_rows(path)
-    assert str(caught.value).startswith(f"{path}, line 5: {told}")
+    assert str(caught.value).startswith(f"{path}, line 5: {message}")
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,8 @@ def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: Capsys) ->
     assert table["own"] == table["learned"]
     Path("a").mkdir()
     shutil.copy(SHIPPED, "a/own.safetensors")
-    told = "own.safetensors: there is a policy named 'own' already"
-    fails(["bench", *ONE, "--policies", "own.safetensors,a/own.safetensors"], told, capsys)
+    message = "own.safetensors: there is a policy named 'own' already"
+    fails(["bench", *ONE, "--policies", "own.safetensors,a/own.safetensors"], message, capsys)
 
 
 @pytest.mark.nightly

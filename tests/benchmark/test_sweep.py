@@ -241,7 +241,7 @@ def test_a_broken_part_is_named_and_made_anew(tmp_path: Path, small: Sweep, form
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"split": "exam"}, "split = 'exam'"),
         ({"specs": ("decimate:every=2", "decimate:every=2.0")}, "'decimate:every=2' is given more than once"),
@@ -252,9 +252,9 @@ def test_a_broken_part_is_named_and_made_anew(tmp_path: Path, small: Sweep, form
         ({"backend": "sloky"}, "backend = 'sloky': must be one of loky"),
     ],
 )
-def test_a_bad_sweep_writes_nothing(tmp_path: Path, small: Sweep, change: dict[str, Any], told: str) -> None:
+def test_a_bad_sweep_writes_nothing(tmp_path: Path, small: Sweep, change: dict[str, Any], message: str) -> None:
     where = {name: change.pop(name) for name in ("jobs", "backend") if name in change}
-    refuse(told, sweep.run_sweep, Sweep(**{**vars(small), **change}), tmp_path / "out", **where)
+    refuse(message, sweep.run_sweep, Sweep(**{**vars(small), **change}), tmp_path / "out", **where)
     assert not (tmp_path / "out").exists()
 
 

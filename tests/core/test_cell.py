@@ -105,9 +105,9 @@ def test_the_whole_byte_reference_agrees_exactly(drawn, decide_at):
     for i, robot in enumerate(reference(episode, knots, ReferenceLook, capacity, max_bytes, decide_at).robots):
         assert cases.log(fleet.senders, i) == cases.reference_log(robot)
         assert cases.order(fleet.senders, i) == robot.order
-        told = outcome(fleet.senders, i)
-        assert told.arrived == told.delivered + told.in_transmission + told.buffered + told.dropped
-        assert told.qoi == pytest.approx(naive.information(V, [episode.arrivals[i]["x"][k] for k in robot.order]))
+        result = outcome(fleet.senders, i)
+        assert result.arrived == result.delivered + result.in_transmission + result.buffered + result.dropped
+        assert result.qoi == pytest.approx(naive.information(V, [episode.arrivals[i]["x"][k] for k in robot.order]))
         for (now_us, left), its in zip(seen[i], robot.policy.noted, strict=True):
             # A message that follows another counts as whole until the microsecond in which it was taken is over.
             whole = [int(episode.arrivals[i]["size_bytes"][seq]) for seq, us in robot.dequeued.items() if us == now_us]

@@ -71,9 +71,9 @@ test_other_parameters = refused(
 
 
 def test_what_the_robot_was_told_survives() -> None:
-    rng, told = np.random.default_rng(0), Episode(THREE, STEADY, encodings={"json": np.ones(3, np.int64)}, ends_us=7)
+    rng, full = np.random.default_rng(0), Episode(THREE, STEADY, encodings={"json": np.ones(3, np.int64)}, ends_us=7)
     fleet = FleetEpisode((THREE, THREE), STEADY, 7)
-    others = told.with_uniforms(rng), told.encoded("json"), told.copied(2), told.valued(V)
+    others = full.with_uniforms(rng), full.encoded("json"), full.copied(2), full.valued(V)
     for episode in (*others, fleet.episode(1), fleet.with_uniforms(rng).episode(0)):
         assert episode.ends_us == 7
     refuse("ends_us = -7", FleetEpisode, (THREE, THREE), STEADY, -7)

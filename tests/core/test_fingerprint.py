@@ -242,11 +242,11 @@ def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
 
     seen: list[str] = []
 
-    def told(value: Any, waiting: list[Any]) -> str:
+    def described(value: Any, waiting: list[Any]) -> str:
         seen.append(answer := original(value, waiting))
         return answer
 
-    original, module._told = module._told, told
+    original, module._described = module._described, described
     try:
         from bufgym.envs import step
         from bufgym.sim import rollout
@@ -254,6 +254,6 @@ def test_every_kernel_has_a_closure_that_any_process_finds_again() -> None:
         for one in (step.step_rows, step.step_cells, rollout.rollout):
             fingerprint(getattr(one, "py_func", one))
     finally:
-        module._told = original
+        module._described = original
     assert jit.FOLDER or not JIT
     assert [text for text in seen if " at 0x" in text] == []

@@ -102,7 +102,7 @@ except NotCachedError:
 def test_where_no_folder_can_be_written_a_temporary_one_serves(tmp_path: Path) -> None:
     nowhere = f"import os; os.environ.pop('NUMBA_CACHE_DIR', None); os.access = lambda *_: False; {PATIENT}"
     done = run(tmp_path, before=nowhere, TMPDIR=str(tmp_path))
-    assert done.stderr.startswith("bufgym: compiled code cannot be kept")
+    assert done.stderr.startswith("bufgym: compiled code cannot be cached")
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.glob("bufgym-*"))  # removed at the end
 

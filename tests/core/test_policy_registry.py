@@ -52,18 +52,18 @@ def test_agrees_with_reference(spec, case, v):
     ours, reference = case.run(policy, v), case.run_reference(naive.policy(spec, v))
     assert log(ours) == reference_log(reference)
     assert order(ours) == reference.order
-    sender, told = ours.batch.senders[0], outcome(ours, 0)
+    sender, result = ours.batch.senders[0], outcome(ours, 0)
     assert (sender["rejected"], sender["evicted"]) == (reference.rejected, reference.evicted)
     assert (sender["dequeued"], sender["transmitted"]) == (len(reference.dequeued), len(reference.transmitted))
     assert sender["backlog_bytes"] == sum(m["bytes"] for m in reference.queue)
-    assert told.invalid == reference.invalid
-    assert (told.arrived, told.delivered) == (len(case.reference_messages), len(reference.order))
-    assert (told.dropped, told.in_transmission) == (len(reference.dropped), len(reference.socket))
-    assert told.buffered == len(reference.queue)
+    assert result.invalid == reference.invalid
+    assert (result.arrived, result.delivered) == (len(case.reference_messages), len(reference.order))
+    assert (result.dropped, result.in_transmission) == (len(reference.dropped), len(reference.socket))
+    assert result.buffered == len(reference.queue)
     x = [case.reference_messages[k]["x"] for k in reference.order]
-    assert told.qoi == naive.information(v, x)
+    assert result.qoi == naive.information(v, x)
     # What was credited message by message is H; what is kept or sent is H of all of it.
-    assert (sender["delivered_gain"] + 1 if x else 0) == pytest.approx(told.qoi, abs=1e-12)
+    assert (sender["delivered_gain"] + 1 if x else 0) == pytest.approx(result.qoi, abs=1e-12)
     kept = x + [m["x"] for m in [*(sent.message for sent in reference.socket), *reference.queue]]
     assert (sender["retained_gain"] + 1 if kept else 0) == pytest.approx(naive.information(v, kept), abs=1e-9)
 

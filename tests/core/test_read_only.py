@@ -68,10 +68,10 @@ def test_a_python_policy_cannot_write(write: str) -> None:
 @pytest.mark.parametrize("write", WRITES)
 def test_a_compiled_policy_that_writes_has_no_result(write: str) -> None:
     policy = writer(write, compile=True)
-    told = f"policy test-writer: wrote to what it may only read: {WRITES[write]}|read-only"  # that without a compiler
-    with pytest.raises((BufgymError, ValueError), match=told):
+    fault = f"policy test-writer: wrote to what it may only read: {WRITES[write]}|read-only"  # that without a compiler
+    with pytest.raises((BufgymError, ValueError), match=fault):
         run(policy, [EPISODE], 3, V)
-    with pytest.raises((BufgymError, ValueError), match=told):
+    with pytest.raises((BufgymError, ValueError), match=fault):
         run_fleet(policy, [FleetEpisode((EPISODE.arrivals,) * 2, EPISODE.link)], 3, V)
 
 
@@ -107,8 +107,8 @@ def test_a_row_above_the_clairvoyant_is_an_error(monkeypatch: pytest.MonkeyPatch
             yield [[{**row, "clairvoyant": 0.99 * row["qoi"]} for row in rows] for rows in results]
 
     monkeypatch.setattr(QueueTask, "play", lowered)
-    told = r"^policy drop-oldest, L = 4, trace constant, seed 3: H = \S+ is above \S+, which no policy can reach$"
-    refuse(told, bench.run, [get("drop-oldest")], Uplink(traces=(EPISODE.link.trace,), duration_s=3), [4], [3])
+    fault = r"^policy drop-oldest, L = 4, trace constant, seed 3: H = \S+ is above \S+, which no policy can reach$"
+    refuse(fault, bench.run, [get("drop-oldest")], Uplink(traces=(EPISODE.link.trace,), duration_s=3), [4], [3])
 
 
 def test_honest_policies_are_not_accused() -> None:

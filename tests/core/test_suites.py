@@ -130,8 +130,8 @@ def test_what_is_unknown_or_missing_is_named(tmp_path: Path) -> None:
     refuse(r"unknown suite 'outage-v0'; did you mean 'outage-v1'\?", suites.get, "outage-v0")
     refuse(r"split = 'tests': must be one of train, validation, test", suites.get("lte-v1").settings, "tests")
     for name in RECORDED:
-        told = rf"suite {name} needs a folder of recordings \(--data DIR\) with .*{re.escape(suites.get(name).needs)}"
-        refuse(told, suites.get(name).settings, "test")
+        fault = rf"suite {name} needs a folder of recordings \(--data DIR\) with .*{re.escape(suites.get(name).needs)}"
+        refuse(fault, suites.get(name).settings, "test")
         refuse(str(tmp_path / "nowhere"), suites.get(name).settings, "test", tmp_path / "nowhere")
     (tmp_path / "mahimahi").mkdir()
     for k in range(5):

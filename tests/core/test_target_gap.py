@@ -178,8 +178,8 @@ def reference():
 @given(cases(max_messages=25), VALUES)
 def test_decides_as_its_reference(case, v):
     assert same(case.run(POLICY, v), case.run(reference(), v))
-    told = replace(case.episode, ends_us=int(case.episode.arrivals["arrival_us"][-1]) * 3 // 4)
-    for other in (replace(case, decide_at="overflow"), replace(case, episode=told)):
+    with_end = replace(case.episode, ends_us=int(case.episode.arrivals["arrival_us"][-1]) * 3 // 4)
+    for other in (replace(case, decide_at="overflow"), replace(case, episode=with_end)):
         assert same(other.run(POLICY, v), other.run(reference(), v))
 
 

@@ -262,7 +262,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
 def test_infos_have_the_same_entries_in_every_step() -> None:
     """As recorders that stack them step by step want it."""
     for options in ({}, {"bound": True}):
-        env = SenderEnv("lte", 4, info="steady", **STREAM, **options, actions="slots")
+        env = SenderEnv("lte", 4, info="summary", **STREAM, **options, actions="slots")
         _, info = env.reset(seed=0)
         ended = False
         while not ended:

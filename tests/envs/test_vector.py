@@ -150,7 +150,7 @@ def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, steps
         for i in range(N):
             own, expected_own = row(infos, i), row(expected_infos, i)
             if step[3][i] and not step[2][i]:
-                # The wrapper that truncates asks for no summary.
+                # The environment inside the wrapper does not know that its episode was cut, so it gives no summary.
                 last = own.get("final_info", own)
                 assert last["qoi"] == expected_own.get("final_info", expected_own)["qoi"]
                 assert last.pop("arrived") >= last.pop("delivered") + last.pop("dropped")
@@ -302,8 +302,8 @@ test_wrong_use_is_named = refused(
         for n in (0, 1.5, "5")
     ),
     (lambda: SenderVectorEnv(observation="vector", actions="slots"), "must be one of 'dict', 'flat', 'slots'"),
-    (lambda: SenderVectorEnv(info="some", actions="slots"), "must be one of 'full', 'steady', 'mask', 'none'"),
-    (lambda: SenderVectorEnv(info="steady", actions="slots"), "info = 'steady': is for recorders"),
+    (lambda: SenderVectorEnv(info="some", actions="slots"), "must be one of 'full', 'summary', 'mask', 'none'"),
+    (lambda: SenderVectorEnv(info="summary", actions="slots"), "info = 'summary': is for recorders"),
     (lambda: SenderVectorEnv(num_threads=0, actions="slots"), "num_threads = 0: must be"),
     (lambda: vector("interruption").step(np.zeros(N, np.int64)), "call reset", RESET),
     (lambda: vector("interruption").reset(options={"reset_mask": np.arange(N) > 0}), "no episode yet", RESET),

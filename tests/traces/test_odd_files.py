@@ -243,10 +243,10 @@ def test_semicolons_and_decimal_commas_are_named(tmp_path: Path, header: str) ->
     """What a spreadsheet saves as CSV where 1/2 is written 0,5; with a header or without."""
     path = written(tmp_path, f"{header}\n0,0;1200,5\n0,5;1300,5\n")
     line = 1 if header else 2
-    told = rf'lte.csv, line {line}: .*: has ";" between cells, as files with decimal commas have: must have "," there'
+    fault = rf'lte.csv, line {line}: .*: has ";" between cells, as files with decimal commas have: must have "," there'
     for read_file in (read_trace, read_motion, read_workload):
-        refuse(told, read_file, path, kind=TraceError)
-    refuse(told, read_trace, path, "rates", kind=TraceError)
+        refuse(fault, read_file, path, kind=TraceError)
+    refuse(fault, read_trace, path, "rates", kind=TraceError)
     # Below a header that fits, too.
     mixed = written(tmp_path, "time_s,bytes_per_s\n0.0;1200\n")
     refuse(r'line 2: 0.0;1200: has ";"', read_trace, mixed, kind=TraceError)

@@ -104,9 +104,9 @@ class Player:
         """Actions for the policy's answers at arrivals. Where the socket asks, for the slot it ``sends``."""
         wrong = answers[(answers < (HOLD if sends else ACCEPT)) | (answers >= capacity)]
         if len(wrong):
-            told, last = ("sends slot", "or HOLD") if sends else ("decision", "REJECT or ACCEPT")
+            what, last = ("sends slot", "or HOLD") if sends else ("decision", "REJECT or ACCEPT")
             slots = f"0..{capacity - 1}," if sends else f"a slot 0..{capacity - 1},"
-            raise BufgymError(f"policy {self.policy.name}: {told} {wrong[0]}: must be {slots} {last}")
+            raise BufgymError(f"policy {self.policy.name}: {what} {wrong[0]}: must be {slots} {last}")
         return np.where(answers >= 0, answers, np.where(answers == ACCEPT, capacity + 1, capacity))
 
 

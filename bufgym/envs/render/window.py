@@ -29,8 +29,8 @@ class Window:
             try:
                 import_module(name)
             except ImportError as error:
-                told = f"render_mode='human' needs {name}: {install('human')}"
-                raise gym.error.DependencyNotInstalled(told) from error
+                message = f"render_mode='human' needs {name}: {install('human')}"
+                raise gym.error.DependencyNotInstalled(message) from error
         self._clock: Any = None
 
     def __reduce__(self) -> Any:

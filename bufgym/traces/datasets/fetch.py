@@ -44,7 +44,7 @@ class Fetched:
 
 
 def cache_folder() -> Path:
-    """Where data sets are kept: `bufgym/datasets` in XDG_CACHE_HOME, or else in the platform's cache folder."""
+    """Where data sets are cached: `bufgym/datasets` in XDG_CACHE_HOME, or else in the platform's cache folder."""
     import pooch
 
     return Path(pooch.os_cache("bufgym")) / "datasets"

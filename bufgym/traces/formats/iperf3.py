@@ -109,8 +109,8 @@ def _lost_percent(report: dict[str, Any], suffix: str) -> float | None:
     """Largest share of packets lost that the end tells of a direction; None where it tells none."""
     end = report.get("end")
     sums = [end.get(f"{name}{suffix}") for name in ("sum", "sum_received")] if isinstance(end, dict) else []
-    told = [one.get("lost_percent") for one in sums if isinstance(one, dict)]
-    return max((float(value) for value in told if isinstance(value, int | float)), default=None)
+    lost_percent = [one.get("lost_percent") for one in sums if isinstance(one, dict)]
+    return max((float(value) for value in lost_percent if isinstance(value, int | float)), default=None)
 
 
 def _report(path: StrPath) -> Any:

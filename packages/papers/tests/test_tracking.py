@@ -107,11 +107,11 @@ def test_it_follows_every_frame_and_fails_at_a_gap(monkeypatch: pytest.MonkeyPat
     assert torn.poses[:20].tolist() == whole.poses[:20].tolist()
     assert np.isnan(torn.poses[20:]).all()
     # The recording claims a jump that its frames do not show.
-    told = frame_cases.Held(sequence.camera, [sequence.depth(k) for k in range(6)], list(sequence.poses[:6]))
-    told.poses[4:, 0, 3] += 0.2
-    assert track(told, range(6)).where == 4
+    wrong = frame_cases.Held(sequence.camera, [sequence.depth(k) for k in range(6)], list(sequence.poses[:6]))
+    wrong.poses[4:, 0, 3] += 0.2
+    assert track(wrong, range(6)).where == 4
     monkeypatch.setattr(tracking, "MOST_ERROR_M", 0.3)
-    assert track(told, range(6)).where is None
+    assert track(wrong, range(6)).where is None
     for frames in ([], [3, 2], [2, 2], [-1, 1], [1, 80]):
         refuse("at least one index below 80, increasing", track, sequence, frames)
 

@@ -89,8 +89,10 @@ class Bus:
         async with asyncio.timeout(ANSWER_S + _SAME_NAME_S):
             await self._client.connect(self._settings.place, error_cb=self._wrong, **given)
             await self._take_name()
+            # The name before the place: two relays of one name would take each other's messages from one place.
             self._stream = self._client.jetstream(timeout=ANSWER_S)
             await self._take_place(known)
+            # The place before all else: NATS forgets a no_drop message that no place waits for.
             self._heard = heard
             self._messages = await self._subscribe()
             await self._client.flush(ANSWER_S)  # from here on the server sends what others publish
@@ -124,6 +126,7 @@ class Bus:
                 self.most = max(1, (self.most or MANY) // 2)
             else:
                 self.most = 2 * self.most if 2 * self.most <= MANY else 0
+            # The flush lets all that was sent to the old subscription come before the new one begins to count.
             await self._messages.unsubscribe()
             await self._client.flush(_BACKLOG_S)
             self._messages = await self._subscribe()
@@ -135,6 +138,7 @@ class Bus:
             await asked.respond(b"")
 
         subject = f"{NAME}.{self._settings.name}"
+        # Before it asks: of two that start at once each hears the other. no_echo: its own question it does not hear.
         await self._client.subscribe(subject, cb=here)
         with contextlib.suppress(self._library.errors.NoRespondersError, TimeoutError):
             await self._client.request(subject, timeout=_SAME_NAME_S)

@@ -31,7 +31,7 @@ class Caller:
         self.answers: deque[str] = deque()
         self.subscriptions: dict[str, Subscription] = {}
         self._verifier, self._listens = verifier, listens
-        self.told: Callable[[], None] = lambda: None  # called with each answer to come
+        self.on_answer: Callable[[], None] = lambda: None  # called with each answer to come
 
     async def prove(self, token: str | None) -> Identity:
         """Learn who it is: by token, certificate, or address alone."""
@@ -69,7 +69,7 @@ class Caller:
     def say(self, text: str) -> None:
         """Have this text frame sent before any message."""
         self.answers.append(text)
-        self.told()
+        self.on_answer()
 
     def refuse(self, what: str, error: BufgymError, **fields: Any) -> None:
         """Tell it of a refusal and the reason. Refusals of messages are audited elsewhere."""

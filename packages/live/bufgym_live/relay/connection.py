@@ -39,7 +39,7 @@ class Connection:
     """A ``hub.Member`` on a WebSocket, made once its client is let in."""
 
     acks = True
-    policies: tuple[str, ...] = ()
+    own_policies: tuple[str, ...] = ()
     """Policies that its kind of client may choose beside the configuration's."""
 
     def __init__(self, caller: Caller, admitted: Admitted, session: StoredSession, quota: Quota) -> None:
@@ -49,7 +49,8 @@ class Connection:
         self._outbox = Outbox(caller, self, admitted.form, admitted.received)
         self._recordings = None if self._hub.config.folder is None else self._hub.config.folder / RECORDINGS
         self.wake, self.tell, self.sent = self._outbox.wake, caller.tell, 0
-        caller.told = self._told
+        caller.on_answer = self._answer_waits
+        # ``end`` is called where nobody may wait, so a task closes the socket; the first reason stands.
         self._ending: asyncio.Task[None] | None = None
         self._orders: asyncio.Queue[tuple[int, Work]] = asyncio.Queue(_MOST_ORDERS)
         self._ids_waiting: list[str] = []  # of subscriptions
@@ -68,6 +69,7 @@ class Connection:
         hub.join(self)
         self._socket.protocol.max_message_size = hub.config.limits.message_bytes
         hub.audit("joined", name=admitted.name, session=self.session.name, **caller.identity.as_json())
+        # Told before the outbox runs, so that nothing overtakes the welcome.
         numbers = self.session.received, hub.now_us()
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, *numbers))
         greeted()
@@ -81,6 +83,7 @@ class Connection:
             pass
         finally:
             expiry.cancel()
+            # The tasks first: nothing may begin for a session that has left the hub.
             for task in tasks:
                 task.cancel()
             while not self._orders.empty():
@@ -93,8 +96,10 @@ class Connection:
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
         for heard in itertools.count(1):
+            # The reason is on its way: what the client still says is not obeyed.
             if self._ending is not None:
                 break
+            # A socket with much to read never lets go of the event loop by itself.
             if heard % _MOST_IN_TURN == 0:
                 await asyncio.sleep(0)
             match protocol.asked(await self._caller.heard(), self._hub.config.limits.message_bytes):
@@ -107,6 +112,7 @@ class Connection:
                     else:
                         await self._publish(message)
                 case {"op": "subscribe" | "unsubscribe"} as said:
+                    # A change of an id must not overtake an earlier one of it that waits for the disk.
                     late = said.get("durable") or said["id"] in self._ids_waiting
                     self._ids_waiting.append(said["id"])
                     change = partial(self._change, said)
@@ -129,6 +135,7 @@ class Connection:
             size_bytes, work = 0, partial(self._busy, message.topic, message.seq)
         if message is not None:  # the client sends it again on its next connection, and must find the session there
             self.session.kept = True
+        # Counted before it waits: a session with orders is not forgotten.
         self.session.orders += 1
         await self._orders.put((size_bytes, work))
 
@@ -170,7 +177,7 @@ class Connection:
         await self._caller.pace(min(said["most_bytes"], replay.MOST_BYTES))
         try:
             async with self._hub.replaying:
-                text = await asyncio.to_thread(replay.told, said["id"], self._recordings, *asked, may)
+                text = await asyncio.to_thread(replay.answer_text, said["id"], self._recordings, *asked, may)
         except BufgymError as error:
             self._caller.refuse("replay", error, id=said["id"])
         else:
@@ -225,7 +232,7 @@ class Connection:
             self.permissions.check_subscription(said["topic"])
             # A policy that nobody has asked for yet is compiled, while others are served.
             policy = (
-                await asyncio.to_thread(policies.warm, name) if name in (*config.policies, *self.policies) else None
+                await asyncio.to_thread(policies.warm, name) if name in (*config.policies, *self.own_policies) else None
             )
             self._quota.subscribe(said["id"], self.subscriptions, pattern(said["topic"]).cost)
             subscription = protocol.subscription(said, config, policy, self.session.temporary, left_bytes)
@@ -238,15 +245,15 @@ class Connection:
         self.tell("subscribed", id=subscription.id, policy=subscription.policy.name, capacity=subscription.capacity)
         await self._hub.offer_latched(self, subscription)
 
-    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
+    def offer(self, subscription: Subscription, outgoing: Outgoing) -> None:
         """A message that its queues decide on."""
-        if is_stop(frame.message.topic):
-            self._outbox.urgent[frame.message.topic] = frame
+        if is_stop(outgoing.message.topic):
+            self._outbox.urgent[outgoing.message.topic] = outgoing
         else:
-            subscription.offer(frame.message.topic, frame, frame.size_bytes)
+            subscription.offer(outgoing.message.topic, outgoing, outgoing.size_bytes)
         self._outbox.wake()
 
-    def _told(self) -> None:
+    def _answer_waits(self) -> None:
         self._outbox.wake()
         if len(self._caller.answers) > outbox.MAX_ANSWERS:
             self.end("reads none of the answers")
@@ -278,6 +285,7 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
         await hub.store.catch_up(caller.identity, admitted.session, admitted.acked, admitted.received)
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
+            # Nothing is awaited from ``take_over`` to here, or a second connection of the session could come between.
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
             stage = "frame"
             one = kind(caller, admitted, session, quota)

@@ -51,6 +51,7 @@ class Disk:
     @property
     def stalls(self) -> bool:
         """Whether a piece of work takes too long."""
+        # Read once: the thread may set it to None at any moment.
         began_s = self._began_s
         return began_s is not None and time.monotonic() - began_s > STALL_S
 

@@ -188,6 +188,7 @@ class Held:
                 self._db.execute("UPDATE session SET numbered = ? WHERE id = ?", (number, receiver.id))
             self._db.execute("UPDATE session SET received = ? WHERE id = ?", (seq, sender.id))
         sender.received = seq
+        # Only after the commit: what is rolled back must not count.
         self.bytes += len(frame) if receivers else 0
         for receiver in receivers:
             receiver.numbered += 1
@@ -314,6 +315,7 @@ class Held:
                     freed_bytes += size_bytes
                     if sender in self._by_id:
                         settled.append(Settled(self._by_id[sender], seq, receivers, gone))
+        # After the commit, too; and only then are senders told.
         session.held -= len(sizes)
         session.held_bytes -= sum(sizes)
         self.bytes -= freed_bytes

@@ -50,7 +50,7 @@ class Member(Protocol):
     sent: int  # number of messages sent to it
     acks: bool  # whether its client acks no_drop messages; otherwise it gets them like all others
 
-    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
+    def offer(self, subscription: Subscription, outgoing: Outgoing) -> None:
         """Offer a message to its queues."""
 
     def reruled(self, rules: Sequence[Rule]) -> None:
@@ -175,21 +175,21 @@ class Hub:
     def publish(self, sender: Member | None, message: wire.Message) -> None:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
-        frame = Outgoing(message)
+        outgoing = Outgoing(message)
         if is_last(message.topic) or is_stop(message.topic) or _any_whole(self.config.latched, message.topic):
-            self._latch(frame)
+            self._latch(outgoing)
         for member, subscription in self._route(message.topic):
             if member is not sender:
-                member.offer(subscription, frame)
+                member.offer(subscription, outgoing)
 
-    def _latch(self, frame: Outgoing) -> None:
+    def _latch(self, outgoing: Outgoing) -> None:
         """Keep it in place of its topic's last message."""
-        before = self._latched.pop(frame.message.topic, None)
+        before = self._latched.pop(outgoing.message.topic, None)
         self._latched_bytes -= before.size_bytes if before else 0
-        if is_last(frame.message.topic) and frame.message.payload == GONE:
+        if is_last(outgoing.message.topic) and outgoing.message.payload == GONE:
             return
-        self._latched[frame.message.topic] = frame
-        self._latched_bytes += frame.size_bytes
+        self._latched[outgoing.message.topic] = outgoing
+        self._latched_bytes += outgoing.size_bytes
         while self._latched_bytes > MAX_LATCHED_BYTES:
             oldest = next(topic for topic in self._latched if not is_stop(topic))
             self._latched_bytes -= self._latched.pop(oldest).size_bytes

@@ -18,7 +18,7 @@ class Latch:
         self._work: asyncio.Task[Any] | None = None
 
     @property
-    def told(self) -> dict[str, str] | None:
+    def status(self) -> dict[str, str] | None:
         """The stop that holds, for the robot's status: its id, and who said it."""
         return {"id": self._id, "by": self._by} if self.is_set else None
 

@@ -63,6 +63,7 @@ class Outbox:
     async def one(self) -> bool:
         """Send the next message; return whether there was one."""
         while self.urgent:
+            # Taken out before the wait: a newer stop that comes during it must go out, too.
             await self._send(self.urgent.pop(next(iter(self.urgent))))
         if self._caller.answers:
             await self._caller.send_answers()
@@ -77,6 +78,7 @@ class Outbox:
             return made
         if not self._hub.orders.is_over(item.message.message, self._hub.now_us()):
             await self._send(item.message)
+        # After the send: until then the policy counts these bytes as still to leave.
         lane.gone()
         return True
 
@@ -87,6 +89,7 @@ class Outbox:
                 self._fetching = self._hub.store.next(member.session, self._sent_number)
                 self._fetching.add_done_callback(lambda _: self.wake())
             return False
+        # Messages from the queues go on while the disk looks.
         if not self._fetching.done():
             return False
         (self._sent_number, topic, frame), self._fetching = self._fetching.result(), None
@@ -102,6 +105,6 @@ class Outbox:
                 self._hub.store.denied(member.session, self._sent_number)
         return True
 
-    async def _send(self, frame: Outgoing) -> None:
-        await self._socket.send_frame(frame.frame(self._form))
+    async def _send(self, outgoing: Outgoing) -> None:
+        await self._socket.send_frame(outgoing.frame(self._form))
         self._member.sent += 1

@@ -88,6 +88,7 @@ class Peers:
                 await bus.open(self._options, self._heard, self._known)
                 self._bus = bus
                 backoff.connected()
+                # Only now: while NATS is away nothing must queue up for it.
                 everything = Subscription("all", pattern(""), policy, DEFAULT_CAPACITY)
                 await self._hub.subscribe(self, everything)
                 await self._hub.offer_latched(self, everything)
@@ -129,10 +130,10 @@ class Peers:
     def _goes(self, verb: Any, topic: str) -> bool:
         return not topic.startswith(f"/{wire.OWN}/") and self.permissions.allow(verb, topic)
 
-    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
+    def offer(self, subscription: Subscription, outgoing: Outgoing) -> None:
         """Offer a message of this relay."""
-        if not frame.message.no_drop and self._goes("receive", frame.message.topic):
-            subscription.offer(frame.message.topic, (frame, time.time_ns() // 1000), frame.size_bytes)
+        if not outgoing.message.no_drop and self._goes("receive", outgoing.message.topic):
+            subscription.offer(outgoing.message.topic, (outgoing, time.time_ns() // 1000), outgoing.size_bytes)
             self._awake.set()
 
     async def _send_all(self, bus: Bus) -> None:
@@ -145,10 +146,10 @@ class Peers:
             while (lane := next_lane(list(self.subscriptions.values()), self._hub.clock())) is not None:
                 item = lane.take(self._hub.clock())
                 if item is not None:
-                    frame, put_us = item.message
-                    headers = {"Relay": self._settings.name, "Put": str(put_us), **self._left(frame.message)}
+                    outgoing, put_us = item.message
+                    headers = {"Relay": self._settings.name, "Put": str(put_us), **self._left(outgoing.message)}
                     try:
-                        await bus.publish(frame.message.topic, wire.encode(_undated(frame.message)), headers)
+                        await bus.publish(outgoing.message.topic, wire.encode(_undated(outgoing.message)), headers)
                         self.sent += 1
                     except wire.RefusedError as refused:
                         self._note(refused)
@@ -231,6 +232,7 @@ class Peers:
         if message is not None and re.fullmatch("[0-9]{1,17}", put := headers.get("Put", "")):
             extra_s = self._delays[relay].extra_s(time.time() - int(put) / 1e6, self._hub.clock())
             message = self._dated(message, headers, extra_s)
+        # The last one comes again if NATS did not hear its ack.
         if message is not None and self._hub.is_no_drop(message.topic) and number != self.session.received:
             try:
                 await self._hub.hold(self, message, taken=number)
@@ -240,6 +242,7 @@ class Peers:
                     if heard.metadata.num_delivered < TRIES:
                         await heard.nak(delay=_RETRY_S)
                         return
+        # Also what was not wanted, or came twice: NATS must not give it again.
         await heard.ack()
 
     def _ignore(self, *words: Any, **fields: Any) -> None:

@@ -72,7 +72,7 @@ def piece(
     return {"messages": messages, "next_us": next_us, "first_us": recording.first_us, "last_us": recording.last_us}
 
 
-def told(id: str, *asked: Any) -> str:
+def answer_text(id: str, *asked: Any) -> str:
     """Give the text frame with a ``piece``; written bit by bit, because others wait while JSON is written."""
     try:
         part = piece(*asked)

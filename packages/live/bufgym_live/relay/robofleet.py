@@ -81,7 +81,7 @@ class RobofleetConnection(Connection):
     """Connection of a client that Robofleet released."""
 
     acks = False
-    policies = (SKIP_PENDING,)
+    own_policies = (SKIP_PENDING,)
 
     @staticmethod
     async def greet(caller: Caller) -> Admitted:
@@ -123,7 +123,7 @@ class RobofleetConnection(Connection):
         else:
             await self._subscribe({"id": flat.pattern, "topic": flat.pattern, "policy": SKIP_PENDING})
 
-    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
+    def offer(self, subscription: Subscription, outgoing: Outgoing) -> None:
         """Offer a message if it is a flatbuffer, the only encoding that the client reads."""
-        if frame.message.encoding == ROBOFLEET:
-            super().offer(subscription, frame)
+        if outgoing.message.encoding == ROBOFLEET:
+            super().offer(subscription, outgoing)

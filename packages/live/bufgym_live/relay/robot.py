@@ -150,7 +150,7 @@ class Robot:
             "policies": self._policies,
             "answer": self._answer,
             "driver": self._drive.driver,
-            "stop": self.latch.told,
+            "stop": self.latch.status,
             **own,
             "commands": sorted({*own.get("commands", ()), "stop", "release"}),
         }

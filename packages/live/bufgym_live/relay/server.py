@@ -266,7 +266,7 @@ async def serve_forever(config: Config, say: Any = print, load: Callable[[], Con
         say(f"{server.hub.peers.state}; goes on without the other relays until NATS is there")
     if server.window is not None:
         say(f"ws://{server.window.address}: Foxglove, Lichtblick")
-    told = asyncio.Event()
+    asked_to_end = asyncio.Event()
 
     def reread() -> None:
         try:
@@ -280,14 +280,14 @@ async def serve_forever(config: Config, say: Any = print, load: Callable[[], Con
     with contextlib.suppress(
         AttributeError, NotImplementedError, RuntimeError, ValueError
     ):  # Windows; a thread other than the main one
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, asked_to_end.set)
         asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, reread)
 
     async def works() -> None:
         await server.warm()
-        await told.wait()
+        await asked_to_end.wait()
 
     try:
-        await until_one_ends(works(), told.wait())
+        await until_one_ends(works(), asked_to_end.wait())
     finally:
         await server.close()

@@ -160,7 +160,7 @@ class Session:
         """Connect, and again whenever the connection ends or could not be made, until cancelled.
 
         Raises:
-            RefusedError: the relay does not let this client in, and waiting does not mend it: a wrong key or name.
+            RefusedError: the relay does not let this client in, and waiting does not fix it: a wrong key or name.
         """
         backoff = Backoff()
         try:
@@ -203,6 +203,7 @@ class Session:
             self.connected.clear()
             self.ready.clear()
             self._subscriptions.confirmed.clear()
+            # Taken out first: others look at it to see whether there is one.
             connection, self._connection = self._connection, None
             with contextlib.suppress(AttributeError):  # there is none; or asyncio's of 3.11, if it has ended already
                 connection.transport.abort()
@@ -323,6 +324,7 @@ class Session:
             await self._subscriptions.call(message)
         if message.no_drop:
             self._received[self.stands_in] = message.seq
+            # After the program has had it: if the connection breaks before, the relay sends it again.
             await self._say_it("ack", seq=message.seq)
 
     def _answer(self, said: dict[str, Any]) -> None:

@@ -154,6 +154,7 @@ class Store:
         """
         for session in (sender, *receivers):
             session.kept = True
+        # ``kept`` is set before the wait: a session that leaves meanwhile must not be forgotten with its message.
         new: bool = await self.disk.do(self._held.hold, sender, seq, topic, frame, receivers)
         return new
 

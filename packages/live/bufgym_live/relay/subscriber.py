@@ -70,18 +70,18 @@ class Subscription:
     """Its queues, made or still to be made."""
     _topics: dict[str, int] = field(init=False, default_factory=dict)
     _early: defaultdict[int, list[tuple[int, Any, int]]] = field(init=False, default_factory=lambda: defaultdict(list))
-    """Number of a queue that is still to be made -> its messages: topic, frame, bytes."""
+    """Number of a queue that is still to be made -> its messages: topic, message, bytes."""
     _lost: int = field(init=False, default=0)
 
-    def offer(self, topic: str, frame: Any, size_bytes: int) -> None:
+    def offer(self, topic: str, message: Any, size_bytes: int) -> None:
         """Put a message into its queue, where the policy decides; until that is made, the newest wait."""
         lane, place = self._place(topic)
         while isinstance(self.policy, type) and self.make():  # plain Python takes no time
             pass
         if lane < len(self.lanes):
-            self.lanes[lane].queue.put(frame, size_bytes, topic=place)
+            self.lanes[lane].queue.put(message, size_bytes, topic=place)
             return
-        self._early[lane].append((place, frame, size_bytes))
+        self._early[lane].append((place, message, size_bytes))
         if len(self._early[lane]) > self.capacity + 1:
             del self._early[lane][0]
             self._lost += 1
@@ -103,8 +103,8 @@ class Subscription:
         if len(self.lanes) == self.queues:
             return False
         self.lanes.append(Lane(new_queue(self.policy, self.capacity), self.left_bytes))
-        for place, frame, size_bytes in self._early.pop(len(self.lanes) - 1, ()):
-            self.lanes[-1].queue.put(frame, size_bytes, topic=place)
+        for place, message, size_bytes in self._early.pop(len(self.lanes) - 1, ()):
+            self.lanes[-1].queue.put(message, size_bytes, topic=place)
         return True
 
     @property

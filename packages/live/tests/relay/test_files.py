@@ -22,7 +22,7 @@ from bufgym_live.relay import disk
 from bufgym_live.relay.audit import FILE, Audit
 from bufgym_live.relay.config import Rotation, Rule
 from bufgym_live.relay.recorder import FOLDER, Recorder
-from bufgym_live.relay.replay import piece, recordings, told
+from bufgym_live.relay.replay import answer_text, piece, recordings
 from bufgym_live.relay.wire import Message
 from bufgym_live.robot.mcap_file import McapFile
 from bufgym_live.robot.sockets import free_port
@@ -180,7 +180,7 @@ def test_only_recordings_are_read(tmp_path: Path) -> None:
     for k in range(8, len(whole)):  # each byte in turn is another one, and the file is read or refused
         (tmp_path / f"{k}.mcap").write_bytes(whole[:k] + bytes([whole[k] ^ 0xFF]) + whole[k + 1 :])
         try:
-            told("a", tmp_path, f"{k}.mcap", 0, 1, every)
+            answer_text("a", tmp_path, f"{k}.mcap", 0, 1, every)
         except BufgymError as error:
             refused += str(error).startswith(f"recording '{k}.mcap': cannot be read")
         (tmp_path / f"{k}.mcap").unlink()

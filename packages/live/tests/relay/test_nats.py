@@ -56,8 +56,8 @@ async def test_a_relay_connects_again_whose_library_has_stopped_to_read(tmp_path
         bus.write(b'CONNECT {"verbose": false, "headers": true}\r\n')
         bus.write(b"HPUB bufgym.relay.message %d %d\r\n%b\r\n" % (len(broken), len(broken), broken))
         await wait("NATS to have it", bus.drain())
-        told = "'state': 'connected'"  # the log has it, also where the time between is too short to be seen
-        await until("another connection", lambda: str(a.hub.audit.recent).count(told) == 2)
+        text = "'state': 'connected'"  # the log has it, also where the time between is too short to be seen
+        await until("another connection", lambda: str(a.hub.audit.recent).count(text) == 2)
 
 
 async def test_without_nats_a_relay_serves_its_own_robots_and_joins_when_it_comes(tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def test_a_stop_withdraws_what_the_relay_took_before_it() -> None:
     orders = Orders()
     goal, stop = {"command": "goal", "id": "1"}, {"command": "stop", "id": "s1"}
     before = orders.dated(said(goal, 1_000_000), 3.0, 1_000_000, "ann")
-    told = orders.dated(said(stop, 2_000_000, 1, STOP)._replace(until_us=0), 3.0, 2_000_000, "bob@x.org")
-    assert (json.loads(bytes(told.payload))["by"], told.until_us) == ("bob@x.org", 0)
+    dated = orders.dated(said(stop, 2_000_000, 1, STOP)._replace(until_us=0), 3.0, 2_000_000, "bob@x.org")
+    assert (json.loads(bytes(dated.payload))["by"], dated.until_us) == ("bob@x.org", 0)
     assert orders.is_over(before, 2_000_000)
     assert not orders.is_over(before._replace(topic="/robots/other/command"), 2_000_000)
     with pytest.raises(RefusedError, match=r"r was stopped by bob@x\.org: release it first"):
@@ -195,11 +195,11 @@ async def test_a_goal_that_waited_on_a_link_is_refused_and_the_stop_comes_first(
             link.thaw()
             id = await wait("the stop", stop)
             await wait("the goal", goal)
-            await until("it stands", lambda id=id: one.robot.latch.told == {"id": id, "by": "operator"})
+            await until("it stands", lambda id=id: one.robot.latch.status == {"id": id, "by": "operator"})
             await until("the program", lambda: one.program.names[1:2] == ["stop"])
             assert "was stopped by operator" in await one.goal("while it holds")
             await one.operator.release("r", id)
-            await until("it is free", lambda: one.robot.latch.told is None)
+            await until("it is free", lambda: one.robot.latch.status is None)
             assert await one.goal("next") == ""
             await until("the next goal", lambda: one.program.names[-1] == "next")
             assert one.program.names == ["first", "stop", "next"]
@@ -228,7 +228,7 @@ async def test_a_robot_that_was_away_hears_the_stop_before_all_else() -> None:
         with pytest.raises(BufgymError, match="stopped again, by operator"):
             await one.operator.release("r", first)
         one.far.mend()
-        await until("it stands", lambda: one.robot.latch.told == {"id": second, "by": "operator"})
+        await until("it stands", lambda: one.robot.latch.status == {"id": second, "by": "operator"})
         await until("the program", lambda: one.program.names == ["stop"])
 
 
@@ -254,10 +254,10 @@ async def test_cuts_at_random_moments(seed: int) -> None:
             link.mend()
             if stop is not None:
                 id = await wait("the stop", stop)
-                await until("it stands", lambda id=id: (one.robot.latch.told or {}).get("id") == id)
+                await until("it stands", lambda id=id: (one.robot.latch.status or {}).get("id") == id)
                 before = len(one.program.done)
                 await until("the program stops", lambda: "stop" in one.program.names)
-                while one.robot.latch.told is not None:
+                while one.robot.latch.status is not None:
                     with contextlib.suppress(BufgymError):
                         await wait("the release", one.operator.release("r", id))
                     await asyncio.sleep(0.02)

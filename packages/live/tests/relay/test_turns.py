@@ -166,7 +166,7 @@ async def test_recordings_are_read_one_at_a_time(tmp_path: Path, monkeypatch: py
 async def test_a_long_answer_is_written_as_its_reader_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 8 MB at most one piece waits in the relay. Others' messages go on, and the answer is whole in the end."""
     text = json.dumps({"op": "replayed", "id": "r", "messages": [{"data": "x" * 1_000_000}] * 8})
-    monkeypatch.setattr(replay, "told", lambda *asked: text)
+    monkeypatch.setattr(replay, "answer_text", lambda *asked: text)
     async with (
         relay(settings(folder=tmp_path)) as server,
         client(server.port, receive_buffer_bytes=65_536) as one,

@@ -38,9 +38,9 @@ def test_the_page_has_every_key() -> None:
     message = {key.rstrip("?") for key in wire.FIELDS["message"]}
     assert message <= set(re.findall(r"^\| `(\w+)`", PAGE, re.MULTILINE))
     for op, fields in wire.FIELDS.items():
-        told = re.findall(r"`(\w+)`", " ".join(re.findall(rf"^\| `{op}`.*$", PAGE, re.MULTILINE)))
+        documented = re.findall(r"`(\w+)`", " ".join(re.findall(rf"^\| `{op}`.*$", PAGE, re.MULTILINE)))
         own = {key.rstrip("?") for key in fields} - (message if op in ("publish", "message") else set())
-        assert op in told and own <= set(told), op
+        assert op in documented and own <= set(documented), op
 
 
 @contextlib.asynccontextmanager

@@ -36,8 +36,8 @@ class Reproduction(FrameFigure):
         main, facts = self.recordings[-1], dict[str, Any]()
         for policy in self.policies:
             ends_s = (ends[name, policy] for name in self.recordings)
-            told = ("to the end" if s == np.inf else f"breaks at second {s:.1f}" for s in ends_s)
-            facts[f"{policy.removeprefix('drop-')}_end"] = self.of_each(told)
+            texts = ("to the end" if s == np.inf else f"breaks at second {s:.1f}" for s in ends_s)
+            facts[f"{policy.removeprefix('drop-')}_end"] = self.of_each(texts)
         limits = {policy: about(at_s) for policy, at_s in PAPER_S.items()}
         near = {policy: low <= ends[main, policy] <= high for policy, (low, high) in limits.items()}
         return facts | {"afr": ends[main, "afr"] == np.inf, "oldest": near["drop-oldest"], "random": near["random"]}

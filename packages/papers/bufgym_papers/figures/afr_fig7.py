@@ -69,8 +69,8 @@ class Reproduction(FrameFigure):
             if {"afr", other} <= set(self.policies):
                 facts[key] = within(change(rows.where(recording=main), ONE_WAY, "afr", other), *about(paper))
                 for what, column in columns.items():
-                    told = (spelled(change(rows.where(recording=r), column, "afr", other)) for r in self.recordings)
-                    facts[f"{key}_{what}"] = self.of_each(told)
+                    texts = (spelled(change(rows.where(recording=r), column, "afr", other)) for r in self.recordings)
+                    facts[f"{key}_{what}"] = self.of_each(texts)
                 changes = (change(rows.where(recording=r, k=0), ONE_WAY, "afr", other) for r in self.recordings)
                 facts[f"{key}_paper"] = self.of_each(f"{found.value:+.1%}" for found in changes)
         if {"afr", "drop-oldest", "random"} <= set(self.policies) and len(self.capacities) > 1:

@@ -71,8 +71,8 @@ class Reproduction(FrameFigure):
         if shown:
             grown = {name: self.by_size(rows.where(policy=name), small, large_L) for name in shown}
             facts["sizes"] = of_all(within(found, np.nextafter(-HELP, 0), 1.0) for found in grown.values())
-            told = (f"{POLICIES[name][0]} {r.value:+.0%} [{r.low:+.0%}, {r.high:+.0%}]" for name, r in grown.items())
-            facts["by_size"] = "; ".join(told)
+            texts = (f"{POLICIES[name][0]} {r.value:+.0%} [{r.low:+.0%}, {r.high:+.0%}]" for name, r in grown.items())
+            facts["by_size"] = "; ".join(texts)
         if {"afr", "drop-oldest"} <= set(self.policies):
             rates = {
                 policy: {name: rate(rows.where(recording=name, policy=policy)) for name in self.recordings}
@@ -87,8 +87,8 @@ class Reproduction(FrameFigure):
                 facts["orbbuf"] = all(ours <= HALF * theirs for ours, theirs in pairs)
                 facts["orbbuf_count"] = against_oldest(IMAGES)
             for policy in rates:
-                told = (f"{r.value:.0%} [{r.low:.0%}, {r.high:.0%}]" for r in rates[policy].values())
-                facts[f"{policy.removeprefix('drop-')}_rate"] = self.of_each(told)
+                texts = (f"{r.value:.0%} [{r.low:.0%}, {r.high:.0%}]" for r in rates[policy].values())
+                facts[f"{policy.removeprefix('drop-')}_rate"] = self.of_each(texts)
             facts["third_count"] = against_oldest("afr")
             large = FigureRows(row for row in rows if row["L"] > 10)
             facts["large_count"] = failures(large, policy="afr")

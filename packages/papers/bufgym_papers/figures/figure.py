@@ -126,7 +126,7 @@ def statements() -> dict[str, dict[str, Any]]:
     for file in (folder / f"{paper}.toml" for paper in PAPERS for folder in (here, here.parents[3] / "studies")):
         if file.exists():
             package = __package__ if file.parent == here else file.parent.name
-            texts |= {name: {"package": package, **told} for name, told in read_toml(file).items()}
+            texts |= {name: {"package": package, **entries} for name, entries in read_toml(file).items()}
     return texts
 
 

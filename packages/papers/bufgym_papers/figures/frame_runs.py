@@ -91,9 +91,9 @@ class FrameFigure(Figure):
         whole = self.stage(recording).whole
         return whole.motion().at(whole.time_us)
 
-    def of_each(self, told: Iterable[str]) -> str:
+    def of_each(self, texts: Iterable[str]) -> str:
         """Join the sentences about each recording, in order."""
-        return "; ".join(map(" ".join, zip(self.recordings, told, strict=True)))
+        return "; ".join(map(" ".join, zip(self.recordings, texts, strict=True)))
 
     def settings(self) -> list[FrameRun]:
         return list(starmap(FrameRun, product(self.recordings, range(self.offsets), self.capacities, self.policies)))

@@ -197,8 +197,8 @@ class ClientFigure(Figure):
         client = {"queue_size": getattr(self, "queue_size", QUEUE_SIZE), "live": self.live, **client}
         sent = send(name, streams, link, duration_s, seed, round_trip_ms=self.round_trip_ms, **client)
         last_s = float(np.nanmax(sent.received_s, initial=duration_s))
-        for told in self.watchers:
-            told(min(last_s, max(duration_s, client.get("watched_s", math.inf))))
+        for watcher in self.watchers:
+            watcher(min(last_s, max(duration_s, client.get("watched_s", math.inf))))
         return sent
 
 

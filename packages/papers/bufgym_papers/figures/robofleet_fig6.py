@@ -91,13 +91,13 @@ class Reproduction(ClientFigure):
                 straight = float(np.corrcoef(consumers, latency_s)[0, 1])
                 slope = float(np.polyfit(consumers, latency_s, 1)[0])
                 linear.append(straight >= STRAIGHT and slope > 0)
-                told = f"{slope:.3f} s a consumer, r = {straight:.3f}"
-                slopes.append(f"{points:,} points, {line} {'yes' if linear[-1] else 'NO'} ({told})")
+                text = f"{slope:.3f} s a consumer, r = {straight:.3f}"
+                slopes.append(f"{points:,} points, {line} {'yes' if linear[-1] else 'NO'} ({text})")
         one = rows.where(consumers=1)
         trios = {p: [one.mean("mean_latency_s", points=p, sender=n) for n in NAMES] for p in self.points}
         return {
             "rosbridge": all(bridge > native for bridge, native, _ in trios.values()),
-            "bridge": _told(trios, ".3f", " s"),
+            "bridge": _spelled(trios, ".3f", " s"),
             "growth": listed([f"{ratio:.2f} times at {points:,} points" for points, ratio in growth.items()]),
             "linear": either(linear),
             **self.many(rows),
@@ -116,8 +116,8 @@ class Reproduction(ClientFigure):
             "comparable": either([1 / COMPARABLE <= bridge <= COMPARABLE for bridge, _ in slower.values()]),
             "outperforms": all(own < min(1.0, bridge) / COMPARABLE for bridge, own in slower.values()),
             "throughput": all(own >= native / COMPARABLE for _, native, own in by["received_share"].values()),
-            "many_s": _told(by["mean_latency_s"], ".3f"),
-            "many_share": _told(by["received_share"], ".0%"),
+            "many_s": _spelled(by["mean_latency_s"], ".3f"),
+            "many_share": _spelled(by["received_share"], ".0%"),
         }
 
     def size_inches(self, rows: FigureRows) -> tuple[float, float]:
@@ -143,6 +143,6 @@ class Reproduction(ClientFigure):
         legend_below(figure, 4, panels[0])
 
 
-def _told(trios: dict[int, list[float]], spec: str, unit: str = "") -> str:
+def _spelled(trios: dict[int, list[float]], spec: str, unit: str = "") -> str:
     """Format the numbers of ``NAMES`` for each number of points."""
     return "; ".join(f"{p:,} points {' / '.join(format(x, spec) for x in trio)}{unit}" for p, trio in trios.items())
