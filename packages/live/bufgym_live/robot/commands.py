@@ -125,9 +125,8 @@ async def send(
                 if k % max(1, round(rate * REDRAW_S)) == 0:
                     redraw(shown.text())
             elif k % round(max(1.0, rate)) == 0:
-                say(
-                    f"{k / rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued{_alone(sender, to, k > 0)}"
-                )
+                alone = _alone(sender, to, k > 0)
+                say(f"{k / rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued{alone}")
         queue.close()
         if alone := _alone(sender, to):
             say(f"{len(queue) + queue.in_flight} messages wait for the receiver, Ctrl-C drops them{alone}")

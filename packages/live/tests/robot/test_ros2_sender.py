@@ -50,8 +50,12 @@ def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for needed in ("cmake", "g++"):
         if shutil.which(needed) is None:
             pytest.skip(needs("compiler", needed))
-    folder = tmp_path_factory.mktemp("ros2")
-    source = rclcpp.write(folder / "source", roscpp.find(POLICIES))
+    return built_with(tmp_path_factory.mktemp("ros2"), POLICIES)
+
+
+def built_with(folder: Path, policies: str) -> Path:
+    """Build the library with these policies and the program there."""
+    source = rclcpp.write(folder / "source", roscpp.find(policies))
     run("cmake", "-S", source, "-B", folder, "-DCMAKE_BUILD_TYPE=Debug", "-DCMAKE_DISABLE_FIND_PACKAGE_ament_cmake=ON")
     run("cmake", "--build", folder)
     program, own = folder / "talker", HERE / "ros2_talker.cpp"
