@@ -5,7 +5,6 @@ import contextlib
 import os
 import select
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -20,7 +19,7 @@ import roscpp_cases
 from needs import needs
 from ros1_cases import SYSTEM, environment
 
-from bufgym_live.robot import PolicyQueue, roscpp, tunnel
+from bufgym_live.robot import PolicyQueue, tunnel
 from bufgym_live.robot.channels import TcpChannel
 from bufgym_live.robot.receiver import Receiver
 from bufgym_live.robot.sender import Sender
@@ -180,7 +179,7 @@ def ros1(made: Tunnel, folder: Path, talker: list[Any], **settings: str) -> tupl
                 time.sleep(0.1)
             connection = roscpp_cases.subscriber(master, "camera")
         connection.settimeout(120)
-        with connection, contextlib.suppress(OSError, AssertionError, struct.error):  # until the talker is killed
+        with connection, contextlib.suppress(OSError, EOFError):  # until the talker is killed
             while True:
                 roscpp_cases.block(connection)
                 came.append(time.monotonic())
