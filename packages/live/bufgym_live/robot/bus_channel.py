@@ -21,7 +21,15 @@ from typing import Any, Final, Protocol
 from weakref import WeakSet
 
 from bufgym_live.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, whole
-from bufgym_live.robot.sockets import connections_to, little_unsent, unsent_bytes, until_writable
+from bufgym_live.robot.sockets import (
+    BACKOFF_S,
+    bounded_backoff,
+    connections_to,
+    little_unsent,
+    moved_to,
+    unsent_bytes,
+    until_writable,
+)
 
 _MOST_WAITING: Final = 1024  # limit on frames waiting to be taken, more than a sender ever has unacked
 _LEAVE_S: Final = 3.0  # time for a library to leave when the program ends
@@ -61,7 +69,9 @@ class BusChannel:
         self._there = asyncio.Event()
 
     @classmethod
-    async def connect(cls, opening: Open, host: str, port: int, *, small: bool = True) -> BusChannel:
+    async def connect(
+        cls, opening: Open, host: str, port: int, *, small: bool = True, backoff_s: float = BACKOFF_S
+    ) -> BusChannel:
         """Connect a sender once the receiver is there; ``small`` has no effect on the library's buffers."""
         channel = cls(os.urandom(8).hex())
         there = host, port, channel.name, lambda _, data: channel.soon(channel.take, data), channel.peer
@@ -71,6 +81,8 @@ class BusChannel:
         except asyncio.CancelledError:
             made.add_done_callback(_abandoned)
             raise
+        if channel.socket is not None:
+            bounded_backoff(channel.socket, backoff_s)
         channel.publish, channel.on_close = bus.publish, lambda: _aside(bus.close)
         try:
             await channel._there.wait()
@@ -115,6 +127,9 @@ class BusChannel:
 
     def left_bytes(self) -> int | None:
         return None if self.socket is None else unsent_bytes(self.socket)
+
+    def moved_to(self) -> str | None:
+        return None if self.socket is None else moved_to(self.socket)
 
     def close(self) -> None:
         while not self._came.empty():

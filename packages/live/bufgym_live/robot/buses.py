@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from bufgym.utils.libraries import needs
 from bufgym_live.robot.bus_channel import Hear, Open, Peer
-from bufgym_live.robot.sockets import DEAD_AFTER_S
+from bufgym_live.robot.sockets import DEAD_AFTER_S, host_port
 
 ROOT: Final = "bufgym"
 MQTT_PORT: Final = 1883  # Standard port of an MQTT broker
@@ -35,8 +35,8 @@ class ZenohBus:
             "mode": "peer",
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
-            "listen/endpoints": [] if name else [f"tcp/{host}:{port}"],
-            "connect/endpoints": [f"tcp/{host}:{port}"] if name else [],
+            "listen/endpoints": [] if name else [f"tcp/{host_port(host, port)}"],
+            "connect/endpoints": [f"tcp/{host_port(host, port)}"] if name else [],
             "connect/timeout_ms": round(CONNECT_S * 1000),
             "connect/exit_on_failure": True,
             "transport/shared_memory/enabled": False,  # on one machine it would carry bodies past the link

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from bufgym_live.robot.bus_channel import BusChannel
 from bufgym_live.robot.buses import BUSES
 from bufgym_live.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, parse, whole
-from bufgym_live.robot.sockets import connected, unsent_bytes, until_writable
+from bufgym_live.robot.sockets import BACKOFF_S, connected, host_port, moved_to, unsent_bytes, until_writable
 
 PIECE_BYTES: Final = 16_384
 """Bytes written at a time, so that ``left_bytes`` is known while a large message is under way."""
@@ -33,6 +33,9 @@ class Channel(Protocol):
     def left_bytes(self) -> int | None:
         """Bytes given to ``send`` that the system has not sent; None if unknown."""
 
+    def moved_to(self) -> str | None:
+        """This machine's new address, if it is another than the connection's; None if not or unknown."""
+
     def close(self) -> None:
         """Close at once."""
 
@@ -49,9 +52,9 @@ class TcpChannel:
         self._unwritten_bytes = 0
 
     @classmethod
-    async def connect(cls, host: str, port: int, *, small: bool = True) -> TcpChannel:
+    async def connect(cls, host: str, port: int, *, small: bool = True, backoff_s: float = BACKOFF_S) -> TcpChannel:
         """Connect a sender; ``small=False`` leaves the system's buffers as they are."""
-        return cls(await connected(host, port, small))
+        return cls(await connected(host, port, small, backoff_s))
 
     async def send(self, frame: Frame) -> None:
         loop = asyncio.get_running_loop()
@@ -85,6 +88,9 @@ class TcpChannel:
         unsent = unsent_bytes(self._socket)
         return None if unsent is None else self._unwritten_bytes + unsent
 
+    def moved_to(self) -> str | None:
+        return moved_to(self._socket)
+
     def close(self) -> None:
         self._socket.close()
 
@@ -99,7 +105,9 @@ class WebSocketChannel:
         self._unwritten_bytes = 0
 
     @classmethod
-    async def connect(cls, host: str, port: int, *, small: bool = True) -> WebSocketChannel:
+    async def connect(
+        cls, host: str, port: int, *, small: bool = True, backoff_s: float = BACKOFF_S
+    ) -> WebSocketChannel:
         """Connect a sender; ``small=False`` leaves the library's and the system's buffers as they are."""
         from websockets.asyncio.client import connect
         from websockets.exceptions import WebSocketException
@@ -107,10 +115,12 @@ class WebSocketChannel:
         limit: dict[str, Any] = {"write_limit": (1, 0)} if small else {}
         limit["ping_interval"] = None  # a slow link answers late; TCP_USER_TIMEOUT finds a dead one
         try:
-            taken = await connected(host, port, small)
-            connection = await connect(f"ws://{host}:{port}", sock=taken, compression=None, proxy=None, **limit)
+            taken = await connected(host, port, small, backoff_s)
+            connection = await connect(
+                f"ws://{host_port(host, port)}", sock=taken, compression=None, proxy=None, **limit
+            )
         except WebSocketException as error:
-            raise ConnectionError(f"{host}:{port}: {error}") from None
+            raise ConnectionError(f"{host_port(host, port)}: {error}") from None
         return cls(connection)
 
     async def send(self, frame: Frame) -> None:
@@ -148,6 +158,9 @@ class WebSocketChannel:
         waiting = self._unwritten_bytes + transport.get_write_buffer_size()
         return None if unsent is None else waiting + unsent
 
+    def moved_to(self) -> str | None:
+        return moved_to(self._connection.transport.get_extra_info("socket"))
+
     def close(self) -> None:
         self._connection.transport.abort()
 
@@ -168,4 +181,4 @@ TRANSPORTS: Final[dict[str, Callable[..., Any]]] = {
     "websocket": WebSocketChannel.connect,
     **{name: partial(BusChannel.connect, opening) for name, opening in BUSES.items()},
 }
-"""Transport -> function that connects a sender: (host, port, small=True) -> a ``Channel``."""
+"""Transport -> function that connects a sender: (host, port, small=True, backoff_s=BACKOFF_S) -> a ``Channel``."""

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from bufgym.cli.options import Count, Least0, PolicyFile, PortNumber, Positive, one_policy
+from bufgym.cli.options import Count, Least0, PolicyFile, PortNumber, Positive, checked, one_policy
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.decided_in import Compiled, decide_in_python
+from bufgym_live.robot.sockets import BACKOFF_S, LEAST_BACKOFF_S, MOST_BACKOFF_S, host_port
 
 if TYPE_CHECKING:
     from bufgym_live.robot.sender import Sender
@@ -24,14 +25,26 @@ Window = Annotated[
     Count | None, Parameter(help="Messages sent and not yet acked, at most (default: as many as fill the link).")
 ]
 
+Backoff = Annotated[
+    float,
+    checked(
+        float,
+        lambda number: LEAST_BACKOFF_S <= number <= MOST_BACKOFF_S,
+        f"{LEAST_BACKOFF_S:g} to {MOST_BACKOFF_S:g}, in s",
+    ),
+    Parameter(help="Longest time between two tries of TCP at a dead link, s (Linux from 6.15 on)."),
+]
+
 REDRAW_S = 0.25  # Time between two drawings of a view
 
 
 def address(text: str) -> tuple[str, int]:
-    """Split ``HOST:PORT``."""
+    """Split ``HOST:PORT``; an address of IPv6 may stand in brackets."""
     host, _, port = text.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65_535:
-        raise BufgymError(f"{text}: must be HOST:PORT")
+    if host.startswith("[") and host.endswith("]") and ":" in host:
+        host = host[1:-1]
+    if not host or set(host) & set("[]") or not (port.isascii() and port.isdigit()) or int(port) > 65_535:
+        raise BufgymError(f"{text}: must be HOST:PORT, as 192.168.1.5:7410, base:7410 or [fe80::1]:7410")
     return host, int(port)
 
 
@@ -57,6 +70,7 @@ async def send(
     motion: str = "drive-0",
     transport: Transport = "tcp",
     window: Window = None,
+    backoff: Backoff = BACKOFF_S,
     compiled: Compiled = False,
     log: str | None = None,
     view: bool = False,
@@ -99,7 +113,8 @@ async def send(
         value = qoi.exponential(math.exp(-1))
         queue = PolicyQueue(policy, capacity, value=value, duration_s=duration, log=record, window=window or 1)
         leaves: Leaves = "sent" if window is None else "acked"
-        loop, sender = asyncio.get_running_loop(), Sender(queue, lambda: TRANSPORTS[transport](host, port), leaves)
+        loop = asyncio.get_running_loop()
+        sender = Sender(queue, lambda: TRANSPORTS[transport](host, port, backoff_s=backoff), leaves)
         sending, began_s, body = asyncio.create_task(sender.run()), loop.time(), bytes(size)
         for k in range(round(rate * duration)):
             await asyncio.sleep(began_s + k / rate - loop.time())
@@ -110,7 +125,8 @@ async def send(
                 if k % max(1, round(rate * REDRAW_S)) == 0:
                     redraw(shown.text())
             elif k % round(max(1.0, rate)) == 0:
-                say(f"{k / rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued{_alone(sender, to)}")
+                alone = _alone(sender, to, k > 0)
+                say(f"{k / rate:4.0f} s: {k + 1} put, {queue.dropped} dropped, {len(queue)} queued{alone}")
         queue.close()
         if alone := _alone(sender, to):
             say(f"{len(queue) + queue.in_flight} messages wait for the receiver, Ctrl-C drops them{alone}")
@@ -120,9 +136,9 @@ async def send(
         say(f"all put, {queue.dropped} dropped, {len(sender.faults)} broken connections {list(sender.faults)[-1:]}")
 
 
-def _alone(sender: "Sender", to: str) -> str:
-    """Why nothing goes, where no receiver has answered."""
-    if sender.connected.is_set():
+def _alone(sender: "Sender", to: str, asked_long: bool = True) -> str:
+    """Why nothing goes, where no receiver has answered; empty while it is still being asked for the first time."""
+    if sender.connected.is_set() or not (asked_long or sender.faults):
         return ""
     return f"; nobody answers at {to}" + (f" ({sender.faults[-1]})" if sender.faults else "")
 
@@ -168,7 +184,7 @@ async def receive(
     with contextlib.ExitStack() as stack:
         recording: Any = None if out is None else stack.enter_context(Recording(out))
         receiver = Receiver(take)
-        say(f"listening on {host}:{await receiver.listen(port, host, transport)}")
+        say(f"listening on {host_port(host, await receiver.listen(port, host, transport))}")
         try:
             await enough.wait()
             await asyncio.sleep(0.1)  # for the last ack
@@ -191,6 +207,7 @@ async def link(
         delay_ms: Each way.
         back: The messages come back from there (a publisher of ROS 1).
     """
+    decide_in_python()  # nothing here is worth compiling
     from bufgym import traces
     from bufgym.model.link import Link
     from bufgym_live.robot.shaped import ShapedLink

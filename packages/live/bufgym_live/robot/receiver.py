@@ -18,7 +18,7 @@ from bufgym_live.robot.buses import BUSES, MQTT_PORT
 from bufgym_live.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
 from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, Room
 from bufgym_live.robot.mcap_file import McapFile
-from bufgym_live.robot.sockets import free_port
+from bufgym_live.robot.sockets import BACKOFF_S, bounded_backoff, free_port, host_port
 from bufgym_live.robot.tasks import Tasks
 
 MAX_STREAMS: Final = 64  # Number of latest senders that are remembered
@@ -113,6 +113,7 @@ class Receiver:
             connection, _ = await asyncio.get_running_loop().sock_accept(listening)
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            bounded_backoff(connection, BACKOFF_S)  # acks that a dead link lost go again soon, too
             self._tasks.begin(self._serve(TcpChannel(connection, self._max_body_bytes, self._room)))
 
     async def _serve(self, channel: Channel) -> None:
@@ -177,7 +178,7 @@ async def listener(host: str, port: int, receive_buffer_bytes: int | None = None
         listening.listen()
     except OSError as error:
         listening.close()
-        raise BufgymError(f"{host}:{port}: {error.strerror or error}") from None
+        raise BufgymError(f"{host_port(host, port)}: {error.strerror or error}") from None
     return listening
 
 

@@ -25,6 +25,7 @@ Leaves = Literal["sent", "acked", "written"]
 
 RETRY_S: Final = 0.5
 PATIENCE_S: Final = 20.0  # Time for the receiver's answer to the greeting
+LOOK_S: Final = 0.5  # Time between two looks at this machine's address
 _MOST_UNACKED: Final = 256  # limit on messages that await the receiver's ack, where they count as left before it
 
 
@@ -35,8 +36,18 @@ class Sender:
     that the receiver has not acked: those in flight, or at most the queue's window.
     """
 
-    def __init__(self, queue: PolicyQueue, connect: Callable[[], Awaitable[Channel]], leaves: Leaves = "sent") -> None:
-        """``connect`` makes a new connection to the receiver at each call."""
+    def __init__(
+        self,
+        queue: PolicyQueue,
+        connect: Callable[[], Awaitable[Channel]],
+        leaves: Leaves = "sent",
+        told: Callable[[str], None] = lambda fault: None,
+    ) -> None:
+        """``connect`` makes a new connection to the receiver at each call.
+
+        ``told`` is called with "" when the receiver has answered, and with the reason when there is no connection,
+        once for as long as the reason is the same.
+        """
         if leaves not in ("sent", "acked", "written"):
             raise BufgymError(f"leaves = {leaves!r}: must be 'sent', 'acked' or 'written'")
         self.queue = queue
@@ -44,7 +55,8 @@ class Sender:
         """Set while the receiver has answered on this connection."""
         self.faults: deque[str] = deque(maxlen=100)
         """Reasons of the last 100 ends of a connection."""
-        self._connect, self._leaves = connect, leaves
+        self._connect, self._leaves, self._told = connect, leaves, told
+        self._told_last: str | None = None
         self._stream = os.urandom(STREAM_BYTES)
         self._unacked: deque[Item] = deque()
         self._acked = asyncio.Event()
@@ -68,10 +80,7 @@ class Sender:
                 await asyncio.sleep(RETRY_S)
                 continue
             try:
-                await self._greet(channel)
-                self.connected.set()
-                self.queue.left_bytes = channel.left_bytes
-                await self._converse(channel)
+                await until_one_ends(self._talk(channel), self._stays(channel))
                 return
             except (OSError, TimeoutError) as error:
                 self._note(error)
@@ -83,6 +92,26 @@ class Sender:
 
     def _note(self, error: Exception) -> None:
         self.faults.append(f"{type(error).__name__}: {error}")
+        self._tell(self.faults[-1])
+
+    def _tell(self, fault: str) -> None:
+        if fault != self._told_last:
+            self._told_last = fault
+            self._told(fault)
+
+    async def _talk(self, channel: Channel) -> None:
+        """Greet, then send until all is done."""
+        await self._greet(channel)
+        self.connected.set()
+        self._tell("")
+        self.queue.left_bytes = channel.left_bytes
+        await self._converse(channel)
+
+    async def _stays(self, channel: Channel) -> None:
+        """Give the connection up when this machine has a new address: what is sent to the old one does not arrive."""
+        while (new := channel.moved_to()) is None:
+            await asyncio.sleep(LOOK_S)
+        raise ConnectionAbortedError(f"this machine's address has become {new}")
 
     async def _greet(self, channel: Channel) -> None:
         """Name the stream; skip messages that the receiver already has."""

@@ -19,6 +19,12 @@ from typing import Any, Final
 UNSENT_BYTES: Final = 16_384  # TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel
 NEXT_ADDRESS_S: Final = 1.0  # Time for one of a host's addresses to answer before the next is tried
 DEAD_AFTER_S: Final = 20.0  # Time without acks after which a connection is given up, where the system can tell
+BACKOFF_S: Final = 1.0  # Longest time between two tries of TCP at a dead link; the system's own grows to 120 s
+LEAST_BACKOFF_S: Final = 1.0  # The kernel takes 1 to 120 s
+MOST_BACKOFF_S: Final = 120.0
+_CONNECT_S: Final = 3.0  # Time for a new connection; TCP asks again after 1 and 3 s
+_UNBOUNDED_DEAD_AFTER_S: Final = 5.0  # DEAD_AFTER_S where the kernel cannot bound its backoff: a new connection is soon
+_TCP_RTO_MAX_MS: Final = 44  # of linux/tcp.h, from Linux 6.15 on; Python's socket lacks it
 _SIOCOUTQNSD: Final = 0x894B  # of linux/sockios.h; Python's termios lacks it
 
 
@@ -41,6 +47,36 @@ def little_unsent(connection: socket.socket) -> None:
     """Set a sender's socket so that little waits unsent in the system, and small packets go at once."""
     set_option(connection, "TCP_NOTSENT_LOWAT", UNSENT_BYTES)
     set_option(connection, "TCP_NODELAY", 1)
+
+
+def bounded_backoff(connection: socket.socket, most_s: float) -> bool:
+    """Let TCP try a dead link again after ``most_s`` at the latest; False where the system cannot (Linux before 6.15).
+
+    After 20 s without a link the kernel's retransmission timer stands at 15 to 20 s, in which nobody sends.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    try:
+        connection.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, round(1000 * most_s))
+    except OSError:
+        return False
+    return True
+
+
+def address_to(connection: socket.socket) -> str | None:
+    """This machine's address from which a new connection to the peer would leave; None if no way leads there."""
+    with contextlib.suppress(OSError), socket.socket(connection.family, socket.SOCK_DGRAM) as probe:
+        probe.connect(connection.getpeername())  # which sends nothing
+        return str(probe.getsockname()[0])
+    return None
+
+
+def moved_to(connection: socket.socket) -> str | None:
+    """This machine's new address, if a connection that it made would now leave from another one."""
+    with contextlib.suppress(OSError):
+        new = address_to(connection)
+        return None if new == connection.getsockname()[0] else new
+    return None
 
 
 async def until_writable(connection: Any) -> None:
@@ -93,8 +129,11 @@ def set_option(connection: socket.socket, option: str, number: int) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), number)
 
 
-async def connected(host: str, port: int, small: bool = True) -> socket.socket:
-    """Connect a sender's TCP socket to the first of the host's addresses that answers; ``localhost`` has two."""
+async def connected(host: str, port: int, small: bool = True, backoff_s: float = BACKOFF_S) -> socket.socket:
+    """Connect a sender's TCP socket to the first of the host's addresses that answers; ``localhost`` has two.
+
+    ``small`` and ``backoff_s`` set what waits unsent in the system and how soon it tries a dead link again.
+    """
     loop = asyncio.get_running_loop()
     found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     while True:
@@ -104,8 +143,10 @@ async def connected(host: str, port: int, small: bool = True) -> socket.socket:
             connection.setblocking(False)
             if small:
                 little_unsent(connection)
-                set_option(connection, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
-            async with asyncio.timeout(NEXT_ADDRESS_S if found else None):
+                bounded = bounded_backoff(connection, backoff_s)
+                dead_after_s = DEAD_AFTER_S if bounded else max(_UNBOUNDED_DEAD_AFTER_S, backoff_s)
+                set_option(connection, "TCP_USER_TIMEOUT", round(dead_after_s * 1000))
+            async with asyncio.timeout(NEXT_ADDRESS_S if found else _CONNECT_S):
                 await loop.sock_connect(connection, address)
             return connection
         except BaseException as error:
@@ -114,8 +155,13 @@ async def connected(host: str, port: int, small: bool = True) -> socket.socket:
                 raise
 
 
+def host_port(host: str, port: int) -> str:
+    """Write an address as HOST:PORT, one of IPv6 as [HOST]:PORT."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 def free_port(host: str) -> int:
     """Find a port on which nobody listens."""
-    with socket.socket() as free:
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as free:
         free.bind((host, 0))
         return int(free.getsockname()[1])

@@ -114,6 +114,9 @@ class Channel:
     def left_bytes(self) -> int | None:
         return None
 
+    def moved_to(self) -> str | None:
+        return None
+
     def close(self) -> None:
         pass
 

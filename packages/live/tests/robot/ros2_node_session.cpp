@@ -126,7 +126,14 @@ std::string answer(const std::string &command, std::istream &words)
     words >> options.space;
     while (words >> name)
       options.overrides.emplace(name.substr(0, name.find('=')), value_of(name.substr(name.find('=') + 1)));
-    node = make_node(options);
+    try
+    {
+      node = make_node(options);
+    }
+    catch (const std::exception &error)  // as main.cpp does, which ends with exit code 2
+    {
+      return quoted(error.what());
+    }
   }
   else if (command == "offer")
   {

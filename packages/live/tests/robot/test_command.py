@@ -18,7 +18,8 @@ from bufgym.cli import main
 from bufgym.model import qoi
 from bufgym.traces.formats import bags
 from bufgym_live.robot import LogFile
-from bufgym_live.robot.sockets import free_port
+from bufgym_live.robot.commands import address
+from bufgym_live.robot.sockets import free_port, host_port
 from bufgym_live.robot.view import View
 
 FAST = ["--size", "1000", "--rate", "300", "--duration", "0.1", "--capacity", "64"]
@@ -26,16 +27,16 @@ FAST = ["--size", "1000", "--rate", "300", "--duration", "0.1", "--capacity", "6
 
 
 @contextmanager
-def receiver(capsys: pytest.CaptureFixture[str], *words: str) -> Iterator[str]:
+def receiver(capsys: pytest.CaptureFixture[str], *words: str, host: str = "127.0.0.1") -> Iterator[str]:
     """Where ``bufgym live receive`` listens, in a thread, for 30 messages."""
-    port = str(free_port("127.0.0.1"))
-    arguments = ["live", "receive", f"127.0.0.1:{port}", "--messages", "30", *words]
+    port = str(free_port(host.strip("[]")))
+    arguments = ["live", "receive", f"{host}:{port}", "--messages", "30", *words]
     thread = threading.Thread(target=main, args=(arguments,), daemon=True)
     thread.start()
     while "listening" not in capsys.readouterr().out:
         assert thread.is_alive()
         time.sleep(0.005)
-    yield f"127.0.0.1:{port}"
+    yield f"{host}:{port}"
     thread.join()
 
 
@@ -58,14 +59,14 @@ def test_send_shows_what_the_queue_does(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_send_to_nobody_says_so() -> None:
-    """And why, every second; at the end it waits for a receiver until it is stopped."""
+    """And why, every second once it has asked; at the end it waits for a receiver until it is stopped."""
     place = f"127.0.0.1:{free_port('127.0.0.1')}"
     code = f"from bufgym.cli import main; main(['live', 'send', '{place}', '--size', '10', '--duration', '0.5'])"
     with subprocess.Popen([sys.executable, "-uc", code], stdout=subprocess.PIPE, text=True) as sending:
         assert sending.stdout is not None
         told = [sending.stdout.readline(), sending.stdout.readline()]
         sending.kill()
-    assert told[0].startswith("   0 s: 1 put") and told[0].endswith(f"nobody answers at {place}\n")
+    assert told[0] == "   0 s: 1 put, 0 dropped, 0 queued\n"  # it is still being asked
     assert told[1].startswith("9 messages wait for the receiver") and "ConnectionRefusedError" in told[1]
 
 
@@ -76,6 +77,17 @@ def test_validate_keeps_its_runs(tmp_path: Path) -> None:
     kept = json.loads((tmp_path / "runs.json").read_text(encoding="utf-8"))
     assert len(kept["runs"]) == 2 and "--transport tcp websocket" in kept["command"]
     assert all(len(one["live_s"]) == one["live_delivered"] > 0 for one in kept["runs"])
+
+
+def test_an_address_of_ipv6_stands_in_brackets(capsys: pytest.CaptureFixture[str]) -> None:
+    """As browsers and ``ss`` write it; a message crosses."""
+    assert address("[::1]:7999") == address("::1:7999") == ("::1", 7999)
+    assert address("base:7410") == ("base", 7410) and host_port("::1", 7) == "[::1]:7" and host_port("a", 7) == "a:7"
+    with receiver(capsys, host="[::1]") as place:
+        assert place.startswith("[::1]:") and main(["live", "send", place, *FAST]) == 0
+    assert "30 received" in capsys.readouterr().out
+    for wrong in ("[::1]", "[base]:1", "[::1:7999", "[::1]:", "base:७"):
+        fails(["live", "send", wrong], f"{wrong if wrong.isascii() else 'base:'}", capsys)
 
 
 def test_mistakes_are_told(capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,7 +30,7 @@ from bufgym_live.robot.log import of, read_log
 from bufgym_live.robot.ros2 import relay
 from bufgym_live.robot.ros2.diagnostics import Diagnostics
 from bufgym_live.robot.ros2.names import Published, parse
-from bufgym_live.robot.ros2.places import Place, places
+from bufgym_live.robot.ros2.places import Place, left_out, places
 from bufgym_live.robot.ros2.relay import RosSender
 
 REPO = Path(__file__).resolve().parents[4]
@@ -85,6 +85,7 @@ def test_the_relay_takes_ros_2s_own_words() -> None:
     assert seen["qos"] == [[50, 60, 70], "MANUAL_BY_TOPIC"] and seen["reliability"] == "BEST_EFFORT"
     told = {name: (message, numbers) for name, message, numbers in seen["diagnostics"]}
     topics = ("/front/camera", "/scan_left", "/scan_right", "/odd")
+    assert told.pop("/robot/bufgym_send: uplink") == ("connected", {})
     assert set(told) == {f"/robot/bufgym_send: {name}" for name in topics}
     for message, numbers in told.values():
         assert message == "connected" and numbers["arrived"] == numbers["left"] >= 1
@@ -139,7 +140,7 @@ def test_diagnostics_by_hand() -> None:
 
 
 def test_places_by_name_and_by_pattern() -> None:
-    """A pattern has eight numbers; names that are taken, of others or of ROS 2 itself, are left out."""
+    """Names that are taken, of others or of ROS 2 itself, are no pattern's."""
     node = SimpleNamespace(resolve_topic_name=lambda name: f"/robot/{name}", get_namespace=lambda: "/robot")
     made = places(None, ["camera", "/scan*", "own*"], moves=False)
     for place in made:
@@ -148,13 +149,34 @@ def test_places_by_name_and_by_pattern() -> None:
     for place in made:
         place.find(published, [one.name for one in made])
     names = [place.name for place in made]
-    assert names == ["/robot/camera", "/scan1", "/scan2", *[None] * 6, "/robot/own", "/robot/owner", *[None] * 6]
+    assert names == ["/robot/camera", "/scan1", "/scan2", *[None] * 62, "/robot/own", "/robot/owner", *[None] * 62]
+    assert left_out(made, published) == {}
     every = places(None, ["*"], moves=False)
     for place in every:
         place.find(["/rosout", "/clock", "/a"], [one.name for one in every])
     assert [place.name for place in every[:2]] == ["/a", None]
     assert every[0].x(node, None) is None and every[0].x(node, 2.5) == 2.5
     refuse("no topics: name them in --config", places, None, [], False)
+
+
+def test_a_pattern_sends_all_or_names_what_it_leaves_out() -> None:
+    """``/*`` has 64 numbers: for 30 topics, for 33 that come late, and for one that has a number of its own."""
+    every = places(None, ["/*", "/t000"], moves=False)
+    every[-1].name = "/t000"
+    for count in (30, 63, 65, 67):
+        names = ["/rosout", *(f"/t{k:03}" for k in range(count))]
+        for place in every:
+            place.find(names, [one.name for one in every])
+        assert sum(place.name is not None for place in every) == min(count, 65)
+    assert left_out(every, names) == {
+        name: "/* stands for 64 topics at most: name it in topics, or split the pattern" for name in ("/t065", "/t066")
+    }
+
+
+def test_all_patterns_together_stand_for_as_many_topics_as_a_queue_has() -> None:
+    """Five patterns and 31 names share 256 numbers: 45 for each pattern, and 31."""
+    made = places(None, [*(f"/{k}/*" for k in range(5)), *(f"/n{k}" for k in range(31))], moves=False)
+    assert len(made) == 5 * 45 + 31 == 256
 
 
 def test_x_of_a_ruled_topic_is_the_nodes_time() -> None:

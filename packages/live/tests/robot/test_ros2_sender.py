@@ -50,8 +50,12 @@ def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for needed in ("cmake", "g++"):
         if shutil.which(needed) is None:
             pytest.skip(needs("compiler", needed))
-    folder = tmp_path_factory.mktemp("ros2")
-    source = rclcpp.write(folder / "source", roscpp.find(POLICIES))
+    return built_with(tmp_path_factory.mktemp("ros2"), POLICIES)
+
+
+def built_with(folder: Path, policies: str) -> Path:
+    """Build the library with these policies and the program there."""
+    source = rclcpp.write(folder / "source", roscpp.find(policies))
     run("cmake", "-S", source, "-B", folder, "-DCMAKE_BUILD_TYPE=Debug", "-DCMAKE_DISABLE_FIND_PACKAGE_ament_cmake=ON")
     run("cmake", "--build", folder)
     program, own = folder / "talker", HERE / "ros2_talker.cpp"
@@ -231,6 +235,21 @@ async def test_the_nodes_life(node: Path, tmp_path: Path) -> None:
     assert [len(parse(message.body)[1]) for message in second[-2:]] == [50, 60]  # before them what was on its way
 
 
+async def test_wrong_parameters_are_one_line(node: Path) -> None:
+    """The program prints it and ends with code 2; a container fails to load the node."""
+    for given, why in (
+        ("topics=/camera", "parameter topics"),
+        ("port=0", "port"),
+        ("capacity=65", "capacity"),
+        ("policy=nonsense", f"policy nonsense: must be one of {POLICIES.replace(',', ', ')}"),
+        ("value=cubic:2", "value cubic:2: must be exponential:BASE or saturating:DISTANCE"),
+        ("log=/no/folder", "log /no/folder: must be a folder that can be written"),
+    ):
+        async with talking(node) as one:
+            said_at_once = await said(one, f"make /robot {given if 'topics' in given else f'topics=[camera] {given}'}")
+            assert isinstance(said_at_once, str) and why in said_at_once and said_at_once.isprintable()
+
+
 async def told_of_camera(process: Process, arrived: int) -> dict[str, float]:
     """What /diagnostics tells of the camera once all of its messages have left or are dropped."""
     while True:
@@ -245,8 +264,8 @@ async def test_a_node_that_starts_by_itself(node: Path, tmp_path: Path) -> None:
     """x is the robot's motion in scenes of 2 m; what cannot be configured waits until it is set right."""
     async with receiving() as (_, port, came):
         async with talking(node) as one:
-            assert await made(one, "topics=[camera]", f"port={port}", "odometry=odom", "value=cubic:2") == 1
-            await said(one, "pass 0")
+            own = "autostart=false", f"port={port}", "odometry=odom", "value=cubic:2"
+            assert await made(one, "topics=[camera]", *own) == 1
             assert await said(one, "configure") == 1
             assert await said(one, "set policy codel") == f"policy codel: must be one of {POLICIES.replace(',', ', ')}"
             assert [await said(one, f"set {right}") for right in ("value saturating:4", "odometry o'", "port 1")] == [

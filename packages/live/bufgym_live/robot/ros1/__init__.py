@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from bufgym.utils.errors import BufgymError
+from bufgym_live.robot.sockets import BACKOFF_S, LEAST_BACKOFF_S, MOST_BACKOFF_S
 
 if TYPE_CHECKING:  # the command says first whether policies run compiled, and these would import the compiler
     from bufgym.model.qoi import Value
@@ -51,6 +52,7 @@ def install(
     motion: MotionSettings | None = None,
     value: Value | None = None,
     log: str | Path | None = None,
+    backoff_s: float = BACKOFF_S,
 ) -> None:
     """Put the queues of this process's publishers under ``policy`` from now on.
 
@@ -62,6 +64,7 @@ def install(
         motion: the camera's field of view and the scene's scale, for ``odometry``.
         value: V (default: 1 - 0.618^d over messages, 1 - e^-d over motion).
         log: folder for a log of each queue, ``TOPIC-K.mcap``.
+        backoff_s: longest time between two tries of TCP at a dead link, 1 to 120 s (Linux from 6.15 on).
 
     Raises:
         BufgymError: rospy is not installed, or the policy is unknown or cannot rule a live queue.
@@ -71,10 +74,12 @@ def install(
         from rospy.impl.tcpros_pubsub import QueuedConnection
     from bufgym.model import qoi
     from bufgym.model.buffer import MAX_CAPACITY
+    from bufgym.model.checks import between
     from bufgym_live.robot import LogFile, PolicyQueue
     from bufgym_live.robot.odometry import followed
     from bufgym_live.robot.ros1.connection import PolicyConnection
 
+    between("backoff_s", backoff_s, LEAST_BACKOFF_S, MOST_BACKOFF_S, "s")
     if value is None:
         value = qoi.exponential() if odometry is None else qoi.exponential(math.exp(-1))
     if log is not None:
@@ -97,9 +102,9 @@ def install(
         file = None if log is None else LogFile(Path(log, name))
         queue = PolicyQueue(ruling, min(queue_size, MAX_CAPACITY), value=value, log=file, room=_ROOM)
         if moved is None:
-            return PolicyConnection(connection, queue, log=file)
+            return PolicyConnection(connection, queue, log=file, backoff_s=backoff_s)
         moved.subscribe()
-        return PolicyConnection(connection, queue, moved.x, file)
+        return PolicyConnection(connection, queue, moved.x, file, backoff_s)
 
     rospy_topics.QueuedConnection = queued
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import ros1
 from bufgym_live.robot.decided_in import decide_in_python
+from bufgym_live.robot.sockets import BACKOFF_S
 
 RULES = "also mine.safetensors or module:function, whose code is run; 'rospy': rospy's own queue"
 
@@ -22,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--odom", metavar="TOPIC", help="poses that x is summed from (default: x counts messages)")
     parser.add_argument("--value", metavar="V", help="as in bench: exponential:0.618")
     parser.add_argument("--log", metavar="FOLDER", help="log every decision there")
+    tries = "longest time between two tries of TCP at a dead link, s (1; Linux from 6.15 on)"
+    parser.add_argument("--backoff", type=float, default=BACKOFF_S, metavar="S", help=tries)
     parser.add_argument("--compiled", action="store_true", help="decide in 0.05 ms, after some seconds of compiling")
     parser.add_argument("node", metavar="NODE.py", help="the node")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGS", help="its arguments")
@@ -34,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise BufgymError(f"{options.node}: no such file")
         topics = dict(map(_choice, options.policy))
         value = None if options.value is None else qoi.parse(options.value)
-        ros1.install(topics.pop("", "afr"), topics=topics, odometry=options.odom, value=value, log=options.log)
+        chosen = {"topics": topics, "odometry": options.odom, "value": value, "log": options.log}
+        ros1.install(topics.pop("", "afr"), **chosen, backoff_s=options.backoff)
     except BufgymError as error:
         print(f"bufgym_live.robot.ros1: error: {error}", file=sys.stderr)
         return 2

@@ -12,9 +12,11 @@ from typing import Any, Final
 
 from bufgym_live.robot import LogFile, PolicyQueue
 from bufgym_live.robot.channels import PIECE_BYTES
-from bufgym_live.robot.sockets import is_writable, little_unsent, unsent_bytes
+from bufgym_live.robot.sockets import BACKOFF_S, bounded_backoff, is_writable, little_unsent, set_option, unsent_bytes
 
 _LOOK_S: Final = 0.1  # Time between two looks at whether the connection was closed
+_DEAD_AFTER_S: Final = 900.0
+"""Time without acks after which the connection ends. The subscriber alone can connect again, and is not told."""
 
 
 class PolicyConnection:
@@ -26,8 +28,12 @@ class PolicyConnection:
         queue: PolicyQueue,
         x: Callable[[], float | None] = lambda: None,
         log: LogFile | None = None,
+        backoff_s: float = BACKOFF_S,
     ) -> None:
-        """``connection`` is a ``TCPROSTransport``, ``x`` gives the coordinate now, and ``log`` is closed at the end."""
+        """``connection`` is a ``TCPROSTransport``, ``x`` gives the coordinate now, and ``log`` is closed at the end.
+
+        ``backoff_s`` is the longest time between two tries of TCP at a dead link.
+        """
         self._connection = connection
         self.queue = queue
         self._x = x
@@ -37,6 +43,8 @@ class PolicyConnection:
         queue.left_bytes = self._left_bytes
         with contextlib.suppress(OSError):  # it may be closed by now
             little_unsent(connection.socket)
+            if bounded_backoff(connection.socket, backoff_s):  # 15 tries, the kernel's limit, would last 14 s
+                set_option(connection.socket, "TCP_USER_TIMEOUT", round(_DEAD_AFTER_S * 1000))
         connection.set_cleanup_callback(lambda _: queue.close())
         self._thread = threading.Thread(target=self._run, name=f"{connection.name} to {connection.endpoint_id}")
         self._thread.start()

@@ -5,6 +5,13 @@ The relay needs no change of any node. ``bufgym ros2 send`` subscribes on the ro
 ``node.create_publisher`` in your own node, and sends to the same receiver.
 """
 
-from bufgym_live.robot.ros2.publisher import Publisher
+from typing import TYPE_CHECKING
+
+from bufgym.utils.modules import on_demand
+
+if TYPE_CHECKING:
+    from bufgym_live.robot.ros2.publisher import Publisher
 
 __all__ = ["Publisher"]
+# The commands say first whether policies run compiled, and Publisher would import the compiler before that.
+__getattr__ = on_demand(__name__, {"Publisher": "publisher"})

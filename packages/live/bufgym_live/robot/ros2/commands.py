@@ -6,10 +6,11 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from bufgym.cli.options import Count, PolicyFile, one_policy
+from bufgym.cli.options import Count, Least0, PolicyFile, one_policy
 from bufgym.utils.errors import BufgymError
-from bufgym_live.robot.commands import PORT, RECEIVER, Host, Port, Transport, Window, address, listens_at, say
+from bufgym_live.robot.commands import PORT, RECEIVER, Backoff, Host, Port, Transport, Window, address, listens_at, say
 from bufgym_live.robot.decided_in import Compiled, decide_in_python
+from bufgym_live.robot.sockets import BACKOFF_S, host_port
 
 RosArgs = Annotated[
     tuple[str, ...],
@@ -32,6 +33,7 @@ async def send(
     odom: str | None = None,
     transport: Transport = "tcp",
     window: Window = None,
+    backoff: Backoff = BACKOFF_S,
     compiled: Compiled = False,
     log: str | None = None,
     ros_args: RosArgs = (),
@@ -66,7 +68,7 @@ async def send(
         told = _parameters(node, {"topics": [""], **options, "host": host, "port": port})
         robot = RosSender(
             client,
-            *address(f"{told['host']}:{told['port']}"),
+            *address(host_port(told["host"], told["port"])),
             topics=[name for name in told["topics"] if name],
             policy=one_policy(told["policy"], policy_file) if told["policy"] else None,
             capacity=told["capacity"],
@@ -74,6 +76,7 @@ async def send(
             odometry=told["odometry"] or None,
             transport=transport,
             window=window,
+            backoff_s=backoff,
             log=None if log is None else stack.enter_context(LogFile(log)),
             say=say,
         )
@@ -114,15 +117,17 @@ async def receive(
     port: Port = PORT,
     host: Host = "127.0.0.1",
     transport: Transport = "tcp",
+    hold: Least0 = 10.0,
     ros_args: RosArgs = (),
 ) -> None:
     """At the other end: receive and republish; Ctrl-C ends it.
 
     Args:
         at: HOST:PORT to listen on, in place of --host and --port.
+        hold: From the start a topic's messages wait for a reader, and the sender with them, so many seconds at most.
     """
     decide_in_python()
     from bufgym_live.robot.ros2 import relay
 
     host, port = listens_at(at, host, port)
-    await relay.receive(port, host, transport, say, ros_args)
+    await relay.receive(port, host, transport, say, ros_args, hold)

@@ -102,7 +102,7 @@ def publisher(node: Any, say: Callable[[str], None]) -> Callable[[Mapping[str, d
     def publish(numbers: Mapping[str, dict[str, float]], fault: str) -> None:
         array = messages.DiagnosticArray()
         array.header.stamp = node.get_clock().now().to_msg()
-        for name, told in numbers.items():
+        for name, told in {"uplink": {}, **numbers}.items():
             one = messages.DiagnosticStatus(name=f"{node.get_fully_qualified_name()}: {name}", hardware_id="bufgym")
             one.level = one.WARN if fault else one.OK
             one.message = fault or "connected"

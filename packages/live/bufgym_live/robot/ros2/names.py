@@ -99,6 +99,14 @@ class Published:
         return _HEAD.pack(len(name), len(kind), flags, min(self.depth, 2**16 - 1), *times) + name + kind
 
 
+def overriding() -> Any:
+    """Let parameters such as ``qos_overrides./camera.subscription.depth`` change any quality of service."""
+    from rclpy.qos import QoSPolicyKind
+    from rclpy.qos_overriding_options import QoSOverridingOptions
+
+    return QoSOverridingOptions([kind for kind in QoSPolicyKind if kind.name != "INVALID"])
+
+
 def resolved(node: Any, name: str) -> str:
     """Apply the node's namespace and remappings; raises an error if ROS 2 has no such names."""
     try:

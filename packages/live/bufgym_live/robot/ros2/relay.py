@@ -23,11 +23,13 @@ from bufgym_live.robot import LogFile, PolicyQueue
 from bufgym_live.robot.channels import TRANSPORTS
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.odometry import Odometry, followed
-from bufgym_live.robot.receiver import Received, Receiver
+from bufgym_live.robot.receiver import Receiver
 from bufgym_live.robot.ros2.diagnostics import Diagnostics, publisher
-from bufgym_live.robot.ros2.names import Published, needs_rclpy, parse, published, resolved
-from bufgym_live.robot.ros2.places import places
+from bufgym_live.robot.ros2.names import Published, needs_rclpy, overriding, published, resolved
+from bufgym_live.robot.ros2.places import left_out, places
+from bufgym_live.robot.ros2.republishing import HOLD_S, Republisher
 from bufgym_live.robot.sender import Leaves, Sender
+from bufgym_live.robot.sockets import BACKOFF_S, host_port
 from bufgym_live.robot.tasks import until_one_ends
 
 SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
@@ -35,14 +37,6 @@ SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 LOOK_S: Final = 0.2  # Time between two searches for publishers
 TELL_S: Final = 1.0  # Time between two messages on /diagnostics
 _MATCH_S: Final = 1.0  # longest wait of a new publisher's first message for a subscriber
-
-
-def overriding() -> Any:
-    """Let parameters such as ``qos_overrides./camera.subscription.depth`` change any quality of service."""
-    from rclpy.qos import QoSPolicyKind
-    from rclpy.qos_overriding_options import QoSOverridingOptions
-
-    return QoSOverridingOptions([kind for kind in QoSPolicyKind if kind.name != "INVALID"])
 
 
 @contextmanager
@@ -136,6 +130,7 @@ class RosSender:
         odometry: str | None = None,
         transport: str = "tcp",
         window: int | None = None,
+        backoff_s: float = BACKOFF_S,
         log: LogFile | Callable[[Record], None] | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
@@ -143,14 +138,15 @@ class RosSender:
         Args:
             client: topics with their rules; ``bufgym.scenario.read_client`` reads one.
             topics: more topics, without rules; their x is the motion with ``odometry``, otherwise it counts messages.
-                A name with ``*`` or ``?``, here or in ``client``, is a pattern, and stands for up to 8 topics.
+                A name with ``*`` or ``?``, here or in ``client``, is a pattern, and stands for up to 64 topics.
             policy: a drop rule for one topic, a scheduler for several; None: afr or learned-scheduler.
             capacity: L, messages of all topics together, and the least depth of each subscription.
             value: V of topics without one; None: the client's, or 1 - 0.618^d.
             odometry: a topic with poses, which gives x to topics that move; x of other topics is time. The poses of one
                 frame count (TOPIC:FRAME, of tf TOPIC:PARENT:CHILD, else that of the first).
             window: n_T, messages sent and not yet acked by the receiver, at most; None: as many as fill the link.
-            say: called with a line for each topic found.
+            backoff_s: longest time between two tries of TCP at a dead link.
+            say: called with a line for each topic found or left out, and for each reason why there is no connection.
         """
         self._places = places(client, topics, odometry is not None)
         value = value or (qoi.exponential() if client is None else client.value)
@@ -171,9 +167,13 @@ class RosSender:
             log=record,
         )
         leaves: Leaves = "sent" if window is None else "acked"
-        self.sender = Sender(self.queue, lambda: TRANSPORTS[transport](host, port), leaves)
+        self._fault = "no answer yet"
+        self._to = host_port(host, port)
+        self.sender = Sender(
+            self.queue, lambda: TRANSPORTS[transport](host, port, backoff_s=backoff_s), leaves, self._on_connection
+        )
         self._depth = capacity
-        self._found = asyncio.Event()
+        self._left_out: set[str] = set()
         self._odometry_topic: str | None
         self._odometry_topic, self._odometry = (None, Odometry()) if odometry is None else followed(odometry)
         self._say = say
@@ -188,23 +188,29 @@ class RosSender:
                 looking = look(node, partial(self._names, node), partial(self._subscribe, node), RECEIVER, self._say)
                 await until_one_ends(self.sender.run(), looking, self._tell(node))
 
+    def _on_connection(self, fault: str) -> None:
+        self._fault = fault
+        self._say(f"not connected to {self._to}: {fault}" if fault else f"connected to {self._to}")
+
     async def _tell(self, node: Any) -> None:
-        """Publish each topic's numbers, from the first topic on."""
-        await self._found.wait()
+        """Publish each topic's numbers and how the connection is, also while there is no topic."""
         publish = publisher(node, self._say)
         while True:
             await asyncio.sleep(TELL_S)
             numbers = zip(self._places, self._diagnostics.tell(), strict=True)
-            why = self.sender.faults[-1] if self.sender.faults else "no answer yet"
-            fault = "" if self.sender.connected.is_set() else f"not connected: {why}"
+            fault = f"not connected to {self._to}: {self._fault}" if self._fault else ""
             publish({place.name: told for place, told in numbers if place.name is not None}, fault)
 
     def _names(self, node: Any) -> list[str]:
         """Names of the topics to look for; topics that a pattern fits take one of its places."""
-        if any(place.name is None for place in self._places):
-            published = [name for name, _ in node.get_topic_names_and_types()]
+        if any(place.by_pattern for place in self._places):
+            names = [name for name, _ in node.get_topic_names_and_types() if node.count_publishers(name)]
             for place in self._places:
-                place.find(published, [one.name for one in self._places])
+                place.find(names, [one.name for one in self._places])
+            for name, why in left_out(self._places, names).items():
+                if name not in self._left_out:
+                    self._left_out.add(name)
+                    self._say(f"{name}: left out: {why}")
         names = [place.name for place in self._places if place.name is not None]
         return names if self._odometry_topic is None else [*names, self._odometry_topic]
 
@@ -222,7 +228,6 @@ class RosSender:
             deep = replace(topic, depth=max(self._depth, topic.depth)).qos
             kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
             made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
-            self._found.set()
         if topic.name == self._odometry_topic:
             made.append(node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos))
         return made
@@ -234,36 +239,22 @@ async def receive(
     transport: str = "tcp",
     say: Callable[[str], None] = lambda text: None,
     ros_args: Sequence[str] = (),
+    hold_s: float = HOLD_S,
 ) -> None:
     """Run the other end: republish messages with their publishers' quality of service, until cancelled.
 
     Messages whose package is not installed here are republished as they came. What ROS 2 can't publish is reported once
-    and dropped.
+    and dropped. For ``hold_s`` from its start a topic's messages wait for readers (``Republisher``).
     """
     with own_node(RECEIVER, ros_args) as node:
-        publishers: dict[Published, Any] = {}
-
-        async def republish(message: Received) -> None:
-            topic, body = parse(message.body)
-            if topic not in publishers:
-                try:
-                    kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
-                    publishers[topic] = node.create_publisher(kind, topic.name, topic.qos, **options)
-                    say(f"{topic.name}: {topic.type}")
-                except BufgymError as error:
-                    publishers[topic] = None
-                    say(f"{topic.name}: dropped: {error}")
-                else:
-                    await matched(publishers[topic].get_subscription_count)
-            if publishers[topic] is not None:
-                publishers[topic].publish(body)
-
-        receiver = Receiver(republish)
-        say(f"listening on {host}:{await receiver.listen(port, host, transport)}")
+        republisher = Republisher(node, hold_s, say)
+        receiver = Receiver(republisher)
+        say(f"listening on {host_port(host, await receiver.listen(port, host, transport))}")
         try:
             await asyncio.Event().wait()
         finally:
             await receiver.close()
+            republisher.drain()
 
 
 async def matched(subscribers: Callable[[], int]) -> None:

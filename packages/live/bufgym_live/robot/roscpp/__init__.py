@@ -19,7 +19,7 @@ from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.c.header import SUPPORTED, header
 
 _SOURCE: Final = Path(__file__).with_name("source")
-SHARED: Final = {name: _SOURCE / name for name in ("log.h", "motion.h", "policy.cpp", "policy.h")}
+SHARED: Final = {name: _SOURCE / name for name in ("link.h", "log.h", "motion.h", "policy.cpp", "policy.h")}
 """Files without ROS 1."""
 _CAPACITY: Final = 64  # ``MOST`` of policy.h
 

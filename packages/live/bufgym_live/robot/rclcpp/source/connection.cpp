@@ -1,4 +1,5 @@
 // The connection of a sender: its thread connects, writes messages and takes acks.
+#include "link.h"
 #include "sender.h"
 
 #include <algorithm>
@@ -22,8 +23,12 @@ namespace
 const int UNSENT_BYTES = 16384;   // the system wants more when less than this is unsent, whatever is in flight
 const size_t PIECE_BYTES = 16384; // written at a time
 const int DEAD_MS = 20000;        // a connection without acks for so long is given up
+const int SOONER_DEAD_MS = 5000;  // where the kernel cannot bound its backoff: a new connection is soon
+const int BACKOFF_MS = 1000;      // longest time between two tries of TCP at a dead link
 const int RETRY_MS = 500;
-const int CONNECT_MS = 1000;
+const int LOOK_MS = 500;          // time between two looks at this machine's address
+const int CONNECT_MS = 3000;      // TCP asks again after 1 and 3 s
+const int NEXT_ADDRESS_MS = 1000; // before another of the host's addresses is tried
 const size_t MOST_UNACKED = 256;
 
 // Why a connection ended.
@@ -50,11 +55,12 @@ int connected(const Address &to)
       continue;
     set(made, TCP_NOTSENT_LOWAT, UNSENT_BYTES);
     set(made, TCP_NODELAY, 1);
-    set(made, TCP_USER_TIMEOUT, DEAD_MS);
+    if (!bounded_backoff(made, BACKOFF_MS, DEAD_MS))
+      set(made, TCP_USER_TIMEOUT, SOONER_DEAD_MS);
     pollfd watched = {made, POLLOUT, 0};
     socklen_t size = sizeof error;
     error = connect(made, one->ai_addr, one->ai_addrlen) ? errno : 0;
-    if (error == EINPROGRESS && (error = ETIMEDOUT, poll(&watched, 1, CONNECT_MS) > 0))
+    if (error == EINPROGRESS && (error = ETIMEDOUT, poll(&watched, 1, one->ai_next ? NEXT_ADDRESS_MS : CONNECT_MS) > 0))
       getsockopt(made, SOL_SOCKET, SO_ERROR, &error, &size);
     if (!error)
       return made;
@@ -116,9 +122,15 @@ void Sender::ready(short events)
   for (;;)
   {
     pollfd watched[] = {{socket_, short(events | POLLIN), 0}, {wake_, POLLIN, 0}};
-    const int found = poll(watched, 2, DEAD_MS);
+    const int found = poll(watched, 2, LOOK_MS);
     if (found < 0 && errno != EINTR)
       throw Fault(std::strerror(errno));
+    if (found == 0)
+    {
+      const std::string address = moved_to(socket_);
+      if (!address.empty())
+        throw Fault("this machine's address has become " + address);
+    }
     if (found <= 0 && !events)
       return;
     if (found <= 0)

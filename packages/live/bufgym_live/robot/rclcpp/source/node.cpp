@@ -7,6 +7,7 @@
 #include <functional>
 #include <map>
 #include <memory>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -53,45 +54,24 @@ public:
     declare("log", std::string(), "Folder for a log of each queue, which bufgym live replay reads");
     declare("autostart", true, "Whether the node configures and activates itself");
     changes_ = add_on_set_parameters_callback(std::bind(&SenderNode::change, this, std::placeholders::_1));
-    if (get_parameter("autostart").as_bool())
-      start_ = create_wall_timer(0s, [this] {
-        start_->cancel();
-        if (configure().id() == lifecycle_msgs::msg::State::PRIMARY_STATE_INACTIVE)
-          activate();
-      });
+    if (!get_parameter("autostart").as_bool())
+      return;
+    if (const std::string wrong = configuration(); !wrong.empty())  // nobody would set it right
+      throw std::invalid_argument(wrong);
+    start_ = create_wall_timer(0s, [this] {
+      start_->cancel();
+      if (configure().id() == lifecycle_msgs::msg::State::PRIMARY_STATE_INACTIVE)
+        activate();
+    });
   }
 
   ~SenderNode() override { stop(); }
 
   CallbackReturn on_configure(const rclcpp_lifecycle::State &) override
   {
-    const std::string odometry = get_parameter("odometry").as_string();
-    std::string value = get_parameter("value").as_string();
-    if (value.empty())
-      value = odometry.empty() ? "exponential:0.618" : "exponential:0.36787944117144233";
-    policy_ = find(get_parameter("policy").as_string());
-    if (!policy_ || !set_value(value))
+    if (const std::string wrong = configuration(); !wrong.empty())
     {
-      RCLCPP_ERROR(
-          get_logger(), "policy must be one of %s; V = %s must be exponential:BASE or saturating:DISTANCE",
-          known().c_str(), value.c_str());
-      return CallbackReturn::FAILURE;
-    }
-    try
-    {
-      wanted();
-      if (!odometry.empty())
-        get_node_topics_interface()->resolve_topic_name(odometry);
-    }
-    catch (const std::exception &error)
-    {
-      RCLCPP_ERROR(get_logger(), "topics and odometry must be names of topics: %s", error.what());
-      return CallbackReturn::FAILURE;
-    }
-    const std::string log = get_parameter("log").as_string();
-    if (!log.empty() && !Log::writable(log))
-    {
-      RCLCPP_ERROR(get_logger(), "log = %s: must be a folder that can be written", log.c_str());
+      RCLCPP_ERROR(get_logger(), "%s", wrong.c_str());
       return CallbackReturn::FAILURE;
     }
     capacity_ = int(get_parameter("capacity").as_int());
@@ -160,6 +140,33 @@ private:
       descriptor.integer_range[0].step = 1;
     }
     declare_parameter(name, at, descriptor);
+  }
+
+  // Take policy and V; what is wrong with the parameters, in one line, or nothing.
+  std::string configuration()
+  {
+    const std::string odometry = get_parameter("odometry").as_string(), log = get_parameter("log").as_string();
+    const std::string policy = get_parameter("policy").as_string();
+    std::string value = get_parameter("value").as_string();
+    value = !value.empty() ? value : odometry.empty() ? "exponential:0.618" : "exponential:0.36787944117144233";
+    policy_ = find(policy);
+    if (!policy_)
+      return "policy " + policy + ": must be one of " + known();
+    if (!set_value(value))
+      return "value " + value + ": must be exponential:BASE or saturating:DISTANCE";
+    try
+    {
+      wanted();
+      if (!odometry.empty())
+        get_node_topics_interface()->resolve_topic_name(odometry);
+    }
+    catch (const std::exception &error)
+    {
+      return std::string("topics and odometry must be names of topics: ") + error.what();
+    }
+    if (!log.empty() && !Log::writable(log))
+      return "log " + log + ": must be a folder that can be written";
+    return "";
   }
 
   Address address() { return {get_parameter("host").as_string(), int(get_parameter("port").as_int())}; }
@@ -333,6 +340,11 @@ private:
   rclcpp::TimerBase::SharedPtr start_, look_, tell_;
   rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr changes_;
 };
+}
+
+std::shared_ptr<rclcpp_lifecycle::LifecycleNode> make_sender(const rclcpp::NodeOptions &options)
+{
+  return std::make_shared<bufgym::SenderNode>(options);
 }
 
 RCLCPP_COMPONENTS_REGISTER_NODE(bufgym::SenderNode)

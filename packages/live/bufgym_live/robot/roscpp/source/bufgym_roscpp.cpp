@@ -37,6 +37,7 @@
 #define TCP_NOTSENT_LOWAT 25
 #endif
 
+#include "link.h"
 #include "log.h"
 #include "motion.h"
 #include "policy.h"
@@ -54,6 +55,7 @@ NAMED(Written, ros::Connection, uint32_t, write_sent_)
 NAMED(ToWrite, ros::Connection, uint32_t, write_size_)
 NAMED(Ending, ros::TopicManager, boost::mutex, shutting_down_mutex_)
 
+const int DEAD_MS = 900000;  // the subscriber alone can connect again, and is not told, so a connection stays for 15 min
 const int UNSENT_BYTES = 16384;  // the system wants more when less than this is unsent, whatever is in flight
 
 const bufgym::Settings &settings()
@@ -180,6 +182,7 @@ void begin(State &state, ros::TransportSubscriberLink *link, int capacity)
     state.log.open(settings().log, topic, *policy, capacity);
   tcp->setNoDelay(true);
   setsockopt(state.socket, IPPROTO_TCP, TCP_NOTSENT_LOWAT, &UNSENT_BYTES, sizeof UNSENT_BYTES);
+  bufgym::bounded_backoff(state.socket, 1000 * settings().backoff_s, DEAD_MS);
 }
 
 State &state_of(ros::TransportSubscriberLink *link, const ros::PublicationWPtr &publication)

@@ -5,6 +5,7 @@
 //   BUFGYM_VALUE       V (exponential:0.618 over messages, exponential:0.36787944 over motion)
 //   BUFGYM_QUEUE_SIZE  L (the publisher's queue_size)
 //   BUFGYM_ODOMETRY    topic of nav_msgs/Odometry from which x is summed (x counts messages)
+//   BUFGYM_BACKOFF_S   longest time between two tries of TCP at a dead link, 1 to 120 s (1; Linux from 6.15 on)
 //   BUFGYM_LOCAL       1: also for subscribers on this machine
 //   BUFGYM_LOG         folder for a log of each queue, which `bufgym live replay` reads
 #ifndef BUFGYM_ROSCPP_SETTINGS_H
@@ -30,7 +31,7 @@ struct Settings
 {
   const Policy *policy = nullptr;
   std::map<std::string, const Policy *> topics;
-  int capacity = 0;
+  int capacity = 0, backoff_s = 1;
   bool local = false;
   std::string odometry, log;
 
@@ -61,6 +62,13 @@ struct Settings
     {
       ROS_ERROR("bufgym: L = %s: must be 1 to %d; it is the publisher's queue_size", size.c_str(), MOST);
       capacity = 0;
+    }
+    const std::string backoff = text("BACKOFF_S", "1");
+    backoff_s = std::atoi(backoff.c_str());
+    if (backoff != std::to_string(backoff_s) || backoff_s < 1 || backoff_s > 120)
+    {
+      ROS_ERROR("bufgym: BUFGYM_BACKOFF_S = %s: must be 1 to 120; it is 1", backoff.c_str());
+      backoff_s = 1;
     }
     local = here == "1" || here == "true";
     if (!local && here != "0" && here != "false")

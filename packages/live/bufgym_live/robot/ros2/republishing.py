@@ -1,0 +1,83 @@
+"""Publishes what a relay has received, each topic once its readers are there.
+
+DDS drops what is published before reader and writer have found each other. The receiver acks a message when this has
+published it, so the robot would never send such a message again. A receiver that was restarted is a new writer to all
+its readers.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from bufgym.utils.errors import BufgymError
+from bufgym_live.robot.receiver import Received
+from bufgym_live.robot.ros2.names import Published, overriding, parse
+
+HOLD_S: Final = 10.0
+"""Time from the start in which messages wait for readers; by then participants of DDS have found each other."""
+_MATCH_S: Final = 2.0  # longest wait of a new publisher for a reader that is known
+_SETTLE_S: Final = 0.1  # from the match at the writer to that at the reader, of which nothing tells the writer
+_LOOK_S: Final = 0.01
+
+
+class Republisher:
+    """Call it with each received message."""
+
+    def __init__(self, node: Any, hold_s: float, say: Callable[[str], None]) -> None:
+        self._node, self._say = node, say
+        self._hold_until_s = time.monotonic() + hold_s
+        self._publishers: dict[Published, Any] = {}
+        self._matched: set[Published] = set()
+
+    async def __call__(self, message: Received) -> None:
+        topic, body = parse(message.body)
+        if topic not in self._publishers:
+            self._publishers[topic] = self._made(topic)
+        publisher = self._publishers[topic]
+        if publisher is None:
+            return
+        # Publishing comes last: a connection that ends while this waits leaves the message to the next one.
+        if topic not in self._matched:
+            await self._match(publisher)
+            self._matched.add(topic)
+        publisher.publish(body)
+
+    def drain(self) -> None:
+        """Wait until readers have acked what was published; the end of a writer takes the rest with it."""
+        until_s = time.monotonic() + _MATCH_S
+        for publisher in self._publishers.values():
+            while publisher is not None and not _all_acked(publisher) and time.monotonic() < until_s:
+                time.sleep(_LOOK_S)
+
+    def _made(self, topic: Published) -> Any:
+        try:
+            kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
+            publisher = self._node.create_publisher(kind, topic.name, topic.qos, **options)
+        except BufgymError as error:
+            self._say(f"{topic.name}: dropped: {error}")
+            return None
+        self._say(f"{topic.name}: {topic.type}")
+        return publisher
+
+    async def _match(self, publisher: Any) -> None:
+        """Wait for all readers that this node knows of, and for one at least while it still gets to know them."""
+        name = publisher.topic_name
+
+        def matched() -> bool:
+            return bool(publisher.get_subscription_count() >= max(1, self._node.count_subscribers(name)))
+
+        known_until_s = time.monotonic() + (_MATCH_S if self._node.count_subscribers(name) else 0.0)
+        if publisher.get_subscription_count() == 0 and time.monotonic() < self._hold_until_s:
+            self._say(f"{name}: messages wait for a reader, {self._hold_until_s - time.monotonic():.0f} s at most")
+        until_s = max(self._hold_until_s, known_until_s)
+        while not (found := matched()) and time.monotonic() < until_s:
+            await asyncio.sleep(_LOOK_S)
+        if found:
+            await asyncio.sleep(_SETTLE_S)
+
+
+def _all_acked(publisher: Any) -> bool:
+    from rclpy.duration import Duration
+
+    return bool(publisher.wait_for_all_acked(Duration(nanoseconds=1_000_000)))

@@ -1,0 +1,58 @@
+// A TCP connection over a link that dies and comes back, and under a robot whose address changes (robot/sockets.py).
+#ifndef BUFGYM_ROSCPP_LINK_H
+#define BUFGYM_ROSCPP_LINK_H
+#include <cstring>
+#include <string>
+
+#include <arpa/inet.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#ifndef TCP_USER_TIMEOUT  // Linux has it since 2.6.37
+#define TCP_USER_TIMEOUT 18
+#endif
+
+namespace bufgym
+{
+const int RTO_MAX_MS = 44;  // TCP_RTO_MAX_MS of linux/tcp.h since 6.15
+
+// Let TCP try a dead link again after so long at the latest, and give the connection up after dead_ms without acks.
+// False where the kernel cannot bound its backoff, which then grows to 120 s. The second limit stands beside the first:
+// tcp_retries2 counts tries, and would give up after 15 short ones.
+inline bool bounded_backoff(int socket, int most_ms, int dead_ms)
+{
+  const bool bounded = !setsockopt(socket, IPPROTO_TCP, RTO_MAX_MS, &most_ms, sizeof most_ms);
+  if (bounded)
+    setsockopt(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, &dead_ms, sizeof dead_ms);
+  return bounded;
+}
+
+inline std::string host_of(const sockaddr_storage &address)
+{
+  char text[INET6_ADDRSTRLEN] = "";
+  if (address.ss_family == AF_INET)
+    inet_ntop(AF_INET, &reinterpret_cast<const sockaddr_in &>(address).sin_addr, text, sizeof text);
+  else if (address.ss_family == AF_INET6)
+    inet_ntop(AF_INET6, &reinterpret_cast<const sockaddr_in6 &>(address).sin6_addr, text, sizeof text);
+  return text;
+}
+
+// This machine's new address, if a connection that it made to the peer would now leave from another one; else empty.
+inline std::string moved_to(int connection)
+{
+  sockaddr_storage own = {}, peer = {}, now = {};
+  socklen_t size = sizeof own, peer_size = sizeof peer, now_size = sizeof now;
+  if (getsockname(connection, reinterpret_cast<sockaddr *>(&own), &size) ||
+      getpeername(connection, reinterpret_cast<sockaddr *>(&peer), &peer_size))
+    return "";
+  const int probe = socket(peer.ss_family, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+  const bool known = probe >= 0 && !connect(probe, reinterpret_cast<sockaddr *>(&peer), peer_size) &&
+                     !getsockname(probe, reinterpret_cast<sockaddr *>(&now), &now_size);  // which sends nothing
+  if (probe >= 0)
+    close(probe);
+  return known && host_of(now) != host_of(own) ? host_of(now) : "";
+}
+}
+#endif

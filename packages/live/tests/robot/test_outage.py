@@ -1,0 +1,226 @@
+"""Links that die and come back, and a robot's new address, over the kernel's own TCP between two namespaces."""
+
+import asyncio
+import contextlib
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import roscpp_cases
+from needs import needs
+from ros1_cases import SYSTEM, environment
+
+from bufgym_live.robot import PolicyQueue, tunnel
+from bufgym_live.robot.channels import TcpChannel
+from bufgym_live.robot.receiver import Receiver
+from bufgym_live.robot.sender import Sender
+from bufgym_live.robot.sockets import bounded_backoff
+from bufgym_live.robot.tunnel import ADDRESSES, End, Tunnel
+
+NEAR, FAR = ADDRESSES
+PORT, MASTER = 7410, 11311
+DEAD_S, SOON_S = 20.0, 3.0
+NODE = """
+import rospy
+from std_msgs.msg import String
+rospy.init_node("camera")
+publisher, rate = rospy.Publisher("camera", String, queue_size=5), rospy.Rate(50)
+while not rospy.is_shutdown():
+    publisher.publish(String(data="x" * 1000))
+    rate.sleep()
+"""
+
+
+class Wire:
+    """The link between both ends, which loses every packet while it is cut."""
+
+    def __init__(self, between: Tunnel) -> None:
+        self.cut = threading.Event()
+        self._ended = threading.Event()
+        self._devices = {between.near.device: between.far.device, between.far.device: between.near.device}
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            for device in select.select(list(self._devices), [], [], 0.05)[0]:
+                with contextlib.suppress(OSError):
+                    packet = os.read(device, 2000)
+                    if not self.cut.is_set():
+                        os.write(self._devices[device], packet)
+
+
+@pytest.fixture
+def between() -> Iterator[tuple[Tunnel, Wire]]:
+    if reason := tunnel.impossible():
+        pytest.skip(needs("root", reason))
+    with tunnel.opened() as made:
+        wire = Wire(made)
+        yield made, wire
+        wire.close()
+
+
+def at(end: End, work: Callable[[], Any]) -> threading.Thread:
+    """Run it in a thread of its own in this namespace."""
+
+    def run() -> None:
+        end.enter()
+        work()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def program(end: End, *words: Any, **settings: str) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        list(map(str, words)), env={**os.environ, **settings}, preexec_fn=end.enter, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+class Far:
+    """A receiver at the far end, and when messages came."""
+
+    def __init__(self, end: End) -> None:
+        self.came: list[float] = []
+        self.listens = threading.Event()
+        at(end, lambda: asyncio.run(self._receive()))
+        assert self.listens.wait(10)
+
+    async def _receive(self) -> None:
+        receiver = Receiver(lambda message: self.came.append(time.monotonic()))
+        await receiver.listen(PORT, FAR)
+        self.listens.set()
+        await asyncio.Event().wait()
+
+
+def waited(holds: Callable[[], Any]) -> None:
+    ends_s = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < ends_s
+        time.sleep(0.01)
+
+
+def test_a_robots_new_address_is_a_new_connection(between: tuple[Tunnel, Wire]) -> None:
+    """Ten messages, a new address in place of the old one, ten more: each comes, in order, and the sender says why."""
+    made, _ = between
+    far, queue = Far(made.far), PolicyQueue("fifo", 64)
+    senders: list[Sender] = []
+
+    async def send() -> None:
+        senders.append(Sender(queue, lambda: TcpChannel.connect(FAR, PORT)))
+        await senders[0].run()
+
+    def change() -> None:
+        for words in (f"del {NEAR}/24", "add 10.79.0.3/24"):
+            verb, address = words.split()
+            subprocess.run(["ip", "addr", verb, address, "dev", "bufgym0"], check=True)
+
+    sending = at(made.near, lambda: asyncio.run(send()))
+    for _ in range(10):
+        queue.put(b"before", 6)
+    waited(lambda: len(far.came) == 10)
+    at(made.near, change).join()
+    for _ in range(10):
+        queue.put(b"after", 5)
+    queue.close()
+    sending.join(60)
+    assert len(far.came) == 20
+    assert "this machine's address has become 10.79.0.3" in senders[0].faults[0]
+
+
+def test_the_kernel_bounds_its_backoff_or_says_that_it_cannot() -> None:
+    """1 to 120 s, from Linux 6.15 on; what it takes can be read back in ms."""
+    with socket.socket() as one:
+        if bounded_backoff(one, 2.0):
+            assert one.getsockopt(socket.IPPROTO_TCP, 44) == 2000
+        assert not bounded_backoff(one, 0.5) and not bounded_backoff(one, 121)
+
+
+def live(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
+    far = Far(made.far)
+    words = ("live", "send", f"{FAR}:{PORT}", "--size", "1000", "--duration", "120")
+    return far.came, [program(made.near, sys.executable, "-m", "bufgym", *words)]
+
+
+def sender_in_cpp(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
+    from test_ros2_sender import built_with
+
+    far = Far(made.far)
+    return far.came, [
+        program(made.near, built_with(folder, "drop-oldest"), FAR, PORT, "drop-oldest", 4, folder, 6000, 1000, 50)
+    ]
+
+
+def ros1(made: Tunnel, folder: Path, talker: list[Any], **settings: str) -> tuple[list[float], list[Any]]:
+    where = {"ROS_MASTER_URI": f"http://{NEAR}:{MASTER}", "ROS_IP": NEAR, "ROS_HOME": str(folder), **settings}
+    started = [program(made.near, "rosmaster", "--core", "-p", MASTER, **where)]
+    started.append(program(made.near, *talker, **where))
+    came: list[float] = []
+
+    def hear() -> None:
+        with xmlrpc.client.ServerProxy(f"http://{NEAR}:{MASTER}") as proxy:
+            master: Any = proxy
+            while not roscpp_cases.publishers(master, "camera"):
+                time.sleep(0.1)
+            connection = roscpp_cases.subscriber(master, "camera")
+        connection.settimeout(120)
+        with connection, contextlib.suppress(OSError, EOFError):  # until the talker is killed
+            while True:
+                roscpp_cases.block(connection)
+                came.append(time.monotonic())
+
+    at(made.far, hear)
+    return came, started
+
+
+def node_in_cpp(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
+    if reason := roscpp_cases.missing():
+        pytest.skip(needs("roscpp", reason))
+    library = roscpp_cases.build(folder, "afr")
+    words = [folder / "talker", "camera", 5, 6000, 1000, 50]
+    return ros1(made, folder, words, LD_PRELOAD=str(library), BUFGYM_POLICY="afr")
+
+
+def node_in_python(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
+    if not (SYSTEM / "rospy").is_dir():
+        pytest.skip(needs("ros1"))
+    (folder / "node.py").write_text(NODE)
+    words = [sys.executable, "-m", "bufgym_live.robot.ros1", "--policy", "afr", folder / "node.py"]
+    return ros1(made, folder, words, **environment(folder))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("way", [live, sender_in_cpp, node_in_cpp, node_in_python])
+def test_frames_come_soon_after_a_link_that_was_dead(way: Any, between: tuple[Tunnel, Wire], tmp_path: Path) -> None:
+    """Dead for 20 s, in which every packet is lost: with TCP's own backoff the next frame comes up to 18 s later."""
+    made, wire = between
+    came, started = way(made, tmp_path)
+    try:
+        waited(lambda: len(came) > 20)
+        wire.cut.set()
+        time.sleep(DEAD_S)
+        before, back_s = len(came), time.monotonic()
+        wire.cut.clear()
+        waited(lambda: len(came) > before)
+        print(way.__name__, came[before] - back_s)
+        assert came[before] - back_s < SOON_S
+        waited(lambda: len(came) > before + 50)  # and they go on
+    finally:
+        for one in started:
+            one.kill()
+            one.communicate()
