@@ -17,9 +17,8 @@ from typing import Any
 PILOTS = {
     "evolve": ("evolve", 4_000_000),
     "guided-ppo": ("guided-ppo", 200_000),
-    "ppo": ("ppo", 100_000),
-    "ppo-unmasked": ("ppo --unmasked", 100_000),
-    "dqn": ("dqn", 100_000),
+    "ppo": ("ppo", 20_000),
+    "dqn": ("dqn", 20_000),
 }
 """Algorithm -> its command, and the steps of its pilot."""
 ENVS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
