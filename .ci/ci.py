@@ -4,6 +4,7 @@ With arguments it installs all of these for this checkout and runs ``make`` with
 ``.ci/run nightly`` each night.
 """
 
+import atexit
 import glob
 import os
 import shlex
@@ -30,6 +31,7 @@ def as_first_user(command: list[str]) -> list[str]:
     # Debian's names are links: g++ to x86_64-linux-gnu-g++-14.
     programs = sorted({os.path.realpath(path) for path in named if path})
     empty = tempfile.mkdtemp()
+    atexit.register(os.rmdir, empty)
     mounts = [f"mount --bind {empty} {shlex.quote(path)}" for path in folders]
     mounts += [f"mount --bind /dev/null {shlex.quote(path)}" for path in programs]
     hidden = ["unshare", "--mount", "--propagation", "private", "sh", "-c", " && ".join([*mounts, 'exec "$@"']), "sh"]
