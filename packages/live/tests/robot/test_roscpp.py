@@ -209,6 +209,7 @@ def test_parameters_are_numbers_too(built: Path, nodes: Nodes, tmp_path: Path) -
 def test_no_message_waits_for_the_master(built: Path, nodes: Nodes, tmp_path: Path) -> None:
     """Who sends holds a lock that roscpp takes second when it subscribes: a thread does it, for which an end waits."""
     words = {"TOPICS": "", "VALUE": "exponential:0.5", "QUEUE_SIZE": "5", "ODOMETRY": "/odom", "POLICY": "afr"}
+    words["BACKOFF_S"] = "1"  # a setting without a variable is asked of the master
     talker = nodes.talker("alone", 5, 10_000, 1000, 100, "__name:=alone", **preload(built, tmp_path / "log", **words))
     found, pid = nodes.master.lookupNode("/test", "/alone"), nodes.master.getPid("/test")[2]
     os.kill(pid, signal.SIGSTOP)
