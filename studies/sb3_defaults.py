@@ -206,9 +206,14 @@ def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
         for n, curve in enumerate(of_seed.values()):
             steps, scores, _ = zip(*curve, strict=True)
             axes.plot(steps, scores, color=f"C{k}", alpha=0.7, label=one.label if n == 0 else None)
+    at_level: dict[float, list[str]] = {}
     for name, score in rules.items():
+        at_level.setdefault(round(score, 3), []).append(name)
+    for score, names in at_level.items():
         axes.axhline(score, color="black", linewidth=0.8, linestyle=":")
-        axes.annotate(name, (1, score), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
+        axes.annotate(
+            ", ".join(names), (1, score), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8
+        )
     axes.legend(loc="lower right", frameon=False)
     figure.savefig(out)
 
