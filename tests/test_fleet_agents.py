@@ -11,7 +11,7 @@ import train_cases  # noqa: F401  (it skips without the extra)
 import train
 from agents.learner import learner_of
 from agents.objectives import fleet
-from agents.settings import PPO, Evolve
+from agents.settings import Evolve, FleetPPO
 from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
@@ -38,7 +38,7 @@ TASK = TASKS["fleet"]
 ON = Suites(("fleet-v1",), test_seeds=1)
 TINY = Evolve(suites=ON, name="tiny", steps=12_000, validate_every=6_000)
 SMALL = {"num_envs": 4, "n_steps": 32, "batch_size": 64, "width": 8, "epochs": 1, "steps": 256, "validate_every": 128}
-BY_PPO = PPO(suites=ON, name="tiny", **SMALL)  # type: ignore[arg-type]
+BY_PPO = FleetPPO(suites=ON, name="tiny", **SMALL)  # type: ignore[arg-type]
 
 
 @pytest.fixture(autouse=True)

@@ -210,7 +210,7 @@ def test_a_suite_takes_files_and_named_policies_and_those_registered_here(tmp_pa
     assert {row["policy"] for row in done.rows} == {"mine", "learned-ppo", "drop-oldest", "afr"}
     policies.register("stubborn")(stubborn)
     done = bufgym.compare(stubborn, "interruption-v1", **options)
-    assert {row["policy"] for row in done.rows} == {"stubborn", "drop-oldest"}
+    assert {row["policy"] for row in done.rows} == {"stubborn", "drop-oldest", "afr"}
 
 
 def test_a_picture() -> None:

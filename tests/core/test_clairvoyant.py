@@ -1,4 +1,4 @@
-"""The clairvoyant: as good as the best of all decision sequences, never beaten; long episodes; plans that are kept."""
+"""The clairvoyant: as good as the best of all decision sequences, never beaten; long episodes; cached plans."""
 
 import sys
 from dataclasses import replace
@@ -17,7 +17,7 @@ from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
-from bufgym.oracle import beam, clairvoyant, integer, kept, labels, pieces, programme
+from bufgym.oracle import beam, cached, clairvoyant, integer, labels, pieces, programme
 from bufgym.oracle.clairvoyant import Plan
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.scenario.numbered import draw
@@ -233,7 +233,7 @@ PLANNER = sys.modules[clairvoyant.__module__]
 def in_pieces(patch: Any, length: int, margin: int, episode: Episode, L: int, v: qoi.Value, **limits: int) -> Plan:
     """The plan of an episode that counts as long, in pieces of so many messages; nothing is read from disk."""
     patch.setattr(PLANNER, "LONG", 1)
-    patch.setattr(PLANNER, "kept", lambda inputs, messages, find: find())
+    patch.setattr(PLANNER, "cached", lambda inputs, messages, find: find())
     patch.setattr(pieces, "PIECE", length)
     patch.setattr(pieces, "MARGIN", margin)
     return clairvoyant(episode, L, v, **limits)
@@ -284,16 +284,16 @@ def test_unequal_sizes_in_pieces_keep_to_messages_and_bytes(monkeypatch):
     assert afr.qoi <= result.qoi <= plan.qoi + 1e-9 < 1.3 * result.qoi
 
 
-def test_a_kept_plan_is_read_and_a_damaged_one_made_anew(monkeypatch, tmp_path):
-    monkeypatch.setattr(kept, "FOLDER", str(tmp_path / "kernels"))
+def test_a_cached_plan_is_read_and_a_damaged_one_made_anew(monkeypatch, tmp_path):
+    monkeypatch.setattr(cached, "FOLDER", str(tmp_path / "kernels"))
     found, made = (2.1, np.array([True, False, True] * 3), True), list[int]()
 
-    def find() -> kept.Found:
+    def find() -> cached.Found:
         made.append(1)
         return found
 
     def asked(*inputs: Any) -> int:
-        qoi_, plan, certified = kept.kept(inputs, 9, find)
+        qoi_, plan, certified = cached.cached(inputs, 9, find)
         assert (qoi_, plan.tolist(), certified) == (2.1, found[1].tolist(), True)
         return len(made)
 
@@ -305,5 +305,5 @@ def test_a_kept_plan_is_read_and_a_damaged_one_made_anew(monkeypatch, tmp_path):
         if file.is_file():
             file.write_bytes(file.read_bytes()[:-1])
     assert [asked(size, 3), asked(size, 3)] == [4, 4]
-    monkeypatch.setattr(kept, "sources", lambda: "another text")
+    monkeypatch.setattr(cached, "sources", lambda: "another text")
     assert asked(size, 3) == 5

@@ -95,8 +95,8 @@ def agree_on_gaps(senders, reference):
     seen = jit.named(senders.batch)
     buffer, arrival = python_view(seen, 0), seen.arrivals[0, seen.senders[0].next]
     newcomer, slots = reference.newcomer, reference.slots()
-    reference, last = reference.reference(), reference.kept_before(newcomer)
-    assert (buffer.dequeued_arrival_us, buffer.dequeued_x) == (reference["us"], reference["x"])
+    zero, last = reference.reference(), reference.kept_before(newcomer)
+    assert (buffer.dequeued_arrival_us, buffer.dequeued_x) == (zero["us"], zero["x"])
     gain = reference.gain(reference.lane(newcomer), [last, newcomer]) if last else 0.0
     assert arrival_gain(buffer, arrival) == pytest.approx(gain, abs=1e-12)
     assert decisions.has_room(senders.batch, 0) == reference.fits(newcomer)

@@ -187,6 +187,7 @@ async def test_who_greets_before_the_receiver_has_its_bus_is_served() -> None:
 async def test_a_receiver_that_sends_garbage_is_left() -> None:
     async def babble(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"\xff" * 100)
+        await reader.read()  # until the sender has left: to a socket that is closed it could not even greet
         writer.close()
 
     server = await asyncio.start_server(babble, "127.0.0.1")
