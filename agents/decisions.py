@@ -21,6 +21,7 @@ from agents.callbacks import Budget, Checkpoints, Curve, Progress, Validation, c
 from agents.learner import Learner
 from agents.runs import MODEL, Numbers, Run, Validations
 from agents.settings import SingleDecisions
+from bufgym import sb3
 from bufgym.policies import weights
 
 Decisions = TypeVar("Decisions", bound=SingleDecisions)
@@ -43,9 +44,9 @@ class DecisionLearner(Learner[Decisions]):
     def make(self, env: VecEnv) -> Any:
         """Make an untrained model."""
 
-    @abstractmethod
     def weights_of(self, model: Any) -> Any:
         """The weights of the compiled policy that decides as the model does."""
+        return sb3.weights_of(model)
 
     def callbacks(self, curve: Curve) -> list[BaseCallback]:
         """Work between updates, besides saving and validating."""

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.decisions import DecisionLearner
 from agents.settings import DQN, PPO, ActorCritic, FleetPPO, OnCandidates
-from bufgym.sb3 import SlotPolicy, weights_of
+from bufgym.sb3 import SlotPolicy
 from bufgym.utils.errors import BufgymError
 
 Candidates = TypeVar("Candidates", bound=OnCandidates)
@@ -24,10 +24,6 @@ class CandidateLearner(DecisionLearner[Candidates]):
     def env_options(self) -> dict[str, Any]:
         """Asked at a full buffer, where every action is valid, so nothing is masked."""
         return {"candidates": self.settings.candidates, "info": "none"}
-
-    def weights_of(self, model: Any) -> Any:
-        """The perceptron's weights."""
-        return weights_of(model)
 
 
 class CandidatePPO(CandidateLearner[PPO]):
@@ -82,10 +78,6 @@ class SlotPPO(DecisionLearner[FleetPPO]):
         settings = self.settings
         arguments = ppo_arguments(settings, env, settings.n_steps, LinearSchedule(settings.learning_rate, 0.0, 1.0))
         return MaskablePPO(SlotPolicy, env, policy_kwargs={"width": settings.width, "masked": True}, **arguments)
-
-    def weights_of(self, model: Any) -> Any:
-        """The slot network's weights."""
-        return weights_of(model)
 
 
 def ppo_arguments(settings: ActorCritic, env: VecEnv, n_steps: int, learning_rate: Any) -> dict[str, Any]:
