@@ -201,7 +201,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             return None
         from bufgym.envs import render  # loaded only to draw
 
-        drawn = render.draw(self.rows.senders, 0, self.render_mode)
+        drawn = render.draw(self.rows.senders, 0, self.render_mode, self.rows.output.slot_actions[0])
         return drawn if self._window is None else self._window.show([drawn], self.metadata["render_fps"])
 
     def close(self) -> None:
