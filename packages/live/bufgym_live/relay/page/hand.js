@@ -14,7 +14,7 @@ const TOPICS = {
 const KINDS = ["stop", "goal", "pose", "cancel", "drive"];
 
 export class Hand {
-  // asks: {robot(), isReplay(), frame(), nowMs(), removed(name)}
+  // asks: {robot(), live(), all(), isReplay(), frame(), nowMs(), removed(name)}; ``live`` is the chosen robot as it is now, ``robot`` as it is shown
   constructor($, relay, map, notices, asks) {
     this.$ = $;
     this.relay = relay;
@@ -87,18 +87,16 @@ export class Hand {
   }
 
   // A robot that knows stops hears this as soon as it can be reached, before all else, and stands until somebody releases it.
-  stop() {
-    const robot = this.asks.robot();
-    if (!robot || this.asks.isReplay()) return;
-    if (!robot.status?.commands.includes("release")) return this.send("stop");
-    if (!this.way(robot, "stop")) return;
+  stop(robot = this.asks.live()) {
+    if (!robot || !this.way(robot, "stop")) return;
+    if (!robot.status?.commands.includes("release")) return this.send("stop", {}, robot);
     this.take(null);
     this.sent = {id: this.relay.stop(robot.name), kind: "stop", robot, state: "on its way"};
     this.draw();
   }
 
   release() {
-    const robot = this.asks.robot(), stop = robot?.status?.stop;
+    const robot = this.asks.live(), stop = robot?.status?.stop;
     if (!stop) return;
     this.sent = {id: this.relay.release(robot.name, stop.id), kind: "release", robot, state: "on its way"};
     this.draw();
@@ -139,12 +137,12 @@ export class Hand {
 
   // What is offered, and how far the last command is.
   draw() {
-    const robot = this.asks.robot(), isOff = !robot || this.asks.isReplay(), isLive = this.relay.isLive, ways = Object.fromEntries(KINDS.map(kind => [kind, !isOff && this.way(robot, kind) !== undefined]));
-    const may = !isOff && this.relay.mayCommand(`/robots/${robot.name}/command`);
-    this.$("stop").hidden = !may && !ways.stop;
-    this.$("stop").disabled = !ways.stop;
-    say(this.$("stop"), ways.stop ? `Stop ${robot.name}` : `${robot?.name ?? ""} takes no stop`);
-    this.$("release").hidden = isOff || !isLive || !robot.status?.stop || !may;
+    const robot = this.asks.live(), isOff = !robot || this.asks.isReplay(), {isLive} = this.relay, ways = Object.fromEntries(KINDS.map(kind => [kind, !isOff && this.way(robot, kind) !== undefined]));
+    const may = robot !== undefined && this.relay.mayCommand(`/robots/${robot.name}/command`), stops = robot !== undefined && this.way(robot, "stop") !== undefined;
+    this.$("stop").hidden = !may && !stops;
+    this.$("stop").disabled = !stops;
+    say(this.$("stop"), stops ? `Stop ${robot.name}` : `${robot?.name ?? ""} takes no stop`);
+    this.$("release").hidden = !isLive || !robot?.status?.stop || !may;
     say(this.$("release"), `Release ${robot?.name ?? ""}`);
     for (const kind of ["goal", "pose", "cancel"]) this.$(kind).hidden = !ways[kind] || !isLive;
     this.drive.offer(ways.drive && isLive && !robot.away ? robot : null);
