@@ -1,4 +1,4 @@
-"""Breaks of a robot's and an operator's link at random moments, for any robot: what it does, and what it must not do."""
+"""Breaks of the links of a robot and an operator at random moments: what any robot does, and what it must not do."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""A robot of ROS behind a link that is cut, for test_cuts.py: runs ``break_story`` on it. Needs what ros_session does."""
+"""A robot of ROS behind a link that is cut, for test_cuts.py: runs ``break_story``. Needs what ros_session does."""
 
 import asyncio
 import json

@@ -3,13 +3,14 @@
 
 import {Cameras} from "./cameras.js";
 import {say, seconds, tint, whenColoursChange} from "./draw.js";
-import {AWAY_MS, Fleet, split, troubles} from "./fleet.js";
+import {AWAY_MS, Fleet, GONE_MS, split, troubles} from "./fleet.js";
 import {Hand} from "./hand.js";
 import {Health} from "./health.js";
 import {Layers} from "./layers.js";
 import {List} from "./list.js";
 import {Map2D} from "./map.js";
 import {DRAWN, HEALTH, json} from "./messages.js";
+import {Near} from "./near.js";
 import {Notices} from "./notices.js";
 import {Overview} from "./overview.js";
 import {Player} from "./player.js";
@@ -75,7 +76,7 @@ const layers = new Layers($("layers"), () => {
   subscribe();
 });
 const map = new Map2D($("map"), layers, name => { location.hash = address(name, tab); });
-const notices = new Notices($("notices"), $("spoken")), overview = new Overview($), health = new Health($);
+const notices = new Notices($("notices"), $("spoken")), near = new Near($("near")), overview = new Overview($), health = new Health($);
 const cameras = new Cameras($("first"), $("cameras"), $("large"));
 const relay = new Relay({
   state(text, isOn) {
@@ -212,6 +213,8 @@ function sayAbsence() {
 
 function sayRobots() {
   const now = relay.clock.now();
+  near.mark(live.all().filter(one => now - one.heardMs < GONE_MS));
+  near.mark(recorded.all());
   for (const [one, ms] of [...live.all().map(one => [one, now]), ...recorded.all().map(one => [one, nowMs()])]) {
     one.away = ms - one.heardMs > AWAY_MS;
     one.troubles = troubles(one, ms);
@@ -224,9 +227,10 @@ function sayRobots() {
 
 // A map has one frame: the chosen robot's. A place without a frame is shown on each.
 function shown() {
-  const all = fleet.all().filter(one => one.isHere || one === robot()), frame = robot()?.pose?.frame || all.find(one => one.pose?.frame)?.pose.frame;
+  const all = fleet.all().filter(one => one.isHere || one.troubles.length || one === robot()), frame = robot()?.pose?.frame || all.find(one => one.pose?.frame)?.pose.frame;
   const here = all.filter(one => !one.pose?.frame || one.pose.frame === frame), away = all.length - here.length;
   say($("frame"), [frame && `in ${frame}`, away && `${away} in other frames`].filter(Boolean).join(", "));
+  $("no-map").hidden = !robot()?.pose || [...robot().layers.values()].some(layer => layer.kind === "grid");
   return {here, frame};
 }
 

@@ -6,7 +6,7 @@ import {address} from "./route.js";
 const MOST = 200;                                   // beyond it refusals and what is over go, the least first; a trouble that lasts never goes
 const CALM_MS = 2000;                               // a screen reader is told of new alerts so often at most
 const REFUSED = 1.5;                                // the rank of a refusal: behind a robot that is silent, before a low battery
-const isNarrow = matchMedia("(max-width: 44rem)");
+const isNarrow = matchMedia("(max-width: 44rem), (max-height: 30rem)");
 
 export class Notices {
   // ``spoken`` is the live region: texts of ``element`` change with each second, so nobody would listen to them.
