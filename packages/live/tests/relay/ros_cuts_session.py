@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
 from break_story import Done, story
 from pose_cases import POSE, message
 from relay_cases import wait
@@ -33,7 +34,7 @@ async def cuts(version: str, folder: Path, count: int, seed: int) -> dict[str, i
         "cmd_vel": lambda said: done.moves(said.linear.x),
     }
     publishers = {"1": node_1, "2": node_2}[version](str(folder), hear)
-    backoff.MOST_S = 0.05
+    pytest.MonkeyPatch().setattr(backoff, "MOST_S", 0.05)  # for as long as this process lives
     async with story(done, goal) as (url, run):
         words = ["relay", "robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
         words += ["--policies", "drop-oldest", "--receive", "goal_pose", "--receive", "cmd_vel"]

@@ -32,8 +32,7 @@ class Watched(MadeUp):
     """A made-up robot without a camera that keeps what it executes."""
 
     def __init__(self, done: Done) -> None:
-        super().__init__()
-        self.streams = tuple(stream for stream in self.streams if stream.topic.name == "odom")
+        super().__init__(0, tuple(stream for stream in MadeUp().streams if stream.topic.name == "odom"))
         self.executed = done
 
     async def on_command(self, command: Any) -> None:
