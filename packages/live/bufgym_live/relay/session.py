@@ -284,7 +284,7 @@ class Session:
         link = self._connection
         if link is None or (unsent := unsent_bytes(link.transport.get_extra_info("socket"))) is None:
             return None
-        return link.transport.get_write_buffer_size() + unsent
+        return unsent + int(link.transport.get_write_buffer_size())
 
     async def _send_no_drop(self) -> None:
         while True:
