@@ -27,6 +27,7 @@ NEEDED = {
     "studies.relay_others": ("mqtt", "mosquitto"),
 }
 ELSEWHERE = {
+    "studies.bounds": "studies/test_bounds.py",
     "studies.causal_planner": "studies/test_causal_planner.py",
     "studies.compiling": "it compiles for minutes",
     "studies.coverage": "studies/test_coverage.py",

@@ -101,7 +101,6 @@ GUIDED = [("fading", "guided"), ("fading", None), ("dying", "guided"), ("interru
         *((case, None, {}) for case in CASES),
         *((case, 4, {}) for case in (*CASES,)[:-1]),
         *((case, None, form) for case in ("fading", "topics") for form in FORMS),
-        *((case, None, {"fields": "rule"}) for case in ("fading", "dying")),
         *((case, None, {"actions": "guided", "fields": fields}) for case, fields in GUIDED),
     ],
 )

@@ -29,8 +29,8 @@ def go(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     goes, transaction, write = threading.Event(), Held._transaction, _Lines.write
 
     @contextlib.contextmanager
-    def stalling(held: Held) -> Iterator[None]:
-        with transaction(held):
+    def stalling(held: Held, **how: bool) -> Iterator[None]:
+        with transaction(held, **how):
             yield
             assert goes.wait(60.0)
 
