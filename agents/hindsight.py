@@ -35,7 +35,7 @@ from agents.hindsight_network import Student, expected
 from agents.hindsight_rows import Lessons, Part, TaughtRows
 from agents.learner import Learner
 from agents.mixed_env import Cell, cells
-from agents.ready_families import FAMILIES
+from agents.ready_families import FAMILIES, STAYING
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Hindsight
 from bufgym.policies import weights
@@ -61,7 +61,7 @@ class School:
 
     def __init__(self, settings: Hindsight, families: int, seconds: float) -> None:
         self.settings, self.longest = settings, seconds
-        self.student = Student(settings.candidates, settings.width)
+        self.student = Student(settings.candidates, settings.width, settings.ruled)
         """The latest weights."""
         average = get_ema_multi_avg_fn(MEAN)  # type: ignore[no-untyped-call]
         self.mean = AveragedModel(self.student, multi_avg_fn=average)
@@ -141,7 +141,9 @@ class HindsightLearner(Learner[Hindsight]):
             return [Part("", Cell("", split_scenario(on)[0], on.capacity), n)]
         found = {name: FAMILIES[name]("train") for name in self.settings.sets.names}
         found |= {s: cells(s, "train", chosen.capacities_of(s), chosen.data) for s in chosen.suite}
-        return [Part(s, cell, math.ceil(n / len(found) / len(own))) for s, own in found.items() for cell in own]
+        return [
+            Part(s, cell, math.ceil(n / len(found) / len(own)), s in STAYING) for s, own in found.items() for cell in own
+        ]
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
         """Train one seed; a resumed one has its state of learning, and begins to collect anew."""
@@ -156,8 +158,8 @@ class HindsightLearner(Learner[Hindsight]):
             school.load(checkpoint)
         # Every session has a seed of its own, by its first step: the episodes before a kill do not come again.
         rng = np.random.default_rng([seed, school.steps])
-        rows = TaughtRows(parts, settings.candidates, rng)
-        lessons = Lessons(len(rows.families), settings.room // len(rows.families), settings.candidates)
+        rows = TaughtRows(parts, settings.candidates, settings.ruled, rng)
+        lessons = Lessons(rows.stays, settings.room // len(rows.families), rows.seen.shape[1], rows.decisions.shape[1])
         curve = Record(home / "curve.csv", ("steps", "seconds", "loss"), school.steps)
         validations = Validations(home, objective.columns, objective.best, settings, school.steps)
         bar = seed_bar(settings.steps, school.steps, seed, line)
