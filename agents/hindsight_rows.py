@@ -151,7 +151,7 @@ class Lessons:
         self.room, self.stays, self.counts = room, stays, np.zeros(len(stays), np.int64)
         self._seen = torch.zeros(len(stays) * room, numbers)
         self._cost = torch.zeros(len(stays) * room, actions)
-        self._of_rule, self._met = np.zeros(families), np.zeros(families)
+        self._of_rule, self._met = np.zeros(len(stays)), np.zeros(len(stays))
 
     def add(self, lesson: Lesson, family: NDArray[np.int64], rng: np.random.Generator) -> None:
         """Keep these, with the number of each row's family, where action 0 and another one are offered."""
