@@ -178,6 +178,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
         pytest("compiled", folder, *others, *add, environment=cov, limit_s=40 * MINUTE),
         pytest("servers", folder, *servers, *add, environment=cov, limit_s=20 * MINUTE),
         Stage("coverage", report, environment=measured(folder)),
+        Stage("rclcpp", [PYTHON, ".ci/rclcpp.py", "-q", f"--junitxml={folder}/rclcpp.xml"], limit_s=30 * MINUTE),
         pytest("all uncompiled", folder, *plain, compiled=False, limit_s=25 * MINUTE),
         pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
         Stage("claims", [*make, "claims", f"DATA={DATA}"], limit_s=30 * MINUTE, unless=recordings),

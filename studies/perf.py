@@ -32,6 +32,9 @@ from bufgym import scenario as scenarios
 from bufgym.cli.options import Count
 from bufgym.envs import SenderVectorEnv, expert
 from bufgym.jit import JIT
+from bufgym.model.topics import Topic
+from bufgym.scenario.client import Client, Stream
+from bufgym.scenario.draws import shipped
 from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 from bufgym.utils.errors import BufgymError
@@ -42,11 +45,14 @@ from studies.page import command
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"
+SCHEDULER = "learned-scheduler"
 POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")
 NATIVE = "vector_entry_point"
 SEED = 1
 NAMED = ["rank", "loss", "occupancy", "rate_long"]
 """Fields that a batch names: two for each slot, one of the context's and one outside the tables."""
+BUSY, CROWDS = 8, (8, 256)
+"""Topics that publish 8 messages a second each, and topics in all: the others publish once an episode."""
 LABELLED = 64
 """Environments side by side whose decisions the clairvoyant labels."""
 FELL, BEFORE = 0.15, 5  # A ratio fell if it is lower by more than this share than the median of so many runs before
@@ -173,6 +179,13 @@ def _batches(meter: _Meter) -> Iterator[Measurement]:
     yield figure(ENVIRONMENTS[0], largest, " of slots with four named fields", fields=NAMED, actions="slots")
     yield figure(ENVIRONMENTS[0], largest, " with four named fields", fields=NAMED)
     yield figure(ENVIRONMENTS[0], max(sizes.batches), " on 2 threads", time.perf_counter, num_threads=2)
+    yield from (figure(TOPICS, min(sizes.batches), f" of {k} topics", scenario=crowd(k)) for k in CROWDS)
+
+
+def crowd(topics: int) -> Client:
+    """A client of so many topics, of which ``BUSY`` publish nearly everything: the same messages wait in all."""
+    streams = [Stream(Topic(f"{k}", 1.0 + k % 3), 8.0 if k < BUSY else 1e-3, 60_000) for k in range(topics)]
+    return Client(tuple(streams), shipped()["traces"], scale=0.5)
 
 
 def _singles(meter: _Meter) -> Iterator[Measurement]:
@@ -188,18 +201,28 @@ def _singles(meter: _Meter) -> Iterator[Measurement]:
 
 
 def _rollouts(meter: _Meter) -> Iterator[Measurement]:
-    scenario, capacity = scenarios.get("lte"), meter.sizes.capacity
-    episodes = [draw(scenario, seed) for seed in range(meter.sizes.episodes)]
+    sizes = meter.sizes
+    yield from _rolled(meter, "scenario lte", scenarios.get("lte"), sizes.episodes, sizes.capacity, POLICIES)
+    for topics in CROWDS:
+        what = f"{topics} topics"
+        yield from _rolled(meter, what, crowd(topics), -(-sizes.episodes // 50), sizes.topic_slots, [SCHEDULER])
+
+
+def _rolled(
+    meter: _Meter, what: str, scenario: Any, count: int, capacity: int, names: Sequence[str]
+) -> Iterator[Measurement]:
+    episodes = [draw(scenario, seed) for seed in range(count)]
     arrivals = sum(len(episode.arrivals) for episode in episodes)
-    senders = Senders(len(episodes), capacity, scenario.value, max_messages=scenario.max_messages)
-    about = f"arrivals a second of Senders.run, {len(episodes)} episodes of scenario lte, L = {capacity};"
+    senders = Senders(count, capacity, scenario.value, max_messages=scenario.max_messages, topics=scenario.topics)
+    about = f"arrivals a second of Senders.run, {count} episodes of {what}, L = {capacity};"
     about += " drawing, loading and scoring them not in the time"
     load = partial(senders.load_all, [(i, episode, None) for i, episode in enumerate(episodes)])
-    for name in POLICIES:
+    for name in names:
         run = partial(senders.run, policies.get(name))
         load()
         run()  # compiled, or loaded from disk, before the clock starts
-        yield meter.figure(f"rollout, {name}", about, arrivals, "arrivals", load, run)
+        title = f"rollout, {name}" if names is POLICIES else f"rollout, {name}, {what}"
+        yield meter.figure(title, about, arrivals, "arrivals", load, run)
 
 
 def _labels(meter: _Meter) -> Measurement:

@@ -25,7 +25,7 @@ from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.scenario import Client, suites
 from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
-from bufgym.sim.rules import age_until
+from bufgym.sim.rules import age_topic_until
 from bufgym.utils import files
 from bufgym.utils.errors import BufgymError
 
@@ -93,7 +93,7 @@ class ClientEpisodes:
         batch, count = self._senders.batch, len(self.client.topics)
         for i in range(len(self.episodes)):
             for k in range(count):
-                age_until(batch, i, k, FOREVER)
+                age_topic_until(batch, i, k, FOREVER)
         topics = np.asarray(batch.topics)[:, :count]
         qoi = batch.senders["delivered_gain"].sum() + ((topics["received"] > 0) * topics["weight"]).sum()
         dropped = np.asarray(batch.log["dropped_us"]) >= 0

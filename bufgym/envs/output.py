@@ -77,8 +77,7 @@ def settle_gains(batch: Batch, i: int, ended: bool) -> None:
         # Messages that a dead link never carried were not retained after all.
         sender.retained_gain = sender.delivered_gain
     if batch.several is not None:
-        for topic in range(sender.topics):
-            age_until(batch, i, topic, until_us)
+        age_until(batch, i, until_us)
 
 
 @kernel
@@ -98,13 +97,8 @@ def write_rewards(batch: Batch, i: int, begins: bool, rewarded: NDArray[np.float
     rewarded[i, DELIVERED] = sender.delivered_gain
     rewarded[i, RETAINED] = sender.retained_gain
     if batch.several is not None:
-        weight = 0.0
-        for topic in range(sender.topics):
-            weight += batch.topics[i, topic].weight
-        # If all topics have weight 0, nothing is rewarded, and any divisor will do.
-        weight = weight if weight > 0 else 1.0
-        terms[i, AGE] = (rewarded[i, AGE] - sender.aged) / weight
-        terms[i, LATE] = (rewarded[i, LATE] - sender.late) / weight
+        terms[i, AGE] = (rewarded[i, AGE] - sender.aged) / sender.weight
+        terms[i, LATE] = (rewarded[i, LATE] - sender.late) / sender.weight
         rewarded[i, AGE], rewarded[i, LATE] = sender.aged, sender.late
     for k in range(len(output.weights)):
         output.rewards[i] += output.weights[k] * terms[i, k]
@@ -117,10 +111,7 @@ def delivered_qoi(batch: Batch, i: int) -> float:
     # The 1 in H = 1 + sum of V, for each topic with a delivery.
     ones = 1.0 if sender.credited > 0 else 0.0
     if batch.several is not None:
-        ones = 0.0
-        for topic in range(sender.topics):
-            if batch.topics[i, topic].received > 0:
-                ones += batch.topics[i, topic].weight
+        ones = sender.heard
     return float(ones + sender.delivered_gain)
 
 

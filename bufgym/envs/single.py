@@ -116,9 +116,10 @@ class SenderEnv(gym.Env[Observation, np.int64]):
       ``action_mask``). A "flat" observation is always nested, by True as for "pettingzoo".
     - ``mask_dtype``: "int8" or "bool", of the mask in observations; in ``info`` it is int8, which Gymnasium samples by.
     - ``render_mode``: "ansi", "rgb_array", or "human" for a window that shows each step (extra ``human``).
-    - ``bound``: whether the last ``info`` also has ``clairvoyant``, ``regret`` and ``score``, for one queue only. The
-      clairvoyant is the best H or an upper bound of it. The score is 0 for Drop Oldest and 1 for the clairvoyant, NaN
-      where they are equal. Computing them takes a tenth of a second after a long episode.
+    - ``bound``: whether the last ``info`` also has ``clairvoyant``, ``certified``, ``regret`` and ``score``, for one
+      queue only. The clairvoyant is the best H where ``certified`` is 1, otherwise an upper bound of it. The score is 0
+      for Drop Oldest and 1 for the clairvoyant, NaN where they are equal. Computing them takes a tenth of a second
+      after a long episode.
     - ``pool``: take every episode from a fixed set of so many, each drawn once, instead of drawing a new one at each
       reset. The set, a ``bufgym.scenario.numbered.Pool``, is the same for every seed. None for no pool.
     - any further argument replaces a parameter of the scenario (``t_max=100``). It is an object or the text that the
@@ -201,7 +202,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             return None
         from bufgym.envs import render  # loaded only to draw
 
-        drawn = render.draw(self.rows.senders, 0, self.render_mode)
+        drawn = render.draw(self.rows.senders, 0, self.render_mode, self.rows.output.slot_actions[0])
         return drawn if self._window is None else self._window.show([drawn], self.metadata["render_fps"])
 
     def close(self) -> None:

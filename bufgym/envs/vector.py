@@ -172,7 +172,9 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         from bufgym.envs import render  # loaded only to draw
 
         shown = self.num_envs if self._window is None else min(self.num_envs, render.MOST)
-        drawn = tuple(render.draw(self.rows.senders, i, self.render_mode) for i in range(shown))
+        drawn = tuple(
+            render.draw(self.rows.senders, i, self.render_mode, self.rows.output.slot_actions[i]) for i in range(shown)
+        )
         return drawn if self._window is None else self._window.show(drawn, self.metadata["render_fps"])
 
     def close_extras(self, **_: Any) -> None:

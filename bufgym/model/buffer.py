@@ -38,6 +38,8 @@ TOPIC = np.dtype(
         ("no_drop", np.int64),  # 1: may not be dropped
         ("deadline_us", np.int64),  # a message is late when it is older than this at the server
         ("v_start", np.int64),  # where the topic's V begins in the array of all V
+        ("highest_priority", np.float64),  # the highest priority and
+        ("largest_weight", np.float64),  # the largest weight of all topics, in every row
         # the topic's past, as the sender knows it
         ("queued", np.int64),  # messages in the buffer
         ("arrived", np.int64),
@@ -55,8 +57,6 @@ TOPIC = np.dtype(
         ("newest_us", np.int64),  # arrival time of the newest received
         ("aged_us", np.int64),  # time up to which the topic's age has been counted
         ("aged", np.float64),  # its age, integrated over that time, s^2
-        # scratch of kernels that walk along the queue
-        ("mark", np.int64),
     ],
     align=True,
 )

@@ -126,6 +126,7 @@ def topic_table(topics: Sequence[Topic], capacity: int, v: Value) -> tuple[NDArr
             row["deadline_us"] = round(topic.deadline_s * 1e6)
     if topics:
         table["priority"][len(topics) :] = table["weight"][len(topics) :] = 0.0  # the companion weighs nothing
+    table["highest_priority"], table["largest_weight"] = table["priority"].max(), table["weight"].max()
     values = v.array if len(arrays) == 1 else np.concatenate(arrays)
     values.flags.writeable = False
     return table, values

@@ -15,7 +15,7 @@ BASELINE = "drop-oldest"
 
 TIE = 1e-9  # Relative difference up to which two H are equal: they sum the same gaps in another order
 
-MEASURED = ("clairvoyant", "regret", "score")  # The entries of ``measured``
+MEASURED = ("clairvoyant", "certified", "regret", "score")  # The entries of ``measured``
 
 
 def regret(h: float, most: float) -> float:
@@ -35,12 +35,13 @@ def normalised_score(h: Any, base: Any, best: Any) -> Any:
 def measured(senders: Senders, i: int, h: float) -> dict[str, float]:
     """Rate ``h`` on the episode of sender ``i``, of one queue; this takes a tenth of a second on long episodes.
 
-    ``clairvoyant`` is the best H or an upper bound of it (see ``Plan``).
+    ``clairvoyant`` is the best H; where ``certified`` is 0, it is an upper bound of it (see ``Plan``).
     """
     episode, v, capacity = senders.episodes[i], senders.value_of(i), senders.capacity
     assert episode is not None
     most_bytes = None if senders.max_bytes >= UNLIMITED_BYTES else senders.max_bytes
-    best = clairvoyant(episode, capacity, v, max_bytes=most_bytes).qoi
+    plan = clairvoyant(episode, capacity, v, max_bytes=most_bytes)
+    best = plan.qoi
     rolled = run(policies.get(BASELINE), [episode], capacity, v, max_bytes=most_bytes, decide_at=senders.decide_at)
     score = float(normalised_score(h, outcome(rolled, 0).qoi, best))
-    return {"clairvoyant": best, "regret": regret(h, best), "score": score}
+    return {"clairvoyant": best, "certified": float(plan.certified), "regret": regret(h, best), "score": score}

@@ -34,8 +34,14 @@ class Messages(NamedTuple):
         return max(0, int((self.limit + self.size).max()))
 
     def grid(self, steps: int) -> int:
-        """Bytes to a grid step, see ``new_problem``."""
-        return max(1, int(self.size.mean()) // steps, self.reach * len(self.c) // MAX_CELLS)
+        """Bytes to a grid step, see ``new_problem``; a whole number of them makes a mean message.
+
+        Ends are rounded down to the grid: what is left of each message would add up over all that wait, and the bound
+        would be far from the best.
+        """
+        mean = int(self.size.mean())
+        grid = max(1, mean // steps, self.reach * len(self.c) // MAX_CELLS)
+        return mean // (mean // grid) if grid < mean else grid
 
 
 class Problem(NamedTuple):

@@ -101,12 +101,10 @@ def own_rollout(functions: Any, hears_departures: bool) -> Any:
 def python_view(batch: Batch, i: int) -> Buffer:
     """Make a ``view`` for Python over a ``named`` batch: the compiled kernel must not hand its arrays to Python.
 
-    It is read-only. Kernels keep marks in the rows of several topics, so these rows are a copy.
+    It is read-only.
     """
     buffer: Buffer = _view(batch, i)
     buffer.slots.flags.writeable = False
-    if len(buffer.topics) > 1:
-        return buffer._replace(topics=buffer.topics.copy())
     buffer.topics.flags.writeable = False
     return buffer
 

@@ -42,6 +42,7 @@ def arrived_on_topic(batch: Batch, i: int, message: Any, enqueued: bool) -> None
     else:
         topic.step_us, topic.step_x = 0, 0.0
         topic.aged_us, topic.newest_us = message.arrival_us, message.arrival_us
+        begin_ageing(batch, i, topic.weight, message.arrival_us)
     if enqueued:
         if topic.dequeued + topic.queued == 0:
             # until one is sent, spacing counts from here
@@ -65,30 +66,61 @@ def dequeued_on_topic(batch: Batch, i: int, message: Any) -> None:
 @kernel
 def received_on_topic(batch: Batch, i: int, message: Any, received_us: int) -> None:
     """Record that ``message`` has reached the server: its topic is younger again, and it may be late."""
-    age_until(batch, i, message.topic, received_us)
-    topic = unchecked_at(batch.topics, i, message.topic)
+    age_until(batch, i, received_us)
+    age_topic_until(batch, i, message.topic, received_us)
+    topic, sender = unchecked_at(batch.topics, i, message.topic), batch.senders[i]
+    if topic.received == 0:
+        sender.heard += topic.weight
     topic.received += 1
+    sender.newest_s += topic.weight * max(message.arrival_us - topic.newest_us, 0) / 1e6
     topic.newest_us = max(topic.newest_us, message.arrival_us)
     if received_us - message.arrival_us > topic.deadline_us:
-        batch.senders[i].late += topic.weight
+        sender.late += topic.weight
 
 
 @kernel
-def age_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
-    """Count the age of a topic's information at the server up to ``until_us``, times its weight.
+def begin_ageing(batch: Batch, i: int, weight: float, at_us: int) -> None:
+    """Let the age of one more topic's information count from ``at_us`` on, the topic's first arrival."""
+    sender = batch.senders[i]
+    sender.ageing += weight
+    sender.newest_s += weight * at_us / 1e6
+    # ``age_until`` goes on from ``aged_us``, and would count the time until then as an age below 0.
+    sender.aged += weight * ((at_us - sender.aged_us) / 1e6) ** 2 / 2
 
-    Counting begins with the topic's first arrival and ends with the episode's last, whatever a policy does.
+
+@kernel
+def age_until(batch: Batch, i: int, until_us: int) -> None:
+    """Count the ages of all topics' information at the server up to ``until_us``, each times its weight.
+
+    A topic's age at time t is t minus a constant, so all of them together are ``ageing`` x t - ``newest_s``, however
+    many topics there are. Counting begins with a topic's first arrival and ends with the episode's last, whatever a
+    policy does.
     """
     sender = batch.senders[i]
+    until_us = counted_until(batch, i, until_us)
+    if until_us > sender.aged_us:
+        from_s, until_s = sender.aged_us / 1e6, until_us / 1e6
+        sender.aged += (until_s - from_s) * ((from_s + until_s) / 2 * sender.ageing - sender.newest_s)
+        sender.aged_us = until_us
+
+
+@kernel
+def counted_until(batch: Batch, i: int, until_us: int) -> int:
+    """``until_us``, but no later than the episode's last arrival.
+
+    Otherwise a policy that keeps the link busy for longer would pay for a longer time.
+    """
+    return int(min(until_us, unchecked_at(batch.arrivals, i, batch.senders[i].arrivals - 1).arrival_us))
+
+
+@kernel
+def age_topic_until(batch: Batch, i: int, topic: int, until_us: int) -> None:
+    """Count the age of one topic's information as ``age_until`` does for all of them together, without its weight."""
     rules = unchecked_at(batch.topics, i, topic)
-    # Else a policy that keeps the link busy for longer would pay for a longer time.
-    until_us = min(until_us, unchecked_at(batch.arrivals, i, sender.arrivals - 1).arrival_us)
-    if rules.arrived == 0 or until_us <= rules.aged_us:
-        return
-    area = age_between(rules.newest_us, rules.aged_us, until_us)
-    rules.aged += area
-    sender.aged += rules.weight * area
-    rules.aged_us = until_us
+    until_us = counted_until(batch, i, until_us)
+    if rules.arrived > 0 and until_us > rules.aged_us:
+        rules.aged += age_between(rules.newest_us, rules.aged_us, until_us)
+        rules.aged_us = until_us
 
 
 @kernel

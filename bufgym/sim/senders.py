@@ -74,8 +74,8 @@ class Senders:
         self._rules = self.topic_table.view(np.int64)
         when_full = int(decide_at == "overflow")
         limits = {"capacity": self.capacity, "max_bytes": self.max_bytes, "topics": len(self.topic_table)}
-        screens = int(when_full or self.max_bytes < UNLIMITED_BYTES)
-        self._beginning = beginning(ask_when_full=when_full, screens=screens, **limits)
+        screens, weight = int(when_full or self.max_bytes < UNLIMITED_BYTES), sum(self.topic_table["weight"].tolist())
+        self._beginning = beginning(ask_when_full=when_full, screens=screens, weight=weight or 1.0, **limits)
 
     def __len__(self) -> int:
         return len(self.episodes)

@@ -39,6 +39,7 @@ SENDER = np.dtype(
         ("shows_left", np.int64),  # 1: the bytes left in the socket are shown; 0: nobody reads them
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
+        ("weight", np.float64),  # sum of the weights of all topics; 1 if that is 0, as it divides
         ("limit_at_send", np.int64),  # 1: rate limits hold back at the socket, 0: they drop at arrival
         ("limit_since_sent", np.int64),  # 1: at arrival they count from the message sent last, 0: kept last
         ("flush_no_drop", np.int64),  # 1: no_drop messages are sent even when the window is full
@@ -110,6 +111,10 @@ SENDER = np.dtype(
         ("delivered_gain", np.float64),  # sum of V over what reached the server
         ("retained_gain", np.float64),  # sum of V over what is kept or sent
         ("aged", np.float64),  # weight x age of information at the server, integrated over time, s^2
+        ("aged_us", np.int64),  # time up to which this has been counted
+        ("ageing", np.float64),  # sum of the weights of topics with an arrival: their age counts
+        ("newest_s", np.float64),  # sum of weight x arrival time of the topic's newest message at the server, s
+        ("heard", np.float64),  # sum of the weights of topics with a message at the server
         ("late", np.float64),  # sum of weights of messages that came later than their deadline
     ],
     align=True,
@@ -181,7 +186,7 @@ def batch_type(several: bool) -> Any:
     return cast(Any, numba).typeof(new_batch(1, 1, 1, 2 if several else 1, exponential().array))
 
 
-def beginning(**settings: int) -> NDArray[np.int64]:
+def beginning(**settings: float) -> NDArray[np.int64]:
     """int64[fields]: SENDER at the beginning of an episode, as whole words: empty buffer, idle socket, nothing arrived.
 
     NumPy copies records field by field; it copies words five times as fast.

@@ -17,7 +17,7 @@ from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
-from bufgym.oracle import beam, cached, clairvoyant, integer, labels, pieces, programme
+from bufgym.oracle import beam, cached, clairvoyant, integer, labels, pieces, programme, unequal
 from bufgym.oracle.clairvoyant import Plan
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.scenario.numbered import draw
@@ -202,6 +202,24 @@ def test_bounds_coarse_grids_and_little_room_lose_nothing(module, setting, numbe
     best = [without_bounds(*problem) for problem in problems]
     monkeypatch.setattr(module, setting, number)
     assert [labels.best(problem)[1] for problem in problems] == pytest.approx(best, abs=EXACT)
+
+
+@kernels
+def test_a_coarse_grid_still_divides_a_message():
+    """Forty messages of 1,000 bytes at once, L = 30, and cells for 29 steps each: 31,000 bytes x 40 / 3,500 = 354.
+
+    At 354 bytes a step, a message is 2 steps and 292 bytes, and the bound forgets these bytes of each that waits: it
+    lets messages wait that find no room. At 500 bytes it is exactly 2 steps, and the bound is the best gain itself.
+    """
+    c, size, limit = np.zeros(40, np.int64), np.full(40, 1_000), np.full(40, 30_000)
+    crowd = programme.Messages(c, size, limit, np.arange(40.0), V.array, 20_000)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(programme, "MAX_CELLS", 3_500)
+        assert crowd.grid(16) == 500
+        problem = programme.new_problem(crowd, limit, 16)
+        unequal.priced(problem, np.zeros((2, 40)), 1, 1)
+        assert pieces.most_from(problem, 40) == pytest.approx(labels.best(crowd)[1], abs=EXACT)
+    assert crowd.grid(16) == 1_000 // 16
 
 
 @kernels

@@ -12,17 +12,20 @@ from hypothesis import strategies as st
 from topic_cases import topic_cases
 
 from bufgym import jit, policies, sim
+from bufgym.envs import SenderEnv
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, arrival_gain, before, gaps, is_first, loss, motion_gaps
 from bufgym.model.buffer import after as slot_after
 from bufgym.model.link import FOREVER
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import ClientSettings
+from bufgym.scenario.client import Client, Stream
 from bufgym.sim import decisions
 from bufgym.sim.rollout import python_view
-from bufgym.sim.rules import age_until
+from bufgym.sim.rules import age_topic_until, age_until
 from bufgym.sim.socket import credit
 from bufgym.sim.state import DECISION, DEQUEUE, END, NEVER, SEND
 from bufgym.sim.transition import next_event
+from bufgym.traces import Trace
 
 kernels = pytest.mark.kernels
 
@@ -51,8 +54,9 @@ def test_agrees_with_reference_event_by_event(case):
     agree_on_log(senders, reference)
     until = int(senders.batch.senders[0]["now_us"]) + 5_000
     credit(senders.batch, 0, until)
+    age_until(senders.batch, 0, until)
     for k in range(len(case.topics)):
-        age_until(senders.batch, 0, k, until)
+        age_topic_until(senders.batch, 0, k, until)
     agree(senders, reference, until, to_the_end=True)
 
 
@@ -80,7 +84,12 @@ def agree(senders, reference, until=None, to_the_end=False):
         assert slot["gain"] == pytest.approx(gain, abs=1e-12)
     if reference.one_queue:
         return
-    assert sender["aged"] == pytest.approx(reference.aged(until, to_the_end), rel=1e-9, abs=1e-12)
+    topics, aged = np.asarray(batch.topics[0]), reference.aged(until, to_the_end)
+    assert (topics["weight"] * topics["aged"]).sum() == pytest.approx(aged, rel=1e-9, abs=1e-12)
+    if to_the_end:  # all topics at once say the same as topic by topic
+        assert sender["aged"] == pytest.approx(aged, rel=1e-9, abs=1e-9)
+    heard = sum(rules.weight for k, rules in enumerate(reference.rules) if reference.received(k, until))
+    assert sender["heard"] == pytest.approx(heard)
     assert sender["late"] == pytest.approx(reference.late(until))
     for k, row in enumerate(np.asarray(batch.topics[0])[: len(reference.rules)]):
         counted = reference.queues[k], reference.arrived[k], reference.sent[k], reference.received(k, until)
@@ -289,3 +298,22 @@ def test_every_policy_runs_on_topics_and_nothing_is_lost(name, case):
         assert rows["dropped_us"][lost] == at_us  # rejected when it came: no_drop is never evicted
         later = [(rows[field] == NEVER) | (rows[field] > at_us) for field in ("dequeued_us", "dropped_us")]
         assert not (free & later[0] & later[1])[:lost].any()
+
+
+@kernels
+def test_a_step_reads_no_topic_that_has_had_no_message():
+    """Rules that are no numbers would be in the reward, H and the observation, were they read."""
+    streams = [Stream(Topic(name), hz, 40_000) for name, hz in (("a", 20.0), ("b", 10.0), ("silent", 0.1))]
+    env = SenderEnv(Client(tuple(streams), (Trace.constant(1e6, 10),), duration_s=10.0), 4, observation="flat")
+    _, info = env.reset(seed=4)
+    arrivals, batch = env.rows.senders.episodes[0].arrivals, env.rows.senders.batch
+    begins = int(np.flatnonzero(arrivals["topic"] == 2)[0])
+    assert begins > 60
+    for name in ("priority", "weight", "aged"):
+        batch.topics[name][0, 2] = np.nan
+    steps = 0
+    while batch.senders["next"][0] < begins - 1:
+        seen, reward, *_, info = env.step(int(np.flatnonzero(info["action_mask"])[-1]))
+        assert np.isfinite([*seen, reward, info["qoi"], *info["reward_terms"].values()]).all()
+        steps += 1
+    assert steps > 60

@@ -173,6 +173,7 @@ def test_the_bound_worked_by_hand(T: int, action: int, h: float, best: float, sc
         assert ended or "score" not in info
         first = False
     found = [info[name] for name in ("qoi", "clairvoyant", "regret", "score")]
+    assert info["certified"] == 1
     assert found == pytest.approx([h, best, 1 - h / best, score], nan_ok=True)
 
 

@@ -33,6 +33,17 @@ def test_a_frame_of_text_by_hand() -> None:
     assert [line.split()[1:] for line in rest[:3]] == [["______██"], ["●·●●···●"], [*"●__"]]
 
 
+def test_a_frame_says_what_each_action_drops() -> None:
+    """T = 6, L = 2, all gaps are 1: dropping 1, 2 or the newcomer leaves a gap of 2, and ties go to the older."""
+    env = SenderEnv(Interruption(law="fixed", t_max=6), 2, render_mode="ansi", candidates=3)
+    assert env.reset(seed=0)[1]["slots"].tolist() == [0, 1, 2, 0]
+    actions = "0 drops slot 0, 1 drops slot 1, 2 rejects the newcomer"
+    assert f"actions   {actions}" in env.render()
+    asked_always = SenderEnv(Interruption(law="fixed", t_max=6), 2, render_mode="ansi", decide_at="arrival")
+    asked_always.reset(seed=0)
+    assert "0 accepts the newcomer" in asked_always.render()
+
+
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
 def test_every_environment_draws_itself_in_both_modes(env_id: str) -> None:
     smaller = SMALL[env_id] | {"actions": "slots"} | ({"law": "fixed"} if "Interruption" in env_id else {})

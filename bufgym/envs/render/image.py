@@ -7,7 +7,18 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.render.scene import DROPPED, NEWCOMER, QUEUED, SENDING, STATES, Scene, letter, link_rates, scene_of
+from bufgym.envs.render.scene import (
+    DROPPED,
+    NEWCOMER,
+    NO_ACTIONS,
+    QUEUED,
+    SENDING,
+    STATES,
+    Scene,
+    letter,
+    link_rates,
+    scene_of,
+)
 from bufgym.sim import Senders
 from bufgym.utils.errors import install
 
@@ -21,13 +32,15 @@ _MOST_BOXES = 64  # Largest L for which every slot is drawn as a box; above it, 
 _MOST_NAMES = 24  # Most lanes with room for their topics' names
 
 
-def rgb_array(senders: Senders, i: int) -> NDArray[np.uint8]:
+def rgb_array(senders: Senders, i: int, slot_actions: NDArray[np.int64] = NO_ACTIONS) -> NDArray[np.uint8]:
     """Sender ``i`` as an image uint8[400, 800, 3]: link capacity, messages by state over time, and the slots.
+
+    A slot has the number of the action that drops it, if ``slot_actions`` has one.
 
     Raises ResetNeeded without an episode, DependencyNotInstalled without matplotlib (the extra ``plot``).
     """
     figure, canvas = canvas_of()
-    scene = scene_of(senders, i)
+    scene = scene_of(senders, i, slot_actions)
     ratios = (2, 4.2, 0.9) if scene.topics else (3, 3, 1.1)
     link, timeline, slots = figure.subplots(
         3, 1, height_ratios=ratios, gridspec_kw={"left": 0.155, "right": 0.985, "top": 0.93, "bottom": 0.03}
@@ -178,4 +191,11 @@ def _draw_slots(axes: Any, scene: Scene) -> None:
     if scene.topics:
         axes.text(L + 0.95, 0.0, scene.question, ha="right", va="top", fontsize=8, color="#555555")
     elif scene.newcomers and L <= 16:
-        text(L + 0.95, "new", "white", 8)
+        rejects = f", {scene.actions[L]}" if L in scene.actions else ""
+        text(L + 0.95, f"new{rejects}", "white", 8)
+    for slot, action in scene.actions.items():
+        if slot < L <= 32:
+            text(slot + 0.55, f"{action}", "white", 9 if L <= 16 else 6)
+    if scene.actions:
+        accepts = f"; {scene.actions[L + 1]} accepts the newcomer" if L + 1 in scene.actions else ""
+        axes.text(L + 1.3, 0.0, f"numbers: actions{accepts}", ha="right", va="top", fontsize=8, color="#555555")

@@ -12,6 +12,7 @@ from bufgym.sim import Senders
 from bufgym.sim.state import ARRIVAL_WAITS, SOCKET_WAITS
 
 DELIVERED, SENDING, QUEUED, DROPPED, NEWCOMER = range(5)  # States of a message
+NO_ACTIONS: NDArray[np.int64] = np.zeros(0, np.int64)
 STATES = ("delivered", "in transmission", "queued", "dropped", "newcomer")
 
 
@@ -30,6 +31,8 @@ class Scene(NamedTuple):
         qoi: H of the messages delivered so far.
         topics: names of the topics; empty for one queue.
         question: who asks for a decision; empty for one queue, or if nobody asks.
+        actions: slot -> the action that drops it, L for the newcomer and L + 1 for accepting it; of several actions the
+            first. Empty where actions are slots, or if no arrival asks.
     """
 
     now_us: int
@@ -43,6 +46,7 @@ class Scene(NamedTuple):
     qoi: float
     topics: tuple[str, ...]
     question: str
+    actions: dict[int, int]
 
     @property
     def newcomers(self) -> list[int]:
@@ -64,7 +68,7 @@ def letter(topic: int) -> str:
     return string.ascii_letters[topic % 52]
 
 
-def scene_of(senders: Senders, i: int) -> Scene:
+def scene_of(senders: Senders, i: int, slot_actions: NDArray[np.int64] = NO_ACTIONS) -> Scene:
     """The scene of sender ``i``; ResetNeeded if it has no episode."""
     episode = senders.episodes[i]
     if episode is None:
@@ -94,6 +98,7 @@ def scene_of(senders: Senders, i: int) -> Scene:
         qoi=delivered_qoi(senders.batch, i),
         topics=tuple(topic.name for topic in senders.topics),
         question=questions.get(waiting, ""),
+        actions={int(slot_actions[a]): a for a in reversed(range(len(slot_actions))) if waiting == ARRIVAL_WAITS},
     )
 
 

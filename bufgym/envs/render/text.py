@@ -2,11 +2,14 @@
 
 import bisect
 import itertools
+import operator
+import textwrap
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bufgym.envs.render.scene import NEWCOMER, QUEUED, STATES, Scene, letter, link_rates, scene_of
+from bufgym.envs.render.scene import NEWCOMER, NO_ACTIONS, QUEUED, STATES, Scene, letter, link_rates, scene_of
 from bufgym.sim import Senders
 
 _MARKS = "●▶■·?"  # The character of each state
@@ -18,14 +21,14 @@ _LABEL, _TOPIC_LABEL = 10, 16  # Columns of a line's label, and of a label that 
 _WIDTH = 100  # Columns of the picture
 
 
-def ansi(senders: Senders, i: int) -> str:
+def ansi(senders: Senders, i: int, slot_actions: NDArray[np.int64] = NO_ACTIONS) -> str:
     """Sender ``i`` as lines of text: counts, link capacity, messages, queue, legend.
 
     One column of capacity and messages is one arrival: its mark below, and above it the link's mean capacity until the
     next arrival. The latest arrivals are shown, as many as fit. With several topics each has a line of messages, and
-    the queue is a row of their letters.
+    the queue is a row of their letters. A line says what ``slot_actions`` drop.
     """
-    scene = scene_of(senders, i)
+    scene = scene_of(senders, i, slot_actions)
     label = _TOPIC_LABEL if scene.topics else _LABEL
     latest = slice(max(0, len(scene.states) - (_WIDTH - label)), None)
     counts = scene.counts
@@ -37,6 +40,7 @@ def ansi(senders: Senders, i: int) -> str:
         "capacity".ljust(label) + _capacity_line(senders, i, scene, latest),
         *_message_lines(scene, latest, label),
         "queue".ljust(label) + (_topic_queue_line if scene.topics else _queue_line)(scene, _WIDTH - label),
+        *(["actions".ljust(label) + _actions_line(scene, _WIDTH - label)] if scene.actions else []),
         " " * _LABEL + legend + (f"  {scene.question}" if scene.topics else f"  {_painted([(_RED, '9')])} missing"),
     ]
     if scene.demand > 0:
@@ -107,6 +111,17 @@ def _queue_line(scene: Scene, columns: int) -> str:
         marks.append(_mark(QUEUED if queued else NEWCOMER))
     slots += [(_PLAIN, "_")] * (scene.capacity - len(scene.queue))
     return _fitted(slots, last, columns)
+
+
+def _actions_line(scene: Scene, columns: int) -> str:
+    """What each action of candidates does, as far as it fits."""
+    L = scene.capacity
+    does = {L: "rejects the newcomer", L + 1: "accepts the newcomer"}
+    words = [f"{a} {does.get(slot, f'drops slot {slot}')}" for slot, a in sorted(scene.actions.items(), key=_second)]
+    return textwrap.shorten(", ".join(words), columns, placeholder=" ...")
+
+
+_second = operator.itemgetter(1)
 
 
 def _fitted(marks: list[tuple[str, str]], last: list[tuple[str, str]], columns: int) -> str:

@@ -70,11 +70,7 @@ _write_context = writer(TOPIC_CONTEXT_FIELDS, "buffer, arriving", first=len(CONT
 @kernel
 def largest(buffer: Buffer) -> tuple[float, float]:
     """The highest priority and the largest weight of all topics, to divide by."""
-    priority, weight = TINY, TINY
-    for k in range(len(buffer.topics)):
-        priority = max(priority, buffer.topics[k].priority)
-        weight = max(weight, buffer.topics[k].weight)
-    return priority, weight
+    return max(TINY, buffer.topics[0].highest_priority), max(TINY, buffer.topics[0].largest_weight)
 
 
 @kernel

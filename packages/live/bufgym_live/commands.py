@@ -24,4 +24,4 @@ RELAY: Any = (
     "A server for fleets: robots and viewers meet there.",
     {name: f"{_RELAY}:{name}" for name in ("serve", "robot", "foxglove")},
 )
-EXPORT = f"{_ROBOT}.c.commands:export"
+EXPORT = f"{_ROBOT}.export:export"

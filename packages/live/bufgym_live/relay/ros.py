@@ -5,7 +5,10 @@ the robot was told to receive that topic.
 """
 
 import asyncio
+import functools
 import struct
+import time
+from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
@@ -15,7 +18,8 @@ from bufgym_live.relay import ros_messages, wire
 from bufgym_live.relay.robot import Robot
 from bufgym_live.robot.ros1 import needs_rospy
 from bufgym_live.robot.ros2.names import Published
-from bufgym_live.robot.ros2.relay import look, matched, own_node, spinning
+from bufgym_live.robot.ros2.relay import look, own_node, spinning
+from bufgym_live.robot.ros2.republishing import HOLD_S, readers_found
 
 NODE: Final = "bufgym_robot"
 TWIST: Final = Published("/cmd_vel", "geometry_msgs/msg/Twist")
@@ -38,7 +42,7 @@ class _RosSource:
         self._receive = tuple(map(resolved, receive))
         self._outlets: dict[Published, Outlet] = {}
         self._advertise: Callable[[Published], Awaitable[Outlet]] | None = None
-        self._advertising = asyncio.Lock()
+        self._advertising: defaultdict[Published, asyncio.Lock] = defaultdict(asyncio.Lock)
 
     def _wanted(self, robot: Robot) -> list[str]:
         """Its topics, and the one that is named as the robot's odometry, which need not be one of them."""
@@ -74,7 +78,7 @@ class _RosSource:
 
     async def _publish(self, topic: Published, payload: bytes) -> None:
         """Publish a message in CDR here."""
-        async with self._advertising:
+        async with self._advertising[topic]:  # a stop does not wait for another topic's readers
             if topic not in self._outlets:
                 if self._advertise is None:
                     raise BufgymError(f"topic {topic.name}: not published: ROS is not there yet")
@@ -104,9 +108,12 @@ class Ros2(_RosSource):
         with own_node(NODE) as here:
             from rclpy.serialization import deserialize_message
 
+            until_s = time.monotonic() + HOLD_S
+
             async def advertise(topic: Published) -> Outlet:
                 publisher = here.create_publisher(topic.message_class, topic.name, topic.qos)
-                await matched(publisher.get_subscription_count)
+                known = functools.partial(here.count_subscribers, topic.name)
+                await readers_found(topic.name, publisher.get_subscription_count, known, until_s, robot.client.note)
 
                 def publish(payload: bytes) -> None:
                     deserialize_message(payload, topic.message_class)  # nodes would meet what is broken
@@ -132,10 +139,11 @@ class Ros1(_RosSource):
         with needs_rospy():
             import rospy
         rospy.init_node(NODE, anonymous=True, disable_signals=True)
+        until_s = time.monotonic() + HOLD_S
 
         async def advertise(topic: Published) -> Outlet:
             publisher = rospy.Publisher(topic.name, topic.message_class, queue_size=10)
-            await matched(publisher.get_num_connections)
+            await readers_found(topic.name, publisher.get_num_connections, lambda: 0, until_s, robot.client.note)
 
             def publish(payload: bytes) -> None:
                 sent = rospy.AnyMsg()

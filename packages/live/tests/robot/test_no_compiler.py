@@ -59,6 +59,14 @@ def test_both_ends_the_link_between_and_a_view_load_no_compiler(tmp_path: Path) 
     assert Program(f"live view {log}").ended() == "0 False"
 
 
+def test_an_export_to_c_compiles_nothing(tmp_path: Path) -> None:
+    """A library's header has no calls of an episode, which the simulator would play; a header alone has them."""
+    library, alone = tmp_path / "library", tmp_path / "afr.h"
+    assert Program(f"export afr,learned {library} --to ros2").ended() == "0 False"
+    assert Program(f"export afr {alone} --to c").ended() == "0 False"
+    assert "_parity(" not in (library / "p_afr.h").read_text() and "bufgym_parity(" in alone.read_text()
+
+
 @pytest.mark.parametrize("words", ["send --ros-args -p topics:=[a]", "receive --port 0"])
 def test_the_relay_of_ros_2_loads_no_compiler(words: str) -> None:
     """All its modules are imported before it finds that rclpy is not there; with rclpy it is measured at night."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import os
 import select
 import socket
@@ -29,6 +30,7 @@ from bufgym_live.robot.tunnel import ADDRESSES, End, Tunnel
 NEAR, FAR = ADDRESSES
 PORT, MASTER = 7410, 11311
 DEAD_S, SOON_S = 20.0, 3.0
+CAMERA = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "camera.py"
 NODE = """
 import rospy
 from std_msgs.msg import String
@@ -108,6 +110,12 @@ class Far:
         await asyncio.Event().wait()
 
 
+def new_address() -> None:
+    """What a robot meets that comes into another network."""
+    for verb, address in (("del", NEAR), ("add", "10.79.0.3")):
+        subprocess.run(["ip", "addr", verb, f"{address}/24", "dev", "bufgym0"], check=True)
+
+
 def waited(holds: Callable[[], Any]) -> None:
     ends_s = time.monotonic() + 60
     while not holds():
@@ -125,16 +133,11 @@ def test_a_robots_new_address_is_a_new_connection(between: tuple[Tunnel, Wire]) 
         senders.append(Sender(queue, lambda: TcpChannel.connect(FAR, PORT)))
         await senders[0].run()
 
-    def change() -> None:
-        for words in (f"del {NEAR}/24", "add 10.79.0.3/24"):
-            verb, address = words.split()
-            subprocess.run(["ip", "addr", verb, address, "dev", "bufgym0"], check=True)
-
     sending = at(made.near, lambda: asyncio.run(send()))
     for _ in range(10):
         queue.put(b"before", 6)
     waited(lambda: len(far.came) == 10)
-    at(made.near, change).join()
+    at(made.near, new_address).join()
     for _ in range(10):
         queue.put(b"after", 5)
     queue.close()
@@ -163,6 +166,17 @@ def sender_in_cpp(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
     far = Far(made.far)
     return far.came, [
         program(made.near, built_with(folder, "drop-oldest"), FAR, PORT, "drop-oldest", 4, folder, 6000, 1000, 50)
+    ]
+
+
+def ros2_send(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
+    pytest.importorskip("rclpy", reason=needs("ros2", "rclpy"))
+    far, where = Far(made.far), {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_HOME": str(folder)}
+    words = ["ros2", "send", "--to", f"{FAR}:{PORT}", "--ros-args", "-p", "topics:=[/camera]"]
+    camera = [sys.executable, CAMERA, "--frames", 6000, "--size", 1000, "--rate", 50]
+    return far.came, [
+        program(made.near, sys.executable, "-m", "bufgym", *words, **where),
+        program(made.near, *camera, **where),
     ]
 
 
@@ -205,7 +219,7 @@ def node_in_python(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("way", [live, sender_in_cpp, node_in_cpp, node_in_python])
+@pytest.mark.parametrize("way", [live, sender_in_cpp, ros2_send, node_in_cpp, node_in_python])
 def test_frames_come_soon_after_a_link_that_was_dead(way: Any, between: tuple[Tunnel, Wire], tmp_path: Path) -> None:
     """Dead for 20 s, in which every packet is lost: with TCP's own backoff the next frame comes up to 18 s later."""
     made, wire = between
@@ -220,6 +234,26 @@ def test_frames_come_soon_after_a_link_that_was_dead(way: Any, between: tuple[Tu
         print(way.__name__, came[before] - back_s)
         assert came[before] - back_s < SOON_S
         waited(lambda: len(came) > before + 50)  # and they go on
+    finally:
+        for one in started:
+            one.kill()
+            one.communicate()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("way", [live, sender_in_cpp, ros2_send])
+def test_frames_come_soon_after_a_new_address(way: Any, between: tuple[Tunnel, Wire], tmp_path: Path) -> None:
+    """Without a look at its address a sender is silent until TCP gives up. ROS 1's subscribers know the old address."""
+    made, _ = between
+    came, started = way(made, tmp_path)
+    try:
+        waited(lambda: len(came) > 20)
+        at(made.near, new_address).join()
+        before, changed_s = len(came), time.monotonic()
+        waited(lambda: len(came) > before + 20)  # more than was on its way
+        silent_s = max(b - a for a, b in itertools.pairwise([changed_s, *came[before:]]))
+        print(way.__name__, silent_s)
+        assert silent_s < SOON_S
     finally:
         for one in started:
             one.kill()

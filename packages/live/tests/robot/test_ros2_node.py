@@ -1,10 +1,11 @@
-"""The ament package bufgym_sender, built against rclcpp itself and run. It needs rclcpp's headers and libraries.
+"""The ament package bufgym_sender, built against rclcpp itself and run: alone, launched, in a container.
 
-They cannot be had where bufgym is made, so this file has not run there: test_ros2_sender.py has the node over a double.
+``.ci/rclcpp.py`` builds rclcpp and runs this file. test_ros2_sender.py has the node over a double.
 """
 
 import asyncio
 import importlib.util
+import itertools
 import os
 import shutil
 import signal
@@ -28,15 +29,23 @@ from bufgym_live.robot import rclcpp, read_log, roscpp
 from bufgym_live.robot.ros2.names import parse
 from bufgym_live.robot.shaped import ShapedLink
 
-pytestmark = pytest.mark.nightly
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]  # the first one builds the package
 PLACES: Final = (
     *(os.environ[name] for name in ("BUFGYM_ROS2_PREFIX", "AMENT_PREFIX_PATH") if os.environ.get(name)),
     *map(str, sorted(Path("/opt/ros").glob("*"))),
 )
+HERE: Final = Path(__file__).parent
 CAMERA: Final = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "camera.py"
 PAYLOAD: Final = 1448 / 1514  # Share of an Ethernet frame's bytes
 ROSCPP_QOI: Final = 136.5
 """QoI of roscpp's queue under ``afr`` over the same fade (docs/guide/on-a-robot.md)."""
+WRONG: Final = {
+    "topics:=/camera": "topics",
+    "port:=0": "port",
+    "capacity:=65": "capacity",
+    "policy:=nonsense": "policy nonsense: must be one of afr, learned",
+}
+"""Wrong parameters, and what the error names."""
 PARAMETERS: Final = """\
 /robot/sender:
   ros__parameters:
@@ -101,9 +110,22 @@ async def says(process: asyncio.subprocess.Process, part: str) -> None:
         assert line, f"it has ended and never said {part}"
 
 
-def camera(env: dict[str, str], frames: int) -> tuple[dict[str, str], str, Path, str, str]:
-    python = sys.executable if importlib.util.find_spec("rclpy") else "python3"
-    return {**env, "PYTHONWARNINGS": "ignore"}, python, CAMERA, "--frames", str(frames)
+def python(env: dict[str, str], *words: object) -> tuple[dict[str, str], object, *tuple[object, ...]]:
+    """A program for the Python that has rclpy."""
+    found = "python3" if "BUFGYM_ROS2_PREFIX" in env or not importlib.util.find_spec("rclpy") else sys.executable
+    return {**env, "PYTHONWARNINGS": "ignore"}, found, *words
+
+
+def camera(env: dict[str, str], frames: int) -> tuple[dict[str, str], object, *tuple[object, ...]]:
+    return python(env, CAMERA, "--frames", frames)
+
+
+async def asked(env: dict[str, str], *words: object) -> str:
+    """What a service of the node or of its container answers (ros2_services_session.py)."""
+    async with started(*python(env, HERE / "ros2_services_session.py", *words)) as one:
+        out, _ = await asyncio.wait_for(one.communicate(), 120)
+    assert one.returncode == 0, out.decode()
+    return out.decode().splitlines()[-1]
 
 
 def settled(log: Path, frames: int) -> bool:
@@ -138,17 +160,81 @@ async def test_over_the_fade_it_is_as_good_as_roscpp(installed: dict[str, str], 
     assert qoi.exponential().information([one.x for one in came]) > 0.99 * ROSCPP_QOI
 
 
-async def test_its_launch_file(installed: dict[str, str]) -> None:
-    """All that the file leaves at its defaults is good enough to start with."""
+@pytest.mark.parametrize("given", WRONG)
+async def test_wrong_parameters_are_one_line_and_an_exit_code(given: str, installed: dict[str, str]) -> None:
+    program = Path(installed["BUILT"], "lib", "bufgym_sender", "sender")
+    async with started(installed, program, "--ros-args", "-p", given) as node:
+        out, _ = await asyncio.wait_for(node.communicate(), 60)
+    (line,) = out.decode().splitlines()
+    assert line.startswith("bufgym_sender: error: ") and WRONG[given] in line and node.returncode == 2
+
+
+@pytest.fixture
+def launch(installed: dict[str, str]) -> tuple[str, ...]:
+    """The command that launches the node."""
     ros2 = shutil.which("ros2", path=installed.get("PATH"))
     if ros2 is None:
         pytest.skip(needs("rclcpp", "no ros2 launch"))
+    return ros2, "launch", "bufgym_sender", "sender.launch.xml"
+
+
+async def test_its_launch_file(launch: tuple[str, ...], installed: dict[str, str]) -> None:
+    """All that the file leaves at its defaults is good enough to start with."""
     async with receiving() as (_, port, came):
         given = "topics:=['/camera']", f"port:={port}", "namespace:=robot"
-        launch = started(installed, ros2, "launch", "bufgym_sender", "sender.launch.xml", *given)
-        async with launch as node, started(*camera(installed, 30)):
+        async with started(installed, *launch, *given) as node, started(*camera(installed, 30)):
             await says(node, "/camera: sensor_msgs/msg/CompressedImage")
             await until(lambda: len(came) >= 10)
             node.send_signal(signal.SIGINT)
             await asyncio.wait_for(node.wait(), 20)
     assert in_order(came)
+
+
+@pytest.mark.parametrize("given", WRONG)
+async def test_launched_with_wrong_parameters(given: str, launch: tuple[str, ...], installed: dict[str, str]) -> None:
+    """The line is in what launch prints, then the node's exit code; launch ends, as nothing else runs."""
+    topics = () if "topics" in given else ("topics:=['/camera']",)
+    async with started(installed, *launch, *topics, given) as node:
+        out, _ = await asyncio.wait_for(node.communicate(), 60)
+    (line,) = (line for line in out.decode().splitlines() if "bufgym_sender: error: " in line)
+    assert WRONG[given] in line and "exit code 2" in out.decode()
+
+
+async def test_its_lifecycle(installed: dict[str, str], tmp_path: Path) -> None:
+    """Three rounds of configure, activate, deactivate, clean up by its services; each is a new stream."""
+    program = Path(installed["BUILT"], "lib", "bufgym_sender", "sender")
+    async with receiving() as (_, port, came):
+        given = "topics:=['/camera']", f"port:={port}", "autostart:=false"
+        ros = (word for one in given for word in ("-p", one))
+        async with started(installed, program, "--ros-args", *ros) as node, started(*camera(installed, 3000)):
+            for _ in range(3):
+                before = len(came)
+                assert await asked(installed, "change", "/bufgym_sender", "configure", "activate") == "2 3"
+                await until(lambda before=before: len(came) > before + 5)
+                assert await asked(installed, "change", "/bufgym_sender", "deactivate", "cleanup") == "2 1"
+            assert await asked(installed, "change", "/bufgym_sender", "shutdown") == "4"
+            node.send_signal(signal.SIGTERM)
+            assert await asyncio.wait_for(node.wait(), 20) == 0
+    rounds = [list(of_one) for _, of_one in itertools.groupby(came, lambda message: message.stream)]
+    assert len(rounds) == 3 and all(map(in_order, rounds))
+
+
+async def test_in_a_component_container(installed: dict[str, str]) -> None:
+    """The container refuses wrong parameters with the same words, loads the node with right ones, and unloads it."""
+    container = Path(next(filter(None, map(container_of, installed["AMENT_PREFIX_PATH"].split(os.pathsep)))))
+    async with receiving() as (_, port, came), started(installed, container) as one, started(*camera(installed, 3000)):
+        load = "load", "/ComponentManager", "bufgym_sender", "bufgym::SenderNode"
+        refused = await asked(installed, *load, "policy:=nonsense")
+        assert refused.startswith("refused: ") and WRONG["policy:=nonsense"] in refused
+        name, number = (await asked(installed, *load, "topics:=['/camera']", f"port:={port}")).split()
+        assert name == "/bufgym_sender"
+        await until(lambda: len(came) > 5)
+        assert await asked(installed, "unload", "/ComponentManager", number) == "unloaded"
+        one.send_signal(signal.SIGINT)
+        await asyncio.wait_for(one.wait(), 20)
+    assert in_order(came)
+
+
+def container_of(prefix: str) -> Path | None:
+    path = Path(prefix, "lib", "rclcpp_components", "component_container")
+    return path if path.exists() else None

@@ -4,11 +4,10 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import compile_signature, kernel, records, unchecked_at
+from bufgym.jit import JIT, compile_signature, kernel, records, unchecked_at
 from bufgym.model.link import FOREVER, Link
 from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy, signatures
@@ -85,7 +84,11 @@ def _record(
 
 @functools.cache
 def _compiled_record() -> Any:
-    """Compile ``_record`` for every compiled policy."""
+    """Compile ``_record`` for every compiled policy, where there is a compiler."""
+    if not JIT:
+        return _record
+    import numba
+
     arrives, departs, _, _ = (numba.types.FunctionType(signature) for signature in signatures())
     memory = numba.types.Array(numba.types.float64, 2, "C")
     calls = numba.types.Array(numba.from_dtype(CALL), 1, "C")

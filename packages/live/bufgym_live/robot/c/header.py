@@ -71,10 +71,18 @@ def write(
     return Path(out)
 
 
-def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = None, prefix: str = "bufgym") -> str:
+def header(
+    policy: Policy,
+    capacity: int,
+    value: Value,
+    max_bytes: int | None = None,
+    prefix: str = "bufgym",
+    parity: bool = True,
+) -> str:
     """Make the policy's C99 header for L up to ``capacity`` and B = ``max_bytes`` with V = ``value``.
 
-    All its names begin with ``prefix``, its macros with the same in capitals.
+    All its names begin with ``prefix``, its macros with the same in capitals. With ``parity`` it has recorded calls,
+    which take time to make: the simulator plays them.
 
     Raises:
         BufgymError: the policy or a field that it reads has no C, a limit is invalid, or C has no names that begin so.
@@ -93,10 +101,7 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False))
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
-    unlimited, rng = max_bytes is None, np.random.default_rng(_SEED)
-    # Messages of the calls in the header all fit into B.
-    episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
-    calls = recorded(policy, episodes, capacity, value, max_bytes)
+    unlimited = max_bytes is None
     numbers = {
         "ABOUT": _comment(policy.summary),
         "SOURCE": _comment(policy.source),
@@ -117,19 +122,25 @@ def header(policy: Policy, capacity: int, value: Value, max_bytes: int | None = 
         "TINY": repr(TINY),
         "ROUNDING": repr(ROUNDING),
         **{name: repr(getattr(module, name)) for module, names in _CONSTANTS.items() for name in names.split()},
-        "STRAIGHT": repr(straight(value.array)),
+        "STRAIGHT": repr(_uncompiled(straight)(value.array)),
         **{name.upper(): repr(float(number)) for name, number in parameters.items()},
         "INPUTS": _lines(f"BUFGYM_IN_{name.upper()}" for name in guided.INPUTS),
         "OUTPUTS": _lines(f"BUFGYM_OUT_{output.name.upper()}" for output in guided.OUTPUTS),
         "WEIGHTS": _array("double", "bufgym_weights", policy.weights[guided.NUMBERS :]) if guides else "",
         "STEADY_US": repr(thinning.HORIZON_US),
-        "CALLS": "".join(f"    {{{', '.join(map(repr, call.item()))}}},\n" for call in calls),
     }
     if learns:
         numbers |= _numbers(policy, _scorer(policy))
     if chooses:
         numbers |= _candidate_numbers(policy)
-    text = _filled(_part("about.h") + _part("queue.h") + _part("parity.h") + "\n#endif\n", numbers)
+    last = ""
+    if parity:
+        rng, last = np.random.default_rng(_SEED), _part("parity.h")
+        # Messages of the calls in the header all fit into B.
+        episodes = [random_episode(rng, _MESSAGES, max_bytes) for _ in range(_EPISODES)]
+        calls = recorded(policy, episodes, capacity, value, max_bytes)
+        numbers["CALLS"] = "".join(f"    {{{', '.join(map(repr, call.item()))}}},\n" for call in calls)
+    text = _filled(_part("about.h") + _part("queue.h") + last + "\n#endif\n", numbers)
     named = re.sub(r"\bbufgym_", f"{prefix}_", text)
     return re.sub(r"\bBUFGYM_", f"{prefix.upper()}_", named)
 
@@ -188,8 +199,13 @@ def _helped(rule: str) -> str:
 
 
 def _scorer(policy: Policy) -> Scorer:
-    found: Scorer = getattr(unpack, "py_func", unpack)(np.array(policy.weights))
+    found: Scorer = _uncompiled(unpack)(np.array(policy.weights))
     return found
+
+
+def _uncompiled(kernel: Any) -> Any:
+    """Get a kernel's function in Python: one call is not worth the compiler."""
+    return getattr(kernel, "py_func", kernel)
 
 
 def _numbers(policy: Policy, scorer: Scorer) -> dict[str, Any]:

@@ -7,7 +7,6 @@ way through a second pair with ``no_drop`` topics.
 """
 
 import asyncio
-import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -36,7 +35,6 @@ SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 """Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
 LOOK_S: Final = 0.2  # Time between two searches for publishers
 TELL_S: Final = 1.0  # Time between two messages on /diagnostics
-_MATCH_S: Final = 1.0  # longest wait of a new publisher's first message for a subscriber
 
 
 @contextmanager
@@ -255,10 +253,3 @@ async def receive(
         finally:
             await receiver.close()
             republisher.drain()
-
-
-async def matched(subscribers: Callable[[], int]) -> None:
-    """Wait for subscribers to find a new publisher, which takes some 100 ms; earlier messages would be missed."""
-    deadline_s = time.monotonic() + _MATCH_S
-    while subscribers() == 0 and time.monotonic() < deadline_s:
-        await asyncio.sleep(0.01)

@@ -6,6 +6,7 @@ its readers.
 """
 
 import asyncio
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -39,7 +40,9 @@ class Republisher:
             return
         # Publishing comes last: a connection that ends while this waits leaves the message to the next one.
         if topic not in self._matched:
-            await self._match(publisher)
+            name = publisher.topic_name
+            known = functools.partial(self._node.count_subscribers, name)
+            await readers_found(name, publisher.get_subscription_count, known, self._hold_until_s, self._say)
             self._matched.add(topic)
         publisher.publish(body)
 
@@ -60,21 +63,22 @@ class Republisher:
         self._say(f"{topic.name}: {topic.type}")
         return publisher
 
-    async def _match(self, publisher: Any) -> None:
-        """Wait for all readers that this node knows of, and for one at least while it still gets to know them."""
-        name = publisher.topic_name
 
-        def matched() -> bool:
-            return bool(publisher.get_subscription_count() >= max(1, self._node.count_subscribers(name)))
+async def readers_found(
+    name: str, matched: Callable[[], int], known: Callable[[], int], hold_until_s: float, say: Callable[[str], None]
+) -> None:
+    """Wait for all readers that a new publisher's node knows of; until ``hold_until_s`` for one at least."""
 
-        known_until_s = time.monotonic() + (_MATCH_S if self._node.count_subscribers(name) else 0.0)
-        if publisher.get_subscription_count() == 0 and time.monotonic() < self._hold_until_s:
-            self._say(f"{name}: messages wait for a reader, {self._hold_until_s - time.monotonic():.0f} s at most")
-        until_s = max(self._hold_until_s, known_until_s)
-        while not (found := matched()) and time.monotonic() < until_s:
-            await asyncio.sleep(_LOOK_S)
-        if found:
-            await asyncio.sleep(_SETTLE_S)
+    def found() -> bool:
+        return matched() >= max(1, known())
+
+    if matched() == 0 and time.monotonic() < hold_until_s:
+        say(f"{name}: messages wait for a reader, {hold_until_s - time.monotonic():.0f} s at most")
+    until_s = max(hold_until_s, time.monotonic() + (_MATCH_S if known() else 0.0))
+    while not found() and time.monotonic() < until_s:
+        await asyncio.sleep(_LOOK_S)
+    if found():
+        await asyncio.sleep(_SETTLE_S)
 
 
 def _all_acked(publisher: Any) -> bool:

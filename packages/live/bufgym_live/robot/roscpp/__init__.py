@@ -60,7 +60,7 @@ def write(folder: str | Path, chosen: Sequence[Policy], files: Mapping[str, Path
     queues, table = "", ""
     for policy in chosen:
         prefix = "p_" + re.sub("[^a-z0-9]", "_", policy.name.lower())
-        texts[f"{prefix}.h"] = header(policy, _CAPACITY, qoi.exponential(), prefix=prefix)
+        texts[f"{prefix}.h"] = header(policy, _CAPACITY, qoi.exponential(), prefix=prefix, parity=False)
         queues += _QUEUE.format(prefix=prefix, macro=prefix.upper())
         facts = json.dumps(policy.name), json.dumps(json.dumps(dict(policy.parameters))), f"{prefix}_class::make"
         table += f"    {{{', '.join(facts)}}},\n"

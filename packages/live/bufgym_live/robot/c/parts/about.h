@@ -9,10 +9,8 @@
        bufgym_sent      when the oldest dequeued message has left (acked, or out of the system's send buffer)
 
    Times are in us of one clock, and must not fall. Headers of several policies may be included in one file if each was
-   made with a --prefix of its own. With
-   BUFGYM_PARITY defined, bufgym_parity() plays an episode whose decisions are known; it must return 0. Decisions are
-   Python's to the last bit where doubles are IEEE 754 and products are not fused with sums (gcc: -ffp-contract=off;
-   never -ffast-math). */
+   made with a --prefix of its own. Decisions are Python's to the last bit where doubles are IEEE 754 and products are
+   not fused with sums (gcc: -ffp-contract=off; never -ffast-math). */
 #ifndef BUFGYM_POLICY_H
 #define BUFGYM_POLICY_H
 

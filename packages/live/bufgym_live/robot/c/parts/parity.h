@@ -1,6 +1,7 @@
 
+/* --- With BUFGYM_PARITY defined, bufgym_parity() plays an episode's calls, and says whether this machine decides as
+   Python did: it must return 0. --- */
 #ifdef BUFGYM_PARITY
-/* --- calls of an episode and what Python decided: bufgym_parity() says whether this machine decides the same --- */
 
 enum { BUFGYM_INIT, BUFGYM_ARRIVAL, BUFGYM_DEQUEUE, BUFGYM_SENT, BUFGYM_ENDS };
 
