@@ -10,8 +10,6 @@ from bufgym.policies.ruled_network import RuledWeights, fields_seen, seen
 
 START = 2.0
 """Bias of action 0 before learning, "accept where there is room, else drop the cheapest"; all other outputs are 0."""
-SWITCH = 2.0
-"""What the units get that begin as a switch, either way."""
 NEVER = -1e9
 """Output in place of that of an action which is not offered."""
 LAYERS = 0, 2, 4
@@ -26,7 +24,7 @@ class Student(nn.Sequential):
 
     def __init__(self, candidates: int, width: int, ruled: bool = False) -> None:
         size, out = seen(candidates) if ruled else inputs(candidates), nn.Linear(width, candidates + 2 + ruled)
-        super().__init__(nn.Linear(size, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), out)
+        super().__init__(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), out)
         self.candidates, self.ruled = candidates, ruled
         nn.init.zeros_(out.weight)
         nn.init.zeros_(out.bias)
@@ -36,19 +34,18 @@ class Student(nn.Sequential):
                 names = fields_seen(candidates)
                 for layer in self[0], self[2]:
                     layer.weight[0], layer.bias[0] = 0.0, 0.0
-                self[0].bias[0] = -SWITCH
-                self[0].weight[0, names.index("guided_plain")] = 2 * SWITCH
-                self[0].weight[0, names.index("guided_size_spread")] = 10 * SWITCH
-                self[2].weight[0, 0] = SWITCH
-                out.weight[0, 0], out.bias[0] = -START / 2, START / 2
-                out.weight[-1, 0] = START
+                self[0].bias[0] = -1.0
+                self[0].weight[0, names.index("guided_plain")] = 2.0
+                self[0].weight[0, names.index("guided_size_spread")] = 10.0
+                self[2].weight[0, 0] = 1.0
+                out.weight[-1, 0], out.weight[0, 0] = 2 * START, -START
 
     def weights(self) -> CandidateWeights:
         """The weights as in a file."""
         numbers = {name: tensor.detach().numpy() for name, tensor in self.named_parameters()}
         layers = tuple((numbers[f"{k}.weight"].T.copy(), numbers[f"{k}.bias"].copy()) for k in LAYERS)
         kind = RuledWeights if self.ruled else CandidateWeights
-        return kind(self.candidates, at_arrivals=True, masks=True, activation="tanh", layers=layers)
+        return kind(self.candidates, at_arrivals=True, masks=True, activation="relu", layers=layers)
 
 
 def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:

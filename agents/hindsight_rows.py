@@ -26,7 +26,7 @@ RULED = 6
 """The rule, action 0, plays one row in so many: good states never end, and a student that fell finds its way back."""
 LONGEST = 600
 """Most steps over which rows are spread at first."""
-LEAVING = 3.0
+LEAVING = 20.0
 """Cost of leaving the rule in families that stay with it, in the same units."""
 MOST = 60.0
 """Largest cost, in units of the mean cost of action 0."""
