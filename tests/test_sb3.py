@@ -243,18 +243,6 @@ def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Pat
         assert (run(policy, EPISODES, 20, SCENARIO.value).batch.senders["invalid"] == 0).all()
 
 
-def test_an_agent_whose_prior_is_the_rule_begins_there() -> None:
-    """In torch and as a compiled policy; without the rule's fields there is no prior."""
-    env = make_vec_env("bufgym/Uplink-v0", 2, seed=0, fields="rule", **WORLD, actions="slots")
-    model = untrained(MaskablePPO, SlotPolicy, env, 6, policy_kwargs={"width": 8, "prior": 1e4})
-    rule = repr(reached(policies.get("gap-price")))
-    assert repr(reached(as_policy(model, "ruled"))) == repr(reached_in_env(model, "dict", "rule")) == rule
-    refuse("prior = 10000: what the rule chooses is not observed", untrained, MaskablePPO, SlotPolicy, **_PRIOR)
-
-
-_PRIOR: dict[str, Any] = {"policy_kwargs": {"prior": 1e4}}
-
-
 def test_export_takes_over_what_the_run_noted(tmp_path: Path) -> None:
     untrained(MaskablePPO, SlotPolicy, policy_kwargs={"width": 8}).save(tmp_path / "model.zip")
     model, notes, out = tmp_path / "model.zip", tmp_path / "notes.json", tmp_path / "one.safetensors"

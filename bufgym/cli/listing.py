@@ -93,11 +93,9 @@ def _list_rewards() -> str:
 
 def _list_observations() -> str:
     from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, OWN_FIELDS, TOPIC_FIELDS
-    from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
 
     named = (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS, *OWN_FIELDS.values())
     parts = {"": FIELDS, _SEVERAL: TOPIC_FIELDS, "where `fields` names it": named}
-    parts |= {"alone, with fields = 'rule'": (*RULE_SLOT_FIELDS, *RULE_FIELDS)}
     return _in_parts({title: [(f.name, f.per, f.group, f.unit, f.meaning) for f in parts[title]] for title in parts})
 
 

@@ -1,7 +1,6 @@
 """Guided environments: an action sets the numbers of the rule gap-price, and an observation holds what the rule knows.
 
-``actions="guided"`` and ``fields="guided"`` may be used together or alone. With ``fields="rule"`` the observation
-holds what the rule knows of every candidate (``bufgym.policies.rule_fields``). Each row has the rule's memory
+``actions="guided"`` and ``fields="guided"`` may be used together or alone. Each row has the rule's memory
 (``bufgym.policies.guided``), which learns of every decision.
 """
 
@@ -11,17 +10,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from bufgym.envs.options import GUIDED, RULE, InvalidActionError, Options
+from bufgym.envs.options import GUIDED, InvalidActionError, Options
 from bufgym.envs.output import StepOutput, decision_of, write_observation, write_state
-from bufgym.jit import kernel, unchecked_slice, unchecked_table
+from bufgym.jit import kernel, unchecked_slice
 from bufgym.model.observe import Chosen
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, OUTPUTS, SCALES, GuidedWeights, follow, inputs, recall
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.sim.state import Batch
 from bufgym.sim.view import arrival_of, view
-
-SEES_INPUTS, SEES_RULE = 1, 2
-_SLOTS, _CONTEXT = len(RULE_SLOT_FIELDS), len(RULE_FIELDS)
 
 
 class Guide(NamedTuple):
@@ -32,7 +27,7 @@ class Guide(NamedTuple):
         base: float64[numbers], the plain rule's.
         outputs: float64[n, outputs], what the present actions add to them.
         acts: 1 if actions are guided.
-        sees: SEES_INPUTS or SEES_RULE if the observation holds the rule's inputs, or all that it knows, alone; else 0.
+        sees: 1 if the observation holds the rule's inputs alone.
     """
 
     memory: NDArray[np.float64]
@@ -60,14 +55,8 @@ def write_guided(batch: Batch, i: int, ended: bool, output: StepOutput, guide: G
     if ended:
         return
     buffer, arrival = view(batch, i), arrival_of(batch, i)
-    if guide.sees == SEES_RULE:
-        entries = batch.senders[i].capacity + 1
-        rows = unchecked_table(output.flat, i, 0, _SLOTS, entries)
-        context = unchecked_slice(output.flat, i, _SLOTS * entries, _CONTEXT)
-        observe_rule(buffer, arrival, guide.memory[i], rows, context)
-        return
     recall(buffer, arrival, guide.memory[i], guide.base)
-    if guide.sees == SEES_INPUTS:
+    if guide.sees == 1:
         inputs(buffer, arrival, guide.memory[i], guide.base, unchecked_slice(output.flat, i, 0, N_INPUTS))
 
 
@@ -77,8 +66,7 @@ class Guiding:
     def __init__(self, n: int, options: Options) -> None:
         plain = GuidedWeights(np.zeros((N_OUTPUTS, N_INPUTS), np.float32)).policy(GUIDED)
         memory = plain.new_memory(n, options.capacity)
-        sees = {GUIDED: SEES_INPUTS, RULE: SEES_RULE}.get(options.sees, 0)
-        self.guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(options.acts_guided), sees)
+        self.guide = Guide(memory, BASE, np.zeros((n, N_OUTPUTS)), int(options.acts_guided), int(options.sees_guided))
         self._nothing = np.zeros(n, np.int64)
         self.action_space = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)
 

@@ -19,14 +19,11 @@ if TYPE_CHECKING:
     from bufgym.envs.render import Window
 
 GUIDED = "guided"
-RULE = "rule"
 CANDIDATES, SLOTS = "candidates", "slots"
 ACTIONS = (CANDIDATES, SLOTS, GUIDED)  # What an action is: the candidate or slot that goes, or numbers of the rule
 INFOS = ("full", "summary", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
 nothing. At an episode's end the summary is always there."""
-MASKS = ("valid", "plausible")
-"""Actions that the mask shows: all valid ones, or those of them that a good rule chooses among (``plausible``)."""
 RENDER_MODES = ("ansi", "rgb_array", "human")
 MASK_KEYS = {
     "rllib": ("observations", "action_mask"),
@@ -35,7 +32,7 @@ MASK_KEYS = {
 }
 """Library -> its keys of the observation and of the action mask in it."""
 
-_CHOICES = {"info": INFOS, "mask": MASKS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
+_CHOICES = {"info": INFOS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
 
 
 class InvalidActionError(BufgymError, gym.error.InvalidAction):
@@ -58,7 +55,6 @@ class Options:
     reward_scale: float | str | None = None
     actions: str = CANDIDATES
     candidates: int = 2
-    mask: str = "valid"
     fields: str | Sequence[str] | None = None
     observation: str | None = None
     info: str = "full"
@@ -76,15 +72,13 @@ class Options:
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
         whole("candidates", self.candidates, 1, MOST_CANDIDATES)
-        if self.acts_on_candidates and (self.mask != "valid" or self.fields in ("compact", GUIDED, RULE)):
-            given = f"mask = {self.mask!r}" if self.mask != "valid" else f"fields = {self.fields!r}"
-            raise BufgymError(
-                f"{given}: is for actions = 'slots'; {CANDIDATES!r} have fields of their own, and no mask"
-            )
-        names: Any = () if self.fields in (None, "compact", GUIDED, RULE) else self.fields
+        if self.acts_on_candidates and self.fields in ("compact", GUIDED):
+            given = f"fields = {self.fields!r}"
+            raise BufgymError(f"{given}: is for actions = 'slots'; {CANDIDATES!r} have fields of their own")
+        names: Any = () if self.fields in (None, "compact", GUIDED) else self.fields
         is_list = isinstance(names, Collection) and not isinstance(names, str)
         if not (is_list and all(isinstance(name, str) for name in names)):
-            raise BufgymError(f"fields = {names!r}: must be a list of names, 'compact', 'guided' or 'rule'")
+            raise BufgymError(f"fields = {names!r}: must be a list of names, 'compact' or 'guided'")
         if not isinstance(self.bound, bool | np.bool_):
             raise BufgymError(f"bound = {self.bound!r}: must be True or False")
         whole("num_threads", self.num_threads, 1)
@@ -120,9 +114,9 @@ class Options:
         return self.actions == GUIDED
 
     @property
-    def sees(self) -> str:
-        """What an observation holds of that rule, and nothing else: "guided", its inputs; "rule", all it knows; ""."""
-        return self.fields if isinstance(self.fields, str) and self.fields in (GUIDED, RULE) else ""
+    def sees_guided(self) -> bool:
+        """Whether an observation holds that rule's inputs, and nothing else."""
+        return self.fields == GUIDED
 
     @property
     def shows_all(self) -> bool:
@@ -164,12 +158,10 @@ class Options:
             raise BufgymError(
                 f"bound = True: the clairvoyant is known for one queue on a link of its own, not for {what}"
             )
-        if self.mask == "plausible":
-            raise BufgymError(f"mask = 'plausible': the plausible actions are known for one queue, not for {what}")
         if self.acts_on_candidates:
             raise BufgymError(f"actions = {CANDIDATES!r}: known for one queue on a link of its own, not for {what}")
-        if self.acts_guided or self.sees:
-            given = f"actions = {GUIDED!r}" if self.acts_guided else f"fields = {self.sees!r}"
+        if self.acts_guided or self.sees_guided:
+            given = f"{'actions' if self.acts_guided else 'fields'} = {GUIDED!r}"
             raise BufgymError(f"{given}: the rule serves one queue on a link of its own, not {what}")
 
 

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from bufgym.envs.candidates import new_choices
 from bufgym.envs.guided import Guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
-from bufgym.envs.options import RULE, InvalidActionError, Options
+from bufgym.envs.options import InvalidActionError, Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
-from bufgym.envs.plausible import keep_plausible
 from bufgym.envs.regret import Regret
 from bufgym.envs.reward import reward_weights
 from bufgym.envs.step import step_rows
@@ -36,7 +35,6 @@ from bufgym.model.observe import (
 )
 from bufgym.oracle.measure import MEASURED, measured
 from bufgym.policies.guided import INPUT_FIELDS
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
@@ -90,7 +88,7 @@ class Rows:
             self._draw = Pool(scenario.draw, options.pool)
         self._threads = Threads(np.arange(n), options.num_threads)
 
-        self.guiding = Guiding(n, options) if options.acts_guided or options.sees else None
+        self.guiding = Guiding(n, options) if options.acts_guided or options.sees_guided else None
         self._guide = self.guiding and self.guiding.guide
         self._acts = self.guiding if options.acts_guided else None
         self.choices = None
@@ -123,10 +121,8 @@ class Rows:
         With several topics it leaves out the slot fields if none of them is observed.
         """
         options, several_topics = self.options, bool(self.scenario.topics)
-        if options.sees:
-            slots = RULE_SLOT_FIELDS if options.sees == RULE else ()
-            context = RULE_FIELDS if options.sees == RULE else INPUT_FIELDS
-            return ObservationForm(options.form, slots, context, self.capacity, mask=options.mask_keys)
+        if options.sees_guided:
+            return ObservationForm(options.form, (), INPUT_FIELDS, self.capacity, mask=options.mask_keys)
         if self.choices is not None:
             return ObservationForm(
                 options.form, CANDIDATE_FIELDS, QUEUE_FIELDS, self.capacity, options.fields, options.mask_keys,
@@ -226,8 +222,6 @@ class Rows:
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
         how = self.choices, self._guide, self.form.named
         step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, *how)
-        if self.options.mask == "plausible":
-            keep_plausible(self.senders.batch, rows, self.output.action_mask)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""

@@ -105,9 +105,6 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``reward_scale``: factor on the reward, by default none. "episode" is the constant ``reward_scale`` of the
       scenario's class, which brings a rule's return in a default episode between 1 and 10; weights of your own terms
       stay as they are. ``info["reward_terms"]`` is not scaled.
-    - ``mask``: "valid", or "plausible" (slots of one queue) for the few valid actions that a good rule chooses among:
-      accept, reject, evict what leaves one of the two smallest gaps, evict the head when its turn is near. The others
-      stay valid, and do what they say.
     - ``info``: "full"; "summary" adds the summary so far in every step, for recorders; "mask" has the mask alone,
       and at an episode's end its summary; "none" has only this summary.
     - ``mask_in_observation``: whether observations hold the action mask, for libraries that look for it there. True

@@ -165,8 +165,13 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
         if first == own - 1:
             continue
         chosen = max(n + 1, work.target[t - 2, first] if t > 2 else 0)
-        for m in range(chosen, last + 1):
+        # Nothing follows the newcomer best: later messages are like it. Of these the first that finds room will do.
+        alike = last < 0
+        for m in range(chosen, sender.arrivals if alike else last + 1):
             work.future[m] = sends(ahead, i, m, u)
+            last = max(last, m)
+            if alike and work.future[m] != -1:
+                break
         for k in range(first, own - 1):
             most, target = 0.0, -1
             for m in range(chosen, last + 1):

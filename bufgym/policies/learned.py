@@ -22,10 +22,7 @@ from bufgym.model.observe import (
     observe_on_board,
     observe_on_board_slots,
 )
-from bufgym.policies import chains, price_dp
-from bufgym.policies.guided import REMEMBERED
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.policies.scoring import DROP, KEEP, Network, Scorer, Scratch, begin, divide, score, unpack
 
 __all__ = ["NAMES", "Network", "Weights"]
@@ -37,14 +34,11 @@ SLOTS, CONTEXT = len(SLOT_NAMES), len(CONTEXT_NAMES)
 # Fields beyond these are observed only if they are read.
 TABLE_SLOTS, TABLE = len(SLOT_FIELDS), len(CONTEXT_FIELDS)
 BESIDE = (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS)
-BY_RULE = (*RULE_SLOT_FIELDS, *RULE_FIELDS)
-ALL_SLOTS, ALL_CONTEXT = SLOTS + len(RULE_SLOT_FIELDS), CONTEXT + len(RULE_FIELDS)
-RULE_SCRATCH = len(REMEMBERED) + chains.SCRATCH[0]
 
 
 @kernel
 def look(buffer: Buffer, arrival: Arrival, scorer: Scorer, scratch: Scratch) -> None:
-    """Observe what the scorer reads, but for what the rule knows."""
+    """Observe what the scorer reads."""
     context, slot = scorer.fields[: scorer.context], scorer.fields[scorer.context :]
     if reads(context, 0, TABLE) or reads(slot, 0, TABLE_SLOTS):
         observe(buffer, arrival, scratch.rows[:TABLE_SLOTS], scratch.context[:TABLE])
@@ -95,33 +89,17 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     return choose(buffer, arrival, scorer, scratch)
 
 
-@kernel
-def decide_by_rule(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The same with the rule's fields, whose memory comes first."""
-    scorer = unpack(buffer.parameters)
-    own = memory[RULE_SCRATCH + chains.COLUMNS * (buffer.capacity + 1) :]
-    scratch = divide(own, scorer, ALL_CONTEXT, ALL_SLOTS, buffer.capacity)
-    observe_rule(buffer, arrival, memory, scratch.rows[SLOTS:], scratch.context[CONTEXT:])
-    look(buffer, arrival, scorer, scratch)
-    return choose(buffer, arrival, scorer, scratch)
-
-
 def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """A trained slot scorer."""
     return decide(buffer, arrival, memory)
-
-
-def on_arrival_by_rule(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A trained slot scorer that knows what the rule gap-price knows."""
-    return decide_by_rule(buffer, arrival, memory)
 
 
 @dataclass(frozen=True)
 class Weights:
     """A slot scorer for one queue: the fields that it reads, and its networks."""
 
-    SLOT_NAMES: ClassVar[tuple[str, ...]] = SLOT_NAMES + tuple(field.name for field in RULE_SLOT_FIELDS)
-    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = CONTEXT_NAMES + tuple(field.name for field in RULE_FIELDS)
+    SLOT_NAMES: ClassVar[tuple[str, ...]] = SLOT_NAMES
+    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = CONTEXT_NAMES
     NETWORKS: ClassVar[tuple[str, ...]] = ("drop", "accept")
     LAYERS: ClassVar[int] = 2
     SETTINGS: ClassVar[Mapping[str, Any]] = {}
@@ -168,18 +146,13 @@ class Weights:
         numbers, (first, second) = tuple(self.parameters().tolist()), self.widths
         work = 2 * len(self.fields) - len(self.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
         policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_left=True, built_in=True)
-        policy = replace(policy, reads_rate=on_link, about=about, source=source)
-        if all(field.name not in self.fields for field in BY_RULE):
-            return policy
-        work = work[0] + len(RULE_FIELDS) + chains.SCRATCH[0], ALL_SLOTS + chains.SCRATCH[1]
-        return replace(policy, on_arrival=on_arrival_by_rule, memory=REMEMBERED, work=work, reads_rate=True)
+        return replace(policy, reads_rate=on_link, about=about, source=source)
 
     @staticmethod
     def definition(fields: Sequence[str]) -> list[Any]:
         """What defines the observation; fields beside the table count only if they are among ``fields``."""
-        beside = [field for field in (*BESIDE, *BY_RULE) if field.name in fields]
-        table: list[Any] = [(field.name, field.per, field.unit, field.meaning) for field in (*FIELDS, *beside)]
-        return [*table, price_dp.PARAMETERS] if set(BY_RULE) & set(beside) else table
+        beside = [field for field in BESIDE if field.name in fields]
+        return [(field.name, field.per, field.unit, field.meaning) for field in (*FIELDS, *beside)]
 
     @staticmethod
     def inputs_text(fields: Sequence[str], settings: Mapping[str, Any]) -> str:

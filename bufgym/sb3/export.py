@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from torch import Tensor, nn
+from torch import nn
 
 from bufgym.oracle import EveryLength
 from bufgym.policies import Policy
@@ -92,17 +92,17 @@ def weights_of(model: Any) -> Weights | CandidateWeights:
     if not isinstance(features, SlotExtractor) or not isinstance(scorer, SlotScorer):
         raise BufgymError(
             "only an agent that chooses among candidates, observed flat, or scores slots can be exported "
-            "(train.py ppo --network slots)"
+            "(bufgym.sb3.SlotPolicy)"
         )
     fields = (*features.slot_fields, *features.context_fields)
-    return Weights(fields, _network(scorer.score, scorer.priors[0]), _network(scorer.accept, scorer.priors[1]))
+    return Weights(fields, _network(scorer.score), _network(scorer.accept))
 
 
-def _network(perceptron: nn.Sequential, prior: Tensor) -> Network:
-    """ReLU layers, one output and direct weights of the inputs; torch keeps weights as [outputs, inputs]."""
+def _network(perceptron: nn.Sequential) -> Network:
+    """ReLU layers, one output and no direct weights of the inputs; torch keeps weights as [outputs, inputs]."""
     *hidden, last = [layer for layer in perceptron if isinstance(layer, nn.Linear)]
     return Network(
-        array(prior),
+        np.zeros(hidden[0].in_features, np.float32),
         array(last.bias),
         tuple((np.ascontiguousarray(array(layer.weight).T), array(layer.bias)) for layer in hidden),
         array(last.weight)[0],

@@ -20,10 +20,8 @@ from bufgym.utils.errors import BufgymError
 ACCEPT_BIAS = 2.0  # Initial logit of accepting: exploration that drops messages where there is room learns little
 
 
-OCCUPIED = ("occupied", "rule_place")
-"""Slot fields that are 0 for an empty slot alone."""
-RULED = ("rule_drops", "rule_accepts")
-"""Fields that say what the rule chooses: of a slot, and of the context."""
+OCCUPIED = "occupied"
+"""The slot field that is 0 for an empty slot alone."""
 
 
 def takes_masks(agent: Any) -> bool:
@@ -71,31 +69,16 @@ class SlotScorer(nn.Module):
         width: units of each hidden layer.
         masked: whether actions are masked. Empty slots are then never chosen, so they get the logit 0 unscored.
         accept_bias: initial logit of accepting.
-        prior: logit of what the rule gap-price chooses, besides; it needs ``fields="rule"``. The scorer then learns
-            what to add to the rule.
     """
 
     def __init__(
-        self,
-        features: SlotExtractor,
-        width: int,
-        masked: bool = True,
-        accept_bias: float = ACCEPT_BIAS,
-        prior: float = 0.0,
+        self, features: SlotExtractor, width: int, masked: bool = True, accept_bias: float = ACCEPT_BIAS
     ) -> None:
         super().__init__()
         slots, inputs = features.slots, features.per_slot
         self.shape = (slots, inputs)
         self.latent_dim_pi, self.latent_dim_vf = slots + 1, width
-        self.occupied = next((k for k, name in enumerate(features.slot_fields) if name in OCCUPIED), None)
-        self.priors = torch.zeros(2, inputs)
-        """Direct weights of the inputs in the logit of dropping a slot, and in that of accepting the newcomer."""
-        if prior != 0:
-            names = [*features.slot_fields, *features.context_fields]
-            if RULED[0] not in names:
-                raise BufgymError(f"prior = {prior:g}: what the rule chooses is not observed; make fields = 'rule'")
-            for weights, name in zip(self.priors, RULED, strict=True):
-                weights[names.index(name)] = prior
+        self.occupied = next((k for k, name in enumerate(features.slot_fields) if name == OCCUPIED), None)
         self.masked = masked and self.occupied is not None
         self.score = _perceptron(inputs, width)
         """Slot -> logit of dropping it; the last slot is the newcomer, so its logit is for rejecting."""
@@ -120,8 +103,7 @@ class SlotScorer(nn.Module):
             drop = torch.zeros(occupied.shape).masked_scatter(occupied, self.score(slots[occupied]).squeeze(-1))
         else:
             drop = self.score(slots).squeeze(-1)
-        drop = drop + slots @ self.priors[0]
-        return torch.cat([drop, self.accept(slots[:, -1]) + (slots[:, -1] @ self.priors[1])[:, None]], dim=1)
+        return torch.cat([drop, self.accept(slots[:, -1])], dim=1)
 
     def forward_critic(self, features: Tensor) -> Tensor:
         """Latent from the mean over messages and from the newcomer, whose width is independent of L."""
@@ -144,8 +126,8 @@ def _perceptron(inputs: int, width: int, bias: float = 0.0) -> nn.Sequential:
 class SlotPolicy(MaskableMultiInputActorCriticPolicy):
     """Actor and critic from a ``SlotScorer``, for MaskablePPO or, with ``masked=False``, for PPO."""
 
-    def __init__(self, *args: Any, width: int = 32, masked: bool = True, prior: float = 0.0, **kwargs: Any) -> None:
-        self.width, self.masked, self.prior = width, masked, prior
+    def __init__(self, *args: Any, width: int = 32, masked: bool = True, **kwargs: Any) -> None:
+        self.width, self.masked = width, masked
         kwargs.pop("use_sde", None)  # PPO passes it to every policy, MaskablePPO to none; actions are discrete
         kwargs.setdefault("features_extractor_class", SlotExtractor)
         # Layers are initialised here as torch does; the library's orthogonal scheme would undo the accept bias.
@@ -155,9 +137,7 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
     def _build_mlp_extractor(self) -> None:
         features = self.features_extractor
         assert isinstance(features, SlotExtractor)
-        self.mlp_extractor = SlotScorer(
-            features, self.width, self.masked, 0.0 if self.prior else ACCEPT_BIAS, self.prior
-        )  # type: ignore[assignment]
+        self.mlp_extractor = SlotScorer(features, self.width, self.masked)  # type: ignore[assignment]
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
@@ -167,4 +147,4 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), **settings)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {"width": self.width, "masked": self.masked, "prior": self.prior}
+        return super()._get_constructor_parameters() | {"width": self.width, "masked": self.masked}

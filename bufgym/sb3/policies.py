@@ -15,9 +15,7 @@ from bufgym.envs.own import write_in_python
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies import Policy, candidate_network
-from bufgym.policies.chains import SCRATCH
 from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, REMEMBERED, SCALES, WORK, follow, inputs, recall
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.candidates import CandidateDecisions, candidates_of, perceptron
@@ -70,8 +68,7 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     if masked and isinstance(getattr(network, "mlp_extractor", None), SlotScorer) and not decisions.for_topics:
         return weights_of(network).policy(name, about)
     if not decisions.for_topics:
-        memory: Any = {"memory": REMEMBERED, "work": SCRATCH} if decisions.by_rule else {}
-        return Policy(name, decisions.on_arrival, about=about, reads_rate=True, **memory)
+        return Policy(name, decisions.on_arrival, about=about, reads_rate=True)
     return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True)
 
 
@@ -105,19 +102,16 @@ class _Decisions:
             observe.SLOT_FIELDS + observe.TOPIC_SLOT_FIELDS,
             observe.CONTEXT_FIELDS + observe.TOPIC_CONTEXT_FIELDS,
         )
-        by_rule = ObservationForm(form, RULE_SLOT_FIELDS, RULE_FIELDS, self.capacity)
-        self.by_rule = space == by_rule.space
         if names is None:
             self.for_topics = numbers == ObservationForm(form, *all_fields, self.capacity).numbers
         else:
             self.for_topics = any(field.name in names for field in observe.TOPIC_FIELDS)
-        one_queue = (RULE_SLOT_FIELDS, RULE_FIELDS) if self.by_rule else (observe.SLOT_FIELDS, observe.CONTEXT_FIELDS)
-        per_slot, context = all_fields if self.for_topics else one_queue
+        per_slot, context = all_fields if self.for_topics else (observe.SLOT_FIELDS, observe.CONTEXT_FIELDS)
         known = [field.name for field in per_slot + context]
         for field in names or ():
             if field not in (*known, *observe.BUILT_IN) and observe.own_field(field) is None:
                 raise BufgymError(f"model {name}: observes {field!r}, which is no field (bufgym list observations)")
-        only_chosen = names is not None and not (self.for_topics or self.by_rule)
+        only_chosen = names is not None and not self.for_topics
         self.form = ObservationForm(form, per_slot, context, self.capacity, names, only_chosen=only_chosen)
         if self.for_topics and (self.form.named is not None or self.form.own_places):
             raise BufgymError(f"model {name}: observes fields of one's own; with several topics no policy can")
@@ -162,8 +156,6 @@ class _Decisions:
             if self.for_topics:
                 observe.observe_topic_slots(buffer, arrival, arriving, slots)
                 observe.observe_topic_context(buffer, arrival, arriving, context)
-            elif self.by_rule:
-                observe_rule(buffer, arrival, memory, slots, context)
             else:
                 observe.observe(buffer, arrival, slots, context)
         for place in self.form.own_places:

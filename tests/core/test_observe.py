@@ -19,7 +19,6 @@ from bufgym.model.observe import FIELDS, TOPIC_FIELDS, Field, declare
 from bufgym.model.qoi import saturating
 from bufgym.model.topics import Topic
 from bufgym.policies import guided, guided_topics
-from bufgym.policies.rule_fields import RULE_FIELDS, RULE_SLOT_FIELDS, observe_rule
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
 from bufgym.sim.decisions import decide
@@ -211,7 +210,7 @@ TABLES = {
     "observed": OBSERVED,
     "guided": guided.INPUT_FIELDS,
     "guided topics": guided_topics.INPUT_FIELDS,
-    "scorers": (*observe.FIELDS, *ON_BOARD, *RULE_FIELDS, *RULE_SLOT_FIELDS),
+    "scorers": (*observe.FIELDS, *ON_BOARD),
 }
 GROUPS = {"queue", "time", "motion", "value", "link", "topic"}
 
@@ -251,13 +250,14 @@ def test_fields_of_one_queue_stay_in_their_bounds(case, v) -> None:
         observe.observe_on_board(buffer, arrival, context)
         observe.observe_on_board_slots(buffer, arrival, rows)
         check(ON_BOARD, [*context, *rows])
-        context, rows = np.zeros(len(RULE_FIELDS)), np.zeros((len(RULE_SLOT_FIELDS), width))
-        observe_rule(buffer, arrival, memory, rows, context)
-        check((*RULE_FIELDS, *RULE_SLOT_FIELDS), [*context, *rows])
+        context = np.zeros(guided.N_INPUTS)
+        guided.recall(buffer, arrival, memory, guided.BASE)
+        guided.inputs(buffer, arrival, memory, guided.BASE, context)
+        check(guided.INPUT_FIELDS, context)
         return ANYTHING.on_arrival(buffer, arrival, memory)
 
-    by_rule = policies.Policy("watched", on_arrival, memory=guided.REMEMBERED, work=guided.WORK, reads_rate=True)
-    case.run(by_rule, v)
+    watched = policies.Policy("watched", on_arrival, memory=guided.REMEMBERED, work=guided.WORK, reads_rate=True)
+    case.run(watched, v)
 
 
 @pytest.mark.kernels

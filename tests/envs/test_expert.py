@@ -70,6 +70,7 @@ def episodes(draw: Any) -> tuple[Episode, int]:
     n = draw(st.integers(2, 6))
     gaps = st.lists(st.integers(0, 9), min_size=n, max_size=n)
     times, x = np.cumsum(draw(gaps)), np.cumsum(draw(gaps)) / draw(st.sampled_from([1, 4]))
+    x = np.minimum(x, x[draw(st.integers(0, n - 1))])  # it may stand still from some moment on
     steps = draw(st.lists(st.tuples(st.integers(1, 12), st.integers(0, 14)), min_size=1, max_size=5))
     knots = np.cumsum([(0, 0), *steps], axis=0)
     after = draw(st.sampled_from(["stop", "loop", "hold"]))
@@ -83,8 +84,14 @@ DEAD = Episode(messages([0, 1, 2], 4, [0.0, 1.0, 2.0]), Link(trace([(0, 0), (5, 
 """The link ends in the midst of the first message, which never leaves the socket."""
 
 
+STANDS = Episode(messages(range(0, 15, 3), 4, [0.0, 1.0, 2.0, 3.0, 3.0]), Link(trace([(0, 0), (10, 4)]), 0))
+"""The robot stands still from the fourth message on. Nothing gains after that one, yet the fifth may stand in for it."""
+
+
 @pytest.mark.kernels
 @example((DEAD, 1), V, [0])
+@example((STANDS, 1), V, [0, 1, 2])
+@example((STANDS, 3), V, [0, 1, 2])
 @given(episodes(), st.sampled_from([V, qoi.saturating(3.0)]), st.lists(st.integers(0, 2**32 - 1), max_size=4))
 def test_values_are_those_of_all_action_sequences(case: tuple[Episode, int], v: Any, seeds: list[int]) -> None:
     """At the start, and after actions at random."""

@@ -63,21 +63,6 @@ def test_actions_are_the_outputs_of_a_policy_over_their_scales(case: str) -> Non
     assert np.array_equal(gone, rolled(env, case, GuidedWeights(weights).policy("constant")))
 
 
-def ruled(seen: Any, valid: Any) -> int:
-    """The action that the rule's own choice names, as ``fields="rule"`` shows it."""
-    capacity = len(seen["rule_drops"]) - 1
-    return capacity + 1 if seen["rule_accepts"][0] else int(np.argmax(seen["rule_drops"]))
-
-
-@kernels
-@pytest.mark.parametrize("case", CASES)
-def test_to_do_what_the_rule_chooses_is_gap_price(case: str) -> None:
-    scenario, options = CASES[case]
-    env = SenderEnv(scenario, L, fields="rule", **options, actions="slots")
-    assert last_info(env, ruled, seed=0)["invalid"] == 0
-    assert np.array_equal(env.rows.senders.batch.log["dropped_us"][0], rolled(env, case, policies.get("gap-price")))
-
-
 def test_memory_begins_anew_with_the_episode() -> None:
     scenario, _ = CASES["unequal"]
     used, fresh = (SenderEnv(scenario, L, actions="guided", fields="guided") for _ in range(2))
@@ -130,11 +115,10 @@ test_a_wrong_option_or_action_ends_in_a_sentence = refused(
     (lambda: SenderEnv(actions="guide"), "unknown actions 'guide'; did you mean 'guided'?"),
     (
         lambda: SenderEnv(fields="guide", actions="slots"),
-        "fields = 'guide': must be a list of names, 'compact', 'guided' or 'rule'",
+        "fields = 'guide': must be a list of names, 'compact' or 'guided'",
     ),
     (lambda: SenderEnv("topics", actions="guided"), "actions = 'guided': .*, not several topics"),
     (lambda: SenderEnv("topics", fields="guided"), "fields = 'guided': .*, not several topics"),
-    (lambda: FleetVecEnv(fields="rule"), "fields = 'rule': .*, not a cell of robots"),
     (lambda: FleetVecEnv(actions="guided"), "actions = 'guided': .*, not a cell of robots"),
     (lambda: expert.policy(SenderEnv(actions="guided"), "afr"), "an expert answers with slots"),
     (lambda: begun()[0].step(np.full(10, 2.0)), r"action: 2.0 must lie in -1..1"),

@@ -18,7 +18,7 @@ from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy
 from bufgym.policies.guided import GuidedWeights
-from bufgym.policies.learned import BY_RULE, NAMES
+from bufgym.policies.learned import NAMES
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received
@@ -89,7 +89,6 @@ def driver(folder, text, *flags):
     return compiled(folder, "gcc", "c99", folder / "driver.c", text, *flags)
 
 
-RULE = tuple(field.name for field in BY_RULE)
 IN_C = tuple(name for name in NAMES if name not in without_c(NAMES))
 
 
@@ -106,10 +105,6 @@ def every_output() -> Policy:
 
 AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
 AGENTS |= {"every-field": every_field(), "every-output": every_output()}
-AGENTS |= {
-    "by-rule": random_weights(RULE, 7, 5, seed=5).policy("by-rule"),
-    "by-rule-and-more": random_weights((*RULE, *IN_C), 7, seed=6).policy("by-rule-and-more"),
-}
 AGENTS |= {
     "among-candidates": random_choices(2, False, 64, 64, seed=7).policy("among-candidates"),
     "at-arrivals": random_choices(3, True, 6, 5, 4, activation="relu", seed=13, accept=4.0).policy("at-arrivals"),
@@ -275,17 +270,12 @@ def test_a_field_without_c_is_refused_by_name_and_file(tmp_path, monkeypatch):
     """Each part loses the lines of one field. Whoever does not read it has a header all the same."""
     module = importlib.import_module("bufgym_live.robot.c.header")
     parts = shutil.copytree(module._PARTS, tmp_path / "parts")
-    for part, macro in (("features.h", "LOAD"), ("inputs.h", "IN_STALL"), ("rule_fields.h", "RULE_DROPS")):
+    for part, macro in (("features.h", "LOAD"), ("inputs.h", "IN_STALL")):
         text = (parts / part).read_text(encoding="utf-8")
         cut = re.sub(rf"^.*\[BUFGYM_{macro}\].* = .*\n", "", text, flags=re.MULTILINE)
         assert cut != text
         (parts / part).write_text(cut, encoding="utf-8")
     monkeypatch.setattr(module, "_PARTS", parts)
-    rule = "guided_stall in inputs.h, rule_drops in rule_fields.h"
-    for name, lacking in (
-        ("every-field", "load in features.h"),
-        ("by-rule", rule),
-        ("every-output", "guided_stall in"),
-    ):
+    for name, lacking in (("every-field", "load in features.h"), ("every-output", "guided_stall in inputs.h")):
         refuse(f"policy {name}: reads fields that have no C: {lacking}", header, AGENTS[name], 8, EXPONENTIAL)
     assert header(random_weights(("occupancy", "rank"), 7, seed=6).policy("few"), 8, EXPONENTIAL)

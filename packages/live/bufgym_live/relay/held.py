@@ -85,8 +85,7 @@ class Held:
         path = ":memory:" if config.folder is None else str(config.folder / FILE)
         try:
             self._db = sqlite3.connect(path, timeout=0.5, isolation_level=None, check_same_thread=False)
-            # A kill of the process loses nothing; a power failure may lose the last moments.
-            for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL", "synchronous = NORMAL"):
+            for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL"):
                 self._db.execute(f"PRAGMA {pragma}")
             self._db.executescript(_SCHEMA)
             self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
@@ -157,7 +156,7 @@ class Held:
         """Note that matching messages are held while the session is away."""
         if session.id is None:
             self._save(session)
-        with self._transaction():
+        with self._transaction(synced=True):
             self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern.text))
         session.durable[id] = pattern
 
@@ -177,7 +176,7 @@ class Held:
         for session in (sender, *receivers):
             if session.id is None:
                 self._save(session)
-        with self._transaction():
+        with self._transaction(synced=True):
             if receivers:
                 row = sender.id, seq, topic, frame, len(receivers), len(receivers)
                 columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
@@ -268,12 +267,17 @@ class Held:
         self._db.close()
 
     @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        """Raises RefusedError: the disk cannot be written; then nothing has changed."""
+    def _transaction(self, synced: bool = False) -> Iterator[None]:
+        """Commit what the block writes; if ``synced``, a power failure does not undo it, nor what was committed before.
+
+        Raises RefusedError: the disk cannot be written; then nothing has changed.
+        """
         self.look()
         if not self.there:
             raise RefusedError("store_full", "the store cannot be written: its file was deleted")
         try:
+            # What an ack promises is synced. Other changes may be undone: a client's numbers make good for each.
+            self._db.execute(f"PRAGMA synchronous = {'FULL' if synced else 'NORMAL'}")
             self._db.execute("BEGIN IMMEDIATE")
             yield
             self._db.execute("COMMIT")

@@ -43,6 +43,7 @@ class _RosSource:
         self._outlets: dict[Published, Outlet] = {}
         self._advertise: Callable[[Published], Awaitable[Outlet]] | None = None
         self._advertising: defaultdict[Published, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._is_stopped: Callable[[], bool] = lambda: False
 
     def _wanted(self, robot: Robot) -> list[str]:
         """Its topics, and the one that is named as the robot's odometry, which need not be one of them."""
@@ -59,31 +60,32 @@ class _RosSource:
     def _listen(self, robot: Robot, advertise: Callable[[Published], Awaitable[Outlet]]) -> None:
         """Publish messages for the topics that this robot receives; note messages that fail."""
         before = robot.topic("to")
-        self._advertise = advertise
+        self._advertise, self._is_stopped = advertise, lambda: robot.latch.is_set
 
         async def take(message: wire.Message) -> None:
             name = message.topic.removeprefix(before)
             if name not in self._receive or message.encoding != "cdr":
                 return
-            if why := robot.refusal(message):
-                robot.client.note(f"{message.topic}: not published: {why}")
-                return
             try:
-                await self._publish(Published(name, message.type), bytes(message.payload))
+                outlet = await self._outlet(Published(name, message.type))
+                # Only now: while ROS matched a new publisher, the deadline may have passed, or a stop have come.
+                if why := robot.refusal(message):
+                    raise BufgymError(why)
+                outlet(bytes(message.payload))
             except Exception as error:  # messages are untrusted, and ROS has its own error types
                 robot.client.note(f"{message.topic}: not published: {error}")
 
         if self._receive:
             robot.client.subscribe(f"^{before}/", take)
 
-    async def _publish(self, topic: Published, payload: bytes) -> None:
-        """Publish a message in CDR here."""
+    async def _outlet(self, topic: Published) -> Outlet:
+        """Publisher of a topic here, which is made when it is first asked for."""
         async with self._advertising[topic]:  # a stop does not wait for another topic's readers
             if topic not in self._outlets:
                 if self._advertise is None:
                     raise BufgymError(f"topic {topic.name}: not published: ROS is not there yet")
                 self._outlets[topic] = await self._advertise(topic)
-        self._outlets[topic](payload)
+        return self._outlets[topic]
 
     def status(self) -> dict[str, Any]:
         """Return the topics that others may publish on, below ``to``, and whether one of them drives it."""
@@ -93,10 +95,12 @@ class _RosSource:
         """Publish a velocity as a Twist, zeros at a stop; refuse other commands, because ROS takes them on topics."""
         match command:
             case {"command": "stop"} if TWIST.name in self._receive:
-                await self._publish(TWIST, b"\0\1\0\0" + bytes(48))
+                (await self._outlet(TWIST))(b"\0\1\0\0" + bytes(48))
                 return
             case {"command": "drive", "linear": linear, "angular": angular} if TWIST.name in self._receive:
-                await self._publish(TWIST, b"\0\1\0\0" + struct.pack("<6d", linear, 0, 0, 0, 0, angular))
+                outlet = await self._outlet(TWIST)
+                if (linear, angular) == (0, 0) or not self._is_stopped():  # a stop may have come meanwhile
+                    outlet(b"\0\1\0\0" + struct.pack("<6d", linear, 0, 0, 0, 0, angular))
                 return
         raise BufgymError(f"command {command!r}: this robot takes commands on topics of ROS: {self._receive}")
 

@@ -132,7 +132,10 @@ class Session:
     async def _order(self, robot: str, **said: str) -> str:
         id, answered = self._stops.put(robot, **said)
         if self.connected.is_set():
-            await self._stops.send(self._connection.send)
+            with contextlib.suppress(
+                Exception
+            ):  # as in ``run``, which notes it, and says it again on the next connection
+                await self._stops.send(self._connection.send)
         await answered
         return id
 

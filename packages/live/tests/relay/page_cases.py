@@ -84,6 +84,8 @@ def health(level: int, says: str) -> Topics:
 class Fleet:
     """A relay with made-up robots, in a thread; each publishes its status and topics some times a second."""
 
+    every_s = 0.1
+
     def __init__(self, token: str | None = None, **changed: Any) -> None:
         """``changed`` are settings of the relay; ``token`` is the robots'."""
         self.hello: dict[str, Any] = {"name": "fleet"} if token is None else {"name": "fleet", "token": token}
@@ -125,7 +127,7 @@ class Fleet:
                     self.came.append(command)
                     answer = {"id": command["id"], "why": "too far" if command.get("x", 0) > 1 else ""}
                     self.robots[said.topic.split("/")[2]][0]["answer"] = answer
-                await asyncio.sleep(0.1)
+                await asyncio.sleep(self.every_s)
 
     async def publish(self, one: Client, name: str, status: dict[str, Any], topics: Topics) -> None:
         kinds = {topic: {"type": type, "encoding": "cdr" if type else "jpeg"} for topic, type, _ in topics}

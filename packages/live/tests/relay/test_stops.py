@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import json
-import random
 import time
 from collections.abc import AsyncIterator
 from typing import Any
@@ -230,44 +229,6 @@ async def test_a_robot_that_was_away_hears_the_stop_before_all_else() -> None:
         one.far.mend()
         await until("it stands", lambda: one.robot.latch.status == {"id": second, "by": "operator"})
         await until("the program", lambda: one.program.names == ["stop"])
-
-
-@compiled
-@pytest.mark.parametrize("seed", range(4))
-async def test_cuts_at_random_moments(seed: int) -> None:
-    """Goals and stops go on while links freeze and are cut. Each executed goal is younger than .5 s, and none came
-    between a stop and its release."""
-    chance = random.Random(seed)
-    async with scene() as one:
-        sent = dict[str, float]()
-        waiting = list[asyncio.Future[Any]]()
-        for k in range(25):
-            link = chance.choice((one.near, one.far))
-            chance.choice((link.freeze, link.cut))()
-            for j in range(chance.randrange(3)):
-                sent[f"{k}.{j}"] = time.monotonic()
-                waiting.append(asyncio.ensure_future(one.goal(f"{k}.{j}")))
-                await asyncio.sleep(chance.uniform(0, 0.05))
-            stops = k % 5 == 4
-            stop = asyncio.ensure_future(one.operator.stop("r")) if stops else None
-            await asyncio.sleep(chance.uniform(0, 0.8) if chance.random() < 0.3 else chance.uniform(0, 0.1))
-            link.mend()
-            if stop is not None:
-                id = await wait("the stop", stop)
-                await until("it stands", lambda id=id: (one.robot.latch.status or {}).get("id") == id)
-                before = len(one.program.done)
-                await until("the program stops", lambda: "stop" in one.program.names)
-                while one.robot.latch.status is not None:
-                    with contextlib.suppress(BufgymError):
-                        await wait("the release", one.operator.release("r", id))
-                    await asyncio.sleep(0.02)
-                assert set(one.program.names[before:]) <= {"stop"}
-            await until("both", lambda: one.operator.connected.is_set() and one.robot.client.connected.is_set())
-        await wait("all goals", asyncio.gather(*waiting))
-        assert await one.goal("last") == ""
-        await until("the last goal", lambda: one.program.names[-1] == "last")
-        ages = {name: at_s - sent[name] for name, at_s in one.program.done if name in sent}
-        assert max(ages.values(), default=0.0) < 0.5, ages
 
 
 @compiled

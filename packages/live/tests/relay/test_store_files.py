@@ -66,3 +66,30 @@ def test_a_damaged_store_ends_the_start_in_a_sentence(tmp_path: Path) -> None:
     data = file.read_bytes()
     file.write_bytes(data[:4096] + bytes(4096) + data[8192:])
     refuse("held.sqlite: .*; a damaged one must be moved away, .* or be replaced by a backup", Store, *given)
+
+
+async def test_what_an_ack_promises_is_synced(tmp_path: Path) -> None:
+    """A command that the relay acks, and a durable subscription that it confirms, outlive a power failure.
+
+    SQLite syncs the file at the end of a transaction that is FULL. Sessions and the robot's own ack are not synced.
+    """
+    said = list[str]()
+    async with (
+        relay(settings(folder=tmp_path)) as server,
+        client(server.port, session="operator") as operator,
+        client(server.port, session="robot") as robot,
+    ):
+        server.hub.store._held._db.set_trace_callback(said.append)
+        await robot.subscribe(f"^{COMMAND}$", durable=True)
+        await operator.acked(COMMAND, 1)
+        await robot.came(1)
+        await robot.say("ack", seq=1)
+        assert (await operator.next())["op"] == "delivered"
+    level = ""
+    levels = dict[str, str]()
+    for statement in said:
+        level = statement.rpartition(" ")[2] if "synchronous" in statement else level
+        words = statement.split()
+        levels[" ".join(words[: words.index("INTO") + 2 if "INTO" in words else 3])] = level
+    assert levels["INSERT INTO message"] == levels["INSERT OR REPLACE INTO durable"] == "FULL"
+    assert levels["DELETE FROM delivery"] == levels["INSERT OR REPLACE INTO session"] == "NORMAL"

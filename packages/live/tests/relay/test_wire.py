@@ -43,6 +43,14 @@ def test_the_page_has_every_key() -> None:
         assert op in documented and own <= set(documented), op
 
 
+def test_the_pages_frame_in_hex() -> None:
+    (text,) = re.findall(r"^((?:(?:[0-9a-f]{2} ?){9,16}\n)+)", PAGE, re.MULTILINE)
+    said = wire.decode(bytes.fromhex(text))
+    assert said._replace(payload=bytes(said.payload)) == Message(
+        "/robots/r/chat", b'"hi"', "json", "", "ann", 7, 1_700_000_000_000_000, no_drop=True
+    )
+
+
 @contextlib.asynccontextmanager
 async def client(*words: str) -> AsyncIterator[list[str]]:
     """The example's process, and the lines that it has printed."""

@@ -3,13 +3,14 @@
 
 import {Cameras} from "./cameras.js";
 import {say, seconds, tint, whenColoursChange} from "./draw.js";
-import {AWAY_MS, Fleet, split, troubles} from "./fleet.js";
+import {AWAY_MS, Fleet, GONE_MS, split, troubles} from "./fleet.js";
 import {Hand} from "./hand.js";
 import {Health} from "./health.js";
 import {Layers} from "./layers.js";
 import {List} from "./list.js";
 import {Map2D} from "./map.js";
 import {DRAWN, HEALTH, json} from "./messages.js";
+import {Near} from "./near.js";
 import {Notices} from "./notices.js";
 import {Overview} from "./overview.js";
 import {Player} from "./player.js";
@@ -25,50 +26,57 @@ const USUAL_POSES = ["odom", "odometry/raw", "odometry", "localization", "tf", "
 const $ = id => document.getElementById(id);
 const escaped = text => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 
-let chosen = null, tab = TABS[0], textMs = -Infinity, texts = false, stale = false, wants = false, space = null, onMs = null, awayMs = performance.now();
+let fleet, chosen = null, tab = TABS[0], textMs = -Infinity, texts = false, stale = false, wants = false, space = null, onMs = null, awayMs = performance.now();
 
 const nowMs = () => player.replay ? player.nowMs : relay.clock.now();
-const isReplay = () => player.replay !== null;
+const isReplay = () => fleet === recorded;
 const robot = () => fleet.get(chosen);
 
-const fleet = new Fleet({
-  nowMs,
-  drawn: one => one.name === chosen,
+// How the page shows a fleet, while it is the one that is shown.
+const shows = (own, now) => ({
+  nowMs: now,
+  drawn: one => own() === fleet && one.name === chosen,
   added(one) {
-    list.add(one);
     one.troubles = [];
+    if (own() !== fleet) return;
+    list.add(one);
     if (one.name === chosen) show();
   },
   here(one) {
+    if (own() !== fleet) return;
     if (route().name === null) replace(one.name, tab);  // the address may be newer than what is chosen
     if (chosen === null || one.name === chosen) show();
   },
   removed(name) {
+    if (own() === live) notices.removed(name);
+    if (own() !== fleet) return;
     list.remove(name);
     if (name === chosen) location.hash = address(null);
   },
   status(one) {
     wants = true;
-    if (one.name !== chosen) return;
-    hand.answered(one);
-    hand.offerPolicies();
+    if (own() === live) hand.answered(one);
+    if (one.name === chosen) hand.offerPolicies();
   },
-  stopped(one) { hand.stopped(one); },
-  reframed(one) { if (one.name === chosen) map.forget(); },
-  scanned(one, pose, scan) { map.addScan(pose, scan); },
+  stopped(one) { if (own() === live) hand.stopped(one); },
+  reframed(one) { if (own() === fleet && one.name === chosen) map.forget(); },
+  scanned(one, pose, scan) { if (own() === fleet) map.addScan(pose, scan); },
   moved(isLayer = false) {
+    if (own() !== fleet) return;
     map.changed = true;
     if (space) space.changed = true;
     map.layersChanged ||= isLayer;
   },
 });
+// Alerts and stops are of the robots that are there, also while a recording is shown.
+const live = fleet = new Fleet(shows(() => live, () => relay.clock.now())), recorded = new Fleet(shows(() => recorded, nowMs));
 const list = new List($("list"), $("search"), $("count"));
 const layers = new Layers($("layers"), () => {
   map.belowMs = -Infinity;
   subscribe();
 });
 const map = new Map2D($("map"), layers, name => { location.hash = address(name, tab); });
-const notices = new Notices($("notices")), overview = new Overview($), health = new Health($);
+const notices = new Notices($("notices"), $("spoken")), near = new Near($("near")), overview = new Overview($), health = new Health($);
 const cameras = new Cameras($("first"), $("cameras"), $("large"));
 const relay = new Relay({
   state(text, isOn) {
@@ -81,33 +89,30 @@ const relay = new Relay({
     hand.offerPolicies();
     hand.draw();
   },
-  message(message) { if (!isReplay()) tried(message); },
+  message(message) { tried(live, message); },
   said(said) {
     if (said.op === "recordings") player.list(said.files);
     else if (said.op === "replayed") player.replay?.take(said);
-    else if (said.op === "refused") notices.refused(split(String(said.topic ?? "")).name ?? chosen ?? "", `${said.what}: ${said.why}`, nowMs());
+    else if (said.op === "refused") notices.refused(split(String(said.topic ?? "")).name ?? chosen ?? "", `${said.what}: ${said.why}`, relay.clock.now());
   },
   unauthorized(why, token) { signIn.refused(why, token); },
 });
 const signIn = new SignIn($, relay);
 const player = new Player($, relay, {
-  message: message => tried(message),
+  message: message => tried(recorded, message),
   begin() {
-    forget();
-    for (const id of ["status", "last", "poses", "health", "chosen"]) relay.unsubscribe(id);
-    setTimeout(sayState);
+    turn(recorded);
+    for (const id of ["poses", "chosen"]) relay.unsubscribe(id);
   },
   jump() {
-    for (const one of fleet.all()) fleet.blank(one);
+    for (const one of recorded.all()) recorded.blank(one);
     map.forget();
   },
-  end() {
-    forget();
-    begin();
-    sayState();
-  },
+  end() { turn(live); },
 });
-const hand = new Hand($, relay, map, notices, {robot, isReplay, nowMs, frame: () => shown().frame, removed: name => fleet.remove(name)});
+const hand = new Hand($, relay, map, notices, {
+  robot, isReplay, nowMs: () => relay.clock.now(), live: () => live.get(chosen), all: () => live.all(), frame: () => shown().frame, removed: name => live.remove(name),
+});
 
 function begin() {
   relay.subscribe("status", `${ALL}status$`);
@@ -122,10 +127,10 @@ const layered = () => tab === "3d" ? [...DRAWN, "cloud"] : DRAWN;  // kinds
 // Of all robots where they are and what is wrong, of the chosen one all that is drawn.
 function subscribe() {
   wants = false;
-  if (isReplay()) return;                           // what is drawn now comes from the file
   const of = topics => `(${[...new Set(topics)].sort().map(escaped).join("|")})$`;
+  relay.subscribe("health", ALL + of(["diagnostics", ...live.topics(HEALTH)]));
+  if (isReplay()) return;                           // what is drawn now comes from the file
   relay.subscribe("poses", ALL + of([...USUAL_POSES, ...fleet.topics(["pose", "tf"])]));
-  relay.subscribe("health", ALL + of(["diagnostics", ...fleet.topics(HEALTH)]));
   if (chosen === null) return;
   const own = kinds => robot() ? fleet.topics(kinds, [robot()]) : [];
   const pictures = own(["picture"]), topics = ["queue", ...own(["scan"]).slice(0, 1), ...own(layered()).filter(topic => layers.isOn(topic))];
@@ -133,10 +138,10 @@ function subscribe() {
 }
 
 // A message that is not what it says it is changes nothing.
-function tried(message) {
+function tried(those, message) {
   try {
     if (message.topic === "/relay/status") sayRelay(json(message));
-    else fleet.take(message, relay.isLatched(message.topic));
+    else those.take(message, relay.isLatched(message.topic));
   } catch {
     return;
   }
@@ -207,34 +212,44 @@ function sayAbsence() {
 }
 
 function sayRobots() {
-  for (const one of fleet.all()) {
-    one.away = nowMs() - one.heardMs > AWAY_MS;
-    one.troubles = troubles(one, nowMs());
-    // Who was not heard while there was no connection is not known to be silent.
-    if (!isReplay() && onMs !== null && performance.now() - onMs > AWAY_MS) notices.troubles(one, nowMs());
+  const now = relay.clock.now();
+  near.mark(live.all().filter(one => now - one.heardMs < GONE_MS));
+  near.mark(recorded.all());
+  for (const [one, ms] of [...live.all().map(one => [one, now]), ...recorded.all().map(one => [one, nowMs()])]) {
+    one.away = ms - one.heardMs > AWAY_MS;
+    one.troubles = troubles(one, ms);
   }
+  // Who was not heard while there was no connection is not known to be silent.
+  if (onMs !== null && performance.now() - onMs > AWAY_MS) for (const one of live.all()) notices.troubles(one, now);
   list.update(fleet.all(), chosen, tab, nowMs());
-  notices.draw(nowMs());
+  notices.draw(now);
 }
 
 // A map has one frame: the chosen robot's. A place without a frame is shown on each.
 function shown() {
-  const all = fleet.all().filter(one => one.isHere || one === robot()), frame = robot()?.pose?.frame || all.find(one => one.pose?.frame)?.pose.frame;
+  const all = fleet.all().filter(one => one.isHere || one.troubles.length || one === robot()), frame = robot()?.pose?.frame || all.find(one => one.pose?.frame)?.pose.frame;
   const here = all.filter(one => !one.pose?.frame || one.pose.frame === frame), away = all.length - here.length;
   say($("frame"), [frame && `in ${frame}`, away && `${away} in other frames`].filter(Boolean).join(", "));
+  $("no-map").hidden = !robot()?.pose || [...robot().layers.values()].some(layer => layer.kind === "grid");
   return {here, frame};
 }
 
-function forget() {
-  fleet.clear();
+// Show a fleet: what robots say now, or what they said in a recording.
+function turn(to) {
+  fleet = to;
+  recorded.clear();
   list.clear();
-  notices.forget();
+  for (const one of to.all()) list.add(one);
   chosen = null;
   replace(null);
   show();
   map.forget();
   map.fitted = false;
+  sayState();
 }
+
+// An alert is of now.
+$("notices").addEventListener("click", event => { if (isReplay() && event.target.matches("a")) player.end(); });
 
 $("fit").onclick = () => { map.follow = true; map.fitted = false; };
 

@@ -1,16 +1,17 @@
 // What the robots have said: a state for each, which messages change and others draw.
 
 import {Stamps} from "./clock.js";
-import {colourOf} from "./draw.js";
+import {colourOf, seconds} from "./draw.js";
 import {layer} from "./drawings.js";
 import {unpacked} from "./flat.js";
 import {Place, within} from "./frames.js";
 import {charge, diagnostics, DRAWN, flag, json, kindOf, queue, scan, status} from "./messages.js";
 
 export const AWAY_MS = 5000, LOW = 0.25;
-const GONE_MS = 600_000;                            // who was not here for so long needs nobody now
+export const GONE_MS = 600_000;                     // who was not here for so long needs nobody now
 const HISTORY_MS = 60_000, TRAIL_GAP_MS = 300, POSES = 100, NEAR_MS = 20, GAP_MS = 400, PARTS = 500, LAYERS = 64, EARLY = 1000;
 const JUMPED_MS = 60_000;                           // a jump of a robot's clock is told for so long
+const SAME_MS = 3000;                               // a text that is said for longer says for how long
 const LATELY_MS = 10_000, MANY = 0.3;               // a robot that drops so many of its messages lately is in trouble
 const ROBOT = /^\/(?:robots\/([^/]+)|(ut\/[^/]+))\/(.+)$/;  // ours, and Robofleet's
 
@@ -114,6 +115,7 @@ export class Fleet {
   }
 
   takeStatus(robot, status, ms) {
+    if (robot.status?.text !== status.text) robot.textMs = ms;  // since when it says so
     robot.status = status;
     for (const [topic, what] of Object.entries(status.publishes ?? {})) robot.kinds[topic] ??= kindOf(topic, what);
     this.takePose(robot, robot.place.takeStatus(status.location, ms), ms);
@@ -196,6 +198,13 @@ function poseAt(robot, ms) {
   return {x: before.x + part * (after.x - before.x), y: before.y + part * (after.y - before.y), yaw: before.yaw + part * turn};
 }
 
+// What a robot says of itself, and for how long; of one that is silent it is what it said before.
+export function doing(robot, nowMs) {
+  const {text} = robot.status ?? {}, saidMs = nowMs - robot.textMs;
+  if (nowMs - robot.heardMs > AWAY_MS) return text ? `silent; before: ${text}` : "silent";
+  return text ? `${text}${saidMs > SAME_MS ? `, for ${seconds(saidMs / 1000)}` : ""}` : "";
+}
+
 export const battery = robot => robot.status?.battery ?? robot.charge;
 
 // The part of a robot's messages that it dropped in the last ten seconds.
@@ -204,7 +213,7 @@ function dropping(robot) {
   return last && last.put > first.put ? (last.dropped - first.dropped) / (last.put - first.put) : 0;
 }
 
-// What is wrong with a robot, the worst first: {kind, rank, level, text}; kinds are fault, silent, stopped, battery, clock, dropping and warning.
+// What is wrong with a robot, the worst first: {kind, rank, level, text}; kinds are fault, silent, stopped, battery, clock, dropping, near and warning.
 export function troubles(robot, nowMs) {
   const {status = {}} = robot, silentMs = nowMs - robot.heardMs, charged = battery(robot), part = dropping(robot), found = [];
   if (!robot.isHere && silentMs > GONE_MS) return [];
@@ -220,6 +229,7 @@ export function troubles(robot, nowMs) {
   const {jump} = robot.stamps;
   if (jump && nowMs - jump.ms < JUMPED_MS) say("clock", 3, "warn", `its clock jumped by ${Math.round(jump.byMs / 1000)} s`);
   if (part > MANY) say("dropping", 3, "warn", `drops ${Math.round(100 * part)} %`);
+  if (robot.near) say("near", 3, "warn", `${robot.near.m.toFixed(1)} m from ${robot.near.name}`);
   if (doubtful) say("warning", 3, "warn", `${doubtful.name}: ${doubtful.says}`);
   return found;
 }

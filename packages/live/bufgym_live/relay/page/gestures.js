@@ -1,6 +1,6 @@
 // How the map is moved, zoomed and tapped, and how a place with a heading is drawn on it: by mouse, by wheel, by fingers, by keys.
 
-const STILL_PX = 6, STEP_PX = 60;
+const STILL_PX = 6, STEP_PX = 60, AIM_PX = 15, FINE_PX = 1, LOOK_PX = 40, TURN = Math.PI / 12;
 
 // map: {canvas, shift(dx, dy), zoom(factor, at), pick(x, y), aim(from, to, isOver)}; aim is for a tool, where one is in hand.
 export function listen(map) {
@@ -31,8 +31,27 @@ export function listen(map) {
     before = null;
     map.preview = null;
   });
+  aimByKeys(map);
   wheelAndKeys(canvas, (dx, dy) => map.shift(dx, dy), (factor, at) => map.zoom(factor, at));
   fingers(map);
+}
+
+// A tool by keys: arrows move its place, with shift by a pixel; Enter takes it, then left and right turn where it looks, and Enter ends it.
+function aimByKeys(map) {
+  const {canvas} = map;
+  let tool = null, from = null, yaw = null;
+  canvas.addEventListener("keydown", event => {
+    if (!map.tool) return;
+    if (map.tool !== tool) [tool, from, yaw] = [map.tool, [canvas.clientWidth / 2, canvas.clientHeight / 2], null];
+    const step = {ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1]}[event.key], isOver = event.key === "Enter" && yaw !== null;
+    if (!step && event.key !== "Enter") return;
+    event.preventDefault();
+    event.stopImmediatePropagation();               // the map does not move, too
+    if (!step) yaw ??= 0;
+    else if (yaw !== null) yaw -= TURN * step[0];
+    else from = from.map((at, k) => Math.min([canvas.clientWidth, canvas.clientHeight][k], Math.max(0, at + step[k] * (event.shiftKey ? FINE_PX : AIM_PX))));
+    map.aim(from, yaw === null ? from : [from[0] + LOOK_PX * Math.cos(yaw), from[1] - LOOK_PX * Math.sin(yaw)], isOver);
+  });
 }
 
 // move(dx, dy, isShift) and zoom(factor, at), in pixels.

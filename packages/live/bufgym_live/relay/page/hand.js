@@ -11,10 +11,11 @@ const POSE = "geometry_msgs/msg/PoseStamped", ESTIMATE = "geometry_msgs/msg/Pose
 const TOPICS = {
   goal: {"goal_pose": POSE, "move_base_simple/goal": POSE}, pose: {"initialpose": ESTIMATE}, stop: {"cmd_vel": "geometry_msgs/msg/Twist"},
 };
+const ARMED_MS = 4000;                              // the second press that stops all robots comes within so long
 const KINDS = ["stop", "goal", "pose", "cancel", "drive"];
 
 export class Hand {
-  // asks: {robot(), isReplay(), frame(), nowMs(), removed(name)}
+  // asks: {robot(), live(), all(), isReplay(), frame(), nowMs(), removed(name)}; ``live`` is the chosen robot as it is now, ``robot`` as it is shown
   constructor($, relay, map, notices, asks) {
     this.$ = $;
     this.relay = relay;
@@ -22,6 +23,8 @@ export class Hand {
     this.notices = notices;
     this.asks = asks;
     this.sent = null;
+    this.all = null;                                // of a stop for all: {count, open: robots -> ids of those that have not confirmed}
+    this.armedMs = -Infinity;                       // when the button for all was pressed once
     this.number = 0;
     this.drive = new Drive($, relay);
     $("remove").onclick = () => {
@@ -33,11 +36,12 @@ export class Hand {
       this.stop();
     };
     $("release").onclick = () => this.release();
+    $("stop-all").onclick = () => this.stopAll();
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
     addEventListener("keydown", event => {
       if (event.key === "Escape") this.escape();
-      const isText = /** @type {Element} */ (event.target).matches("[type=search], [type=password], select");
+      const isText = /** @type {Element} */ (event.target).matches("[type=search], [type=password], [type=number], select");
       if (event.key.toLowerCase() === "x" && !isText && !event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey) $("stop").click();
     });
     $("policy").onchange = () => {
@@ -71,7 +75,10 @@ export class Hand {
     this.map.preview = null;
     this.map.canvas.classList.toggle("aims", this.map.tool !== null);
     for (const each of ["goal", "pose"]) this.$(each).setAttribute("aria-pressed", this.map.tool?.kind === each);
-    if (this.map.tool) this.tell(`${robot.name}: press where, drag to where it shall look; Escape ends it`, "aim");
+    if (this.map.tool) {
+      this.map.canvas.focus({preventScroll: true});
+      this.tell(`${robot.name}: press where, drag to where it shall look; or arrows, Enter, arrows, Enter; Escape ends it`, "aim");
+    }
     else if (this.told === "aim") this.tell("");
   }
 
@@ -87,18 +94,36 @@ export class Hand {
   }
 
   // A robot that knows stops hears this as soon as it can be reached, before all else, and stands until somebody releases it.
-  stop() {
-    const robot = this.asks.robot();
-    if (!robot || this.asks.isReplay()) return;
-    if (!robot.status?.commands.includes("release")) return this.send("stop");
-    if (!this.way(robot, "stop")) return;
+  stop(robot = this.asks.live()) {
+    if (!robot || !this.way(robot, "stop")) return;
+    if (!robot.status?.commands.includes("release")) return this.send("stop", {}, robot);
     this.take(null);
     this.sent = {id: this.relay.stop(robot.name), kind: "stop", robot, state: "on its way"};
     this.draw();
   }
 
+  // Live robots that can be stopped; those that are silent, too: a stop is kept for them.
+  stoppable() { return this.asks.all().filter(robot => robot.isHere && this.way(robot, "stop") !== undefined); }
+
+  stopAll() {
+    const robots = this.stoppable();
+    if (performance.now() - this.armedMs > ARMED_MS) this.armedMs = performance.now();
+    else {
+      this.armedMs = -Infinity;
+      this.drive.release();
+      const all = this.all = {count: robots.length, open: new Map()};
+      for (const robot of robots) {
+        this.stop(robot);
+        if (this.sent?.robot === robot) all.open.set(robot, this.sent.id);
+      }
+      this.sent = null;
+    }
+    this.draw();
+  }
+
   release() {
-    const robot = this.asks.robot(), stop = robot?.status?.stop;
+    this.all = null;
+    const robot = this.asks.live(), stop = robot?.status?.stop;
     if (!stop) return;
     this.sent = {id: this.relay.release(robot.name, stop.id), kind: "release", robot, state: "on its way"};
     this.draw();
@@ -129,6 +154,7 @@ export class Hand {
   answered(robot) {
     const {answer: {id, why}, stop} = robot.status, {sent} = this;
     if (this.relay.stops.has(robot.name) && [id, stop?.id].includes(this.relay.stops.get(robot.name))) this.relay.stops.delete(robot.name);
+    if (this.all?.open.has(robot) && [id, stop?.id].includes(this.all.open.get(robot))) this.all.open.delete(robot);
     const isPolicy = sent?.kind === "policy" && robot.queue?.policy === this.$("policy").value;
     if (!sent || sent.doneMs || sent.robot !== robot || (id !== sent.id && stop?.id !== sent.id && !isPolicy)) return;
     if (why && id === sent.id) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
@@ -139,19 +165,24 @@ export class Hand {
 
   // What is offered, and how far the last command is.
   draw() {
-    const robot = this.asks.robot(), isOff = !robot || this.asks.isReplay(), isLive = this.relay.isLive, ways = Object.fromEntries(KINDS.map(kind => [kind, !isOff && this.way(robot, kind) !== undefined]));
-    const may = !isOff && this.relay.mayCommand(`/robots/${robot.name}/command`);
-    this.$("stop").hidden = !may && !ways.stop;
-    this.$("stop").disabled = !ways.stop;
-    say(this.$("stop"), ways.stop ? `Stop ${robot.name}` : `${robot?.name ?? ""} takes no stop`);
-    this.$("release").hidden = isOff || !isLive || !robot.status?.stop || !may;
+    const robot = this.asks.live(), isOff = !robot || this.asks.isReplay(), {isLive} = this.relay, ways = Object.fromEntries(KINDS.map(kind => [kind, !isOff && this.way(robot, kind) !== undefined]));
+    const may = robot !== undefined && this.relay.mayCommand(`/robots/${robot.name}/command`), stops = robot !== undefined && this.way(robot, "stop") !== undefined;
+    this.$("stop").hidden = !may && !stops;
+    this.$("stop").disabled = !stops;
+    say(this.$("stop"), stops ? `Stop ${robot.name}` : `${robot?.name ?? ""} takes no stop`);
+    const count = this.stoppable().length, isArmed = performance.now() - this.armedMs < ARMED_MS;
+    this.$("stop-all").hidden = count < 2;
+    this.$("stop-all").setAttribute("aria-pressed", isArmed);
+    say(this.$("stop-all"), isArmed ? `Stop all ${count}: press again` : `Stop all ${count}`);
+    this.$("release").hidden = !isLive || !robot?.status?.stop || !may;
     say(this.$("release"), `Release ${robot?.name ?? ""}`);
     for (const kind of ["goal", "pose", "cancel"]) this.$(kind).hidden = !ways[kind] || !isLive;
     this.drive.offer(ways.drive && isLive && !robot.away ? robot : null);
     this.$("remove").hidden = isOff || !robot.away || !this.relay.mayCommand(`/robots/${robot.name}/last`);
     if (this.map.tool && !(ways[this.map.tool.kind] && isLive)) this.take(null);
     if (this.told === "aim") return;
-    const {sent} = this;
+    const {sent, all} = this;
+    if (!sent && all) return this.tell(`stop: ${all.count - all.open.size} of ${all.count} robots have confirmed`, "sent");
     this.tell(sent && sent.robot === robot ? `${sent.kind}: ${sent.doneMs ? `${robot.name} answers: ${sent.state}` : this.waits(robot) ?? sent.state}` : "", "sent");
   }
 

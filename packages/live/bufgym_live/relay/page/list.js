@@ -1,7 +1,7 @@
 // The list of robots: those that need somebody first, and those that a search finds.
 
 import {bits, percent, say, seconds, tint} from "./draw.js";
-import {battery, LOW} from "./fleet.js";
+import {battery, doing, LOW} from "./fleet.js";
 import {address} from "./route.js";
 
 const names = new Intl.Collator(undefined, {numeric: true}), byName = (one, other) => names.compare(one.name, other.name);
@@ -66,7 +66,7 @@ export class List {
   say(robot, chosen, tab, nowMs) {
     const card = this.cards.get(robot.name), charged = battery(robot), [worst] = robot.troubles, silentMs = nowMs - robot.heardMs;
     const level = worst?.level ?? (robot.status?.ok && robot.isHere ? "ok" : ""), [says, seen, charge, bar] = [".says", ".seen", ".charge", ".bar"].map(name => card.querySelector(name));
-    const text = worst && worst.kind !== "silent" ? worst.text : robot.status?.text || (robot.status?.ok ? "OK" : "");
+    const text = worst?.kind === "silent" ? doing(robot, nowMs) : worst ? worst.text : robot.status?.text || (robot.status?.ok ? "OK" : "");
     card.classList.toggle("away", robot.away);
     card.classList.toggle("absent", !worst && !robot.isHere);
     card.dataset.level = level;

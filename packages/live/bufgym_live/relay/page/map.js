@@ -10,6 +10,15 @@ const TRAIL_MS = 60_000;
 const REDRAW_MS = 500, LAYERS_MS = 150, FRAME_MS = 30;  // what lies below is drawn twice a second, or soon after a layer came; robots 30 times at most
 const OLD_MS = 3000;
 
+// Around a robot that is near another.
+function ring(drawing, x, y) {
+  drawing.strokeStyle = colour("warn");
+  drawing.lineWidth = 2;
+  drawing.beginPath();
+  drawing.arc(x, y, 18, 0, 7);
+  drawing.stroke();
+}
+
 export class Map2D {
   constructor(canvas, layers, onPick) {
     this.canvas = canvas;
@@ -130,6 +139,7 @@ export class Map2D {
     for (const robot of seen) {
       const [x, y] = this.at(robot.pose.x, robot.pose.y), old = faded(nowMs - robot.poseMs);
       drawing.globalAlpha = 1 - 0.4 * old;
+      if (robot.near) ring(drawing, x, y);
       arrow(drawing, x, y, -(robot.pose.yaw ?? 0), robot === chosen ? 13 : 9, tint(robot.colour, old));
     }
     drawing.globalAlpha = 1;

@@ -1,15 +1,22 @@
-// What must not be missed: troubles that began and refusals. Each stays until somebody says that it was seen, even when it is over.
+// Alerts: troubles that began and refusals, the worst first. Each stays until somebody says that it was seen, even when it is over.
 
 import {say, seconds} from "./draw.js";
 import {address} from "./route.js";
 
-const MOST = 200, isNarrow = matchMedia("(max-width: 44rem)");
+const MOST = 200;                                   // beyond it refusals and what is over go, the least first; a trouble that lasts never goes
+const CALM_MS = 2000;                               // a screen reader is told of new alerts so often at most
+const REFUSED = 1.5;                                // the rank of a refusal: behind a robot that is silent, before a low battery
+const isNarrow = matchMedia("(max-width: 44rem), (max-height: 30rem)");
 
 export class Notices {
-  constructor(element) {
+  // ``spoken`` is the live region: texts of ``element`` change with each second, so nobody would listen to them.
+  constructor(element, spoken) {
     this.element = element;
+    this.spoken = spoken;
+    this.spokenMs = -Infinity;
+    this.begun = new Set();                         // keys that the live region has not said yet
     this.drawnMs = 0;
-    this.notices = new Map();                       // key -> {name, text, ms, overMs, isOver, level}
+    this.notices = new Map();                       // key -> {name, text, ms, overMs, level, rank}
     this.seen = new Set();                          // troubles that were seen and last
   }
 
@@ -20,18 +27,22 @@ export class Notices {
       return before && before.overMs === null ? before.ms : sinceMs;
     };
     const now = new Map(robot.troubles.filter(one => one.level === "error").map(one => [`${robot.name} ${one.kind}`, one]));
-    for (const [key, {text, level, sinceMs}] of now)
-      if (!this.seen.has(key)) this.put(key, {name: robot.name, text, level, overMs: null, ms: begun(key, sinceMs)});
+    for (const [key, {text, level, rank, sinceMs}] of now)
+      if (!this.seen.has(key)) this.put(key, {name: robot.name, text, level, rank, overMs: null, ms: begun(key, sinceMs)});
     for (const [key, notice] of this.notices) if (notice.name === robot.name && notice.level === "error" && !now.has(key)) notice.overMs ??= nowMs;
     for (const key of this.seen) if (key.startsWith(robot.name + " ") && !now.has(key)) this.seen.delete(key);
   }
 
   // ``again`` does once more what was refused, if somebody wants that.
-  refused(name, text, nowMs, again = null) { this.put(`refused ${name} ${text}`, {name, text, level: "refused", overMs: null, ms: nowMs, again}); }
+  refused(name, text, nowMs, again = null) { this.put(`refused ${name} ${text}`, {name, text, level: "refused", rank: REFUSED, overMs: null, ms: nowMs, again}); }
 
   put(key, notice) {
-    if (this.notices.has(key) || this.notices.size < MOST) this.notices.set(key, notice);
+    if (this.notices.get(key)?.overMs !== null) this.begun.add(key);
+    this.notices.set(key, notice);
   }
+
+  // A robot that somebody has removed.
+  removed(name) { for (const [key, notice] of this.notices) if (notice.name === name) this.notices.delete(key); }
 
   clear() {
     for (const key of this.notices.keys()) this.dismiss(key);
@@ -44,15 +55,25 @@ export class Notices {
     this.draw(this.drawnMs);
   }
 
-  forget() {
-    this.seen.clear();
-    this.notices.clear();
-    this.element.hidden = true;
+  // All of them, [key, notice] each: those that last first, the worst of them first, and the latest of equals.
+  sorted() {
+    return [...this.notices].sort(([, one], [, other]) => Number(one.overMs !== null) - Number(other.overMs !== null) || one.rank - other.rank || other.ms - one.ms);
+  }
+
+  // Say which have begun since it was said last: each once, however its text changes.
+  speak(all) {
+    const fresh = all.filter(([key, {overMs}]) => this.begun.has(key) && overMs === null).map(([, {name, text, level}]) => `${name}: ${level === "refused" ? "refused: " : ""}${text}`);
+    if (!fresh.length || performance.now() - this.spokenMs < CALM_MS) return;
+    this.begun.clear();
+    this.spokenMs = performance.now();
+    this.spoken.replaceChildren(fresh.slice(0, 3).join(". ") + (fresh.length > 3 ? `. And ${fresh.length - 3} more alerts` : ""));
   }
 
   draw(nowMs) {
     this.drawnMs = nowMs;
-    const all = [...this.notices].sort(([, one], [, other]) => Number(one.overMs !== null) - Number(other.overMs !== null) || other.ms - one.ms);
+    const all = this.sorted();
+    for (const [key, {level, overMs}] of all.slice(MOST)) if (level === "refused" || overMs !== null) this.notices.delete(key);
+    this.speak(all);
     const shown = all.slice(0, isNarrow.matches ? 1 : 3), more = all.length - shown.length;
     this.element.hidden = all.length === 0;
     while (this.element.children.length > shown.length + 1) this.element.lastChild.remove();

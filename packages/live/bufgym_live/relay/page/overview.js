@@ -1,7 +1,7 @@
 // The tab that shows how the chosen robot is: its laser, its queue, its last minute and its topics in numbers.
 
 import {aged, bits, drawHistory, drawScan, drawSlots, hue, percent, say, seconds, tint} from "./draw.js";
-import {battery} from "./fleet.js";
+import {battery, doing} from "./fleet.js";
 
 export class Overview {
   constructor($) { this.$ = $; }
@@ -17,6 +17,7 @@ export class Overview {
 
   facts(robot, nowMs) {
     const {x, y, frame} = robot.pose ?? {}, {status} = robot, rtt = status?.network?.rtt_ms, charged = battery(robot), oldMs = nowMs - robot.poseMs;
+    say(this.$("doing"), doing(robot, nowMs));
     say(this.$("facts"), [x === undefined ? "" : `at ${x.toFixed(1)}, ${y.toFixed(1)} m${frame && " in " + frame}${oldMs > 3000 ? `, ${seconds(oldMs / 1000)} ago` : ""}`,
       rtt == null ? "" : `answers in ${Math.round(rtt)} ms`, charged == null ? "" : `battery ${percent(charged)}`, status?.recording ?? ""].filter(Boolean).join(" · "));
   }

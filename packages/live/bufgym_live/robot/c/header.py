@@ -49,11 +49,6 @@ _HELPERS = {
     "bufgym_thin(": "thin.h",
 }
 """Parts that rules share, each before its callers."""
-_OBSERVE = {
-    "features.h": "bufgym_observe_context(q, arrival);\n    bufgym_observe_slots(q, arrival);",
-    "rule_fields.h": "bufgym_observe_rule(q, arrival);",
-}
-"""Parts that observe fields, and their calls."""
 _CONSTANTS = {
     thinning: "WAITING SOON_US STEADY",
     target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
@@ -65,7 +60,6 @@ _CONSTANTS = {
 """Constants that the parts name, by the module that has them."""
 _GUIDED = "guided_"
 """Prefix under which a network reads the inputs of guided rules."""
-_BY_RULE = {field.name for field in learned.BY_RULE}
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40  # Seed, episodes and messages of the calls in the header
 
@@ -101,13 +95,13 @@ def header(
     check_limits(capacity, max_bytes)
     if re.fullmatch("[a-z][a-z0-9_]*", prefix) is None:
         raise BufgymError(f"prefix {prefix!r}: must be small letters, digits and _, as names in C begin")
-    learns = policy.on_arrival in (learned.on_arrival, learned.on_arrival_by_rule)
+    learns = policy.on_arrival is learned.on_arrival
     guides = policy.on_arrival is guided.on_arrival
     ruled = policy.on_arrival is ruled_network.on_arrival
     chooses = ruled or policy.on_arrival is candidate_network.on_arrival
     body = _among_candidates(ruled) if chooses else _network(policy) if learns else _rule(policy, guides)
     parameters = policy.parameters
-    if ruled or policy.on_arrival is learned.on_arrival_by_rule:
+    if ruled:
         parameters = price_dp.PARAMETERS
     elif guides:
         parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False))
@@ -175,8 +169,6 @@ def without_c(fields: Iterable[str]) -> dict[str, str]:
         part, macro = "features.h", name.upper()
         if name.startswith(_GUIDED):
             part, macro = "inputs.h", f"IN_{name.removeprefix(_GUIDED).upper()}"
-        elif name in _BY_RULE:
-            part = "rule_fields.h"
         if re.search(rf"\[BUFGYM_{macro}\](\[\w+\])? =\s", _part(part)) is None:
             lacking[name] = part
     return lacking
@@ -195,10 +187,7 @@ def _network(policy: Policy) -> str:
     context, slots = scorer.fields[: scorer.context], scorer.fields[scorer.context :]
     names = [Weights.CONTEXT_NAMES[int(k)] for k in context] + [Weights.SLOT_NAMES[int(k)] for k in slots]
     _refuse_without_c(policy, names)
-    observed = ["features.h"] if (context < learned.CONTEXT).any() or (slots < learned.SLOTS).any() else []
-    observed += ["rule_fields.h"] if policy.on_arrival is learned.on_arrival_by_rule else []
-    body = _part("fields.h") + "".join(map(_part, observed)) + _part("scorer.h")
-    return _helped(body).replace("@OBSERVE@", "\n    ".join(_OBSERVE[part] for part in observed))
+    return _helped(_part("fields.h") + _part("features.h") + _part("scorer.h"))
 
 
 def _among_candidates(ruled: bool) -> str:
@@ -232,21 +221,13 @@ def _numbers(policy: Policy, scorer: Scorer) -> dict[str, Any]:
     text += _array("double", "bufgym_networks", scorer.networks)
     sizes = ", ".join(map(str, (inputs, scorer.context, scorer.first, scorer.second, scorer.size)))
     text += f"static const struct bufgym_scorer bufgym_scorer = {{{sizes}, bufgym_fields, bufgym_networks}};\n"
-    by_rule = policy.on_arrival is learned.on_arrival_by_rule
-    slots, context = (
-        (Weights.SLOT_NAMES, Weights.CONTEXT_NAMES) if by_rule else (learned.SLOT_NAMES, learned.CONTEXT_NAMES)
-    )
+    slots, context = Weights.SLOT_NAMES, Weights.CONTEXT_NAMES
     scratch = (
         "    /* scratch of the policy: features, direct weights, hidden units, all fields */\n"
         f"    double f[{inputs}], skip[{inputs}], h[{units}], context[{len(context)}];\n"
         f"    double rows[{len(slots)}][BUFGYM_CAPACITY + 1];\n"
     )
-    return {
-        "WEIGHTS": text,
-        "SCRATCH": scratch + (_part("places.h") if by_rule else ""),
-        "SLOT_FIELDS": _enum(slots),
-        "CONTEXT_FIELDS": _enum(context),
-    }
+    return {"WEIGHTS": text, "SCRATCH": scratch, "SLOT_FIELDS": _enum(slots), "CONTEXT_FIELDS": _enum(context)}
 
 
 def _candidate_numbers(policy: Policy) -> dict[str, Any]:

@@ -74,7 +74,8 @@ static inline int bufgym_decide(struct bufgym_queue *q, const struct bufgym_mess
     double common, own, best = -HUGE_VAL;
     int64_t freed_bytes = 0;
     int i, k, decision = BUFGYM_REJECT;
-    @OBSERVE@
+    bufgym_observe_context(q, arrival);
+    bufgym_observe_slots(q, arrival);
     for (i = 0; i < scorer->context; i++)
         q->f[i] = q->context[scorer->fields[i]];
     common = bufgym_begin(q, scorer, BUFGYM_DROP);
