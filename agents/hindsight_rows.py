@@ -1,7 +1,6 @@
 """What ``agents.hindsight`` learns from: states that the student reaches, and the cost of each action there."""
 
 from __future__ import annotations
-import os
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -27,7 +26,7 @@ RULED = 6
 """The rule, action 0, plays one row in so many: good states never end, and a student that fell finds its way back."""
 LONGEST = 600
 """Most steps over which rows are spread at first."""
-LEAVING = 20.0
+LEAVING = 10.0
 """Cost of leaving the rule in families that stay with it, in the same units."""
 MOST = 60.0
 """Largest cost, in units of the mean cost of action 0."""
@@ -50,6 +49,17 @@ class Lesson(NamedTuple):
     """float32[n, inputs]"""
     cost: NDArray[np.float32]
     """float32[n, actions], H given up for good by each action; infinite for those that are not offered."""
+
+
+class Ruled(NamedTuple):
+    """Where it is the rule gap-price that teaches: leaving it is what costs there."""
+
+    stays: NDArray[np.bool_]
+    """bool[families]: in the whole family."""
+    plain: int
+    """Place of the input that is 1 on steady links and in bursts, where it teaches in every family."""
+    same: int
+    """First place of the flags of actions that do what the rule does; the last action is the rule's."""
 
 
 class TaughtRows:
@@ -134,7 +144,7 @@ class TaughtRows:
         for span, teacher in zip(self.spans, self._teachers, strict=True):
             decisions = self.decisions[span]
             if teacher is None:
-                cost[span] = np.where(offered[span], decisions != decisions[:, -1:], np.inf)
+                cost[span] = np.where(offered[span], 0.0, np.inf)
                 continue
             values = teacher.values(np.where(offered[span], decisions, -1))
             best = np.where(np.isnan(values), -np.inf, values).max(axis=1, keepdims=True)
@@ -146,14 +156,15 @@ class TaughtRows:
 
 
 class Lessons:
-    """All lessons of each family so far, up to ``room``; then new ones take the places of others at random."""
+    """All lessons of each family so far, up to ``room``; then new ones take the places of others at random.
 
-    def __init__(self, stays: NDArray[np.bool_], room: int, numbers: int, actions: int) -> None:
-        self.room, self.stays, self.counts = room, stays, np.zeros(len(stays), np.int64)
-        self._seen = torch.zeros(len(stays) * room, numbers)
-        self._cost = torch.zeros(len(stays) * room, actions)
-        self.doubt = float(os.environ.get("DOUBT", "0"))
-        self._of_rule, self._met = np.zeros(len(stays)), np.zeros(len(stays))
+    ``shape`` is (numbers seen, actions).
+    """
+
+    def __init__(self, families: int, room: int, shape: tuple[int, int], rule: Ruled | None = None) -> None:
+        self.room, self.counts, self._rule = room, np.zeros(families, np.int64), rule
+        self._seen, self._cost = (torch.zeros(families * room, size) for size in shape)
+        self._of_rule, self._met = np.zeros(families), np.zeros(families)
 
     def add(self, lesson: Lesson, family: NDArray[np.int64], rng: np.random.Generator) -> None:
         """Keep these, with the number of each row's family, where action 0 and another one are offered."""
@@ -165,21 +176,24 @@ class Lessons:
             self.counts[f] = min(count + n, self.room)
             to = torch.from_numpy(places + f * self.room)
             self._seen[to], self._cost[to] = torch.from_numpy(lesson.seen[rows]), torch.from_numpy(lesson.cost[rows])
-            self._of_rule[f] += lesson.cost[rows, 0].sum(dtype=np.float64)
-            self._met[f] += n
+            taught = rows if self._rule is None else rows[lesson.seen[rows, self._rule.plain] != 1]
+            self._of_rule[f] += lesson.cost[taught, 0].sum(dtype=np.float64)
+            self._met[f] += len(taught)
 
     @property
     def units(self) -> NDArray[np.float64]:
-        """float64[families]: the mean cost of action 0, in which a family's costs are counted; leaving the rule is
-        ``LEAVING`` of these."""
-        return np.where(self.stays, 1 / LEAVING, self._of_rule / np.maximum(self._met, 1) + 1e-12)
+        """float64[families]: the mean cost of action 0, in which a family's costs are counted."""
+        return self._of_rule / np.maximum(self._met, 1) + 1e-12
 
     def draw(self, sizes: NDArray[np.int64], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """So many of each family at random: what was seen, and costs in units of the family's own."""
         family = np.repeat(np.arange(len(sizes)), sizes)
         places = torch.from_numpy((rng.random(len(family)) * self.counts[family]).astype(np.int64) + family * self.room)
         units = torch.from_numpy(self.units[family].astype(np.float32))
-        cost = self._cost[places] / units[:, None]
-        if self.doubt > 0:
-            cost[:, :-1] += self.doubt * (1 - self._seen[places][:, -(cost.shape[1] - 1) :])
-        return self._seen[places], torch.where(torch.isfinite(cost), cost.clamp(max=MOST), cost)
+        seen, cost = self._seen[places], self._cost[places]
+        known = (cost / units[:, None]).clamp(max=MOST)
+        if self._rule is not None:
+            stays = torch.from_numpy(self._rule.stays[family]) | (seen[:, self._rule.plain] == 1)
+            leaves = LEAVING * (1 - torch.nn.functional.pad(seen[:, self._rule.same :], (0, 1), value=1.0))
+            known = torch.where(stays[:, None], leaves, known)
+        return seen, torch.where(torch.isfinite(cost), known, cost)

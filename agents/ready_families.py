@@ -87,7 +87,7 @@ def _task(split: str) -> list[Cell]:
 def _frames(split: str) -> list[Cell]:
     first = FIRST_SEED[split]
     scenario = frames_over(range(first, first + FRAMES[split]))
-    return [Cell("", scenario, L) for L in (3, 4, 5, 8, 12, 16, 24, 32, 48)]
+    return [Cell("", scenario, L) for L in (1, 2, 3, 4, 5, 8, 12, 16, 24, 32, 48)]
 
 
 def _random(split: str, equal: bool = True) -> list[Cell]:
@@ -95,7 +95,9 @@ def _random(split: str, equal: bool = True) -> list[Cell]:
     return [cell for cell in found if (cell.scenario.sizes == "equal") == equal]  # type: ignore[attr-defined]
 
 
-def _of_suite(suite: str, capacities: Sequence[int], label: str = "", equal: bool = True) -> Callable[[str], list[Cell]]:
+def _of_suite(
+    suite: str, capacities: Sequence[int], label: str = "", equal: bool = True
+) -> Callable[[str], list[Cell]]:
     """Cells of a suite whose label has this in it, without a limit on bytes."""
 
     def made(split: str) -> list[Cell]:

@@ -73,7 +73,17 @@ class Suites:
 
 
 FAMILY_NAMES = (
-    "task", "frames", "lte", "generated", "outage", "heavy", "light", "interruption", "steady", "random", "unequal",
+    "task",
+    "frames",
+    "lte",
+    "generated",
+    "outage",
+    "heavy",
+    "light",
+    "interruption",
+    "steady",
+    "random",
+    "unequal",
     "random-unequal",
 )
 ALL = "all"
