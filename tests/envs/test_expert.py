@@ -85,7 +85,7 @@ DEAD = Episode(messages([0, 1, 2], 4, [0.0, 1.0, 2.0]), Link(trace([(0, 0), (5, 
 
 
 STANDS = Episode(messages(range(0, 15, 3), 4, [0.0, 1.0, 2.0, 3.0, 3.0]), Link(trace([(0, 0), (10, 4)]), 0))
-"""The robot stands still from the fourth message on. Nothing gains after that one, yet the fifth may stand in for it."""
+"""The robot stands still from the fourth message on: nothing gains after it, yet the fifth may stand in for it."""
 
 
 @pytest.mark.kernels

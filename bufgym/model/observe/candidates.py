@@ -37,6 +37,20 @@ TIE = 1e-12
 
 
 @kernel
+def inverse(b: float) -> float:
+    """1 / b of a number >= 0, infinite for 0: several ratios to b need one division."""
+    return 1.0 / b if b > 0 else np.inf
+
+
+@kernel
+def times(a: float, per: float) -> float:
+    """``ratio`` of ``a`` to the number whose ``inverse`` is ``per``."""
+    if a > 0:
+        return min(max(a * per, LEAST), LARGEST)
+    return LEAST if per < np.inf else 1.0
+
+
+@kernel
 def ratio(a: float, b: float) -> float:
     """The ratio a / b of two numbers >= 0, between e^-3 and e^3; 1 if both are 0."""
     if b > 0:
@@ -152,7 +166,7 @@ class Candidate(NamedTuple):
     cost: float  # merged gap, per byte times mean bytes
     before: float  # motion gap to the message kept before it
     after: float  # motion gap to the message after it
-    even: float  # e
+    per_even: float  # 1 / e
     place: float  # (j + 1) / (s + 1) for slot j of s; 1 for the newcomer
     is_newcomer: bool
     is_head: bool
@@ -169,11 +183,11 @@ CANDIDATE_FIELDS = (
           lambda c: 1.0 if c.is_head else 0.0),
     Field("candidate_merged", "candidate", "motion", _RATIO,
           "log(gap left if it is dropped / 2e), per byte where sizes differ",
-          lambda c: ratio(c.cost, 2 * c.even), -MOST, MOST),
+          lambda c: times(c.cost, 0.5 * c.per_even), -MOST, MOST),
     Field("candidate_before", "candidate", "motion", _RATIO, "log(gap to the message kept before it / e)",
-          lambda c: ratio(c.before, c.even), -MOST, MOST),
+          lambda c: times(c.before, c.per_even), -MOST, MOST),
     Field("candidate_after", "candidate", "motion", _RATIO, "log(gap to the message after it / e)",
-          lambda c: ratio(c.after, c.even), -MOST, MOST),
+          lambda c: times(c.after, c.per_even), -MOST, MOST),
 )  # fmt: skip
 """Numbers of each candidate; all 0 for one that is not there."""
 
@@ -182,9 +196,12 @@ class Around(NamedTuple):
     """The queue and the link, as far as several numbers need them."""
 
     even: float  # e
+    per_even: float  # 1 / e
     short: float  # the link's rate over about 0.1 s, bytes/us
     medium: float  # over about 0.5 s
     rate: float  # r, over about 2 s
+    per_rate: float  # 1 / r
+    per_size: float  # 1 / the newcomer's bytes
     period_us: float  # p
     step: float  # motion since the previous arrival
 
@@ -193,14 +210,14 @@ QUEUE_FIELDS = (
     Field("queue_to_free", "context", "link", _RATIO, "log(arrivals until the message in transmission has left)",
           lambda buffer, arrival, q: ratio(float(buffer.left_bytes), q.short * q.period_us), -MOST, MOST),
     Field("queue_short_rate", "context", "link", _RATIO, "log(link's rate over 0.1 s / r)",
-          lambda buffer, arrival, q: ratio(q.short, q.rate), -MOST, MOST),
+          lambda buffer, arrival, q: times(q.short, q.per_rate), -MOST, MOST),
     Field("queue_medium_rate", "context", "link", _RATIO, "log(link's rate over 0.5 s / r)",
-          lambda buffer, arrival, q: ratio(q.medium, q.rate), -MOST, MOST),
+          lambda buffer, arrival, q: times(q.medium, q.per_rate), -MOST, MOST),
     Field("queue_carried", "context", "link", _RATIO, "log(messages that the link carries in p at r) + 2",
-          lambda buffer, arrival, q: ratio(q.rate * q.period_us * math.e**2, float(arrival.size_bytes)),
+          lambda buffer, arrival, q: times(q.rate * q.period_us * math.e**2, q.per_size),
           -MOST, MOST),
     Field("queue_step", "context", "motion", _RATIO, "log(motion since the previous arrival / e) + 1",
-          lambda buffer, arrival, q: ratio(q.step * math.e, q.even), -MOST, MOST),
+          lambda buffer, arrival, q: times(q.step * math.e, q.per_even), -MOST, MOST),
     Field("queue_age", "context", "link", _RATIO,
           "log(age of the message dequeued last / time in which the link sends L + 1 messages at r)",
           lambda buffer, arrival, q: ratio(
@@ -208,7 +225,7 @@ QUEUE_FIELDS = (
               float((buffer.capacity + 1) * arrival.size_bytes)), -MOST, MOST),
     Field("queue_stalled", "context", "link", _RATIO,
           "log(time since a message was last dequeued / time of one message at r)",
-          lambda buffer, arrival, q: ratio(q.rate * buffer.stalled_us, float(arrival.size_bytes)), -MOST, MOST),
+          lambda buffer, arrival, q: times(q.rate * buffer.stalled_us, q.per_size), -MOST, MOST),
     Field("queue_bend", "context", "value", "-1 to 1", "2 (2 V(e) - V(2e)) / V(e) - 1: -1 where V is straight",
           lambda buffer, arrival, q: bend(buffer, q.even), -1.0),
     Field("queue_fill", "context", "queue", "-1 to 1", "2 s / L - 1 for s messages queued",
@@ -244,7 +261,7 @@ def observe_candidates(
     first = _FLAGS * places
     rows, context = numbers[: _FIELDS * places].reshape((_FIELDS, places)), numbers[_FIELDS * places :]
     even = (arrival.x - buffer.dequeued_x) / (buffer.capacity + 1)
-    step = arrival.x - buffer.previous_x
+    step, per_even = arrival.x - buffer.previous_x, inverse(even)
     for column in range(places):
         j = int(order[column])
         if j == NONE:
@@ -255,13 +272,17 @@ def observe_candidates(
         after = step
         if j < s:
             after = (unchecked_item(buffer.slots, j + 1).x if j + 1 < s else arrival.x) - x
-        candidate = Candidate(cost[column], x - from_x, after, even, (j + 1) / (s + 1), j == s, j == 0)
+        candidate = Candidate(cost[column], x - from_x, after, per_even, (j + 1) / (s + 1), j == s, j == 0)
         _write_candidate(candidate, column, rows)
+    rate = buffer.long_rate_bytes_per_s * 1e-6
     around = Around(
         even,
+        per_even,
         buffer.short_rate_bytes_per_s * 1e-6,
         buffer.medium_rate_bytes_per_s * 1e-6,
-        buffer.long_rate_bytes_per_s * 1e-6,
+        rate,
+        inverse(rate),
+        inverse(float(arrival.size_bytes)),
         max(buffer.period_us, 1.0),
         step,
     )

@@ -281,11 +281,10 @@ class Session:
                 raise HomeIsBack
 
     def _left_bytes(self) -> int | None:
-        connection = self._connection
-        if connection is None:
+        link = self._connection
+        if link is None or (unsent := unsent_bytes(link.transport.get_extra_info("socket"))) is None:
             return None
-        unsent = unsent_bytes(connection.transport.get_extra_info("socket"))
-        return None if unsent is None else connection.transport.get_write_buffer_size() + unsent
+        return unsent + int(link.transport.get_write_buffer_size())
 
     async def _send_no_drop(self) -> None:
         while True:
@@ -306,10 +305,8 @@ class Session:
                 message = wire.decode(frame)
                 if message.at_us:
                     self.deadlines.clock.heard(message.at_us)
-                if is_stop(message.topic):
-                    await self._take(message)  # it waits behind nothing
-                else:
-                    await self._inbox.put(message)
+                # A stop waits behind nothing.
+                await (self._take if is_stop(message.topic) else self._inbox.put)(message)
             else:
                 self._answer(wire.heard(frame))
         raise ConnectionResetError("the relay has closed the connection")

@@ -24,6 +24,22 @@ static inline double bufgym_ratio(double a, double b)
     return a > 0.0 ? @LARGEST_RATIO@ : 1.0;
 }
 
+/* 1 / b of a number >= 0, infinite for 0, and a ratio to b by it. */
+static inline double bufgym_inverse(double b)
+{
+    return b > 0.0 ? 1.0 / b : HUGE_VAL;
+}
+
+static inline double bufgym_times(double a, double per)
+{
+    double r;
+    if (a > 0.0) {
+        r = a * per > @LEAST_RATIO@ ? a * per : @LEAST_RATIO@;
+        return r < @LARGEST_RATIO@ ? r : @LARGEST_RATIO@;
+    }
+    return per < HUGE_VAL ? @LEAST_RATIO@ : 1.0;
+}
+
 /* The logarithm of a ratio to 1e-6, in single precision as Python computes it: log m + n log 2 for r = m 2^n. */
 static inline double bufgym_logarithm(double ratio)
 {
@@ -83,7 +99,8 @@ static inline void bufgym_observe(struct bufgym_queue *q, const struct bufgym_me
     const double even = (arrival->x - q->dequeued_x) / (q->capacity + 1), step = arrival->x - q->previous_x;
     const double rate = 1e6 * q->long_rate * 1e-6, period_us = q->period_us > 1.0 ? q->period_us : 1.0;
     const double short_rate = 1e6 * q->short_rate * 1e-6, medium_rate = 1e6 * q->medium_rate * 1e-6;
-    const double size = (double)arrival->size_bytes, gain = bufgym_value(even);
+    const double per_even = bufgym_inverse(even), per_rate = bufgym_inverse(rate);
+    const double per_size = bufgym_inverse((double)arrival->size_bytes), gain = bufgym_value(even);
     const double age_us = (double)(arrival->arrival_us - q->dequeued_arrival_us);
     const double stalled_us = (double)(q->now_us - q->last_dequeue_us);
     double *f = q->units, *context = f + 6 * n, bend = -1.0;
@@ -103,17 +120,17 @@ static inline void bufgym_observe(struct bufgym_queue *q, const struct bufgym_me
         f[column] = 2.0 * ((double)(j + 1) / (s + 1)) - 1.0;
         f[n + column] = j == s;
         f[2 * n + column] = j == 0;
-        f[3 * n + column] = bufgym_ratio(q->cost[column], 2 * even);
-        f[4 * n + column] = bufgym_ratio(x - from_x, even);
-        f[5 * n + column] = bufgym_ratio(after, even);
+        f[3 * n + column] = bufgym_times(q->cost[column], 0.5 * per_even);
+        f[4 * n + column] = bufgym_times(x - from_x, per_even);
+        f[5 * n + column] = bufgym_times(after, per_even);
     }
     context[0] = bufgym_ratio((double)q->left_bytes, short_rate * period_us);
-    context[1] = bufgym_ratio(short_rate, rate);
-    context[2] = bufgym_ratio(medium_rate, rate);
-    context[3] = bufgym_ratio(rate * period_us * @E_SQUARED@, size);
-    context[4] = bufgym_ratio(step * @E@, even);
+    context[1] = bufgym_times(short_rate, per_rate);
+    context[2] = bufgym_times(medium_rate, per_rate);
+    context[3] = bufgym_times(rate * period_us * @E_SQUARED@, per_size);
+    context[4] = bufgym_times(step * @E@, per_even);
     context[5] = bufgym_ratio(rate * age_us, (double)((q->capacity + 1) * arrival->size_bytes));
-    context[6] = bufgym_ratio(rate * stalled_us, size);
+    context[6] = bufgym_times(rate * stalled_us, per_size);
     if (gain > 0.0) {
         bend = 2 * bufgym_merging_loss(even, gain, even, gain) / gain - 1;
         bend = bend < 1.0 ? bend : 1.0;
