@@ -1,11 +1,15 @@
-"""Check docs/leaderboard.csv: ``leaderboard.py stale`` or ``leaderboard.py COMMIT``; 1 if a row does not hold.
+"""Check docs/leaderboard.csv: ``leaderboard.py stale``, ``sample N`` or ``COMMIT``; 1 if a row does not hold.
 
-``stale`` runs nothing. It names the rows whose policy has changed since they were made. COMMIT runs each row that
-differs from that commit's; a row whose suite needs recordings is named and left out.
+``stale`` runs nothing. It names the rows whose policy has changed since they were made. ``sample`` runs N rows that the
+date draws. COMMIT runs each row that differs from that commit's. A row whose suite needs recordings is named and left
+out.
 """
 
+import random
 import subprocess
 import sys
+import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from bufgym.benchmark import leaderboard
@@ -25,22 +29,34 @@ def name_stale() -> int:
     return int(bool(stale))
 
 
+def validate(names: Iterable[str]) -> int:
+    """Run these rows; 1 if one differs."""
+    board, broken = leaderboard.read(FILE), 0
+    for name in names:
+        if SUITES[board[name].suite].needs:
+            print(f"{name}: left out, its suite needs recordings", flush=True)
+            continue
+        broken |= subprocess.run([sys.executable, "-m", "bufgym", "validate", name], check=False).returncode
+    return int(broken != 0)
+
+
+def sample(count: int) -> int:
+    """Validate so many rows; each day draws others."""
+    names = sorted(leaderboard.read(FILE))
+    return validate(random.Random(time.strftime("%Y%m%d")).sample(names, count))
+
+
 def main(commit: str) -> int:
     """Validate what is new since ``commit``."""
     before = subprocess.run(["git", "show", f"{commit}:{FILE}"], capture_output=True, text=True, check=True).stdout
     old = Path("build/leaderboard-before.csv")
     old.parent.mkdir(exist_ok=True)
     old.write_text(before, encoding="utf-8")
-    known, now, broken = leaderboard.read(old), leaderboard.read(FILE), 0
-    for name, entry in now.items():
-        if name in known and known[name].values == entry.values:
-            continue
-        if SUITES[entry.suite].needs:
-            print(f"{name}: left out, its suite needs recordings")
-            continue
-        broken |= subprocess.run([sys.executable, "-m", "bufgym", "validate", name], check=False).returncode
-    return int(broken != 0)
+    known, now = leaderboard.read(old), leaderboard.read(FILE)
+    return validate(name for name, entry in now.items() if name not in known or known[name].values != entry.values)
 
 
 if __name__ == "__main__":
+    if sys.argv[1] == "sample":
+        sys.exit(sample(int(sys.argv[2])))
     sys.exit(name_stale() if sys.argv[1] == "stale" else main(sys.argv[1]))

@@ -134,29 +134,6 @@ def test_a_map_that_was_published_before_is_shown(opened: tuple[Any, Fleet]) -> 
     until(page, f"{text('#facts')} === 'at 0.0, 0.0 m in map'", f"{WALL} > 50")
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_a_cloud_has_any_fields(opened: tuple[Any, Fleet], order: str) -> None:
-    """Of four points one has no place. A red and a green one, by rgb; brightness from its lowest to its highest."""
-    layout = {"names": ["ring", "z", "x", "y", "rgb", "light"], "offsets": [0, 1, 9, 13, 18, 23], "itemsize": 27}
-    formats = [f"{order}{kind}" for kind in ("u1", "f8", "f4", "i2", "u4", "u2")]
-    points = np.zeros(4, np.dtype({**layout, "formats": formats}))
-    points["x"], points["y"], points["z"] = [1.5, np.nan, -2, 0], [-3, 0, 7, 1], [0.25, 0, 1e9, -8]
-    points["rgb"], points["light"] = [0xFF0000, 0, 0, 0x00FF00], [100, 0, 0, 60_000]
-    read = """async ([bytes, by]) => {
-      const {cloud} = await import("./cloud.js"), message = {payload: new Uint8Array(bytes)};
-      const {places, colours, ...rest} = cloud(message, by);
-      return {...rest, places: [...places], colours: [...colours]};
-    }"""
-    said = opened[0].evaluate(read, [list(cloud(points)), ""])
-    assert (said["frame"], said["count"], said["by"]) == ("base_link", 2, "rgb")
-    assert said["places"] == [1.5, -3, 0.25, 0, 1, -8] and said["colours"] == [255, 0, 0, 255, 0, 255, 0, 255]
-    low, high = np.reshape(opened[0].evaluate(read, [list(cloud(points)), "light"])["colours"], (2, 4))
-    assert low[2] > low[0] and high[0] > high[2]  # blue, red
-    broken = cloud(points)[:-30]
-    fails = f"cloud => ({read})([cloud, '']).then(() => 'read', error => error.name)"
-    assert opened[0].evaluate(fails, list(broken)) == "RangeError"
-
-
 def test_the_3d_tab_shows_points_and_markers(opened: tuple[Any, Fleet]) -> None:
     """Magenta points of a wall before the robot, and its orange markers; they turn with the mouse."""
     page, fleet = opened

@@ -27,9 +27,25 @@ function shaded(values, count, colours) {
   for (let k = 0; k < count; k++) colours[k] = PALETTE[Math.min(255, Math.max(0, Math.round((values[k] - low) * scale) || 0))];
 }
 
+const LATE_MS = 100, EASY_MS = 35, EASY_FRAMES = 30, MOST_EVERY = 64;
+
+// Of how many points one is drawn. A frame that takes long halves the points, and many quick ones double them again:
+// fewer points of now rather than all of a while ago.
+export class Thinning {
+  every = 1;
+  easy = 0;
+
+  // A frame that drew clouds took so long until the next.
+  took(ms) {
+    this.easy = ms < EASY_MS ? this.easy + 1 : 0;
+    if (ms > LATE_MS) this.every = Math.min(MOST_EVERY, 2 * this.every);
+    else if (this.easy >= EASY_FRAMES) [this.every, this.easy] = [Math.max(1, this.every / 2), 0];
+  }
+}
+
 // ``by`` names the field that gives the colours, "z" for the height; what has none is coloured by rgb, intensity or height, the first it has.
-// {frame, fields, by, count, places, colours}: ``places`` x, y and z of each point, ``colours`` red, green, blue and 255.
-export function cloud(message, by = "") {
+// Of ``every`` so many points one is read. {frame, fields, by, count, places, colours}: ``places`` x, y and z of each point, ``colours`` red, green, blue and 255.
+export function cloud(message, by = "", every = 1) {
   const cdr = new Cdr(message.payload), frame = cdr.header(), [height, width] = [cdr.uint(), cdr.uint()];
   const fields = new Map(cdr.list(() => ({name: cdr.string(), offset: cdr.uint(), type: TYPES[cdr.byte()], count: cdr.uint()}), 200).map(one => [one.name, one]));
   const little = cdr.byte() === 0, [step, row] = [cdr.uint(), cdr.uint()], length = cdr.uint(), data = cdr.bytes(length);
@@ -43,10 +59,11 @@ export function cloud(message, by = "") {
   };
   const [x, y, z] = ["x", "y", "z"].map(field), chosen = [by, ...PACKED, ...BRIGHT].find(name => fields.get(name)?.type) ?? "z";
   const isPacked = PACKED.includes(chosen), shade = field(chosen);
-  const places = new Float32Array(3 * width * height), colours = new Uint32Array(width * height), values = new Float64Array(width * height);
+  const most = Math.ceil(width * height / every), places = new Float32Array(3 * most), colours = new Uint32Array(most), values = new Float64Array(most);
   let count = 0;
-  for (let line = 0; line < height; line++)
-    for (let column = 0, at = line * row; column < width; column++, at += step) {
+  for (let line = 0, column = 0; line < height; line += Math.floor(column / width), column %= width || 1)
+    for (; column < width; column += every) {
+      const at = line * row + column * step;
       const px = x.read(view, at + x.offset, little), py = y.read(view, at + y.offset, little), pz = z.read(view, at + z.offset, little);
       if (!(Math.abs(px) < FAR_M && Math.abs(py) < FAR_M && Math.abs(pz) < FAR_M)) continue;  // where a ray met nothing
       places[3 * count] = px;

@@ -1,6 +1,6 @@
 // The 3-D tab: clouds, markers, the map and the robots in the frame that the map has. Loaded once somebody opens it.
 
-import {cloud} from "./cloud.js";
+import {cloud, Thinning} from "./cloud.js";
 import {aged, colour, context, rgb, say, seconds, tint} from "./draw.js";
 import {painted, SHAPES} from "./layers.js";
 import {multiply, project, rigid, seen} from "./matrix.js";
@@ -35,7 +35,9 @@ export class Space {
     this.scene = new Scene(this.canvas);
     this.held = new Map();                          // what is on the graphics card, by what it shows
     this.shade = "";                                // the field that gives a cloud its colours
-    this.drawnMs = -Infinity;
+    this.drawnMs = this.frameMs = -Infinity;
+    this.thinning = new Thinning();
+    this.drewClouds = false;
     this.home();
     listen(this.canvas, this);
     $("home").onclick = () => this.home();
@@ -72,6 +74,9 @@ export class Space {
   // Each frame of the screen; ``frame`` is the map's, ``robots`` are those in it.
   draw(robots, chosen, frame) {
     const clock = performance.now();
+    if (this.drewClouds) this.thinning.took(clock - this.frameMs);
+    this.frameMs = clock;
+    this.drewClouds = false;
     if (!this.changed || clock - this.drawnMs < FRAME_MS || this.scene.lost) return;
     this.changed = false;
     this.drawnMs = clock;
@@ -126,18 +131,19 @@ export class Space {
   }
 
   drawCloud(topic, layer, robot, frame) {
-    const held = this.kept(topic, layer.message, () => ({shade: null}));
-    if (held.shade !== this.shade) {
+    const held = this.kept(topic, layer.message, () => ({shade: null, every: 1})), {every} = this.thinning;
+    this.drewClouds = true;
+    if (held.shade !== this.shade || held.every !== every) {
       for (const item of held.items.splice(0)) this.scene.free(item);
-      held.shade = this.shade;
+      [held.shade, held.every] = [this.shade, every];
       try {
-        held.cloud = cloud(layer.message, this.shade);
+        held.cloud = cloud(layer.message, this.shade, every);
         held.items.push(this.scene.upload(held.cloud.places, held.cloud.colours));
       } catch (error) {
         held.fault = error instanceof RangeError ? "not what it says it is" : error.message;
       }
     }
-    Object.assign(layer, {lost: "", fault: held.fault ?? "", count: held.cloud?.count ?? 0, by: held.cloud?.by, fields: held.cloud?.fields ?? []});
+    Object.assign(layer, {lost: "", fault: held.fault ?? "", count: held.cloud?.count ?? 0, every, by: held.cloud?.by, fields: held.cloud?.fields ?? []});
     const to = held.items.length ? this.led(robot, layer, held.cloud.frame, frame) : undefined;
     if (to) this.scene.drawPoints(held.items[0], rigid(to), 0, POINT_PX);
   }
@@ -231,8 +237,8 @@ export class Space {
   // Some times a second.
   say(robot, nowMs) {
     const clouds = [...robot.layers].filter(([topic, layer]) => layer.kind === "cloud" && this.layers.isOn(topic));
-    const said = clouds.map(([topic, {count, fault, lost, ms}]) =>
-      `${topic}: ${fault || (lost ? `in ${lost}, and tf does not lead there` : `${count?.toLocaleString("en") ?? "no"} points, ${seconds((nowMs - ms) / 1000)} old`)}`);
+    const said = clouds.map(([topic, {count, every, fault, lost, ms}]) =>
+      `${topic}: ${fault || (lost ? `in ${lost}, and tf does not lead there` : `${count?.toLocaleString("en") ?? "no"} points${every > 1 ? `, 1 in ${every} as this machine is busy` : ""}, ${seconds((nowMs - ms) / 1000)} old`)}`);
     say(this.$("space").querySelector("figcaption"), this.scene.lost ? "This browser has lost its graphics: reload the page." : said.join(" · ") || "no PointCloud2");
     aged(this.$("space"), clouds.length ? nowMs - Math.max(...clouds.map(([, layer]) => layer.ms)) : 0);
     const names = ["", ...new Set(clouds.flatMap(([, layer]) => layer.fields ?? []))], select = this.$("shade");
