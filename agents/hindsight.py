@@ -40,7 +40,7 @@ from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Hindsight
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights
-from bufgym.policies.ruled_network import fields_seen, seen
+from bufgym.policies.ruled_network import seen
 from bufgym.utils.files import replaced
 
 MEAN = 0.995
@@ -146,8 +146,6 @@ class HindsightLearner(Learner[Hindsight]):
             Part(s, cell, math.ceil(n / len(found) / len(own)), s in STAYING)
             for s, own in found.items()
             for cell in own
-            for s, own in found.items()
-            for cell in own
         ]
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
@@ -165,7 +163,7 @@ class HindsightLearner(Learner[Hindsight]):
         rng = np.random.default_rng([seed, school.steps])
         rows = TaughtRows(parts, settings.candidates, settings.ruled, rng)
         k, families = settings.candidates, len(rows.families)
-        rule = Ruled(rows.stays, fields_seen(k).index("guided_plain"), seen(k) - (k + 2)) if settings.ruled else None
+        rule = Ruled(rows.stays, seen(k) - (k + 2)) if settings.ruled else None
         lessons = Lessons(families, settings.room // families, (rows.seen.shape[1], rows.decisions.shape[1]), rule)
         curve = Record(home / "curve.csv", ("steps", "seconds", "loss"), school.steps)
         validations = Validations(home, objective.columns, objective.best, settings, school.steps)

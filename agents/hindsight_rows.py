@@ -26,7 +26,7 @@ RULED = 6
 """The rule, action 0, plays one row in so many: good states never end, and a student that fell finds its way back."""
 LONGEST = 600
 """Most steps over which rows are spread at first."""
-LEAVING = 10.0
+LEAVING = 20.0
 """Cost of leaving the rule in families that stay with it, in the same units."""
 MOST = 60.0
 """Largest cost, in units of the mean cost of action 0."""
@@ -56,8 +56,6 @@ class Ruled(NamedTuple):
 
     stays: NDArray[np.bool_]
     """bool[families]: in the whole family."""
-    plain: int
-    """Place of the input that is 1 on steady links and in bursts, where it teaches in every family."""
     same: int
     """First place of the flags of actions that do what the rule does; the last action is the rule's."""
 
@@ -176,9 +174,8 @@ class Lessons:
             self.counts[f] = min(count + n, self.room)
             to = torch.from_numpy(places + f * self.room)
             self._seen[to], self._cost[to] = torch.from_numpy(lesson.seen[rows]), torch.from_numpy(lesson.cost[rows])
-            taught = rows if self._rule is None else rows[lesson.seen[rows, self._rule.plain] != 1]
-            self._of_rule[f] += lesson.cost[taught, 0].sum(dtype=np.float64)
-            self._met[f] += len(taught)
+            self._of_rule[f] += lesson.cost[rows, 0].sum(dtype=np.float64)
+            self._met[f] += n
 
     @property
     def units(self) -> NDArray[np.float64]:
@@ -193,7 +190,7 @@ class Lessons:
         seen, cost = self._seen[places], self._cost[places]
         known = (cost / units[:, None]).clamp(max=MOST)
         if self._rule is not None:
-            stays = torch.from_numpy(self._rule.stays[family]) | (seen[:, self._rule.plain] == 1)
+            stays = torch.from_numpy(self._rule.stays[family])
             leaves = LEAVING * (1 - torch.nn.functional.pad(seen[:, self._rule.same :], (0, 1), value=1.0))
             known = torch.where(stays[:, None], leaves, known)
         return seen, torch.where(torch.isfinite(cost), known, cost)

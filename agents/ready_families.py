@@ -1,4 +1,4 @@
-"""Ten families of links and streams with messages of equal size, which one agent learns side by side.
+"""Twelve families of links and streams, which one agent learns side by side.
 
 ``train.py hindsight --families all`` learns from their train splits, chooses by their validation splits, and reports on
 their test splits. The splits share no link, but for ``task``: its validation has other episodes on the training links.
@@ -87,7 +87,7 @@ def _task(split: str) -> list[Cell]:
 def _frames(split: str) -> list[Cell]:
     first = FIRST_SEED[split]
     scenario = frames_over(range(first, first + FRAMES[split]))
-    return [Cell("", scenario, L) for L in (1, 2, 3, 4, 5, 8, 12, 16, 24, 32, 48)]
+    return [Cell("", scenario, L) for L in (3, 4, 5, 8, 12, 16, 24, 32, 48)]
 
 
 def _random(split: str, equal: bool = True) -> list[Cell]:

@@ -233,18 +233,16 @@ def test_a_student_with_the_rule_begins_as_the_rule_on_steady_links_and_where_si
 
 
 def test_where_the_rule_teaches_leaving_it_is_what_costs() -> None:
-    """The second family stays with the rule, and in the first so does a state that is plain; action 1 is the rule's."""
+    """The second family stays with the rule; action 1 is the rule's, too."""
     inf, rng = math.inf, np.random.default_rng(0)
-    lessons = Lessons(2, 10, (5, 4), Ruled(np.array([False, True]), plain=0, same=2))
+    lessons = Lessons(2, 10, (5, 4), Ruled(np.array([False, True]), same=2))
     cost = np.array([[4.0, 0.0, inf, 0.0]], np.float32)
-    for family, plain in ((0, 0.0), (0, 1.0), (1, 0.0)):
-        state = np.array([[plain, family, 0.0, 1.0, 0.0]], np.float32)
-        lessons.add(Lesson(state, cost), np.array([family]), rng)
-    assert lessons.units[0] == pytest.approx(4.0)  # of the state that is not plain
+    for family in (0, 1):
+        lessons.add(Lesson(np.array([[7.0, family, 0.0, 1.0, 0.0]], np.float32), cost), np.array([family]), rng)
     states, costs = lessons.draw(np.array([50, 10]), rng)
     found = {(*s[:2].tolist(), *c.tolist()) for s, c in zip(states, costs, strict=True)}
     left = hindsight_rows.LEAVING
-    assert found == {(0, 0, 1.0, 0, inf, 0), (1, 0, left, 0, inf, 0), (0, 1, left, 0, inf, 0)}
+    assert found == {(7, 0, 1.0, 0, inf, 0), (7, 1, left, 0, inf, 0)}
 
 
 def test_every_family_has_links_of_its_own_in_each_split() -> None:
@@ -267,7 +265,7 @@ def id_of(trace: Any) -> tuple[str, int]:
 
 
 def test_runs_of_a_family_are_of_many_links_and_l() -> None:
-    """Ten of 24 links at 11 L each; eight runs on two links at one L are four episodes on each."""
+    """Ten of 24 links at 9 L each; eight runs on two links at one L are four episodes on each."""
     runs = ready_families.runs_of("frames", "validation", 10)
     assert len(runs) == 10 and len({run["link"] for run in runs}) > 5 and len({run["capacity"] for run in runs}) > 3
     alone = ready_families.runs_of("task", "test", 8)
