@@ -86,7 +86,7 @@ class Family:
     def shares(self, h: Numbers, weights: NDArray[np.float64] | None = None) -> Numbers:
         """The share of AFR's regret, float64[1 + resamples]; ``weights`` count the draws of each link."""
         counts = np.ones((1, len(self.best))) if weights is None else weights[:, self._link]
-        if self.name == "random":
+        if self.name.startswith("random"):
             ratios = np.clip((1 - h / self.best + LEAST) / (1 - self.afr / self.best + LEAST), 0, MOST)
             return np.asarray(counts @ ratios / counts.sum(axis=1))
         return np.asarray(counts @ (self.best - h) / (counts @ (self.best - self.afr)))

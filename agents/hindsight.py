@@ -32,14 +32,15 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from agents.held_out import split_scenario
 from agents.hindsight_network import Student, expected
-from agents.hindsight_rows import Lessons, Part, TaughtRows
+from agents.hindsight_rows import Lessons, Part, Ruled, TaughtRows
 from agents.learner import Learner
 from agents.mixed_env import Cell, cells
-from agents.ready_families import FAMILIES
+from agents.ready_families import FAMILIES, STAYING
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Hindsight
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights
+from bufgym.policies.ruled_network import seen
 from bufgym.utils.files import replaced
 
 MEAN = 0.995
@@ -61,7 +62,7 @@ class School:
 
     def __init__(self, settings: Hindsight, families: int, seconds: float) -> None:
         self.settings, self.longest = settings, seconds
-        self.student = Student(settings.candidates, settings.width)
+        self.student = Student(settings.candidates, settings.width, settings.ruled)
         """The latest weights."""
         average = get_ema_multi_avg_fn(MEAN)  # type: ignore[no-untyped-call]
         self.mean = AveragedModel(self.student, multi_avg_fn=average)
@@ -76,10 +77,10 @@ class School:
         """The part of the training that is left."""
         return 1 - max(self.steps / max(self.settings.steps, 1), self.seconds / self.longest)
 
-    def choose(self, seen: NDArray[np.float32], offered: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def choose(self, shown: NDArray[np.float32], offered: NDArray[np.bool_]) -> NDArray[np.int64]:
         """The running mean's best actions."""
         with torch.inference_mode():
-            outputs: NDArray[np.float32] = self.mean(torch.from_numpy(seen)).numpy()
+            outputs: NDArray[np.float32] = self.mean(torch.from_numpy(shown)).numpy()
         return np.asarray(np.argmax(np.where(offered, outputs, -np.inf), axis=1), np.int64)
 
     def sizes(self) -> NDArray[np.int64]:
@@ -88,12 +89,12 @@ class School:
         shares = EQUAL / len(lost) + (1 - EQUAL) * lost / lost.sum()
         return np.asarray(np.maximum(1, np.round(shares * self.settings.batch_size)), np.int64)
 
-    def learn(self, seen: Tensor, cost: Tensor, sizes: NDArray[np.int64]) -> float:
+    def learn(self, shown: Tensor, cost: Tensor, sizes: NDArray[np.int64]) -> float:
         """Make one gradient step on states of families of these ``sizes``; return the mean loss of the families."""
         left = max(self.left, 0.0)
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * max(LEAST_RATE, left)
-        costs, entropy = expected(self.student(seen), cost)
+        costs, entropy = expected(self.student(shown), cost)
         loss = costs.mean() - self.settings.entropy * max(0.0, 2 * left - 1) * entropy.mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -141,7 +142,11 @@ class HindsightLearner(Learner[Hindsight]):
             return [Part("", Cell("", split_scenario(on)[0], on.capacity), n)]
         found = {name: FAMILIES[name]("train") for name in self.settings.sets.names}
         found |= {s: cells(s, "train", chosen.capacities_of(s), chosen.data) for s in chosen.suite}
-        return [Part(s, cell, math.ceil(n / len(found) / len(own))) for s, own in found.items() for cell in own]
+        return [
+            Part(s, cell, math.ceil(n / len(found) / len(own)), s in STAYING)
+            for s, own in found.items()
+            for cell in own
+        ]
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
         """Train one seed; a resumed one has its state of learning, and begins to collect anew."""
@@ -156,8 +161,10 @@ class HindsightLearner(Learner[Hindsight]):
             school.load(checkpoint)
         # Every session has a seed of its own, by its first step: the episodes before a kill do not come again.
         rng = np.random.default_rng([seed, school.steps])
-        rows = TaughtRows(parts, settings.candidates, rng)
-        lessons = Lessons(len(rows.families), settings.room // len(rows.families), settings.candidates)
+        rows = TaughtRows(parts, settings.candidates, settings.ruled, rng)
+        k, families = settings.candidates, len(rows.families)
+        rule = Ruled(rows.stays, seen(k) - (k + 2)) if settings.ruled else None
+        lessons = Lessons(families, settings.room // families, (rows.seen.shape[1], rows.decisions.shape[1]), rule)
         curve = Record(home / "curve.csv", ("steps", "seconds", "loss"), school.steps)
         validations = Validations(home, objective.columns, objective.best, settings, school.steps)
         bar = seed_bar(settings.steps, school.steps, seed, line)

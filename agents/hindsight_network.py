@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from bufgym.policies.candidate_network import CandidateWeights, inputs
+from bufgym.policies.ruled_network import RuledWeights, fields_seen, seen
 
 START = 2.0
 """Bias of action 0 before learning, "accept where there is room, else drop the cheapest"; all other outputs are 0."""
@@ -15,22 +16,36 @@ LAYERS = 0, 2, 4
 
 
 class Student(nn.Sequential):
-    """Outputs [n, k + 2] of what n environments with k candidates show at arrivals; two hidden layers of ``width``."""
+    """Outputs [n, actions] of what n environments with k candidates show at arrivals; two hidden layers of ``width``.
 
-    def __init__(self, candidates: int, width: int) -> None:
-        size, out = inputs(candidates), nn.Linear(width, candidates + 2)
-        super().__init__(nn.Linear(size, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), out)
-        self.candidates = candidates
+    Where the rule's decision is an action, ``ruled``, one unit of each layer begins as a switch: the rule decides on
+    steady links, in bursts, and where sizes differ.
+    """
+
+    def __init__(self, candidates: int, width: int, ruled: bool = False) -> None:
+        size, out = seen(candidates) if ruled else inputs(candidates), nn.Linear(width, candidates + 2 + ruled)
+        super().__init__(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), out)
+        self.candidates, self.ruled = candidates, ruled
         nn.init.zeros_(out.weight)
         nn.init.zeros_(out.bias)
         with torch.no_grad():
             out.bias[0] = START
+            if ruled:
+                names = fields_seen(candidates)
+                for layer in self[0], self[2]:
+                    layer.weight[0], layer.bias[0] = 0.0, 0.0
+                self[0].bias[0] = -1.0
+                self[0].weight[0, names.index("guided_plain")] = 2.0
+                self[0].weight[0, names.index("guided_size_spread")] = 10.0
+                self[2].weight[0, 0] = 1.0
+                out.weight[-1, 0], out.weight[0, 0] = 2 * START, -START
 
     def weights(self) -> CandidateWeights:
         """The weights as in a file."""
         numbers = {name: tensor.detach().numpy() for name, tensor in self.named_parameters()}
         layers = tuple((numbers[f"{k}.weight"].T.copy(), numbers[f"{k}.bias"].copy()) for k in LAYERS)
-        return CandidateWeights(self.candidates, at_arrivals=True, masks=True, activation="tanh", layers=layers)
+        kind = RuledWeights if self.ruled else CandidateWeights
+        return kind(self.candidates, at_arrivals=True, masks=True, activation="relu", layers=layers)
 
 
 def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.mixed_env import Cell
+from bufgym.envs.expert.player import Player
 from bufgym.envs.options import Options
 from bufgym.envs.rows import Rows
+from bufgym.model.buffer import ACCEPT
 from bufgym.oracle.hindsight import Hindsight
 from bufgym.policies.candidate_network import inputs
+from bufgym.policies.ruled_network import NOT_OFFERED, seen, watcher
 
 Choose = Callable[[NDArray[np.float32], NDArray[np.bool_]], NDArray[np.int64]]
 """(observations [n, inputs], offered actions [n, actions]) -> actions [n]."""
@@ -23,6 +26,8 @@ RULED = 6
 """The rule, action 0, plays one row in so many: good states never end, and a student that fell finds its way back."""
 LONGEST = 600
 """Most steps over which rows are spread at first."""
+LEAVING = 20.0
+"""Cost of leaving the rule in families that stay with it, in the same units."""
 MOST = 60.0
 """Largest cost, in units of the mean cost of action 0."""
 
@@ -33,6 +38,8 @@ class Part(NamedTuple):
     family: str
     cell: Cell
     rows: int
+    stays: bool = False
+    """Whether leaving the rule gap-price is what costs, in place of what the clairvoyant says."""
 
 
 class Lesson(NamedTuple):
@@ -44,80 +51,117 @@ class Lesson(NamedTuple):
     """float32[n, actions], H given up for good by each action; infinite for those that are not offered."""
 
 
+class Ruled(NamedTuple):
+    """Where it is the rule gap-price that teaches: leaving it is what costs there."""
+
+    stays: NDArray[np.bool_]
+    """bool[families]: in the whole family."""
+    same: int
+    """First place of the flags of actions that do what the rule does; the last action is the rule's."""
+
+
 class TaughtRows:
     """Environments of several cells side by side, with the clairvoyant's word on every decision.
 
     Args:
         parts: the rows of each cell.
         candidates: k, of every row.
+        ruled: whether the rule's decision is an action, and what it knows is seen.
         rng: for episodes.
     """
 
-    def __init__(self, parts: Sequence[Part], candidates: int, rng: np.random.Generator) -> None:
+    def __init__(self, parts: Sequence[Part], candidates: int, ruled: bool, rng: np.random.Generator) -> None:
         self.families = list(dict.fromkeys(part.family for part in parts))
+        self.stays = np.array([any(part.stays and part.family == family for part in parts) for family in self.families])
         sizes = [part.rows for part in parts]
         self.n, ends = sum(sizes), np.cumsum(sizes).tolist()
         self.spans = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
         self.family = np.repeat([self.families.index(part.family) for part in parts], sizes)
         """int64[n]: number of each row's family."""
-        self.groups = []
+        self.groups, self._players, self._teachers = [], [], list[Hindsight | None]()
         for part in parts:
-            options = Options(capacity=part.cell.capacity, decide_at="arrival", candidates=candidates, info="none")
-            self.groups.append(Rows(part.rows, part.cell.scenario, options))
-        self._teachers = [Hindsight(rows.senders, "train.py hindsight") for rows in self.groups]
+            options = Options(
+                capacity=part.cell.capacity, decide_at="arrival", actions="slots", fields=("occupancy",), info="none"
+            )
+            rows = Rows(part.rows, part.cell.scenario, options)
+            self.groups.append(rows)
+            self._players.append(Player(watcher(candidates), part.rows))
+            self._teachers.append(None if part.stays else Hindsight(rows.senders, "train.py hindsight"))
         self._ruled = np.concatenate([np.arange(size) < max(size // RULED, size > 1) for size in sizes])
-        self.seen = np.zeros((self.n, inputs(candidates)), np.float32)
-        self.offered = np.zeros((self.n, candidates + 2), np.bool_)
+        self._candidates = candidates
+        self.seen = np.zeros((self.n, seen(candidates) if ruled else inputs(candidates)), np.float32)
+        self.decisions = np.zeros((self.n, candidates + 2 + ruled), np.int64)
+        """int64[n, actions]: the slot action that each action stands for, ``NOT_OFFERED`` where it is not offered."""
         for rows in self.groups:
             for i in range(len(rows)):
                 rows.seed(i, seeding.np_random(int(rng.integers(2**31)))[0])
             rows.reset(np.arange(len(rows)))
         self._observe()
 
-    def _observe(self) -> None:
-        for rows, span in zip(self.groups, self.spans, strict=True):
-            self.seen[span], self.offered[span] = rows.output.flat, rows.output.action_mask
+    @property
+    def offered(self) -> NDArray[np.bool_]:
+        """bool[n, actions]: whether each action is offered."""
+        return self.decisions != NOT_OFFERED
 
-    def _act(self, actions: NDArray[np.int64]) -> None:
+    def _observe(self) -> None:
+        actions, numbers, k = self.decisions.shape[1], self.seen.shape[1], self._candidates
+        for rows, span, player in zip(self.groups, self.spans, self._players, strict=True):
+            player.actions(rows.senders)
+            end = player.memory[:, player.memory.shape[1] - (k + 3) - seen(k) :]
+            self.seen[span], answers = end[:, k + 3 : k + 3 + numbers], end[:, :actions].astype(np.int64)
+            slots = np.where(answers >= 0, answers, np.where(answers == ACCEPT, rows.capacity + 1, rows.capacity))
+            self.decisions[span] = np.where(answers == NOT_OFFERED, NOT_OFFERED, slots)
+
+    def _act(self, decisions: NDArray[np.int64]) -> None:
         for rows, span in zip(self.groups, self.spans, strict=True):
-            rows.step(actions[span])
+            rows.step(decisions[span])
             if rows.output.terminated.any():
                 rows.reset(np.flatnonzero(rows.output.terminated))
         self._observe()
+
+    def _by_rule(self) -> NDArray[np.int64]:
+        """int64[n]: action 0 of families that the clairvoyant teaches, otherwise what the rule does."""
+        return np.where(self.stays[self.family], self.decisions[:, -1], self.decisions[:, 0])
 
     def scatter(self, rng: np.random.Generator) -> None:
         """Let the rule play until rows are at different moments of their episodes."""
         longest = [min(rows.scenario.max_messages, LONGEST) for rows in self.groups]
         begin = [rng.integers(steps, size=len(rows)) for rows, steps in zip(self.groups, longest, strict=True)]
         for moment in range(max(longest)):
-            for rows, at in zip(self.groups, begin, strict=True):
-                rows.step(np.zeros(len(rows), np.int64))
+            decisions = self._by_rule()
+            for rows, span, at in zip(self.groups, self.spans, begin, strict=True):
+                rows.step(decisions[span])
                 again = rows.output.terminated | (at == moment)
                 if again.any():
                     rows.reset(np.flatnonzero(again))
-        self._observe()
+            self._observe()
 
     def step(self, choose: Choose) -> Lesson:
         """Play one decision in every row, and say what each action would have cost."""
-        cost = np.empty(self.offered.shape)
-        for rows, span, teacher in zip(self.groups, self.spans, self._teachers, strict=True):
-            decisions = np.where(rows.output.action_mask != 0, rows.output.slot_actions, -1)
-            cost[span] = teacher.values(decisions)
-        best = np.where(np.isnan(cost), -np.inf, cost).max(axis=1, keepdims=True)
-        lesson = Lesson(self.seen.copy(), np.where(np.isnan(cost), np.inf, best - cost).astype(np.float32))
-        actions = choose(self.seen, self.offered)
-        actions[self._ruled] = 0
-        self._act(actions)
+        cost, offered = np.empty(self.decisions.shape), self.offered
+        for span, teacher in zip(self.spans, self._teachers, strict=True):
+            decisions = self.decisions[span]
+            if teacher is None:
+                cost[span] = np.where(offered[span], 0.0, np.inf)
+                continue
+            values = teacher.values(np.where(offered[span], decisions, -1))
+            best = np.where(np.isnan(values), -np.inf, values).max(axis=1, keepdims=True)
+            cost[span] = np.where(np.isnan(values), np.inf, best - values)
+        lesson = Lesson(self.seen.copy(), cost.astype(np.float32))
+        chosen = np.take_along_axis(self.decisions, choose(self.seen, offered)[:, None], axis=1)[:, 0]
+        self._act(np.where(self._ruled, self._by_rule(), chosen))
         return lesson
 
 
 class Lessons:
-    """All lessons of each family so far, up to ``room``; then new ones take the places of others at random."""
+    """All lessons of each family so far, up to ``room``; then new ones take the places of others at random.
 
-    def __init__(self, families: int, room: int, candidates: int) -> None:
-        self.room, self.counts = room, np.zeros(families, np.int64)
-        self._seen = torch.zeros(families * room, inputs(candidates))
-        self._cost = torch.zeros(families * room, candidates + 2)
+    ``shape`` is (numbers seen, actions).
+    """
+
+    def __init__(self, families: int, room: int, shape: tuple[int, int], rule: Ruled | None = None) -> None:
+        self.room, self.counts, self._rule = room, np.zeros(families, np.int64), rule
+        self._seen, self._cost = (torch.zeros(families * room, size) for size in shape)
         self._of_rule, self._met = np.zeros(families), np.zeros(families)
 
     def add(self, lesson: Lesson, family: NDArray[np.int64], rng: np.random.Generator) -> None:
@@ -143,5 +187,10 @@ class Lessons:
         family = np.repeat(np.arange(len(sizes)), sizes)
         places = torch.from_numpy((rng.random(len(family)) * self.counts[family]).astype(np.int64) + family * self.room)
         units = torch.from_numpy(self.units[family].astype(np.float32))
-        cost = self._cost[places] / units[:, None]
-        return self._seen[places], torch.where(torch.isfinite(cost), cost.clamp(max=MOST), cost)
+        seen, cost = self._seen[places], self._cost[places]
+        known = (cost / units[:, None]).clamp(max=MOST)
+        if self._rule is not None:
+            stays = torch.from_numpy(self._rule.stays[family])
+            leaves = LEAVING * (1 - torch.nn.functional.pad(seen[:, self._rule.same :], (0, 1), value=1.0))
+            known = torch.where(stays[:, None], leaves, known)
+        return seen, torch.where(torch.isfinite(cost), known, cost)

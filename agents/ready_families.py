@@ -1,4 +1,4 @@
-"""Ten families of links and streams with messages of equal size, which one agent learns side by side.
+"""Twelve families of links and streams, which one agent learns side by side.
 
 ``train.py hindsight --families all`` learns from their train splits, chooses by their validation splits, and reports on
 their test splits. The splits share no link, but for ``task``: its validation has other episodes on the training links.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -89,19 +90,21 @@ def _frames(split: str) -> list[Cell]:
     return [Cell("", scenario, L) for L in (3, 4, 5, 8, 12, 16, 24, 32, 48)]
 
 
-def _random(split: str) -> list[Cell]:
+def _random(split: str, equal: bool = True) -> list[Cell]:
     found = map(random_stream, range(FIRST_SEED[split], FIRST_SEED[split] + STREAMS[split]))
-    return [cell for cell in found if cell.scenario.sizes == "equal"]  # type: ignore[attr-defined]
+    return [cell for cell in found if (cell.scenario.sizes == "equal") == equal]  # type: ignore[attr-defined]
 
 
-def _of_suite(suite: str, capacities: Sequence[int], label: str = "") -> Callable[[str], list[Cell]]:
+def _of_suite(
+    suite: str, capacities: Sequence[int], label: str = "", equal: bool = True
+) -> Callable[[str], list[Cell]]:
     """Cells of a suite whose label has this in it, without a limit on bytes."""
 
     def made(split: str) -> list[Cell]:
         found = {name: s for name, s in suites.get(suite).settings(split).items() if label in name}
         kept = {name: s.scenario for name, s in found.items() if s.max_bytes is None}
-        equal = {name: s for name, s in kept.items() if getattr(s, "sizes", "equal") == "equal"}
-        return [Cell(name, scenario, L) for name, scenario in equal.items() for L in capacities]
+        chosen = {name: s for name, s in kept.items() if (getattr(s, "sizes", "equal") == "equal") == equal}
+        return [Cell(name, scenario, L) for name, scenario in chosen.items() for L in capacities]
 
     return made
 
@@ -117,8 +120,16 @@ FAMILIES: dict[str, Callable[[str], list[Cell]]] = {
     "interruption": _of_suite("interruption-v1", (5, 8, 16, 32)),
     "steady": _of_suite("sustained-v1", (5, 8, 15)),
     "random": _random,
+    "unequal": _of_suite("jpeg-v1", (5, 10, 25), equal=False),
+    "random-unequal": partial(_random, equal=False),
 }
 """Name -> cells of a split."""
+STAYING = ("interruption", "steady", "unequal", "random-unequal")
+"""Families in which the clairvoyant teaches nothing: there the student learns to do what the rule gap-price does.
+
+For messages of unequal size there are no costs in hindsight. On steady links and in interruptions accepting is free in
+hindsight, as the clairvoyant could still drop the right messages later, and a student that accepts does not.
+"""
 
 
 def runs_of(family: str, split: str, most: int) -> list[Run]:

@@ -260,8 +260,8 @@ class Hindsight(Settings):
     candidates: Natural = 0
     """k: how many of the cheapest candidates the agent chooses among, beside the head and accepting; 0: 2 in an
     environment, else 3."""
-    width: Natural = 0
-    """Hidden units of both layers; 0: 64 in an environment, else 96."""
+    width: Count = 64
+    """Hidden units of both layers."""
     num_envs: Natural = 0
     """Environments side by side, a sixth of which the rule plays; 0: 256 in an environment, else 384."""
     batch_size: Natural = 0
@@ -288,11 +288,16 @@ class Hindsight(Settings):
         return self.sets.kind if self.sets.families else super().kind
 
     @property
+    def ruled(self) -> bool:
+        """Whether the decision of gap-price is an action: where one network learns from many families of links."""
+        return self.kind != "environment"
+
+    @property
     def resolved(self) -> "Hindsight":
         """The same without zeros that stand for numbers by the task."""
-        usual: dict[str, Any] = {"candidates": 2, "width": 64, "num_envs": 256, "batch_size": 1024}
+        usual: dict[str, Any] = {"candidates": 2, "num_envs": 256, "batch_size": 1024}
         if self.kind != "environment":
-            usual = {"candidates": 3, "width": 96, "num_envs": 384, "batch_size": 2560}
+            usual = {"candidates": 3, "num_envs": 384, "batch_size": 2560}
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
 
 

@@ -72,7 +72,20 @@ class Suites:
         return self.capacities or suites.get(suite).capacities
 
 
-FAMILY_NAMES = ("task", "frames", "lte", "generated", "outage", "heavy", "light", "interruption", "steady", "random")
+FAMILY_NAMES = (
+    "task",
+    "frames",
+    "lte",
+    "generated",
+    "outage",
+    "heavy",
+    "light",
+    "interruption",
+    "steady",
+    "random",
+    "unequal",
+    "random-unequal",
+)
 ALL = "all"
 
 

@@ -20,6 +20,7 @@ from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.registry import Policy
+from bufgym.policies.ruled_network import RuledWeights
 from bufgym.utils import __version__, strict_json
 from bufgym.utils.errors import BufgymError, where
 from bufgym.utils.files import read_whole, replaced
@@ -117,7 +118,7 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     except safetensors.SafetensorError as error:
         raise BufgymError(f"{path}: no safetensors file, or a broken one: {error}") from None
     prefixes = {name.partition(".")[0] for name in entries}
-    kinds: tuple[Kind, ...] = (GuidedWeights, SchedulerWeights, CandidateWeights)
+    kinds: tuple[Kind, ...] = (GuidedWeights, SchedulerWeights, CandidateWeights, RuledWeights)
     kind = next((kind for kind in kinds if kind.NETWORKS[0] in prefixes), Weights)
     metadata = _metadata(path, data, kind)
     fields, settings = metadata["fields"], {name: metadata[name] for name in kind.SETTINGS}
@@ -169,7 +170,7 @@ def _metadata(path: StrPath, data: bytes, kind: Kind) -> dict[str, Any]:
     for key, (holds, rule) in kind.SETTINGS.items():
         if not holds(metadata.get(key)):
             raise wrong(key, rule)
-    if kind is CandidateWeights and tuple(fields) != known:
+    if issubclass(kind, CandidateWeights) and tuple(fields) != known:
         raise wrong("fields", f"must be {', '.join(known)}")
     return metadata
 

@@ -14,6 +14,7 @@ from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Network, Weights
+from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.utils.errors import BufgymError
 
 
@@ -51,6 +52,16 @@ def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed
     layers[-1][1][0] += accept
     single = tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
     return CandidateWeights(k, at_arrivals, masks, activation, single)
+
+
+def random_ruled(k, *widths, activation="tanh", seed=0, accept=0.0):
+    """Of a network among k candidates, the head and what the rule does, inclined to its first action by ``accept``."""
+    rng = np.random.default_rng(seed)
+    pairs = itertools.pairwise([seen(k), *widths, k + 3])
+    layers = [(2 * rng.normal(size=pair) / pair[0] ** 0.5, rng.normal(size=pair[1])) for pair in pairs]
+    layers[-1][1][0] += accept
+    single = tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
+    return RuledWeights(k, True, True, activation, single)
 
 
 KINDS = QUEUE, TOPICS, CHOICES = Weights, SchedulerWeights, CandidateWeights

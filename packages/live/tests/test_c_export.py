@@ -26,7 +26,7 @@ from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.c import CALL, SUPPORTED, header, random_episode, recorded
 from bufgym_live.robot.c.header import without_c
-from tests.core.weight_cases import random_choices, random_weights
+from tests.core.weight_cases import random_choices, random_ruled, random_weights
 
 REPO = Path(__file__).resolve().parents[3]
 EXPONENTIAL = qoi.exponential()
@@ -109,6 +109,7 @@ AGENTS |= {
     "among-candidates": random_choices(2, False, 64, 64, seed=7).policy("among-candidates"),
     "at-arrivals": random_choices(3, True, 6, 5, 4, activation="relu", seed=13, accept=4.0).policy("at-arrivals"),
     "masked": random_choices(5, True, masks=True, seed=16, accept=4.0).policy("masked"),
+    "ruled": random_ruled(3, 12, 7, seed=17, accept=1.0).policy("ruled"),
 }
 
 

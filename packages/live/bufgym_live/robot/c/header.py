@@ -15,7 +15,18 @@ from bufgym.model.observe import candidates
 from bufgym.model.observe.declare import TINY
 from bufgym.model.observe.queue import ROUNDING
 from bufgym.model.qoi import EXPONENTIAL, SATURATING, TABULATED, Value
-from bufgym.policies import Policy, candidate_network, chains, gaps, guided, learned, price_dp, target_gap, thinning
+from bufgym.policies import (
+    Policy,
+    candidate_network,
+    chains,
+    gaps,
+    guided,
+    learned,
+    price_dp,
+    ruled_network,
+    target_gap,
+    thinning,
+)
 from bufgym.policies.learned import Weights
 from bufgym.policies.scoring import Scorer, unpack
 from bufgym.policies.target_gap import straight
@@ -86,10 +97,13 @@ def header(
         raise BufgymError(f"prefix {prefix!r}: must be small letters, digits and _, as names in C begin")
     learns = policy.on_arrival is learned.on_arrival
     guides = policy.on_arrival is guided.on_arrival
-    chooses = policy.on_arrival is candidate_network.on_arrival
-    body = _part("candidates.h") if chooses else _network(policy) if learns else _rule(policy, guides)
+    ruled = policy.on_arrival is ruled_network.on_arrival
+    chooses = ruled or policy.on_arrival is candidate_network.on_arrival
+    body = _among_candidates(ruled) if chooses else _network(policy) if learns else _rule(policy, guides)
     parameters = policy.parameters
-    if guides:
+    if ruled:
+        parameters = price_dp.PARAMETERS
+    elif guides:
         parameters = dict(zip(price_dp.PARAMETERS, policy.weights, strict=False))
     if "bufgym_departure(" not in body:
         body += "\n" + _part("no_departure.h")
@@ -176,6 +190,11 @@ def _network(policy: Policy) -> str:
     return _helped(_part("fields.h") + _part("features.h") + _part("scorer.h"))
 
 
+def _among_candidates(ruled: bool) -> str:
+    """Write the C of a network among candidates, and what the rule does where that is an action, ``ruled``."""
+    return _part("candidates.h") + "\n" + (_helped(_part("ruled.h")) if ruled else _part("choice.h"))
+
+
 def _helped(rule: str) -> str:
     """Put the parts that it shares before ``rule``."""
     helpers = ""
@@ -217,12 +236,15 @@ def _candidate_numbers(policy: Policy) -> dict[str, Any]:
     begin = candidate_network.WIDTHS + hidden + 1
     k, masks, tanh = (int(policy.weights[i]) for i in range(candidate_network.HIDDEN))
     widths = [int(width) for width in policy.weights[candidate_network.WIDTHS : begin]]
-    units = candidate_network.inputs(k) + sum(widths)
+    ruled = policy.on_arrival is ruled_network.on_arrival
+    seen = int(ruled_network.seen(k)) if ruled else candidate_network.inputs(k)
+    units = seen + sum(widths)
     layers = _array("int", "bufgym_widths", widths) + _array("double", "bufgym_layers", policy.weights[begin:])
     scratch = "    /* scratch of the policy: its candidates, and units of all layers */\n"
     scratch += f"    int order[{k + 1}];\n    double cost[{k + 1}], units[{units}];\n"
+    scratch += _part("places.h") if ruled else ""
     return {
-        "WEIGHTS": layers, "SCRATCH": scratch, "CANDIDATES": k, "HIDDEN": hidden, "ACTIONS": widths[-1],
+        "WEIGHTS": layers, "SCRATCH": scratch, "CANDIDATES": k, "SEEN": seen, "HIDDEN": hidden, "ACTIONS": widths[-1],
         "MASKS": masks, "TANH": tanh, "NONE": candidates.NONE, "TIE": repr(candidates.TIE),
         "LEAST_RATIO": repr(candidates.LEAST), "LARGEST_RATIO": repr(candidates.LARGEST), "E": repr(math.e),
         "E_SQUARED": repr(math.e**2), "SQRT_HALF": candidates.SQRT_HALF, "LOG_TWO": repr(float(candidates.LOG_2)),

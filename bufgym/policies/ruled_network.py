@@ -1,0 +1,177 @@
+"""Learned policies among ordered candidates and what the rule ``gap-price`` would do: one network for every link.
+
+At every arrival the policy looks at the k cheapest candidates and the head, as ``candidate_network`` does, at what the
+rule knows (``guided.INPUTS``), and at the rule's own decision. Its network has an output for each action:
+
+    0: accept where there is room, else drop the cheapest;  1 to k + 1: candidates;  k + 2: what the rule does
+
+and the highest output of those that are offered decides. See docs/methods.md, "Networks among candidates".
+"""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bufgym.jit import kernel
+from bufgym.model.buffer import Buffer, has_space
+from bufgym.model.observe import (
+    CANDIDATE_FIELDS,
+    QUEUE_FIELDS,
+    decision_of_candidate,
+    find_candidates,
+    is_offered,
+    observe_candidates,
+)
+from bufgym.policies import chains, price_dp, target_gap
+from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, forward
+from bufgym.policies.guided import BASE, INPUT_FIELDS, MEANINGS, N_INPUTS, REMEMBERED, RULE, inputs, recall
+from bufgym.policies.registry import Arrival, Memory, Policy
+
+NOT_OFFERED = -100
+"""In place of the decision of an action that is not offered."""
+OF_RULE = tuple(f"guided_{field.name}" for field in INPUT_FIELDS)
+STATE = ("room", "log_capacity")
+"""1 if there is room for the newcomer; log(L / 8)."""
+
+
+PER_CANDIDATE, QUEUE, OTHERS = len(CANDIDATE_FIELDS), len(QUEUE_FIELDS), N_INPUTS + len(STATE)
+
+
+@kernel
+def seen(candidates: int) -> int:
+    """The count of numbers observed: of candidates, of the rule, ``STATE``, and whether each action is the rule's."""
+    return PER_CANDIDATE * (candidates + 1) + QUEUE + OTHERS + candidates + 2
+
+
+def fields_seen(candidates: int) -> list[str]:
+    """The name of each number that is seen, in order."""
+    of_candidates = [field.name for field in CANDIDATE_FIELDS for _ in range(candidates + 1)]
+    same = [f"rule_takes_{a}" for a in range(candidates + 2)]
+    return [*of_candidates, *(field.name for field in QUEUE_FIELDS), *OF_RULE, *STATE, *same]
+
+
+@kernel
+def rule_decision(buffer: Buffer, arrival: Arrival, rule: Memory) -> int:
+    """What gap-price does, once its memory is up to date."""
+    a = price_dp.share(rule, BASE)
+    if a > 0:
+        return price_dp.decide(buffer, arrival, rule, BASE, a)
+    return target_gap.decide(buffer, arrival, rule, BASE)
+
+
+@kernel
+def look(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.float64], places: int) -> None:
+    """Write into ``own`` order and cost of the ``places`` = k + 1 candidates, each action's decision, and what is seen.
+
+    ``memory`` begins with the rule's, which is updated.
+    """
+    actions = places + 2
+    order, cost, decisions = own[:places], own[places : 2 * places], own[2 * places : 2 * places + actions]
+    numbers = own[2 * places + actions :]
+    of_candidates = PER_CANDIDATE * places + QUEUE
+    room = has_space(buffer, arrival)
+    recall(buffer, arrival, memory, BASE)
+    find_candidates(buffer, arrival, order, cost)
+    observe_candidates(buffer, arrival, order, cost, numbers[:of_candidates])
+    inputs(buffer, arrival, memory, BASE, numbers[of_candidates : of_candidates + N_INPUTS])
+    by_rule = rule_decision(buffer, arrival, memory[RULE:])
+    at = of_candidates + N_INPUTS
+    numbers[at], numbers[at + 1] = 1.0 if room else 0.0, math.log(buffer.capacity / 8)
+    decisions[actions - 1] = by_rule
+    for a in range(actions - 1):
+        decisions[a], numbers[at + 2 + a] = NOT_OFFERED, 0.0
+        if is_offered(order, True, room, a):
+            decisions[a] = decision_of_candidate(order, len(buffer.slots), True, room, a)
+            numbers[at + 2 + a] = 1.0 if decisions[a] == by_rule else 0.0
+    for i in range(at + 1 + actions):
+        numbers[i] = np.float32(numbers[i])  # a network learns from single precision
+
+
+@kernel
+def decide(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.float64], places: int) -> int:
+    """The decision with the highest output."""
+    parameters, actions = buffer.parameters, places + 2
+    look(buffer, arrival, memory, own, places)
+    decisions, units = own[2 * places : 2 * places + actions], own[2 * places + actions :]
+    outputs = units[forward(parameters, units, seen(places - 1)) :]
+    best, decision = -np.inf, 0
+    for a in range(actions):
+        if decisions[a] != NOT_OFFERED and outputs[a] > best:
+            best, decision = outputs[a], int(decisions[a])
+    return decision
+
+
+@kernel
+def own_numbers(parameters: NDArray[np.float64]) -> int:
+    """How much of the memory's end the network takes."""
+    places = int(parameters[CANDIDATES]) + 1
+    total = 3 * places + 2 + seen(places - 1)
+    for layer in range(int(parameters[HIDDEN]) + 1):
+        total += int(parameters[WIDTHS + layer])
+    return total
+
+
+def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A trained network that chooses among ordered candidates and what gap-price would do."""
+    own = memory[len(memory) - own_numbers(buffer.parameters) :]
+    return decide(buffer, arrival, memory, own, int(buffer.parameters[CANDIDATES]) + 1)
+
+
+def watch_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """What gap-price does; the memory ends with each action's decision and what the network would see."""
+    places = int(buffer.parameters[CANDIDATES]) + 1
+    own = memory[len(memory) - (3 * places + 2 + seen(places - 1)) :]
+    look(buffer, arrival, memory, own, places)
+    return int(own[3 * places + 1])
+
+
+def watcher(candidates: int) -> Policy:
+    """The rule gap-price, which leaves in its memory what a network with so many candidates would see.
+
+    The memory ends with the decisions of all actions, float64[k + 3], and what is seen, float64[seen(k)].
+    """
+    places = candidates + 1
+    work = chains.SCRATCH[0] + 3 * places + 2 + seen(candidates), chains.SCRATCH[1]
+    return Policy(
+        "watcher", watch_arrival, weights=(float(candidates), 1.0, 1.0, 0.0, 0.0), memory=REMEMBERED, work=work,
+        compile=True, built_in=True, reads_rate=True, reads_left=True,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RuledWeights(CandidateWeights):
+    """A network among ordered candidates and gap-price's decision, as in a file."""
+
+    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = (*CandidateWeights.CONTEXT_NAMES, *OF_RULE, *STATE)
+    NETWORKS: ClassVar[tuple[str, ...]] = ("ruled",)
+
+    def policy(self, name: str, about: str = "", source: str = "") -> Policy:
+        """Make the policy of these weights; it works for every L."""
+        numbers = self.parameters()
+        work = chains.SCRATCH[0] + int(own_numbers(numbers)), chains.SCRATCH[1]
+        return Policy(
+            name, on_arrival, weights=tuple(numbers.tolist()), memory=REMEMBERED, work=work, compile=True,
+            built_in=True, reads_rate=True, reads_left=True, about=about, source=source,
+        )  # fmt: skip
+
+    @staticmethod
+    def definition(fields: Sequence[str]) -> list[Any]:
+        """What defines observation and rule: weights found with others would decide nonsense."""
+        return [*CandidateWeights.definition(fields), MEANINGS, price_dp.PARAMETERS]
+
+    @classmethod
+    def shapes(
+        cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]
+    ) -> dict[str, tuple[int, ...]]:
+        """The shapes of ``tensors`` for hidden layers of these widths, by name."""
+        k, shapes = settings["candidates"], dict[str, tuple[int, ...]]()
+        names = [*map(str, range(len(widths))), "out"]
+        for name, shape in zip(names, itertools.pairwise([seen(k), *widths, k + 3]), strict=True):
+            shapes[f"{cls.NETWORKS[0]}.{name}.weight"] = shape
+            shapes[f"{cls.NETWORKS[0]}.{name}.bias"] = shape[1:]
+        return shapes

@@ -1,0 +1,129 @@
+"""Networks among candidates and what gap-price does decide as their weights say, against a reference model."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from candidate_cases import found, observed, outputs
+from cases import VALUES, cases, same
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from weight_cases import random_choices, random_ruled
+
+from bufgym import policies
+from bufgym.model.buffer import ACCEPT, REJECT
+from bufgym.policies import guided, weights
+from bufgym.policies.registry import Policy
+from bufgym.policies.ruled_network import NOT_OFFERED, fields_seen, seen, watcher
+
+kernels = pytest.mark.kernels
+RULE = policies.get("gap-price")
+
+
+def decisions_of(buffer, arrival, slots):
+    """What each action among candidates does; None where it is not offered."""
+    s = len(buffer.slots)
+    room = s < buffer.capacity and buffer.backlog_bytes + int(arrival.size_bytes) <= buffer.max_bytes
+    cheapest = REJECT if slots[0] == s or (slots[0] is None and not room) else slots[0]
+    does = [ACCEPT if room else cheapest]
+    does += [None if j is None or (a == 0 and not room) else REJECT if j == s else j for a, j in enumerate(slots)]
+    return does, room
+
+
+def reference(made, margins):
+    """A policy that decides by these weights; by how much the best decision leads goes to ``margins``."""
+
+    def on_arrival(buffer, arrival, memory):
+        guided.recall(buffer, arrival, memory, guided.BASE)
+        known = np.zeros(guided.N_INPUTS)
+        guided.inputs(buffer, arrival, memory, guided.BASE, known)
+        by_rule = guided.follow(buffer, arrival, memory, guided.BASE, np.zeros(guided.N_OUTPUTS))
+        candidates, x = found(buffer, arrival, made.candidates)
+        does, room = decisions_of(buffer, arrival, [j for j, _ in candidates])
+        same_as_rule = [float(decision == by_rule) for decision in does]
+        state = [float(room), math.log(buffer.capacity / 8)]
+        ranked = outputs(made, [*observed(buffer, arrival, candidates, x), *known, *state, *same_as_rule])
+        offered = [
+            (value, decision) for value, decision in zip(ranked, [*does, by_rule], strict=True) if decision is not None
+        ]
+        best, decision = max(offered, key=lambda pair: pair[0])
+        margins.append(best - max((value for value, other in offered if other != decision), default=-math.inf))
+        return decision
+
+    return Policy("reference", on_arrival, memory=guided.REMEMBERED, work=guided.WORK, reads_rate=True)
+
+
+@st.composite
+def networks(draw):
+    """Any number of candidates, of hidden layers and of units."""
+    widths = draw(st.sampled_from([(), (1,), (5,), (4, 3), (3, 2, 4)]))
+    activation, k, seed = draw(st.sampled_from(["tanh", "relu"])), draw(st.integers(1, 5)), draw(st.integers(0, 2**32))
+    return random_ruled(k, *widths, activation=activation, seed=seed, accept=2.0)
+
+
+@kernels
+@given(case=cases(), v=VALUES, made=networks())
+def test_it_decides_as_the_reference_model(case, v, made):
+    """Logarithms of the environment are right to 1e-6, so outputs closer than 1e-3 may change places."""
+    margins: list[float] = []
+    slow = case.run(reference(made, margins), v)
+    assume(min(margins, default=1.0) > 1e-3)
+    assert same(case.run(made.policy("fast"), v), slow)
+
+
+def inclined(made, action):
+    """The same, with one action above all others."""
+    *hidden, (weight, bias) = made.layers
+    wanted = np.full_like(bias, -1.0)
+    wanted[action] = 1.0
+    return replace(made, layers=(*hidden, (np.zeros_like(weight), wanted)))
+
+
+@kernels
+@given(case=cases(), v=VALUES, k=st.integers(1, 4))
+def test_with_all_weight_on_its_last_action_it_is_the_rule(case, v, k):
+    assert same(case.run(inclined(random_ruled(k, 3), k + 2).policy("ruled"), v), case.run(RULE, v))
+
+
+@kernels
+@given(case=cases(), v=VALUES, k=st.integers(1, 4))
+def test_with_all_weight_on_its_first_action_it_is_a_network_among_candidates(case, v, k):
+    plain = inclined(random_choices(k, True, 3, masks=True), 0).policy("plain")
+    assert same(case.run(inclined(random_ruled(k, 3), 0).policy("ruled"), v), case.run(plain, v))
+
+
+@kernels
+@given(case=cases(), v=VALUES, k=st.integers(1, 4))
+def test_the_watcher_is_the_rule_and_leaves_in_its_memory_what_the_network_sees(case, v, k):
+    """Its last decision is the rule's, and each flag says whether an action's decision is the same."""
+    met = []
+
+    def on_arrival(buffer, arrival, memory):
+        decision = watcher(k).on_arrival(buffer, arrival, memory)
+        does, numbers = memory[-(k + 3) - seen(k) : -seen(k)], memory[-seen(k) :]
+        same_as_rule = numbers[-(k + 2) :].tolist()
+        assert does[-1] == decision
+        assert same_as_rule == [float(d == decision and d != NOT_OFFERED) for d in does[:-1].tolist()]
+        met.append(numbers.copy())
+        return decision
+
+    watching = replace(watcher(k), on_arrival=on_arrival, compile=False)
+    assert same(case.run(watching, v), case.run(RULE, v))
+    assert all(np.isfinite(numbers).all() for numbers in met)
+
+
+def test_every_number_that_is_seen_has_a_name():
+    for k in (1, 3, 5):
+        assert len(fields_seen(k)) == seen(k)
+
+
+def test_a_file_holds_it(tmp_path):
+    made = random_ruled(3, 6, 5, seed=1)
+    again = weights.read(weights.save(tmp_path / "mine.safetensors", made, {"name": "mine"}))[0]
+    assert type(again) is type(made) and again.candidates == 3
+    assert all((a == b).all() for a, b in zip(_numbers(again), _numbers(made), strict=True))
+
+
+def _numbers(made):
+    return [part for layer in made.layers for part in layer]
