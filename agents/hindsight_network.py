@@ -23,8 +23,10 @@ class Student(nn.Sequential):
     """
 
     def __init__(self, candidates: int, width: int, ruled: bool = False) -> None:
-        size, out = seen(candidates) if ruled else inputs(candidates), nn.Linear(width, candidates + 2 + ruled)
-        super().__init__(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), out)
+        size = int(seen(candidates)) if ruled else inputs(candidates)
+        first, second = nn.Linear(size, width), nn.Linear(width, width)
+        out = nn.Linear(width, candidates + 2 + ruled)
+        super().__init__(first, nn.ReLU(), second, nn.ReLU(), out)
         self.candidates, self.ruled = candidates, ruled
         nn.init.zeros_(out.weight)
         nn.init.zeros_(out.bias)
@@ -32,12 +34,12 @@ class Student(nn.Sequential):
             out.bias[0] = START
             if ruled:
                 names = fields_seen(candidates)
-                for layer in self[0], self[2]:
+                for layer in first, second:
                     layer.weight[0], layer.bias[0] = 0.0, 0.0
-                self[0].bias[0] = -1.0
-                self[0].weight[0, names.index("guided_plain")] = 2.0
-                self[0].weight[0, names.index("guided_size_spread")] = 10.0
-                self[2].weight[0, 0] = 1.0
+                first.bias[0] = -1.0
+                first.weight[0, names.index("guided_plain")] = 2.0
+                first.weight[0, names.index("guided_size_spread")] = 10.0
+                second.weight[0, 0] = 1.0
                 out.weight[-1, 0], out.weight[0, 0] = 2 * START, -START
 
     def weights(self) -> CandidateWeights:

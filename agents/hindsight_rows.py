@@ -101,7 +101,7 @@ class TaughtRows:
     @property
     def offered(self) -> NDArray[np.bool_]:
         """bool[n, actions]: whether each action is offered."""
-        return self.decisions != NOT_OFFERED
+        return np.asarray(self.decisions != NOT_OFFERED)
 
     def _observe(self) -> None:
         actions, numbers, k = self.decisions.shape[1], self.seen.shape[1], self._candidates
