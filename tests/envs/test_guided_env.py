@@ -54,6 +54,19 @@ def test_zero_actions_are_gap_price(case: str) -> None:
 
 @kernels
 @pytest.mark.parametrize("case", CASES)
+def test_who_sees_what_the_rule_sees_may_choose_slots(case: str) -> None:
+    """Other fields change no decision: the first valid slot goes, and if there is none the newcomer is accepted."""
+    scenario, options = CASES[case]
+    gone = []
+    for fields in ("guided", None):
+        env = SenderEnv(scenario, L, actions="slots", fields=fields, **options)
+        last_info(env, lambda _, info: int(np.argmax(info["action_mask"])), seed=0)
+        gone.append(env.rows.senders.batch.log["dropped_us"][0].copy())
+    assert np.array_equal(*gone) and (gone[0] > 0).any()
+
+
+@kernels
+@pytest.mark.parametrize("case", CASES)
 def test_actions_are_the_outputs_of_a_policy_over_their_scales(case: str) -> None:
     """A policy of constant outputs, which keeps the plain rule on a measured steady link."""
     action = np.random.default_rng(1).integers(-2, 3, len(OUTPUTS)).astype(np.float32) / 4
