@@ -1,7 +1,6 @@
 """CI is a first user: ``make test`` in a fresh clone that sees no program or Debian package that tests use besides.
 
-Then ``make everything`` installs what this machine can have, and runs in that clone what the first run skipped. With
-arguments it installs all of these for this checkout and runs ``make`` with them: ``.ci/run test``, and
+With arguments it installs all of these for this checkout and runs ``make`` with them: ``.ci/run test``, and
 ``.ci/run nightly`` each night.
 """
 
@@ -66,12 +65,7 @@ def main(words: list[str]) -> int:
         # In the order of files: other orders are for people, who can look for what an order brought to light.
         os.environ.setdefault("PYTEST_ADDOPTS", "-p no:randomly")
         given = [f"PYTEST_ARGS={os.environ['PYTEST_ARGS']}"] if "PYTEST_ARGS" in os.environ else []
-        recordings = REPO.parent / "shared" / "data"
-        if code := make("test", *given, folder=clone, hide=True):
-            return code
-        if recordings.is_dir():
-            os.environ.setdefault("BUFGYM_SHARED_DATA", str(recordings))
-        return make("everything", folder=clone)
+        return make("test", *given, folder=clone, hide=True)
     finally:
         shutil.rmtree(clone.parent)
 

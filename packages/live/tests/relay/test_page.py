@@ -180,9 +180,7 @@ def test_a_robot_has_one_place_in_one_frame(browser: Any, port: int) -> None:
         until(page, "document.querySelectorAll('.card').length >= 2")
         threading_run(drive())
         for name, facts in (("nav", "at 100.0, 3.0 m in map"), ("by-tf", "at 100.0, 3.0 m in map"), ("stray", "")):
-            page.evaluate(
-                f"[...document.querySelectorAll('.card')].find(c => c.textContent.includes('{name}')).click()"
-            )
+            page.evaluate(f"document.querySelector(\".card[href*='/{name}']\").click()")  # others say who is near
             until(page, f"document.querySelector('#name').textContent === '{name}'")
             until(page, f"document.querySelector('#facts').textContent === '{facts}'")
             until(page, "document.querySelector('#frame').textContent === 'in map, 1 in other frames'")
