@@ -26,8 +26,9 @@ class Student(nn.Sequential):
         size = int(seen(candidates)) if ruled else inputs(candidates)
         first, second = nn.Linear(size, width), nn.Linear(width, width)
         out = nn.Linear(width, candidates + 2 + ruled)
-        super().__init__(first, nn.ReLU(), second, nn.ReLU(), out)
-        self.candidates, self.ruled = candidates, ruled
+        unit = nn.ReLU if ruled else nn.Tanh  # where the rule is asked as well, tanh would take as long again
+        super().__init__(first, unit(), second, unit(), out)
+        self.ruled, self.candidates, self.activation = ruled, candidates, "relu" if ruled else "tanh"
         nn.init.zeros_(out.weight)
         nn.init.zeros_(out.bias)
         with torch.no_grad():
@@ -47,7 +48,7 @@ class Student(nn.Sequential):
         numbers = {name: tensor.detach().numpy() for name, tensor in self.named_parameters()}
         layers = tuple((numbers[f"{k}.weight"].T.copy(), numbers[f"{k}.bias"].copy()) for k in LAYERS)
         kind = RuledWeights if self.ruled else CandidateWeights
-        return kind(self.candidates, at_arrivals=True, masks=True, activation="relu", layers=layers)
+        return kind(self.candidates, at_arrivals=True, masks=True, activation=self.activation, layers=layers)
 
 
 def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:

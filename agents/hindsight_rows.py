@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.mixed_env import Cell
-from bufgym.envs.expert.player import Player
+from bufgym.envs.expert.player import Player, as_actions
 from bufgym.envs.options import Options
 from bufgym.envs.rows import Rows
-from bufgym.model.buffer import ACCEPT
 from bufgym.oracle.hindsight import Hindsight
 from bufgym.policies.candidate_network import inputs
 from bufgym.policies.ruled_network import NOT_OFFERED, seen, watcher
@@ -109,8 +108,7 @@ class TaughtRows:
             player.actions(rows.senders)
             end = player.memory[:, player.memory.shape[1] - (k + 3) - seen(k) :]
             self.seen[span], answers = end[:, k + 3 : k + 3 + numbers], end[:, :actions].astype(np.int64)
-            slots = np.where(answers >= 0, answers, np.where(answers == ACCEPT, rows.capacity + 1, rows.capacity))
-            self.decisions[span] = np.where(answers == NOT_OFFERED, NOT_OFFERED, slots)
+            self.decisions[span] = np.where(answers == NOT_OFFERED, NOT_OFFERED, as_actions(answers, rows.capacity))
 
     def _act(self, decisions: NDArray[np.int64]) -> None:
         for rows, span in zip(self.groups, self.spans, strict=True):

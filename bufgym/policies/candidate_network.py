@@ -168,15 +168,20 @@ class CandidateWeights:
         asked = "at arrivals" if settings["at_arrivals"] else "at a full buffer"
         return f"{settings['candidates']} candidates, {asked},"
 
+    @staticmethod
+    def ends(settings: Mapping[str, Any]) -> tuple[int, int]:
+        """How many numbers go in, and how many come out."""
+        k = settings["candidates"]
+        return inputs(k), k + 1 + settings["at_arrivals"]
+
     @classmethod
     def shapes(
         cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]
     ) -> dict[str, tuple[int, ...]]:
         """The shapes of ``tensors`` for hidden layers of these widths, by name."""
-        k, shapes = settings["candidates"], dict[str, tuple[int, ...]]()
-        sizes = [inputs(k), *widths, k + 1 + settings["at_arrivals"]]
+        shapes, (seen, actions) = dict[str, tuple[int, ...]](), cls.ends(settings)
         names = [*map(str, range(len(widths))), "out"]
-        for name, shape in zip(names, itertools.pairwise(sizes), strict=True):
+        for name, shape in zip(names, itertools.pairwise([seen, *widths, actions]), strict=True):
             shapes[f"{cls.NETWORKS[0]}.{name}.weight"] = shape
             shapes[f"{cls.NETWORKS[0]}.{name}.bias"] = shape[1:]
         return shapes

@@ -8,7 +8,6 @@ rule knows (``guided.INPUTS``), and at the rule's own decision. Its network has 
 and the highest output of those that are offered decides. See docs/methods.md, "Networks among candidates".
 """
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -164,14 +163,8 @@ class RuledWeights(CandidateWeights):
         """What defines observation and rule: weights found with others would decide nonsense."""
         return [*CandidateWeights.definition(fields), MEANINGS, price_dp.PARAMETERS]
 
-    @classmethod
-    def shapes(
-        cls, fields: Sequence[str], widths: Sequence[int], given: Mapping[str, Any], settings: Mapping[str, Any]
-    ) -> dict[str, tuple[int, ...]]:
-        """The shapes of ``tensors`` for hidden layers of these widths, by name."""
-        k, shapes = settings["candidates"], dict[str, tuple[int, ...]]()
-        names = [*map(str, range(len(widths))), "out"]
-        for name, shape in zip(names, itertools.pairwise([seen(k), *widths, k + 3]), strict=True):
-            shapes[f"{cls.NETWORKS[0]}.{name}.weight"] = shape
-            shapes[f"{cls.NETWORKS[0]}.{name}.bias"] = shape[1:]
-        return shapes
+    @staticmethod
+    def ends(settings: Mapping[str, Any]) -> tuple[int, int]:
+        """How many numbers go in, and how many come out."""
+        k = settings["candidates"]
+        return int(seen(k)), k + 3

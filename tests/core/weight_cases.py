@@ -44,24 +44,25 @@ def random_weights(fields, *widths, seed=0):
     return Weights(tuple(fields), *(network(rng, len(fields), *widths) for _ in Weights.NETWORKS))
 
 
-def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed=0, accept=0.0):
-    """Of a network among k candidates and the head, inclined to its first action by ``accept``."""
+def random_layers(sizes, seed, accept):
+    """Layers of these sizes; the first output is ``accept`` higher."""
     rng = np.random.default_rng(seed)
-    pairs = itertools.pairwise([inputs(k), *widths, k + 1 + at_arrivals])
+    pairs = itertools.pairwise(sizes)
     layers = [(2 * rng.normal(size=pair) / pair[0] ** 0.5, rng.normal(size=pair[1])) for pair in pairs]
     layers[-1][1][0] += accept
-    single = tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
-    return CandidateWeights(k, at_arrivals, masks, activation, single)
+    return tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
+
+
+def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed=0, accept=0.0):
+    """Of a network among k candidates and the head, inclined to its first action by ``accept``."""
+    return CandidateWeights(
+        k, at_arrivals, masks, activation, random_layers([inputs(k), *widths, k + 1 + at_arrivals], seed, accept)
+    )
 
 
 def random_ruled(k, *widths, activation="tanh", seed=0, accept=0.0):
     """Of a network among k candidates, the head and what the rule does, inclined to its first action by ``accept``."""
-    rng = np.random.default_rng(seed)
-    pairs = itertools.pairwise([seen(k), *widths, k + 3])
-    layers = [(2 * rng.normal(size=pair) / pair[0] ** 0.5, rng.normal(size=pair[1])) for pair in pairs]
-    layers[-1][1][0] += accept
-    single = tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in layers)
-    return RuledWeights(k, True, True, activation, single)
+    return RuledWeights(k, True, True, activation, random_layers([seen(k), *widths, k + 3], seed, accept))
 
 
 KINDS = QUEUE, TOPICS, CHOICES = Weights, SchedulerWeights, CandidateWeights

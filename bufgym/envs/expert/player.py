@@ -18,6 +18,11 @@ from bufgym.sim.view import arrival_of, view
 from bufgym.utils.errors import BufgymError
 
 
+def as_actions(answers: NDArray[np.int64], capacity: int) -> NDArray[np.int64]:
+    """A policy's answers as actions: 0..L-1 for a slot, L + 1 for ACCEPT, L for REJECT and HOLD."""
+    return np.where(answers >= 0, answers, np.where(answers == ACCEPT, capacity + 1, capacity))
+
+
 class Player:
     """Owns a policy's ``memory``, float64[n, entries], and turns its decisions into an environment's actions.
 
@@ -107,7 +112,7 @@ class Player:
             what, last = ("sends slot", "or HOLD") if sends else ("decision", "REJECT or ACCEPT")
             slots = f"0..{capacity - 1}," if sends else f"a slot 0..{capacity - 1},"
             raise BufgymError(f"policy {self.policy.name}: {what} {wrong[0]}: must be {slots} {last}")
-        return np.where(answers >= 0, answers, np.where(answers == ACCEPT, capacity + 1, capacity))
+        return as_actions(answers, capacity)
 
 
 def ask(

@@ -2,7 +2,6 @@
 
 import bisect
 import itertools
-import operator
 import textwrap
 from collections.abc import Iterable
 
@@ -117,11 +116,11 @@ def _actions_line(scene: Scene, columns: int) -> str:
     """What each action of candidates does, as far as it fits."""
     L = scene.capacity
     does = {L: "rejects the newcomer", L + 1: "accepts the newcomer"}
-    words = [f"{a} {does.get(slot, f'drops slot {slot}')}" for slot, a in sorted(scene.actions.items(), key=_second)]
+    words = [
+        f"{a} {does.get(slot, f'drops slot {slot}')}"
+        for a, slot in sorted((a, slot) for slot, a in scene.actions.items())
+    ]
     return textwrap.shorten(", ".join(words), columns, placeholder=" ...")
-
-
-_second = operator.itemgetter(1)
 
 
 def _fitted(marks: list[tuple[str, str]], last: list[tuple[str, str]], columns: int) -> str:
