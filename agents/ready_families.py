@@ -1,4 +1,4 @@
-"""Twelve families of links and streams, which one agent learns side by side.
+"""Fourteen families of links and streams, which one agent learns side by side.
 
 ``train.py hindsight --families all`` learns from their train splits, chooses by their validation splits, and reports on
 their test splits. The splits share no link, but for ``task``: its validation has other episodes on the training links.
@@ -27,7 +27,7 @@ FIRST_SEED = {"train": 20_000, "validation": 21_000, "test": 22_000}
 """Seeds of links made here count up from these."""
 FRAMES = {"train": 96, "validation": 24, "test": 48}
 """Generated links at the default frames."""
-STREAMS = {"train": 48, "validation": 48, "test": 96}
+STREAMS = {"train": 96, "validation": 48, "test": 96}
 """Streams of random conditions; three in four have messages of equal size."""
 TASK_EPISODES = {"validation": 1500, "test": 1800}
 """First seed of episodes on the links of the task."""
@@ -84,15 +84,30 @@ def _task(split: str) -> list[Cell]:
     return [Cell("", split_scenario(on)[split == "test"], on.capacity)]
 
 
-def _frames(split: str) -> list[Cell]:
+def _frames(split: str, capacities: Sequence[int] = (3, 4, 5, 8, 12, 16, 24, 32, 48, 100, 200)) -> list[Cell]:
     first = FIRST_SEED[split]
     scenario = frames_over(range(first, first + FRAMES[split]))
-    return [Cell("", scenario, L) for L in (3, 4, 5, 8, 12, 16, 24, 32, 48)]
+    return [Cell("", scenario, L) for L in capacities]
 
 
-def _random(split: str, equal: bool = True) -> list[Cell]:
+def _kind(cell: Cell) -> str:
+    """Which of the families of random streams has this one: what the clairvoyant says of it decides."""
+    if cell.scenario.sizes != "equal":  # type: ignore[attr-defined]
+        return "random-unequal"
+    is_hopeful = cell.label.startswith("constant") or cell.scenario.value.name.startswith("saturating")
+    return "random-plain" if is_hopeful else "random"
+
+
+def _random(split: str, kind: str) -> list[Cell]:
     found = map(random_stream, range(FIRST_SEED[split], FIRST_SEED[split] + STREAMS[split]))
-    return [cell for cell in found if (cell.scenario.sizes == "equal") == equal]  # type: ignore[attr-defined]
+    return [cell for cell in found if _kind(cell) == kind]
+
+
+def _short(split: str) -> list[Cell]:
+    """Queues of one and of two places, under random streams and at the default frames."""
+    streams = map(random_stream, range(FIRST_SEED[split], FIRST_SEED[split] + STREAMS[split] // 4))
+    found = [Cell(cell.label, cell.scenario, 1 + k % 2) for k, cell in enumerate(streams)]
+    return [*found, *_frames(split, (1, 2))]
 
 
 def _of_suite(
@@ -117,18 +132,22 @@ FAMILIES: dict[str, Callable[[str], list[Cell]]] = {
     "outage": _of_suite("outage-v1", (5, 15)),
     "heavy": _of_suite("jpeg-v1", (5, 10, 25), "heavy"),
     "light": _of_suite("jpeg-v1", (5, 10, 25), "light"),
-    "interruption": _of_suite("interruption-v1", (5, 8, 16, 32)),
-    "steady": _of_suite("sustained-v1", (5, 8, 15)),
-    "random": _random,
+    "random": partial(_random, kind="random"),
+    "interruption": _of_suite("interruption-v1", (1, 2, 5, 8, 16, 32)),
+    "steady": _of_suite("sustained-v1", (1, 2, 3, 5, 8, 15, 32, 64)),
+    "random-short": _short,
+    "random-plain": partial(_random, kind="random-plain"),
     "unequal": _of_suite("jpeg-v1", (5, 10, 25), equal=False),
-    "random-unequal": partial(_random, equal=False),
+    "random-unequal": partial(_random, kind="random-unequal"),
 }
 """Name -> cells of a split."""
-STAYING = ("interruption", "steady", "unequal", "random-unequal")
+STAYING = ("interruption", "steady", "random-short", "random-plain", "unequal", "random-unequal")
 """Families in which the clairvoyant teaches nothing: there the student learns to do what the rule gap-price does.
 
-For messages of unequal size there are no costs in hindsight. On steady links and in interruptions accepting is free in
-hindsight, as the clairvoyant could still drop the right messages later, and a student that accepts does not.
+For messages of unequal size there are no costs in hindsight. On steady links, in interruptions, in queues of one or two
+places and where V saturates, accepting is free in hindsight, as the clairvoyant could still drop the right messages
+later, and a student that accepts does not. ``random-plain`` has those among the random streams whose link is steady or
+whose V saturates.
 """
 
 

@@ -5,7 +5,8 @@ rule knows (``guided.INPUTS``), and at the rule's own decision. Its network has 
 
     0: accept where there is room, else drop the cheapest;  1 to k + 1: candidates;  k + 2: what the rule does
 
-and the highest output of those that are offered decides. See docs/methods.md, "Networks among candidates".
+and the highest output of those that are offered decides. On a link that has not varied for ``EVEN_US`` the rule alone
+is offered. See docs/methods.md, "Networks among candidates".
 """
 
 import math
@@ -28,16 +29,28 @@ from bufgym.model.observe import (
 )
 from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, forward
-from bufgym.policies.guided import BASE, INPUT_FIELDS, MEANINGS, N_INPUTS, REMEMBERED, RULE, inputs, recall
+from bufgym.policies.guided import (
+    BASE,
+    INPUT_FIELDS,
+    LOG_RATE_VARIANCE,
+    MEANINGS,
+    N_INPUTS,
+    REMEMBERED,
+    RULE,
+    inputs,
+    recall,
+)
 from bufgym.policies.registry import Arrival, Memory, Policy
+from bufgym.policies.target_gap import SEEN_US
+from bufgym.policies.thinning import steady
 
 NOT_OFFERED = -100
 """In place of the decision of an action that is not offered."""
 OF_RULE = tuple(f"guided_{field.name}" for field in INPUT_FIELDS)
+EVEN_US, EVEN = 3e6, 2.5e-5
+"""How long a link must have been measured, us, and the variance of its log rate below which it has not varied."""
 STATE = ("room", "log_capacity")
 """1 if there is room for the newcomer; log(L / 8)."""
-
-
 PER_CANDIDATE, QUEUE, OTHERS = len(CANDIDATE_FIELDS), len(QUEUE_FIELDS), N_INPUTS + len(STATE)
 
 
@@ -64,6 +77,15 @@ def rule_decision(buffer: Buffer, arrival: Arrival, rule: Memory) -> int:
 
 
 @kernel
+def even(buffer: Buffer, memory: Memory) -> bool:
+    """Whether the link has carried at one rate for ``EVEN_US``.
+
+    Regret is so small there that a network which wavers once loses several times what the rule loses.
+    """
+    return bool(steady(buffer) and memory[LOG_RATE_VARIANCE] < EVEN and memory[RULE + SEEN_US] > EVEN_US)
+
+
+@kernel
 def look(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.float64], places: int) -> None:
     """Write into ``own`` order and cost of the ``places`` = k + 1 candidates, each action's decision, and what is seen.
 
@@ -82,9 +104,10 @@ def look(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.float
     at = of_candidates + N_INPUTS
     numbers[at], numbers[at + 1] = 1.0 if room else 0.0, math.log(buffer.capacity / 8)
     decisions[actions - 1] = by_rule
+    alone = even(buffer, memory)
     for a in range(actions - 1):
         decisions[a], numbers[at + 2 + a] = NOT_OFFERED, 0.0
-        if is_offered(order, True, room, a):
+        if not alone and is_offered(order, True, room, a):
             decisions[a] = decision_of_candidate(order, len(buffer.slots), True, room, a)
             numbers[at + 2 + a] = 1.0 if decisions[a] == by_rule else 0.0
     for i in range(at + 1 + actions):

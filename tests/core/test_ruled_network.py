@@ -6,16 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from candidate_cases import found, observed, outputs
-from cases import VALUES, cases, same
+from cases import VALUES, Case, cases, same, trace
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from weight_cases import random_choices, random_ruled
 
 from bufgym import policies
+from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.policies import guided, weights
+from bufgym.model.link import Link
+from bufgym.policies import guided, target_gap, thinning, weights
 from bufgym.policies.registry import Policy
 from bufgym.policies.ruled_network import NOT_OFFERED, fields_seen, seen, watcher
+from bufgym.scenario import Episode, messages
 
 kernels = pytest.mark.kernels
 RULE = policies.get("gap-price")
@@ -41,6 +44,9 @@ def reference(made, margins):
         by_rule = guided.follow(buffer, arrival, memory, guided.BASE, np.zeros(guided.N_OUTPUTS))
         candidates, x = found(buffer, arrival, made.candidates)
         does, room = decisions_of(buffer, arrival, [j for j, _ in candidates])
+        is_old = memory[guided.RULE + target_gap.SEEN_US] > 3e6
+        if is_old and thinning.steady(buffer) and math.sqrt(memory[guided.LOG_RATE_VARIANCE]) < 0.005:
+            does = [None for _ in does]
         same_as_rule = [float(decision == by_rule) for decision in does]
         state = [float(room), math.log(buffer.capacity / 8)]
         ranked = outputs(made, [*observed(buffer, arrival, candidates, x), *known, *state, *same_as_rule])
@@ -127,3 +133,33 @@ def test_a_file_holds_it(tmp_path):
 
 def _numbers(made):
     return [part for layer in made.layers for part in layer]
+
+
+def streamed(link):
+    """The case of a camera with ten messages a second for six seconds, with three places in its queue."""
+    return Case(Episode(messages(np.arange(60) * 100_000, 3_000), Link(link, 0, 0)), [], [], 3, None, "arrival")
+
+
+@kernels
+def test_on_a_link_that_has_been_even_for_three_seconds_the_rule_alone_is_offered():
+    """A camera sends 30 kB/s. One link carries 10 kB/s all the time, the other 5 and 15 in turn."""
+    wavering = [(1_000_000 * s, 10_000 * s - (5_000 if s % 2 else 0)) for s in range(13)]
+    links = {"even": [(0, 0), (60_000_000, 600_000)], "wavering": wavering}
+    made, alone = inclined(random_ruled(2, 3), 0), {}
+    v = qoi.exponential(0.5)
+    for name, knots in links.items():
+        offered = []
+
+        def on_arrival(buffer, arrival, memory, offered=offered):
+            watcher(2).on_arrival(buffer, arrival, memory)
+            actions = memory[-5 - seen(2) : -seen(2)]
+            offered.append((int(arrival.arrival_us), bool((actions[:-1] == NOT_OFFERED).all())))
+            return int(actions[-1])
+
+        case = streamed(trace(knots, "hold"))
+        case.run(replace(watcher(2), on_arrival=on_arrival, compile=False), v)
+        alone[name] = [us for us, only in offered if only]
+        assert same(case.run(made.policy("fast"), v), case.run(reference(made, []), v))
+    assert alone["wavering"] == []
+    assert alone["even"] and min(alone["even"]) > 3_000_000
+    assert alone["even"] == list(range(min(alone["even"]), 6_000_000, 100_000))

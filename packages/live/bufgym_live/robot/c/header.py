@@ -56,6 +56,7 @@ _CONSTANTS = {
     chains: "SPAN",
     gaps: "TIE",
     guided: "MOST SPREAD_US SLOW_US HEAVY HEAVIER",
+    ruled_network: "EVEN_US EVEN",
 }
 """Constants that the parts name, by the module that has them."""
 _GUIDED = "guided_"
