@@ -295,11 +295,11 @@ private:
       status.hardware_id = "bufgym";
       status.level = n.connected ? status.OK : status.WARN;
       status.message = n.connected ? "connected" : "not connected: " + n.fault;
-      const std::pair<const char *, double> told[] = {
+      const std::pair<const char *, double> values[] = {
           {"arrived per s", n.arrived_hz}, {"left per s", n.left_hz}, {"left Mbit/s", n.left_mbps},
           {"arrived", double(n.arrived)},  {"left", double(n.left)},  {"dropped", double(n.dropped)},
           {"queued", double(n.queued)},    {"oldest s", n.oldest_s},  {"QoI", n.qoi}};
-      for (const auto &[key, number] : told)
+      for (const auto &[key, number] : values)
       {
         diagnostic_msgs::msg::KeyValue pair;
         pair.key = key;
