@@ -86,7 +86,7 @@ LEAST = 4
 SHORT_QUEUE, SHORT_RUN_US = 5, 10e6
 """Largest L with a last chance for its head, and how long a stream must have run for it to follow the target, us.
 Structural: the last chance was found on the laws of ``switching-v1``, which has L up to 5 and streams of 10 s."""
-KNOWN_END = 4.0  # How many times sooner a stream follows the target if the robot knows when it ends
+TOLD = 4.0  # How many times sooner a stream follows the target if the robot knows when it ends
 SLOWEST = 16.0  # Most arrivals in S and M. Structural: a link that stands still would make both infinite.
 BURSTY, LATE = 1.5, 1 / 32
 """Arrivals are bursty if the mean square of the time between them exceeds ``BURSTY`` times the square of its mean. The
@@ -145,7 +145,7 @@ def target(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers) -
     if bursty(memory) or (L <= SHORT_QUEUE and memory[SEEN_US] < SHORT_RUN_US):
         return 0.0
     r = link_rate(buffer, memory, numbers) / mean_bytes(buffer, arrival)
-    if L > (KNOWN_END if buffer.remaining_us < FOREVER else 1.0) * r * memory[SEEN_US]:
+    if L > (TOLD if buffer.remaining_us < FOREVER else 1.0) * r * memory[SEEN_US]:
         return 0.0
     horizon_us = within(1e6 * numbers[HORIZON_S], buffer)
     m = (1 - numbers[PACED]) * (arrival.x - buffer.dequeued_x) / elapsed_us + numbers[PACED] * memory[PACE]

@@ -249,7 +249,7 @@ SHORT = Uplink(**MOVING | {"value": qoi.exponential(0.4)}, duration_s=5.0)
 def test_regrets_of_an_episode_sum_to_what_it_lacks(asks: str, actions: str, n: int) -> None:
     """H less the best attainable at the first decision; at arrivals that is the clairvoyant's H of the episode.
 
-    In the night of a thousand episodes.
+    Nightly with a thousand episodes.
     """
     envs = batch_of(SHORT, n, capacity=4, decide_at=asks, actions=actions, reward="regret", info="mask")
     episodes = [draw(SHORT, seed) for seed in range(n)]

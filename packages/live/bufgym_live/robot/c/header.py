@@ -51,7 +51,7 @@ _HELPERS = {
 """Parts that rules share, each before its callers."""
 _CONSTANTS = {
     thinning: "WAITING SOON_US STEADY",
-    target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE KNOWN_END WITHIN",
+    target_gap: "LEAST SHORT_QUEUE SHORT_RUN_US SLOWEST BURSTY LATE TOLD WITHIN",
     price_dp: "LEAST_SHARE SIZES_WEIGHT UNPRICED",
     chains: "SPAN",
     gaps: "TIE",

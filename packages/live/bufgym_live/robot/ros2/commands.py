@@ -85,7 +85,7 @@ async def send(
 
 _ABOUT = {
     "topics": "Names, or patterns with * and ?, besides the topics in --config",
-    "policy": "Which message goes when the queue is full; empty: afr for one topic, learned-scheduler for several",
+    "policy": "Drops messages when the queue is full; empty: afr for one topic, learned-scheduler for several",
     "value": "V of topics without one, as exponential:0.618 or saturating:4",
     "capacity": "L, messages of all topics together",
     "odometry": "Topic with poses, which gives x to the topics that move",

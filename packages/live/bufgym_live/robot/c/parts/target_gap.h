@@ -54,7 +54,7 @@ bufgym_target(const struct bufgym_queue *q, const struct bufgym_message *arrival
     if (bufgym_bursty(q) || (L <= @SHORT_QUEUE@ && memory[BUFGYM_SEEN_US] < @SHORT_RUN_US@))
         return 0.0;
     r = bufgym_link_rate(q) / bufgym_mean_bytes(q, arrival);
-    if (L > (q->ends_us < BUFGYM_FOREVER ? @KNOWN_END@ : 1.0) * r * memory[BUFGYM_SEEN_US])
+    if (L > (q->ends_us < BUFGYM_FOREVER ? @TOLD@ : 1.0) * r * memory[BUFGYM_SEEN_US])
         return 0.0;
     m = (1 - @PACED@) * (arrival->x - q->dequeued_x) / elapsed_us + @PACED@ * memory[BUFGYM_PACE];
     return m * horizon_us / (r * horizon_us + L - q->occupancy);

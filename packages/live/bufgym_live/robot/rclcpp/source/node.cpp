@@ -46,7 +46,7 @@ public:
         "Topics to send, also patterns with * and ?; relative names stand in the namespace");
     declare("host", std::string("127.0.0.1"), "Where bufgym ros2 receive listens; may change at any time");
     declare("port", 7410, "Its port; may change at any time", 1, 65535);
-    declare("policy", std::string("learned"), "Which message goes when a queue is full: " + known());
+    declare("policy", std::string("learned"), "Which message is dropped when a queue is full: " + known());
     declare("value", std::string(), "V, one for all nodes of the process: exponential:BASE or saturating:DISTANCE");
     declare("capacity", 15, "L, messages of each queue; also the depth of the subscription", 1, MOST);
     declare(
