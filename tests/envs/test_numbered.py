@@ -103,7 +103,7 @@ def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
     assert row["trace"] == "same#2" and played(env, "random", options={"trace": 1, "seed": 1})["qoi"] == info["qoi"]
     alone = SenderEnv(Interruption(t_max=30), L, actions="slots")
     alone.reset(options={"seed": 5})
-    assert alone.rows.senders.episodes[0].last_decision == draw(Interruption(t_max=30), 5).last_decision  # type: ignore[union-attr]
+    assert alone.sub_envs.senders.episodes[0].last_decision == draw(Interruption(t_max=30), 5).last_decision  # type: ignore[union-attr]
 
 
 def suite_env(**arguments: Any) -> Any:

@@ -41,7 +41,7 @@ def test_fields_of_topics_need_topics() -> None:
     assert (seen["silence"].shape, seen["socket_asks"].shape) == ((L + 1,), (1,))
     refuse("unknown field 'silence'", SenderEnv, "lte", fields=["silence"])
     # The terms of topics have namesakes there, computed where they are named.
-    assert [term.name for term in SenderEnv("lte", reward="age", actions="slots").rows.terms] == [
+    assert [term.name for term in SenderEnv("lte", reward="age", actions="slots").sub_envs.terms] == [
         "delivered",
         "retained",
         "age",
